@@ -1,0 +1,94 @@
+"""One pool of worker threads for the serial `nogil` kernels.
+
+Numba's own threading aborts after `fork` (OpenMP) and fails from two Python threads at once (workqueue).
+Plain kernels over ranges of work, handed to a pool of ours, have neither problem; since the ranges never
+depend on the number of threads, every result is the same to the bit for any number of them.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+from foldgauss._checks import invalid
+
+_lock = threading.Lock()
+_pool: ThreadPoolExecutor | None = None
+_num_threads: int | None = None
+
+
+def available_cores() -> int:
+    """Cores this process may run on (its affinity, where the system tells)."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        return os.cpu_count() or 1
+
+
+def num_threads() -> int:
+    """Threads the kernels use: what `set_num_threads` said, else FOLDGAUSS_NUM_THREADS, else the cores."""
+    if _num_threads is not None:
+        return _num_threads
+    said = os.environ.get("FOLDGAUSS_NUM_THREADS")
+    if said is None:
+        return available_cores()
+    if not said.isdecimal() or int(said) < 1:
+        raise invalid("FOLDGAUSS_NUM_THREADS", expected="a whole number >= 1", got=repr(said))
+    return int(said)
+
+
+def set_num_threads(count: int | None) -> None:
+    """Fix the number of kernel threads; None returns to the default."""
+    global _pool, _num_threads
+    if count is not None and count < 1:
+        raise invalid("count", expected="a whole number >= 1, or None", got=count)
+    with _lock:
+        _num_threads, _pool = count, None
+
+
+def _forget_pool() -> None:
+    """In a forked child the pool's threads do not exist: start afresh, with a lock nobody holds."""
+    global _pool, _lock
+    _pool, _lock = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)
+
+
+def run_tasks(task: Callable[[int], object], items: Iterable[int]) -> None:
+    """Call `task(item)` for every item on the pool and wait; the first error is raised here.
+
+    Tasks must not call `run_tasks` themselves.
+    """
+    global _pool
+    items = list(items)
+    threads = num_threads()
+    if threads == 1 or len(items) <= 1:
+        for item in items:
+            task(item)
+        return
+    with _lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(threads, thread_name_prefix="foldgauss")
+        pool = _pool
+    # One queue entry per thread, not per item: a Python future costs about as much as a small tile.
+    pending = iter(items)
+    guard = threading.Lock()
+
+    def drain() -> None:
+        while True:
+            with guard:
+                item = next(pending, None)
+            if item is None:
+                return
+            task(item)
+
+    futures = [pool.submit(drain) for _ in range(min(threads, len(items)) - 1)]
+    try:
+        drain()  # the calling thread works too
+    finally:
+        errors = [future.exception() for future in futures]
+    for error in errors:
+        if error is not None:
+            raise error

@@ -1,0 +1,458 @@
+"""The command `foldgauss`: arguments, progress and exit codes. The work is done on the floors below."""
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from foldgauss._checks import invalid
+from foldgauss._threads import num_threads
+from foldgauss.datasets import sample_clip
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable
+from foldgauss.io.model_file import read_header
+from foldgauss.io.pictures import comparison
+from foldgauss.io.video_file import Clip, read_video, write_image, write_video
+from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
+from foldgauss.video.fit import FitConfig, FitInfo, FitState, default_num_gaussians, fit_steps, planned_steps, to_model
+from foldgauss.video.frame_times import interpolated_times
+from foldgauss.video.metrics import Evaluation, evaluate
+from foldgauss.video.model import VideoModel
+
+WRONG_USE, FAILURE = 2, 1
+#: A running fit is kept on disk this often, in seconds.
+CHECKPOINT_SECONDS = 30.0
+DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
+DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+out = Console()
+err = Console(stderr=True)
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
+Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
+Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B.")]
+
+
+class WrongUse(ValueError):
+    """The command was called with arguments that cannot be right."""
+
+
+class Stopped(Exception):
+    """The user asked a fit to stop; the message says how to go on."""
+
+
+@app.callback()
+def root(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Videos as mixtures of folded Gaussians: fit, render, evaluate."""
+    del debug  # read by `main`, before typer runs
+
+
+@app.command()
+def demo(
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
+) -> None:
+    """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out."""
+    clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
+    _make_folder(out_dir)
+    out.print(f"[bold]Bunny[/], frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
+    state, info = _fit_with_progress(clip.frames, DEMO_CONFIG)
+    model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
+    scores, pictures = _evaluate_with_progress(model, clip.frames)
+    figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+    path = save_video_model(out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores))
+    figures["file_bytes"] = path.stat().st_size
+    write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
+    shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
+    captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
+    picture = comparison([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
+    write_image(out_dir / "comparison.png", picture)
+    _write_json(out_dir / "metrics.json", figures | {"psnr": scores.psnr, "ssim": scores.ssim})
+    _print_figures("Demo", figures)
+    for name, what in (
+        ("comparison.png", "original, reconstruction and error side by side"),
+        ("reconstruction.mp4", "plays in any browser (VP9)"),
+        ("model.safetensors", "the model: try `foldgauss render` on it with --upsample 4"),
+        ("metrics.json", "the figures above, and by frame"),
+    ):
+        out.print(f"  {out_dir / name}  [dim]{what}[/]", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def fit(
+    video: Annotated[Path, typer.Argument(help="Video file, or folder of images in natural order.")],
+    out_path: Annotated[
+        Path | None, typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name].")
+    ] = None,
+    size: Size = None,
+    frames: Frames = None,
+    gaussians: Annotated[
+        int | None, typer.Option(help="Number of Gaussians [default: by the frame's size].")
+    ] = None,
+    degree: Annotated[int, typer.Option(help="Degree of the fold polynomial.")] = FitConfig.degree,
+    steps: Annotated[
+        int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips].")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(help="Time to fit for, instead of steps.")] = None,
+    batch_size: Annotated[int, typer.Option(help="Frames per step.")] = FitConfig.batch_size,
+    power: Annotated[
+        float, typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code.")
+    ] = FitConfig.power,
+    seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
+    overwrite: Overwrite = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
+) -> None:
+    """Fit a model to a clip. A stopped fit is kept and goes on with --resume."""
+    try:
+        config = FitConfig(
+            num_gaussians=gaussians,
+            degree=degree,
+            steps=steps,
+            minutes=minutes,
+            batch_size=batch_size,
+            power=power,
+            seed=seed,
+        )
+    except ValueError as error:
+        raise WrongUse(str(error)) from error
+    target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
+    kept = target.with_name(f"{target.name}.checkpoint")
+    _refuse_existing(target, overwrite)
+    if kept.exists() and not (resume or overwrite):
+        raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
+    if resume and not kept.exists():
+        raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
+    check_writable(target)
+    clip = read_video(video, frames=_parse_frames(frames), size=_parse_size(size))
+    _say_clip(clip, config)
+    source = {"clip": clip.source, "num_frames": clip.num_frames, "size": list(clip.size)}
+    state = load_checkpoint(kept, config=config, source=source) if resume else None
+    state, info = _fit_with_progress(
+        clip.frames, config, state, keep=lambda state: save_checkpoint(kept, state, config=config, source=source)
+    )
+    model = to_model(state, config, clip.size, clip.fps)
+    scores, _ = _evaluate_with_progress(model, clip.frames)
+    metadata = _provenance(clip, config, scores) | {"frames": _parse_frames(frames)}
+    save_video_model(target, model, metadata=metadata)
+    kept.unlink(missing_ok=True)
+    figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+    _print_figures(str(target), figures | {"file_bytes": target.stat().st_size})
+
+
+@app.command()
+def render(
+    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    out_path: Annotated[Path, typer.Option("--out", help="FILE.mp4, FILE.webm, or a folder for PNG frames.")],
+    size: Size = None,
+    upsample: Annotated[int, typer.Option(help="Frames per original interval.")] = 1,
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw a model as a video, in between its frames too."""
+    if upsample < 1:
+        raise WrongUse(str(invalid("--upsample", expected="a whole number >= 1", got=upsample)))
+    picture_size = _parse_size(size)
+    if out_path.is_file():
+        _refuse_existing(out_path, overwrite)
+    model = load_video_model(model_path)
+    times = interpolated_times(np.asarray(model.frame_times.times()), upsample)
+    with _bar("Rendering", len(times)) as advance:
+        pictures = _counted(model.frames(times, picture_size), advance)
+        path = write_video(out_path, pictures, model.fps * upsample, overwrite=overwrite)
+    out.print(f"{path}: {len(times)} frames at {model.fps * upsample:g} frames a second", soft_wrap=True)
+
+
+@app.command(name="evaluate")
+def evaluate_command(
+    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+    frames: Frames = None,
+) -> None:
+    """Compare a model with its clip: PSNR and SSIM per frame, size of the file, bits per pixel."""
+    model = load_video_model(model_path)
+    kept = read_header(model_path)["metadata"].get("frames")
+    wanted = _parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
+    clip = read_video(video, frames=wanted, size=model.size)
+    if clip.num_frames != model.num_frames:
+        raise WrongUse(
+            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
+            "Name the frames it was fitted to."
+        )
+    scores, _ = _evaluate_with_progress(model, clip.frames)
+    num_bytes = model_path.stat().st_size
+    figures = _figures(model, scores) | {"file_bytes": num_bytes}
+    figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
+    if json_path is not None:
+        _write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
+    _print_frames(scores)
+    _print_figures(str(model_path), figures)
+
+
+@app.command()
+def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]) -> None:
+    """Say what a model file holds."""
+    model = load_video_model(model_path)
+    about = read_header(model_path)["metadata"]
+    envelope = model.splats.envelope
+    times = np.asarray(model.frame_times.times())
+    figures = {
+        "frames": f"{model.num_frames} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second",
+        "Gaussians": f"{model.splats.num_gaussians:,}",
+        "fold": f"polynomial of degree {model.splats.degree}",
+        "envelope": f"time likelihood, power {float(envelope.power):g} (paper's text 1, its code 2)",
+        "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
+        "numbers stored": f"{model.num_floats:,}",
+        "file": f"{model_path.stat().st_size:,} bytes",
+    }
+    table = Table(title=str(model_path), show_header=False)
+    for name, value in (figures | {k: _short(v) for k, v in about.items() if v is not None}).items():
+        table.add_row(name, value)
+    out.print(table)
+
+
+# ------------------------------------------------------------------------------------------- arguments
+
+
+def _parse_size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    height, cross, width = text.lower().partition("x")
+    if not (cross and height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
+        raise WrongUse(f"--size: expected HxW with both at least 1, as 160x320, got {text!r}.")
+    return int(height), int(width)
+
+
+def _parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    if not colon or any(part and not part.isdecimal() for part in (first, last)):
+        raise WrongUse(f"--frames: expected A:B with whole numbers >= 0, as 0:24, got {text!r}.")
+    return (int(first) if first else None), (int(last) if last else None)
+
+
+def _refuse_existing(path: Path, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise WrongUse(f"--out: {path} exists. Choose another path, or add --overwrite.")
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
+    check_writable(path / "model.safetensors")
+
+
+# -------------------------------------------------------------------------------------------- progress
+
+
+class _FitColumn(ProgressColumn):
+    """Step, loss, PSNR, Gaussians and time left of a fit."""
+
+    def render(self, task) -> str:
+        info: FitInfo | None = task.fields.get("info")
+        if info is None:
+            return "compiling" if not task.finished else ""
+        left = f"{info.seconds_left:.0f} s left" if np.isfinite(info.seconds_left) else ""
+        return (
+            f"step {info.step}  loss {info.loss:.4f}  {info.psnr:.2f} dB  "
+            f"{info.num_gaussians:,} Gaussians ({info.num_alive:,} alive)  {left}"
+        )
+
+
+def _fit_with_progress(
+    frames: np.ndarray,
+    config: FitConfig,
+    state: FitState | None = None,
+    keep: Callable[[FitState], object] | None = None,
+) -> tuple[FitState, FitInfo]:
+    """Run the fit under a bar; `keep` is called now and then, and before leaving on a signal."""
+    columns = TextColumn("Fitting"), BarColumn(bar_width=24), _FitColumn()
+    with Progress(*columns, console=err) as progress, _signals() as asked:
+        task = progress.add_task("fit", total=1.0)
+        kept_at, shown_at = time.monotonic(), 0.0
+        for state, info in fit_steps(frames, config, state):
+            now = time.monotonic()
+            if now - shown_at > 0.1 or info.progress >= 1:
+                progress.update(task, completed=info.progress, info=info)
+                shown_at = now
+            if keep is not None and now - kept_at > CHECKPOINT_SECONDS:
+                keep(state)
+                kept_at = time.monotonic()
+            if asked:
+                if keep is None:
+                    raise Stopped(f"stopped by {asked[0]} after step {info.step}; nothing was kept.")
+                keep(state)
+                raise Stopped(f"stopped by {asked[0]} after step {info.step}; add --resume to go on from there.")
+    return state, info
+
+
+@contextmanager
+def _signals() -> Iterator[list[str]]:
+    """Collect SIGINT and SIGTERM in a list, so that a step is never cut in half; a second SIGINT is final."""
+    asked: list[str] = []
+    before = {}
+
+    def note(number, frame) -> None:
+        asked.append(signal.Signals(number).name)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, note)
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=err) as progress:
+        task = progress.add_task(title, total=total)
+        yield lambda: progress.advance(task)
+
+
+def _counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
+    for item in items:
+        yield item
+        advance()
+
+
+def _evaluate_with_progress(model: VideoModel, frames: np.ndarray) -> tuple[Evaluation, list[np.ndarray]]:
+    """Scores, and the pictures they were read off."""
+    pictures: list[np.ndarray] = []
+
+    with _bar("Evaluating", model.num_frames) as advance:
+
+        def on_frame(picture: np.ndarray) -> None:
+            pictures.append(picture)
+            advance()
+
+        return evaluate(model, frames, on_frame), pictures
+
+
+# --------------------------------------------------------------------------------------------- results
+
+
+def _say_clip(clip: Clip, config: FitConfig) -> None:
+    height, width = clip.size
+    if clip.num_declared > clip.num_frames:
+        err.print(
+            f"[yellow]warning:[/] only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; "
+            "those are used.",
+            soft_wrap=True,
+        )
+    num = config.num_gaussians or default_num_gaussians(height, width)
+    steps = planned_steps(config, clip.num_frames)
+    plan = f"{config.minutes:g} minutes" if steps is None else f"{steps} steps"
+    out.print(
+        f"{clip.source}: {clip.num_frames} frames of {height}x{width}, {num:,} Gaussians of degree {config.degree}, "
+        f"{plan}, {num_threads()} threads",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _figures(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
+    return {
+        "mean_psnr": round(scores.mean_psnr, 3),
+        "mean_ssim": round(scores.mean_ssim, 4),
+        "lowest_psnr": round(min(scores.psnr), 3),
+        "num_frames": model.num_frames,
+        "height": model.size[0],
+        "width": model.size[1],
+        "num_gaussians": model.splats.num_gaussians,
+        "degree": model.splats.degree,
+    }
+
+
+def _provenance(clip: Clip, config: FitConfig, scores: Evaluation) -> dict[str, Any]:
+    return {
+        "clip": Path(clip.source).name,
+        "seed": config.seed,
+        "mean_psnr": round(scores.mean_psnr, 3),
+        "mean_ssim": round(scores.mean_ssim, 4),
+    }
+
+
+_LABELS = {
+    "mean_psnr": ("mean PSNR", "{:.2f} dB"),
+    "mean_ssim": ("mean SSIM", "{:.4f}"),
+    "lowest_psnr": ("lowest PSNR of a frame", "{:.2f} dB"),
+    "num_frames": ("frames", "{:,}"),
+    "height": ("height", "{:,} px"),
+    "width": ("width", "{:,} px"),
+    "num_gaussians": ("Gaussians", "{:,}"),
+    "degree": ("degree of the folds", "{}"),
+    "fit_seconds": ("time spent fitting", "{:.1f} s"),
+    "steps": ("steps", "{:,}"),
+    "file_bytes": ("model file", "{:,} bytes"),
+    "bits_per_pixel": ("bits per pixel", "{:.3f}"),
+}
+
+
+def _print_figures(title: str, figures: dict[str, Any]) -> None:
+    table = Table(title=title, show_header=False)
+    for name, value in figures.items():
+        label, form = _LABELS[name]
+        table.add_row(label, form.format(value))
+    out.print(table)
+
+
+def _print_frames(scores: Evaluation) -> None:
+    table = Table("frame", "PSNR (dB)", "SSIM")
+    for k, (psnr, ssim) in enumerate(zip(scores.psnr, scores.ssim, strict=True)):
+        table.add_row(str(k), f"{psnr:.2f}", f"{ssim:.4f}")
+    out.print(table)
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value) if isinstance(value, list | dict) else str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _write_json(path: Path, figures: dict[str, Any]) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+# ------------------------------------------------------------------------------------------------ main
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command and exit: 0 fine, 2 wrong use, 1 failure; one-line errors unless --debug."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments  # taken out, so that it may stand anywhere
+    try:
+        app([argument for argument in arguments if argument != "--debug"], standalone_mode=True)
+    except (ValueError, OSError, MemoryError, Stopped, KeyboardInterrupt) as error:
+        if debug:
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        err.print(f"[red]error:[/] {escape(text)}", soft_wrap=True, highlight=False)
+        sys.exit(_exit_code(error))
+
+
+def _exit_code(error: BaseException) -> int:
+    """Wrong use: an argument that cannot be right. Failure: a file that cannot be read or written."""
+    names_an_option = str(error).startswith(("frames:", "size:", "resume:"))
+    return WRONG_USE if isinstance(error, WrongUse | FileNotFoundError) or names_an_option else FAILURE
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""The envelope a: how a Folded-Gaussian's space covariance shrinks away from its own time (eq:cond_dens).
+
+Envelopes live in log space: far from its time a component's `a` is below every floating-point number, `log a`
+is not.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from foldgauss._checks import invalid
+
+__all__ = ["AbstractEnvelope", "Constant", "TimeLikelihood"]
+
+
+class AbstractEnvelope(eqx.Module):
+    """An envelope with batch dimensions, known by its logarithm.
+
+    To extend: return `log a <= 0`, let leading dimensions of the leaves broadcast against those of `t`, and
+    say in `leaf_ranks` where they begin.
+    """
+
+    @property
+    @abstractmethod
+    def leaf_ranks(self) -> tuple[int, ...]:
+        """Rank of each leaf (in the order of `jax.tree.leaves`) for one envelope; the rest is batch."""
+
+    @abstractmethod
+    def log_a(
+        self,
+        t: Float[Array, "*#batch"],
+        *,
+        time_loc: Float[Array, "*#batch"],
+        time_scale: Float[Array, "*#batch"],
+    ) -> Float[Array, "*#batch"]:
+        """log a(t); all arguments broadcast."""
+
+
+class Constant(AbstractEnvelope):
+    """`a(t) = 1`: the space covariance does not depend on time.
+
+    **Shapes:** t, time_loc, time_scale (*batch,) -> (*batch,).
+
+    **Example:** `Constant().log_a(0.2, time_loc=0.5, time_scale=0.1)  # 0.`
+
+    **Source:** eq:cond_dens with a = 1.
+    """
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return ()
+
+    def log_a(self, t, *, time_loc, time_scale):
+        shape = jnp.broadcast_shapes(jnp.shape(t), jnp.shape(time_loc), jnp.shape(time_scale))
+        return jnp.zeros(shape, jnp.result_type(t, time_loc, time_scale))
+
+
+class TimeLikelihood(AbstractEnvelope):
+    """The paper's envelope, the time likelihood scaled to 1 at its peak, with a power and a floor.
+
+        log a = logaddexp(log floor, log(1 - floor) - power tau^2 / 2),   tau = (t - time_loc) / time_scale
+
+    The paper's text is `power=1` (the default); its published code scales *standard deviations* by
+    `exp(-tau^2/2)`, which is `power=2`. A floor > 0 keeps the density bounded: without one the ridge
+    `s = loc + f` has an unbounded density where `power (d-1) > 2`, and its maximum likelihood is degenerate.
+
+    **Shapes:** `power`, `floor` (*batch,); t, time_loc, time_scale (*batch,) -> (*batch,); all broadcast.
+
+    **Units:** none; t, time_loc and time_scale share theirs.
+
+    **Example:** `TimeLikelihood(power=2).log_a(1.5, time_loc=0.5, time_scale=0.5)  # -2 * 2^2 / 2 = -4.`
+
+    **Source:** eq:a_func_2d. **Raises:** ValueError if `power` is negative or `floor` is outside [0, 1).
+    """
+
+    power: Float[Array, "*#batch"]
+    floor: Float[Array, "*#batch"]
+
+    def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
+        self.power, self.floor = _float_array(power), _float_array(floor)
+        if _any(self.power, lambda x: x < 0):
+            raise invalid(
+                "power", expected="a number >= 0", got=power, cure="The paper's text is 1, its code 2."
+            )
+        if _any(self.floor, lambda x: (x < 0) | (x >= 1)):
+            raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (0, 0)
+
+    def log_a(self, t, *, time_loc, time_scale):
+        t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(
+            t, time_loc, time_scale, self.power, self.floor
+        )
+        tau = _bounded_tau(t - time_loc, time_scale)
+        return _log_floored(0.5 * power * tau * tau, floor)
+
+
+def _bounded_tau(
+    offset: Float[Array, "*batch"], time_scale: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """offset / time_scale, held where its square is representable (no density is, out there)."""
+    bound = float(np.sqrt(jnp.finfo(offset.dtype).max)) * 1e-2
+    far = jnp.abs(offset) > bound * time_scale
+    # Double where: a quotient that overflows would give 0 * inf in the gradient of the branch not taken.
+    near = jnp.where(far, 0, offset) / jnp.where(far, 1, time_scale)
+    return jnp.where(far, jnp.copysign(bound, offset).astype(offset.dtype), near)
+
+
+@jax.custom_jvp
+def _log_floored(q: Float[Array, "*batch"], floor: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """log(floor + (1 - floor) e^-q)."""
+    near = jnp.log1p((1 - floor) * jnp.expm1(-q))  # exactly 0 at the peak, and never above
+    far = jnp.logaddexp(jnp.log(floor), jnp.log1p(-floor) - q)
+    return jnp.where(q < 0.5, near, far)
+
+
+@_log_floored.defjvp
+def _log_floored_jvp(primals, tangents):
+    # By hand, because autodiff takes 0 * inf through log(floor) at floor = 0, where the derivative is
+    # expm1(q).
+    (q, floor), (q_dot, floor_dot) = primals, tangents
+    log_a = _log_floored(q, floor)
+    by_q = -jnp.exp(jnp.log1p(-floor) - q - log_a)
+    largest = float(np.log(jnp.finfo(q.dtype).max)) * 0.999  # saturate: a finite slope, however steep
+    by_floor = -jnp.expm1(-q) * jnp.exp(jnp.minimum(-log_a, largest))
+    return log_a, by_q * q_dot + by_floor * floor_dot
+
+
+def _float_array(x: ArrayLike) -> Float[Array, "..."]:
+    x = jnp.asarray(x)
+    dtype = x.dtype if jnp.issubdtype(x.dtype, jnp.floating) else jnp.result_type(float)
+    return x.astype(dtype) if x.weak_type or x.dtype != dtype else x
+
+
+def _any(x: Array, wrong) -> bool:
+    """Whether a value is wrong; under tracing there are no values to look at."""
+    return not isinstance(x, jax.core.Tracer) and bool(np.any(wrong(np.asarray(x))))

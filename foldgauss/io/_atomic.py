@@ -1,0 +1,115 @@
+"""Files that appear whole or not at all."""
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class OutputError(OSError):
+    """An output path cannot be written; the message is one line and says what to do."""
+
+
+def _check_target(path: Path) -> None:
+    """Refuse what a rename could not put in place, before any work is done."""
+    if not path.name:
+        raise OutputError(f"path: expected the name of a file, got {str(path)!r}. Add a file name.")
+    if not os.path.exists(path.parent):
+        raise OutputError(
+            f"path: expected an existing folder, got {str(path.parent)!r}, which is missing. "
+            "Create it first, or choose another output path."
+        )
+    if not path.parent.is_dir():
+        raise OutputError(f"path: expected a folder, got the file {str(path.parent)!r}. Choose another path.")
+
+
+def temporary_name(path: Path, suffix: str) -> Path:
+    """A fresh hidden name beside `path`: the rename then stays within one file system."""
+    # The stem is cut: with a long one the random part would pass the file system's limit of 255 bytes.
+    return path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}{suffix}")
+
+
+def not_writable(path: Path, error: OSError) -> OutputError:
+    """The one-line form of a refusal by the operating system."""
+    reason = error.strerror or str(error)
+    return OutputError(
+        f"path: expected a writable place, got {str(path)!r} ({reason}). Choose another output path."
+    )
+
+
+def _new_file(path: Path, suffix: str) -> Path:
+    """Make the empty temporary file that is to become `path`."""
+    _check_target(path)
+    # os.path, not Path: it takes any refusal (a name too long) for "no", and opening then says why.
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OutputError(f"path: expected a file's path, got {str(path)!r}, which is not a plain file.")
+    temporary = temporary_name(path, suffix)
+    try:
+        # O_EXCL and mode 0o666: no clash, and the user's umask holds (mkstemp would give 0o600).
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        raise not_writable(path, error) from error
+    return temporary
+
+
+def check_writable(path: str | os.PathLike) -> None:
+    """Find out before long work, not after it, whether `atomic_path(path)` will work. Raises `OutputError`."""
+    path = Path(path)
+    _new_file(path, path.suffix).unlink()
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike, *, suffix: str | None = None) -> Iterator[Path]:
+    """Lend a temporary path in the folder of `path`; rename it to `path` when the block ends well.
+
+    The temporary file exists (empty) when the block starts and keeps the extension of `path`, or `suffix`
+    where given, since some writers choose the format by it. It is flushed to the disk before the rename.
+    On any exception, `KeyboardInterrupt` included, it is removed and an existing `path` stays as it was.
+
+    Raises `OutputError` if the parent folder is missing or not writable, or if `path` is not a plain file.
+    """
+    path = Path(path)
+    temporary = _new_file(path, path.suffix if suffix is None else suffix)
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        try:
+            os.replace(temporary, path)
+        except OSError as error:
+            raise not_writable(path, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(folder: str | os.PathLike) -> Iterator[Path]:
+    """Lend a temporary folder beside `folder`; it takes that name, and the old one's place, at the end.
+
+    The old folder is moved aside first and deleted last, so at any moment one of the two is whole.
+    Whether it *may* be replaced is the caller's question.
+
+    Raises `OutputError` if the parent folder is missing or not writable.
+    """
+    folder = Path(folder).resolve()
+    _check_target(folder)
+    temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
+    try:
+        temporary.mkdir()
+    except OSError as error:
+        raise not_writable(folder, error) from error
+    try:
+        yield temporary
+        if folder.exists():
+            os.replace(folder, aside)
+        try:
+            os.replace(temporary, folder)
+        except BaseException:
+            if aside.exists():
+                os.replace(aside, folder)
+            raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(aside, ignore_errors=True)

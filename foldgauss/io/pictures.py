@@ -1,0 +1,36 @@
+"""Pictures for people: what was asked for, what came out, and where they differ."""
+
+import cv2
+import numpy as np
+
+#: Errors are this much magnified; 255 / 8 = 32 levels off show as full brightness.
+ERROR_GAIN = 8
+_MARGIN, _BAND, _INK, _PAPER = 8, 26, (40, 40, 40), 250
+
+
+def comparison(
+    originals: list[np.ndarray], reconstructions: list[np.ndarray], captions: list[str]
+) -> np.ndarray:
+    """One row per frame: original, reconstruction, and their absolute difference magnified.
+
+    Pictures are uint8 RGB of one size; `captions` stand above each row. Returns uint8 (height, width, 3).
+    """
+    rows = []
+    for original, picture, caption in zip(originals, reconstructions, captions, strict=True):
+        error = np.abs(original.astype(np.int16) - picture)
+        error = np.clip(error * ERROR_GAIN, 0, 255).astype(np.uint8)
+        titles = [f"original, {caption}", "reconstruction", f"error x {ERROR_GAIN}"]
+        tiles = [_titled(tile, title) for tile, title in zip((original, picture, error), titles, strict=True)]
+        rows.append(np.concatenate(tiles, axis=1))
+    return np.pad(np.concatenate(rows), ((0, _MARGIN), (0, _MARGIN), (0, 0)), constant_values=_PAPER)
+
+
+def _titled(picture: np.ndarray, title: str) -> np.ndarray:
+    """The picture with a line of text above it; the text shrinks where the picture is narrow."""
+    height, width, _ = picture.shape
+    tile = np.full((height + _BAND, width + _MARGIN, 3), _PAPER, np.uint8)
+    tile[_BAND:, _MARGIN:] = picture
+    (natural, _), _ = cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+    scale = 0.45 * min(1.0, width / max(natural, 1))
+    cv2.putText(tile, title, (_MARGIN, _BAND - 9), cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
+    return tile

@@ -1,0 +1,551 @@
+"""Clips from video files and folders of images, and back: the one place where pixels meet the disk."""
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from foldgauss._checks import invalid
+from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, not_writable
+
+# FFmpeg writes to stderr about every damaged packet; our errors say it in one line. OpenCV reads this
+# variable when it first opens a video, so it stands before the import. -8 is AV_LOG_QUIET.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+import cv2
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEO_SUFFIXES = (".mp4", ".webm")  # what `write_video` makes; reading takes whatever OpenCV decodes
+DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
+MIN_SIZE = 16  # px; below this there is less than one tile and one SSIM window (11 taps) of picture
+MAX_FPS = 1000.0  # a container's time stamps are milliseconds
+
+Range = tuple[int | None, int | None]
+PathLike = str | os.PathLike
+
+
+class VideoError(ValueError):
+    """A clip cannot be read or written as asked; the message is one line: expected, got, cure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames in memory.
+
+    `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous. `fps`: frames per second.
+    `source`: the path as given. `num_declared`: frames that the container promised within the range asked
+    for; larger than `num_frames` where a damaged file breaks off ("N of M frames decode").
+    """
+
+    frames: np.ndarray
+    fps: float
+    source: str
+    num_declared: int
+
+    @property
+    def num_frames(self) -> int:
+        return self.frames.shape[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.frames.shape[1], self.frames.shape[2]
+
+
+# ---------------------------------------------------------------------------------------------- reading
+
+
+def read_video(
+    path: PathLike,
+    *,
+    frames: Range | None = None,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+) -> Clip:
+    """Read a video file, or a folder of images in natural order (img2 before img10).
+
+    `frames = (A, B)` keeps frames A <= i < B, None for an open end. `size = (height, width)` cuts each
+    frame to that aspect around its centre (to whole pixels), then resizes it, by area where it shrinks and
+    by cubic interpolation where it grows: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides
+    the rate of the container (25 for images). Decoding is frame by frame: the memory taken is the output's
+    plus one source frame.
+
+    Images of 16 bits are scaled to 8, grey ones get three equal channels; 4 channels are refused.
+    A damaged video yields the frames that decode; see `Clip.num_declared`.
+
+    Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
+    """
+    path = Path(path)
+    if not os.path.exists(path):
+        raise FileNotFoundError(
+            f"path: expected a video file or a folder of images, got {str(path)!r}, which is missing. "
+            "Check the spelling and the current folder."
+        )
+    start, stop = _checked_range(frames)
+    prepare = _fit_to(_checked_size(size))
+    if fps is not None:
+        _check_fps(fps)
+    read = _read_folder if path.is_dir() else _read_file
+    kept, num_declared, found_fps = read(path, start, stop, prepare)
+    if len(kept) < 2:
+        raise _error(
+            "path",
+            expected="at least 2 frames",
+            got=f"{len(kept)} in {str(path)!r}",
+            cure="Give a longer clip or range.",
+        )
+    return Clip(_stacked(kept), float(found_fps if fps is None else fps), str(path), num_declared)
+
+
+def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
+    """(prepared frames, frames declared within the range, fps) of a video file."""
+    with _capture(path) as capture:
+        declared = _declared_frames(capture)
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        # Frames before the range are decoded and dropped: seeking lands on key frames in some containers.
+        num_skipped = sum(1 for _ in islice(iter(capture.grab, False), start))
+        kept = [prepare(frame) for frame in _same_size(_decoded(capture, start, stop), path)]
+    num_decoded = num_skipped + len(kept)
+    num_total = max(declared, num_decoded)
+    if num_total == 0:
+        raise _error(
+            "path",
+            expected="a video with frames that decode",
+            got=f"none in {str(path)!r}",
+            cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
+        )
+    # A container's count may be an estimate, so the range is judged against what decoded as well.
+    _check_within(start, stop, num_total, path)
+    if not kept:
+        raise _error(
+            "frames",
+            expected="a range with frames that decode",
+            got=f"{_text(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}",
+            cure="Ask for earlier frames.",
+        )
+    num_declared = (num_total if stop is None else stop) - start
+    return kept, num_declared, fps if 0 < fps <= MAX_FPS else DEFAULT_FPS
+
+
+def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
+    """(prepared frames, images within the range, fps) of a folder of images."""
+    images = sorted(
+        (
+            entry
+            for entry in folder.iterdir()
+            if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
+        ),
+        key=lambda entry: _natural(entry.name),
+    )
+    if not images:
+        raise _error(
+            "path",
+            expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
+            got=f"{str(folder)!r} without any",
+            cure="Give the folder that holds the frames, or a video file.",
+        )
+    _check_within(start, stop, len(images), folder)
+    chosen = images[start:stop]
+    first_shape, kept = None, []
+    for entry in chosen:
+        image = _read_image(entry)
+        first_shape = first_shape or image.shape
+        if image.shape != first_shape:
+            raise _error(
+                "path",
+                expected=f"images of one size, {_shape_text(first_shape)} as in {chosen[0].name!r}",
+                got=f"{_shape_text(image.shape)} in {entry.name!r}",
+                cure="Resize the images, or choose others with frames=(A, B).",
+            )
+        kept.append(prepare(image))
+    return kept, len(chosen), DEFAULT_FPS
+
+
+def _read_image(path: Path) -> np.ndarray:
+    """One image as uint8 BGR, shape (height, width, 3)."""
+    # UNCHANGED shows a fourth channel; JPEG has none, and COLOR also applies its orientation.
+    flags = cv2.IMREAD_COLOR if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
+    with _quiet():
+        try:
+            image = cv2.imread(str(path), flags)
+        except cv2.error:  # an absurd size in the header
+            image = None
+    if image is None:
+        raise _error(
+            "path",
+            expected="images that decode",
+            got=f"{str(path)!r} ({_bytes_text(path)}), which does not",
+            cure="Replace or remove it.",
+        )
+    if image.ndim == 3 and image.shape[2] == 4:
+        raise _error(
+            "path",
+            expected="images without an alpha channel",
+            got=f"4 channels in {str(path)!r}",
+            cure="Flatten the transparency over a background first.",
+        )
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
+    if image.dtype != np.uint8:
+        raise _error(
+            "path",
+            expected="images of 8 or 16 bits",
+            got=f"{image.dtype} in {str(path)!r}",
+            cure="Convert it to an 8-bit PNG.",
+        )
+    return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+
+
+@contextmanager
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    """An opened decoder, silent and released at the end."""
+    with _quiet():
+        # FFmpeg only, and an absolute path: other backends take 'img01.png' for the first of a sequence,
+        # and FFmpeg takes 'name:rest' for a protocol.
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+        try:
+            if not capture.isOpened():
+                raise _error(
+                    "path",
+                    expected="a video file or a folder of images",
+                    got=f"{str(path)!r} ({_bytes_text(path)}), which does not open as a video",
+                    cure="Check that it is a video and that its copy or download is complete.",
+                )
+            yield capture
+        finally:
+            capture.release()
+
+
+def _decoded(capture: cv2.VideoCapture, start: int, stop: int | None) -> Iterator[np.ndarray]:
+    """The next frames, BGR, at most `stop - start`, until the first that does not decode."""
+    left = math.inf if stop is None else stop - start
+    while left > 0:
+        found, frame = capture.read()
+        if not found:
+            return
+        yield frame
+        left -= 1
+
+
+def _same_size(frames: Iterable[np.ndarray], path: Path) -> Iterator[np.ndarray]:
+    shape = None
+    for number, frame in enumerate(frames):
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            raise _error(
+                "path",
+                expected=f"frames of one size, {_shape_text(shape)}",
+                got=f"{_shape_text(frame.shape)} from frame {number} on in {str(path)!r}",
+                cure="Cut the video there, or choose frames=(A, B).",
+            )
+        yield frame
+
+
+def _declared_frames(capture: cv2.VideoCapture) -> int:
+    """The container's own count, 0 where it gives none (an image's is -2^63)."""
+    count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    return round(count) if math.isfinite(count) and 0 < count < 2**31 else 0
+
+
+def _fit_to(size: tuple[int, int] | None) -> Callable[[np.ndarray], np.ndarray]:
+    """BGR of any size -> RGB of `size` = (height, width): centre crop to the aspect, then resize."""
+
+    def prepare(image: np.ndarray) -> np.ndarray:
+        if size is not None and image.shape[:2] != size:
+            image = _resized(image[_centre_crop(image.shape[:2], size)], size)
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    return prepare
+
+
+def _centre_crop(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, slice]:
+    """The largest centred window of `have` with the aspect of `want`, to whole pixels."""
+    height, width = have
+    if width * want[0] > height * want[1]:
+        cut = height, max(1, round(height * want[1] / want[0]))
+    else:
+        cut = max(1, round(width * want[0] / want[1])), width
+    top, left = (height - cut[0]) // 2, (width - cut[1]) // 2
+    return slice(top, top + cut[0]), slice(left, left + cut[1])
+
+
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    if image.shape[:2] == size:
+        return image
+    shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
+    return cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+
+
+def _stacked(frames: list[np.ndarray]) -> np.ndarray:
+    """np.stack that frees each frame as it goes, so the peak is one copy of the clip and not two."""
+    stacked = np.empty((len(frames), *frames[0].shape), np.uint8)
+    for number in range(len(frames)):
+        stacked[number] = frames[number]
+        frames[number] = None
+    return stacked
+
+
+def _natural(name: str) -> tuple:
+    """Sort key: runs of digits compare as numbers; the name itself breaks ties (1.png, 01.png)."""
+    parts = re.split(r"([0-9]+)", name.lower())
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
+
+
+# ---------------------------------------------------------------------------------------------- writing
+
+
+def write_video(path: PathLike, frames: Iterable[np.ndarray], fps: float, *, overwrite: bool = False) -> Path:
+    """Write frames, uint8 RGB of shape (height, width, 3), and return the path; nothing half-written stays.
+
+    `.mp4` and `.webm` are VP9 (profile 0, 4:2:0), which browsers play: OpenCV's wheel has no H.264 encoder.
+    4:2:0 halves the colour resolution. Bunny comes back at 35 dB at 160x320, the limit of 4:2:0 there, and
+    at 40 dB at 640x1280 (OpenCV hands no quality setting to the encoder); a folder of PNGs is exact. An odd
+    height or width, which OpenCV would cut, gets its last row or column repeated once.
+
+    A path without extension, or an existing folder, goes to `write_frames`, with `overwrite`; an existing
+    *file* is replaced. `fps` is in (0, 1000].
+
+    Raises `VideoError` for another extension, no frames, or frames of other kinds; `OutputError` where the
+    path cannot be written.
+    """
+    path = Path(path)
+    _check_fps(fps)
+    if path.is_dir() or not path.suffix:
+        return write_frames(path, frames, overwrite=overwrite)
+    suffix = path.suffix.lower()
+    if suffix not in VIDEO_SUFFIXES:
+        raise _error(
+            "path",
+            expected="a name ending in .mp4 or .webm, or a folder (no extension) for PNG frames",
+            got=repr(path.name),
+            cure="Rename the output.",
+        )
+    # OpenCV prints a warning for every VP9 tag in WebM, none in its superset Matroska, whose header is then
+    # relabelled.
+    with atomic_path(path, suffix=".mkv" if suffix == ".webm" else suffix) as temporary:
+        num_frames = _encode(temporary, _checked_frames(frames), float(fps))
+        _check_written(temporary, num_frames, path)
+        if suffix == ".webm":
+            _relabel_as_webm(temporary)
+    return path
+
+
+def write_frames(folder: PathLike, frames: Iterable[np.ndarray], *, overwrite: bool = False) -> Path:
+    """Write frames, uint8 RGB of shape (height, width, 3), as 00000.png, 00001.png, ...; returns the folder.
+
+    The folder appears whole or not at all. One that holds files is refused unless `overwrite`, and even
+    then if it holds anything but such numbered frames: what this package did not write it does not delete.
+
+    Raises `VideoError` for no frames or frames of other kinds, `OutputError` where the folder is refused.
+    """
+    folder = Path(folder)
+    _check_replaceable(folder, overwrite)
+    with atomic_folder(folder) as temporary:
+        for number, frame in enumerate(_checked_frames(frames)):
+            (temporary / f"{number:05d}.png").write_bytes(_png(frame))
+    return folder
+
+
+def write_image(path: PathLike, image: np.ndarray) -> Path:
+    """Write one uint8 RGB image of shape (height, width, 3) as PNG, whole or not at all; returns the path.
+
+    Raises `VideoError` for another extension or kind of array, `OutputError` where it cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise _error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
+    data = _png(_checked_frame(image, None, "image"))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return path
+
+
+def _encode(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
+    """Encode in VP9 and return the number of frames; the container goes by the extension of `path`."""
+    code = cv2.VideoWriter.fourcc(*("vp09" if path.suffix.lower() == ".mp4" else "VP90"))
+    writer, num_frames = None, 0
+    with _quiet():
+        try:
+            for frame in frames:
+                image = _for_encoder(frame)
+                if writer is None:
+                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, image.shape[1::-1])
+                if not writer.isOpened():
+                    raise OutputError(
+                        "path: expected an OpenCV with FFmpeg's VP9 encoder, got one without. "
+                        "Install opencv-contrib-python-headless from PyPI, or write to a folder."
+                    )
+                writer.write(image)
+                num_frames += 1
+        finally:
+            if writer is not None:
+                writer.release()
+    return num_frames
+
+
+def _for_encoder(frame: np.ndarray) -> np.ndarray:
+    """RGB -> the BGR of even size that OpenCV's writer encodes with the least error."""
+    image = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    if image.shape[0] % 2 or image.shape[1] % 2:
+        # OpenCV would drop the odd row or column.
+        image = cv2.copyMakeBorder(image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE)
+    # FFmpeg's scaler, as OpenCV calls it, rounds both colour planes down: on Bunny, Chromium shows red and
+    # blue 1.3 (grey levels) too dark. One more of each leaves 0.3, and 0.5 dB at 640x1280. cv2.add saturates.
+    return cv2.add(image, (1, 0, 1, 0))
+
+
+def _check_written(path: Path, num_frames: int, target: Path) -> None:
+    """OpenCV's writer reports no error, not even a full disk: count the frames that decode.
+
+    The container's own count will not do, it can be right in a file that breaks off. Decoding takes a few
+    hundredths of the time of encoding.
+    """
+    with _quiet():
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+        num_decoded = sum(1 for _ in iter(capture.grab, False))
+        capture.release()
+    if num_decoded != num_frames:
+        raise OutputError(
+            f"path: expected {num_frames} frames in {str(target)!r}, got {num_decoded}. "
+            "The disk may be full, or a size limit reached."
+        )
+
+
+def _relabel_as_webm(path: Path) -> None:
+    """Matroska with VP9 *is* WebM but for the DocType; EBML pads a shorter string with zeros."""
+    with open(path, "r+b") as file:
+        start = file.read(64).index(b"matroska")
+        file.seek(start)
+        file.write(b"webm\0\0\0\0")
+
+
+def _png(frame: np.ndarray) -> bytes:
+    return cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def _check_replaceable(folder: Path, overwrite: bool) -> None:
+    """Raise `OutputError` unless `folder` is missing, empty, or frames that `overwrite` gives up."""
+    if not os.path.exists(folder):
+        return
+    if not folder.is_dir():
+        raise OutputError(
+            f"path: expected a folder for PNG frames, got the file {str(folder)!r}. Choose another name."
+        )
+    try:
+        names = [entry.name for entry in folder.iterdir()]
+    except OSError as error:
+        raise not_writable(folder, error) from error
+    foreign = [name for name in names if not re.fullmatch(r"[0-9]{5,}\.png", name)]
+    if foreign:
+        raise OutputError(
+            f"path: expected an empty folder or one of numbered frames, got {str(folder)!r} with "
+            f"{min(foreign)!r} in it. Choose another folder."
+        )
+    if names and not overwrite:
+        raise OutputError(
+            f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} frames. "
+            "Choose another folder, or allow overwriting."
+        )
+
+
+# ----------------------------------------------------------------------------------------------- checks
+
+
+def _checked_frames(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    shape = None
+    for number, frame in enumerate(frames):
+        frame = _checked_frame(frame, shape, f"frames[{number}]")
+        shape = frame.shape
+        yield frame
+    if shape is None:
+        raise _error("frames", expected="at least 1 frame", got="none")
+
+
+def _checked_frame(frame: np.ndarray, shape: tuple | None, parameter: str) -> np.ndarray:
+    frame = np.asarray(frame)
+    fits = frame.ndim == 3 and frame.shape[2] == 3 and min(frame.shape) > 0 and frame.dtype == np.uint8
+    if not fits or (shape is not None and frame.shape != shape):
+        raise _error(
+            parameter,
+            expected=f"uint8 RGB of shape {shape or '(height, width, 3)'}",
+            got=f"{frame.dtype} of shape {frame.shape}",
+            cure="For floats in [0, 1]: np.rint(255 * np.clip(frame, 0, 1)).astype(np.uint8).",
+        )
+    return np.ascontiguousarray(frame)
+
+
+def _checked_range(frames: Range | None) -> tuple[int, int | None]:
+    start, stop = (None, None) if frames is None else frames
+    start = 0 if start is None else start
+    if start < 0 or (stop is not None and stop < 0):
+        raise _error(
+            "frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more."
+        )
+    if stop is not None and stop - start < 2:
+        raise _error(
+            "frames", expected="A:B with at least 2 frames", got=_text(start, stop), cure="Choose B >= A + 2."
+        )
+    return start, stop
+
+
+def _check_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
+    if start >= num_total or (stop is not None and stop > num_total):
+        raise _error(
+            "frames",
+            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+            got=_text(start, stop),
+            cure=f"Choose B <= {num_total} and A below it.",
+        )
+
+
+def _checked_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
+    if size is None:
+        return None
+    height, width = size
+    if height != int(height) or width != int(width) or min(height, width) < MIN_SIZE:
+        raise _error(
+            "size",
+            expected=f"height and width of at least {MIN_SIZE} px",
+            got=f"{height}x{width}",
+            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
+        )
+    return int(height), int(width)
+
+
+def _check_fps(fps: float) -> None:
+    if not 0 < fps <= MAX_FPS:
+        raise _error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+
+
+def _error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:
+    return VideoError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
+
+
+def _text(start: int, stop: int | None) -> str:
+    return f"{start}:{'' if stop is None else stop}"
+
+
+def _shape_text(shape: tuple) -> str:
+    return f"{shape[0]}x{shape[1]} (height x width)"
+
+
+def _bytes_text(path: Path) -> str:
+    size = path.stat().st_size
+    return "an empty file" if size == 0 else f"{size} bytes"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence OpenCV's own log (FFmpeg's is set above); the level is the whole process's, so restore it."""
+    logging = cv2.utils.logging
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(level)

@@ -1,0 +1,499 @@
+"""The CPU engine: Numba kernels over rows of tiles, forward and backward, on our own threads.
+
+How a picture is made, and why so:
+
+* A *row* is a band of tiles across the picture. Splats are bucketed by row in one counting pass, which keeps
+  array order, hence depth order, with no sort. Each row is then one task: it buckets its splats by tile, again
+  counting, and blends tile after tile. Rows share nothing, so any number of threads gives the same bits.
+* Inside a tile only the pixel rows that the splat's cutoff ellipse reaches are visited, and a row of 16 pixels is
+  one AVX-512 vector. The loops are written for the vectoriser: unsigned indices into one scratch buffer at
+  constant offsets, no branches, an exponential made of a polynomial and a bit cast.
+* The backward pass walks in the same order as the forward one. With R the light still to come, colour times
+  incoming gradient, dL/dalpha_i = T_i (c_i . g) - R_i / (1 - alpha_i): no per-splat state is stored. Gradients
+  go to one slot per (splat, row) and are summed per splat afterwards: deterministic, no atomics.
+"""
+
+import dataclasses
+import math
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+from foldgauss._checks import invalid
+from foldgauss._threads import run_tasks
+from foldgauss.render.splats import RenderOptions
+
+TILE = 16  # one AVX-512 vector of float32; narrower machines split it themselves
+PIXELS = TILE * TILE
+CHUNK = 8192  # splats per task where splats, not rows, are shared out
+#: (1 - alpha) is divided by in the backward pass; above this ceiling float32 loses the third digit.
+HIGHEST_CEILING = 0.999
+#: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
+SLACK = np.float32(1e-3)
+
+# Not "fast": NaN and infinity keep their meaning; sums may be reordered, which vector sums need.
+_FASTMATH = {"nsz", "contract", "reassoc", "arcp"}
+_jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=_FASTMATH)
+_inline = nb.njit(inline="always", error_model="numpy", fastmath=_FASTMATH)
+_f, _i, _u = nb.float32, nb.int32, nb.uint64
+
+# Columns of the per-splat geometry. The exponent is kept in powers of two, log2 of the opacity included:
+# alpha = 2^(XX dx^2 + XY dx dy + YY dy^2 + LOG).
+_X, _Y, _XX, _XY, _YY, _LOG, _RX, _RY = range(8)
+# Columns of a gradient slot: three colours, then the sums of p = dL/dalpha * alpha against 1, dx, dy, dx^2, dx dy, dy^2.
+_SLOTS = 9
+# Offsets of the planes in the backward scratch: light, incoming gradient, light to come, pixel coordinates.
+_G, _R, _PX, _PY = PIXELS, 4 * PIXELS, 5 * PIXELS, 6 * PIXELS
+
+
+@intrinsic
+def _bits_as_float(typing_context, bits):
+    """Reinterpret an int32 as a float32, without going through memory."""
+
+    def generate(context, builder, signature, args):
+        return builder.bitcast(args[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+@_inline
+def _exp2(x):
+    """2^x for -126 < x <= 0 within 3e-7: polynomial on the fraction in (-1, 0], integer part into the exponent."""
+    whole = _i(x)
+    part = x - _f(whole)
+    y = _f(9.418212e-4)
+    y = y * part + _f(9.197656e-3)
+    y = y * part + _f(5.5289872e-2)
+    y = y * part + _f(0.24017744)
+    y = y * part + _f(0.6931434)
+    y = y * part + _f(1.0)
+    return y * _bits_as_float((whole + _i(127)) << _i(23))
+
+
+@_jit
+def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff, geometry, span):
+    """Geometry of splats start..stop and the rows of tiles each one reaches (none: it is not seen)."""
+    log2e = _f(math.log2(math.e))
+    for i in range(start, stop):
+        span[i, 0] = 0
+        span[i, 1] = 0
+        a, b, c, d = factor[i, 0, 0], factor[i, 0, 1], factor[i, 1, 0], factor[i, 1, 1]
+        xx = a * a + b * b + low_pass
+        xy = a * c + b * d
+        yy = c * c + d * d + low_pass
+        area = a * d - b * c
+        det = area * area + low_pass * (xx + yy - low_pass)
+        if not (det > 0.0 and det < np.inf and opacity[i] >= cutoff):
+            continue
+        reach = _f(2.0) * math.log(opacity[i] / cutoff) * (_f(1.0) + SLACK) + SLACK
+        radius_x, radius_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
+        x, y = mean[i, 0], mean[i, 1]
+        seen = x + radius_x > 0.0 and x - radius_x < width and y + radius_y > 0.0 and y - radius_y < height
+        if not seen:
+            continue
+        geometry[i, _X] = x
+        geometry[i, _Y] = y
+        geometry[i, _XX] = _f(-0.5) * log2e * yy / det
+        geometry[i, _XY] = log2e * xy / det
+        geometry[i, _YY] = _f(-0.5) * log2e * xx / det
+        geometry[i, _LOG] = math.log2(opacity[i])
+        geometry[i, _RX] = radius_x
+        geometry[i, _RY] = radius_y
+        # Pixel rows whose centres lie within the radius; clipped before the cast, so no float is too large for it.
+        first = int(math.ceil(max(y - radius_y - _f(0.5), _f(0.0))))
+        last = int(math.floor(min(y + radius_y - _f(0.5), _f(height - 1))))
+        if last >= first:
+            span[i, 0] = first // TILE
+            span[i, 1] = last // TILE + 1
+
+
+@_jit
+def _bucket_rows(span, num_rows):
+    """Counting pass: the splats of every row in array order, and where each splat's entries stand."""
+    num = len(span)
+    start = np.zeros(num_rows + 1, np.int64)
+    first_slot = np.zeros(num + 1, np.int64)
+    for i in range(num):
+        first_slot[i + 1] = first_slot[i] + span[i, 1] - span[i, 0]
+        for row in range(span[i, 0], span[i, 1]):
+            start[row + 1] += 1
+    for row in range(num_rows):
+        start[row + 1] += start[row]
+    fill = start.copy()
+    entries = np.empty(start[num_rows], np.int32)
+    slot_position = np.empty(start[num_rows], np.int64)
+    for i in range(num):
+        slot = first_slot[i]
+        for row in range(span[i, 0], span[i, 1]):
+            position = fill[row]
+            entries[position] = i
+            slot_position[slot] = position
+            slot += 1
+            fill[row] = position + 1
+    return start, entries, first_slot, slot_position
+
+
+@_inline
+def _edge(xx, xy, yy, level, dy):
+    """Right edge of the ellipse xx dx^2 + xy dx dy + yy dy^2 = level on the line dy (negative-definite entries)."""
+    half = _f(0.5) * xy * dy
+    inside = max(half * half - xx * (yy * dy * dy - level), _f(0.0))
+    return (-half - math.sqrt(inside)) / xx
+
+
+@_jit
+def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff):
+    """Exact ellipse-tile test within one row: which tiles each entry reaches, listed by tile in array order."""
+    num_tiles = (width + TILE - 1) // TILE
+    count = stop - start
+    reach = np.empty((count, 2), np.int32)
+    tile_start = np.zeros(num_tiles + 1, np.int64)
+    upper, lower = _f(top) + _f(0.5), _f(min(top + TILE, height)) - _f(0.5)
+    for e in range(count):
+        i = entries[start + e]
+        xx, xy, yy = geometry[i, _XX], geometry[i, _XY], geometry[i, _YY]
+        x, y, radius = geometry[i, _X], geometry[i, _Y], geometry[i, _RX]
+        level = (log_cutoff - geometry[i, _LOG]) * (_f(1.0) + SLACK) - SLACK
+        # The ellipse is widest to the right at dy = turn and to the left at -turn; within the band, at the nearest line.
+        turn = _f(-0.5) * xy * radius / yy
+        right = x + _edge(xx, xy, yy, level, min(max(turn, upper - y), lower - y))
+        left = x - _edge(xx, -xy, yy, level, min(max(-turn, upper - y), lower - y))
+        first = int(math.ceil(max(left - _f(0.5), _f(0.0))))
+        last = int(math.floor(min(right - _f(0.5), _f(width - 1))))
+        reach[e, 0] = first // TILE
+        reach[e, 1] = last // TILE + 1 if last >= first else first // TILE
+        for tile in range(reach[e, 0], reach[e, 1]):
+            tile_start[tile + 1] += 1
+    for tile in range(num_tiles):
+        tile_start[tile + 1] += tile_start[tile]
+    fill = tile_start.copy()
+    listed = np.empty(tile_start[num_tiles], np.int32)
+    for e in range(count):
+        for tile in range(reach[e, 0], reach[e, 1]):
+            listed[fill[tile]] = e
+            fill[tile] += 1
+    return tile_start, listed
+
+
+@_inline
+def _pixel_rows(y, radius):
+    """Pixel rows of a tile (y is relative to its first row's centre) whose centres lie within the radius."""
+    first = max(0, int(math.ceil(max(y - radius, _f(-1.0)))))
+    last = min(TILE - 1, int(math.floor(min(y + radius, _f(TILE)))))
+    return first, last + 1
+
+
+@_jit
+def _blend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, finished):
+    """Add splat i to the tile: scratch holds the light left, then the colours, 16 x 16 each."""
+    x, y = geometry[i, _X] - left - _f(0.5), geometry[i, _Y] - top - _f(0.5)
+    xx, xy, yy, log = geometry[i, _XX], geometry[i, _XY], geometry[i, _YY], geometry[i, _LOG]
+    red, green, blue = color[i, 0], color[i, 1], color[i, 2]
+    share = _f(1.0) if over else _f(0.0)
+    first, last = _pixel_rows(y, geometry[i, _RY])
+    for row in range(first, last):
+        dy = _f(row) - y
+        slope, offset = xy * dy, yy * dy * dy + log
+        base = _u(row * TILE)
+        for column in range(_u(TILE)):
+            dx = _f(_i(column)) - x
+            power = (xx * dx + slope) * dx + offset
+            light = scratch[base + column]
+            seen = (power >= log_cutoff) & (light > finished)
+            alpha = min(_exp2(max(power, _f(-100.0))), ceiling)
+            weight = alpha * light if seen else _f(0.0)
+            scratch[base + column] = light - share * weight
+            scratch[base + column + _u(PIXELS)] += weight * red
+            scratch[base + column + _u(2 * PIXELS)] += weight * green
+            scratch[base + column + _u(3 * PIXELS)] += weight * blue
+
+
+@_jit
+def _dark(scratch, finished):
+    """Whether no pixel of the tile has light left."""
+    brightest = _f(0.0)
+    for p in range(_u(PIXELS)):
+        brightest = max(brightest, scratch[p])
+    return brightest <= finished
+
+
+@_jit
+def _forward_row(
+    row, row_start, entries, geometry, color, background, over, log_cutoff, ceiling, finished, image, light
+):
+    """Blend one row of tiles into `image` (3, height, width) and `light` (height, width); return its lists."""
+    height, width = light.shape
+    top, start = row * TILE, row_start[row]
+    tile_start, listed = _bucket_tiles(
+        geometry, entries, start, row_start[row + 1], top, height, width, log_cutoff
+    )
+    used = np.empty(len(tile_start) - 1, np.int64)
+    scratch = np.empty(4 * PIXELS, np.float32)
+    for tile in range(len(used)):
+        scratch[:PIXELS] = 1.0
+        scratch[PIXELS:] = 0.0
+        used[tile] = tile_start[tile + 1]
+        for k in range(tile_start[tile], tile_start[tile + 1]):
+            # Looking costs about as much as half a splat: every 32nd is often enough.
+            if over and (k - tile_start[tile]) % 32 == 31 and _dark(scratch, finished):
+                used[tile] = k
+                break
+            i = entries[start + listed[k]]
+            _blend(
+                geometry, color, i, _f(tile * TILE), _f(top), scratch, over, log_cutoff, ceiling, finished
+            )
+        left = tile * TILE
+        for y in range(min(TILE, height - top)):
+            for x in range(min(TILE, width - left)):
+                p = y * TILE + x
+                light[top + y, left + x] = scratch[p]
+                for c in range(3):
+                    image[c, top + y, left + x] = scratch[(c + 1) * PIXELS + p] + scratch[p] * background[c]
+    return tile_start, listed, used
+
+
+@_jit
+def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, finished, slot):
+    """Gradient sums of splat i over one tile, added to its slot; the scratch moves on behind the splat."""
+    x, y = geometry[i, _X] - left - _f(0.5), geometry[i, _Y] - top - _f(0.5)
+    xx, xy, yy, log = geometry[i, _XX], geometry[i, _XY], geometry[i, _YY], geometry[i, _LOG]
+    red, green, blue = color[i, 0], color[i, 1], color[i, 2]
+    share = _f(1.0) if over else _f(0.0)
+    s_red, s_green, s_blue = _f(0.0), _f(0.0), _f(0.0)
+    s_1, s_x, s_y, s_xx, s_xy, s_yy = _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0)
+    first, last = _pixel_rows(y, geometry[i, _RY])
+    base = _u(first * TILE)
+    for q in range(_u((last - first) * TILE if last > first else 0)):
+        p = base + q
+        dx, dy = scratch[p + _u(_PX)] - x, scratch[p + _u(_PY)] - y
+        power = (xx * dx + xy * dy) * dx + (yy * dy * dy + log)
+        light = scratch[p]
+        seen = (power >= log_cutoff) & (light > finished)
+        free = _exp2(max(power, _f(-100.0)))
+        alpha = min(free, ceiling) if seen else _f(0.0)
+        g_red, g_green, g_blue = (
+            scratch[p + _u(_G)],
+            scratch[p + _u(_G + PIXELS)],
+            scratch[p + _u(_G + 2 * PIXELS)],
+        )
+        own = red * g_red + green * g_green + blue * g_blue
+        weight = alpha * light
+        behind = scratch[p + _u(_R)] - share * weight * own
+        scratch[p + _u(_R)] = behind
+        scratch[p] = light - share * weight
+        slope = (light * own - share * behind / (_f(1.0) - alpha)) * alpha
+        slope = slope if free < ceiling else _f(0.0)
+        s_red += weight * g_red
+        s_green += weight * g_green
+        s_blue += weight * g_blue
+        s_1 += slope
+        s_x += slope * dx
+        s_y += slope * dy
+        s_xx += slope * dx * dx
+        s_xy += slope * dx * dy
+        s_yy += slope * dy * dy
+    slot[0] += s_red
+    slot[1] += s_green
+    slot[2] += s_blue
+    slot[3] += s_1
+    slot[4] += s_x
+    slot[5] += s_y
+    slot[6] += s_xx
+    slot[7] += s_xy
+    slot[8] += s_yy
+
+
+@_jit
+def _backward_row(
+    row,
+    row_start,
+    entries,
+    tile_start,
+    listed,
+    used,
+    geometry,
+    color,
+    over,
+    log_cutoff,
+    ceiling,
+    finished,
+    image,
+    grad_image,
+    slots,
+):
+    """Gradient sums of every entry of one row, into its slots."""
+    height, width = image.shape[1:]
+    top, start = row * TILE, row_start[row]
+    slots[start : row_start[row + 1]] = 0.0
+    scratch = np.empty(7 * PIXELS, np.float32)
+    for p in range(PIXELS):
+        scratch[_PX + p] = p % TILE
+        scratch[_PY + p] = p // TILE
+    for tile in range(len(used)):
+        left = tile * TILE
+        scratch[:PIXELS] = 1.0
+        scratch[_G:_PX] = 0.0
+        for y in range(min(TILE, height - top)):
+            for x in range(min(TILE, width - left)):
+                p = y * TILE + x
+                for c in range(3):
+                    g = grad_image[c, top + y, left + x]
+                    scratch[_G + c * PIXELS + p] = g
+                    if over:
+                        scratch[_R + p] += g * image[c, top + y, left + x]
+        for k in range(tile_start[tile], used[tile]):
+            e = start + listed[k]
+            _unblend(
+                geometry,
+                color,
+                entries[e],
+                _f(left),
+                _f(top),
+                scratch,
+                over,
+                log_cutoff,
+                ceiling,
+                finished,
+                slots[e],
+            )
+
+
+@_jit
+def _gather(
+    start, stop, first_slot, slot_position, slots, geometry, factor, opacity, d_mean, d_factor, d_opacity, d_color
+):
+    """Sum the slots of splats start..stop and carry the sums back to mean, factor, opacity and colour."""
+    ln2 = _f(math.log(2.0))
+    total = np.empty(_SLOTS, np.float32)
+    for i in range(start, stop):
+        total[:] = 0.0
+        for s in range(first_slot[i], first_slot[i + 1]):
+            for k in range(_SLOTS):
+                total[k] += slots[slot_position[s], k]
+        d_color[i, 0], d_color[i, 1], d_color[i, 2] = total[0], total[1], total[2]
+        if first_slot[i] == first_slot[i + 1]:
+            d_opacity[i] = 0.0
+            d_mean[i] = 0.0
+            d_factor[i] = 0.0
+            continue
+        # Conic entries K = Sigma^-1 from the stored powers of two.
+        k_xx = _f(-2.0) * ln2 * geometry[i, _XX]
+        k_xy = -ln2 * geometry[i, _XY]
+        k_yy = _f(-2.0) * ln2 * geometry[i, _YY]
+        d_opacity[i] = total[3] / opacity[i]
+        d_mean[i, 0] = k_xx * total[4] + k_xy * total[5]
+        d_mean[i, 1] = k_xy * total[4] + k_yy * total[5]
+        # dL/dSigma = K S K / 2 with S the second moments of p, and dL/dF = 2 dL/dSigma F.
+        m_xx = k_xx * total[6] + k_xy * total[7]
+        m_xy = k_xx * total[7] + k_xy * total[8]
+        m_yx = k_xy * total[6] + k_yy * total[7]
+        m_yy = k_xy * total[7] + k_yy * total[8]
+        c_xx = m_xx * k_xx + m_xy * k_xy
+        c_xy = m_xx * k_xy + m_xy * k_yy
+        c_yy = m_yx * k_xy + m_yy * k_yy
+        for k in range(2):
+            d_factor[i, 0, k] = c_xx * factor[i, 0, k] + c_xy * factor[i, 1, k]
+            d_factor[i, 1, k] = c_xy * factor[i, 0, k] + c_yy * factor[i, 1, k]
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """What the forward pass leaves for the backward one."""
+
+    inputs: tuple[np.ndarray, ...]  # factor, opacity, color
+    geometry: np.ndarray
+    buckets: tuple[np.ndarray, ...]  # row_start, entries, first_slot, slot_position
+    lists: list  # per row: tile_start, listed, used
+    constants: tuple  # over, log_cutoff, ceiling, finished
+    image: np.ndarray  # (3, height, width)
+    light: np.ndarray  # (height, width)
+
+    @property
+    def num_pairs(self) -> int:
+        """Pixels times splats over the tiles' lists: the unit that speed is counted in."""
+        return sum(len(listed) for _, listed, _ in self.lists) * PIXELS
+
+
+def forward(
+    mean: np.ndarray,
+    factor: np.ndarray,
+    opacity: np.ndarray,
+    color: np.ndarray,
+    background: np.ndarray,
+    size: tuple[int, int],
+    *,
+    compositing: str = "over",
+    options: RenderOptions | None = None,
+) -> Trace:
+    """Render float32 splats: shapes (num, 2), (num, 2, 2), (num,), (num, 3), (3,), in pixels.
+
+    Returns the trace, whose `image` is planar, (3, height, width).
+    """
+    options = RenderOptions() if options is None else options
+    if options.alpha_ceiling > HIGHEST_CEILING:
+        raise invalid(
+            "options.alpha_ceiling",
+            expected=f"at most {HIGHEST_CEILING} for engine 'cpu'",
+            got=options.alpha_ceiling,
+            cure="Use engine='reference' for more.",
+        )
+    (height, width), num = size, len(opacity)
+    geometry, span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
+    low_pass, cutoff = np.float32(options.low_pass), np.float32(options.alpha_cutoff)
+
+    def project(start: int) -> None:
+        stop = min(start + CHUNK, num)
+        _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff, geometry, span)
+
+    run_tasks(project, range(0, num, CHUNK))
+    num_rows = -(-height // TILE)
+    buckets = _bucket_rows(span, num_rows)
+    constants = (
+        compositing == "over",
+        np.float32(math.log2(options.alpha_cutoff)),
+        np.float32(options.alpha_ceiling),
+        np.float32(options.transmittance_stop if compositing == "over" else -1.0),
+    )
+    image, light = np.empty((3, height, width), np.float32), np.empty((height, width), np.float32)
+    lists: list = [None] * num_rows
+
+    def blend(row: int) -> None:
+        lists[row] = _forward_row(row, *buckets[:2], geometry, color, background, *constants, image, light)
+
+    run_tasks(blend, range(num_rows))
+    return Trace((factor, opacity, color), geometry, buckets, lists, constants, image, light)
+
+
+def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Gradients of mean, factor, opacity, color and background, given dL/dimage, planar (3, height, width)."""
+    factor, opacity, color = trace.inputs
+    row_start, entries, first_slot, slot_position = trace.buckets
+    num, slots = len(opacity), np.empty((len(entries), _SLOTS), np.float32)
+
+    def unblend(row: int) -> None:
+        _backward_row(
+            row,
+            row_start,
+            entries,
+            *trace.lists[row],
+            trace.geometry,
+            color,
+            *trace.constants,
+            trace.image,
+            grad_image,
+            slots,
+        )
+
+    run_tasks(unblend, range(len(trace.lists)))
+    grads = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
+    grads += np.empty(num, np.float32), np.empty((num, 3), np.float32)
+
+    def gather(start: int) -> None:
+        stop = min(start + CHUNK, num)
+        _gather(start, stop, first_slot, slot_position, slots, trace.geometry, factor, opacity, *grads)
+
+    run_tasks(gather, range(0, num, CHUNK))
+    return *grads, np.einsum("chw,hw->c", grad_image, trace.light, dtype=np.float32)

@@ -1,0 +1,102 @@
+"""`render`: the one door to every engine, differentiable, usable inside jit and vmap."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from foldgauss._checks import invalid, one_of
+from foldgauss.render import cpu
+from foldgauss.render.reference import render_reference
+from foldgauss.render.splats import RenderOptions, Splats2D
+
+ENGINES = ("auto", "cpu", "reference")
+COMPOSITINGS = ("over", "sum")
+
+
+def render(
+    splats: Splats2D,
+    size: tuple[int, int],
+    *,
+    background: Float[Array, "channels"] | None = None,
+    compositing: str = "over",
+    engine: str = "auto",
+    options: RenderOptions | None = None,
+) -> Float[Array, "height width channels"]:
+    r"""Picture of two-dimensional splats.
+
+    .. math:: C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j)
+
+    - `splats`: in pixels (x right, y down, centres at +0.5), front to back in array order.
+    - `size`: (height, width) in pixels.
+    - `background`: one colour, (channels,); None is black.
+    - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all
+      T_i are 1 and the background is added whole.
+    - `engine`: "cpu" (Numba, float32 inside, three channels), "reference" (dense, slow, any dtype and number of
+      channels), or "auto": "cpu" for three channels, else "reference".
+    - `options`: what may be left out, `RenderOptions`.
+
+    Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
+    `background`. Raises ValueError for an unknown option, a size below 1 or shapes that do not fit.
+
+    Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
+
+    Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 3; VeGaS, section 4.
+    """
+    one_of("engine", engine, ENGINES)
+    one_of("compositing", compositing, COMPOSITINGS)
+    if len(size) != 2 or any(int(n) != n or n < 1 for n in size):
+        raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
+    options = RenderOptions() if options is None else options
+    channels, dtype = splats.color.shape[-1], splats.mean.dtype
+    background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
+    if background.shape != (channels,):
+        raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
+    if engine == "auto":
+        engine = "cpu" if channels == 3 else "reference"
+    height, width = map(int, size)
+    if engine == "reference":
+        return render_reference(
+            splats, (height, width), background, compositing=compositing, options=options
+        )
+    if channels != 3:
+        raise invalid("color", expected="3 channels for engine 'cpu'", got=channels, cure="Use 'reference'.")
+    leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
+    image = _render_cpu((height, width), compositing, options, *(leaf.astype(jnp.float32) for leaf in leaves))
+    return image.astype(dtype)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def _render_cpu(size, compositing, options, *leaves):
+    """The CPU engine as a JAX function of float32 leaves."""
+
+    def draw(*leaves):
+        trace = cpu.forward(*_as_numpy(leaves), size, compositing=compositing, options=options)
+        return np.moveaxis(trace.image, 0, -1)
+
+    shape = jax.ShapeDtypeStruct((*size, 3), jnp.float32)
+    return jax.pure_callback(draw, shape, *leaves, vmap_method="sequential")
+
+
+def _render_cpu_fwd(size, compositing, options, *leaves):
+    return _render_cpu(size, compositing, options, *leaves), leaves
+
+
+def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
+    """Renders again, since a trace cannot travel through JAX: a third of the backward pass's own cost."""
+
+    def differentiate(grad_image, *leaves):
+        trace = cpu.forward(*_as_numpy(leaves), size, compositing=compositing, options=options)
+        return cpu.backward(trace, np.ascontiguousarray(np.moveaxis(np.asarray(grad_image), -1, 0)))
+
+    shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in leaves)
+    return jax.pure_callback(differentiate, shapes, grad_image, *leaves, vmap_method="sequential")
+
+
+def _as_numpy(leaves):
+    return tuple(np.ascontiguousarray(leaf, np.float32) for leaf in leaves)
+
+
+_render_cpu.defvjp(_render_cpu_fwd, _render_cpu_bwd)

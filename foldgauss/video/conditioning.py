@@ -1,0 +1,223 @@
+"""Fused Numba twin of `FoldedSplats.at`, with its gradient, on packed rows of the Gaussians alive at one time.
+
+The fold equation's home is `FoldedGaussian.condition_time`; this is the one exception that the profile bought: it
+touches only the Gaussians alive, whose number changes with every frame, which compiled XLA shapes cannot follow. A test
+holds both to the same values and gradients. Only the polynomial fold and the time-likelihood envelope exist here.
+"""
+
+import dataclasses
+import math
+
+import numba as nb
+import numpy as np
+
+from foldgauss._threads import run_tasks
+from foldgauss.render import pixels_per_unit
+from foldgauss.video.model import SH_C0, TAU_MAX
+from foldgauss.video.packing import columns
+
+CHUNK = 4096  # Gaussians per task
+
+_jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "contract", "reassoc", "arcp"})
+_inline = nb.njit(inline="always", error_model="numpy")
+_f = nb.float32
+
+_place = columns(0)
+_LOC, _SCALE, _COLOR = _place["loc"].start, _place["log_scale"].start, _place["color_dc"].start
+_ANGLE, _OPACITY = _place["angle_logit"].start, _place["opacity_logit"].start
+_TIME, _SPREAD, _FOLD = (
+    _place["time_loc_logit"].start,
+    _place["log_time_scale"].start,
+    _place["coefficients"].start,
+)
+
+
+@_inline
+def _sigmoid(x):
+    return _f(1.0) / (_f(1.0) + math.exp(-x))
+
+
+@_inline
+def _shrink(u, spread, power, floor):
+    """Half of log a(t), and its derivative by -tau^2/2: standard deviations are scaled by exp of the first."""
+    tau = u / spread
+    decay = (_f(1.0) - floor) * math.exp(_f(-0.5) * power * tau * tau)
+    a = floor + decay
+    return _f(0.5) * math.log(a), _f(0.5) * power * decay / a
+
+
+@_jit
+def _windows(start, stop, indices, rows, window):
+    """The span of time in which each of the named Gaussians is drawn."""
+    for k in range(start, stop):
+        i = indices[k]
+        centre, reach = _sigmoid(rows[i, _TIME]), _f(TAU_MAX) * math.exp(rows[i, _SPREAD])
+        window[i, 0] = centre - reach
+        window[i, 1] = centre + reach
+
+
+@_jit
+def _condition(start, stop, alive, rows, degree, t, unit, cx, cy, power, floor, mean, factor, opacity, color):
+    for k in range(start, stop):
+        i = alive[k]
+        row = rows[i]
+        u = _sigmoid(row[_TIME]) - t
+        x, y = _f(0.0), _f(0.0)
+        for j in range(degree - 1, -1, -1):  # Horner
+            x = u * (x + row[_FOLD + 2 * j])
+            y = u * (y + row[_FOLD + 2 * j + 1])
+        mean[k, 0] = (row[_LOC] + x) * unit + cx
+        mean[k, 1] = (row[_LOC + 1] + y) * unit + cy
+        shrink, _ = _shrink(u, math.exp(row[_SPREAD]), power, floor)
+        first, second = math.exp(row[_SCALE] + shrink) * unit, math.exp(row[_SCALE + 1] + shrink) * unit
+        angle = _f(2 * math.pi) * _sigmoid(row[_ANGLE])
+        cos, sin = math.cos(angle), math.sin(angle)
+        factor[k, 0, 0], factor[k, 0, 1] = cos * first, -sin * second
+        factor[k, 1, 0], factor[k, 1, 1] = sin * first, cos * second
+        opacity[k] = _sigmoid(row[_OPACITY])
+        for c in range(3):
+            color[k, c] = max(_f(0.5) + _f(SH_C0) * row[_COLOR + c], _f(0.0))
+
+
+@_jit
+def _pull_back(
+    start,
+    stop,
+    alive,
+    rows,
+    degree,
+    t,
+    unit,
+    power,
+    floor,
+    factor,
+    opacity,
+    color,
+    d_mean,
+    d_factor,
+    d_opacity,
+    d_color,
+    grad,
+):
+    """Add the gradient of each Gaussian's row to `grad`; returns dL/dt over start..stop."""
+    d_time = 0.0
+    for k in range(start, stop):
+        i = alive[k]
+        row, out = rows[i], grad[i]
+        gx, gy = d_mean[k, 0] * unit, d_mean[k, 1] * unit
+        out[_LOC] += gx
+        out[_LOC + 1] += gy
+        centre = _sigmoid(row[_TIME])
+        u = centre - t
+        # Fold: dL/dc_j = g u^j, and dL/du by the derivative of the polynomial.
+        d_u, u_power = _f(0.0), _f(1.0)
+        for j in range(degree):
+            d_u += _f(j + 1) * u_power * (gx * row[_FOLD + 2 * j] + gy * row[_FOLD + 2 * j + 1])
+            u_power *= u
+            out[_FOLD + 2 * j] += gx * u_power
+            out[_FOLD + 2 * j + 1] += gy * u_power
+        # Scales and angle, from the columns of F = R diag(scales).
+        by_first = d_factor[k, 0, 0] * factor[k, 0, 0] + d_factor[k, 1, 0] * factor[k, 1, 0]
+        by_second = d_factor[k, 0, 1] * factor[k, 0, 1] + d_factor[k, 1, 1] * factor[k, 1, 1]
+        out[_SCALE] += by_first
+        out[_SCALE + 1] += by_second
+        by_angle = d_factor[k, 1, 0] * factor[k, 0, 0] - d_factor[k, 0, 0] * factor[k, 1, 0]
+        by_angle += d_factor[k, 1, 1] * factor[k, 0, 1] - d_factor[k, 0, 1] * factor[k, 1, 1]
+        turn = _sigmoid(row[_ANGLE])
+        out[_ANGLE] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
+        # Envelope: -tau^2/2 moves with u and with the spread.
+        spread = math.exp(row[_SPREAD])
+        _, slope = _shrink(u, spread, power, floor)
+        by_exponent = (by_first + by_second) * slope
+        square = u * u / (spread * spread)
+        out[_SPREAD] += by_exponent * square
+        d_u -= by_exponent * u / (spread * spread)
+        out[_TIME] += d_u * centre * (_f(1.0) - centre)
+        d_time -= d_u
+        out[_OPACITY] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
+        for c in range(3):
+            if color[k, c] > _f(0.0):
+                out[_COLOR + c] += d_color[k, c] * _f(SH_C0)
+    return d_time
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditioned:
+    """Splats of one time in pixels, of the Gaussians `alive` (indices, in array order)."""
+
+    alive: np.ndarray
+    t: np.float32
+    unit: np.float32
+    mean: np.ndarray
+    factor: np.ndarray
+    opacity: np.ndarray
+    color: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the frame's size."""
+
+    degree: int
+    power: float
+    floor: float
+    size: tuple[int, int]
+
+
+def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
+    """Write the spans of time of the named rows into `window` (num, 2)."""
+    num = len(indices)
+    run_tasks(
+        lambda start: _windows(start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK)
+    )
+
+
+def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> Conditioned:
+    """The Gaussians whose window holds t, conditioned on t and brought to pixels."""
+    t = np.float32(t)
+    alive = np.flatnonzero((window[:, 0] < t) & (t < window[:, 1]))
+    num, (height, width) = len(alive), shape.size
+    unit = np.float32(pixels_per_unit(shape.size, aspect=height / width))
+    mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
+    opacity, color = np.empty(num, np.float32), np.empty((num, 3), np.float32)
+    constants = np.float32([width / 2, height / 2, shape.power, shape.floor])
+
+    def work(start: int) -> None:
+        stop = min(start + CHUNK, num)
+        _condition(
+            start, stop, alive, rows, shape.degree, t, unit, *constants, mean, factor, opacity, color
+        )
+
+    run_tasks(work, range(0, num, CHUNK))
+    return Conditioned(alive, t, unit, mean, factor, opacity, color)
+
+
+def pull_back(
+    rows: np.ndarray, done: Conditioned, gradients: tuple[np.ndarray, ...], shape: Shape, grad: np.ndarray
+) -> float:
+    """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt."""
+    num = len(done.alive)
+    by_time = np.zeros(-(-num // CHUNK))
+    power, floor = np.float32(shape.power), np.float32(shape.floor)
+
+    def work(start: int) -> None:
+        stop = min(start + CHUNK, num)
+        by_time[start // CHUNK] = _pull_back(
+            start,
+            stop,
+            done.alive,
+            rows,
+            shape.degree,
+            done.t,
+            done.unit,
+            power,
+            floor,
+            done.factor,
+            done.opacity,
+            done.color,
+            *gradients,
+            grad,
+        )
+
+    run_tasks(work, range(0, num, CHUNK))
+    return float(by_time.sum())

@@ -1,0 +1,67 @@
+"""Quality of pictures, by scikit-image."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from foldgauss._checks import invalid
+from foldgauss.video.model import VideoModel
+
+
+def psnr(target: np.ndarray, picture: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of two uint8 pictures; equal pictures give 100 dB, not infinity."""
+    if np.array_equal(target, picture):
+        return 100.0
+    return float(peak_signal_noise_ratio(target, picture, data_range=255))
+
+
+def ssim(target: np.ndarray, picture: np.ndarray) -> float:
+    """Mean SSIM of two uint8 pictures (height, width, 3), both sides >= 11 px, with the weights of Wang et al. 2004."""
+    return float(
+        structural_similarity(
+            target,
+            picture,
+            data_range=255,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            channel_axis=-1,
+        )
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Quality of every frame of a model: dB and SSIM, one entry per frame."""
+
+    psnr: tuple[float, ...]
+    ssim: tuple[float, ...]
+
+    @property
+    def mean_psnr(self) -> float:
+        return float(np.mean(self.psnr))
+
+    @property
+    def mean_ssim(self) -> float:
+        return float(np.mean(self.ssim))
+
+
+def evaluate(
+    model: VideoModel, frames: np.ndarray, on_frame: Callable[[np.ndarray], None] | None = None
+) -> Evaluation:
+    """Compare `model` at its frame times with `frames`, uint8 (num_frames, *model.size, 3).
+
+    Pictures are rounded to 8 bits first, as anyone who watches them gets them. `on_frame` is called with each picture.
+    Raises ValueError if number or size of the frames differ from the model's.
+    """
+    expected = (model.num_frames, *model.size, 3)
+    if frames.shape != expected or frames.dtype != np.uint8:
+        raise invalid("frames", expected=f"uint8 {expected}", got=f"{frames.dtype} {frames.shape}")
+    scores = []
+    for k, picture in enumerate(model.frames()):
+        scores.append((psnr(frames[k], picture), ssim(frames[k], picture)))
+        if on_frame is not None:
+            on_frame(picture)
+    return Evaluation(*map(tuple, zip(*scores, strict=True)))

@@ -1,0 +1,533 @@
+"""The Folded-Gaussian: against scipy, a NumPy twin, quadrature and its own samples; and far out."""
+
+import pickle
+from operator import itemgetter
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.fold import CallableFold, PolynomialFold, ZeroFold
+
+TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
+BEND = [[0.8, -0.5], [0.6, 0.9]]  # odd and even powers, so that each sign mistake shows
+TRIL = [[0.3, 0.0], [0.1, 0.2]]
+
+# Jitted once for the module: most of a test's time would be the compilation of single operations.
+LOG_PROB = eqx.filter_jit(FoldedGaussian.log_prob)
+PDF = eqx.filter_jit(FoldedGaussian.pdf)
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+def _dist(dim=2, *, power=1.0, floor=0.0, fold=None, **changes):
+    parameters = {
+        "loc": jnp.linspace(0.1, -0.4, dim),
+        "scale_tril": jnp.asarray(TRIL)[:dim, :dim],
+        "time_loc": 0.4,
+        "time_scale": 0.3,
+        "fold": PolynomialFold(jnp.asarray(BEND)[:, :dim]) if fold is None else fold,
+        "envelope": TimeLikelihood(power, floor),
+    }
+    return FoldedGaussian(**(parameters | changes))
+
+
+def _batched(leading, key=0, degree=2):
+    k = jax.random.split(jax.random.key(key), 5)
+    tril = jnp.tril(jax.random.uniform(k[0], (*leading, 2, 2), minval=0.2, maxval=0.5))
+    return FoldedGaussian(
+        jax.random.normal(k[1], (*leading, 2)),
+        tril,
+        time_loc=jax.random.uniform(k[2], leading),
+        time_scale=jax.random.uniform(k[3], leading, minval=0.3, maxval=0.5),
+        fold=PolynomialFold(jax.random.normal(k[4], (*leading, degree, 2))),
+    )
+
+
+def _column(u):
+    return u[None]
+
+
+def _close(actual, desired, tolerance):
+    np.testing.assert_allclose(actual, desired, rtol=tolerance, atol=tolerance)
+
+
+def _twin_log_prob(x, *, loc, tril, time_loc, time_scale, coefficients, power):
+    """eq:foldgauss from the book: scipy's densities, one point at a time."""
+    out = []
+    for *s, t in x:
+        u = time_loc - t
+        shift = sum((c * u ** (k + 1) for k, c in enumerate(coefficients)), np.zeros(len(loc)))
+        a = np.exp(-power * (t - time_loc) ** 2 / (2 * time_scale**2))
+        space = stats.multivariate_normal(loc + shift, a * tril @ tril.T).logpdf(s)
+        out.append(space + stats.norm(time_loc, time_scale).logpdf(t))
+    return np.array(out)
+
+
+# --- oracles ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-12)])
+@pytest.mark.parametrize("dim", [1, 2, 3, 10])
+def test_without_fold_and_envelope_it_is_a_gaussian(dim, dtype, tolerance):
+    rng = np.random.default_rng(dim)
+    factor = rng.normal(size=(dim, dim))
+    covariance = factor @ factor.T + dim * np.eye(dim)
+    loc, x = rng.normal(size=dim), rng.normal(size=(50, dim + 1))
+    joint = np.block([[covariance, np.zeros((dim, 1))], [np.zeros((1, dim)), 0.49]])
+    expected = stats.multivariate_normal(np.append(loc, 0.3), joint)
+    with jax.enable_x64(dtype == np.float64):
+        arguments = {"time_loc": 0.3, "time_scale": 0.7, "envelope": Constant()}
+        by_covariance = FoldedGaussian(
+            loc.astype(dtype), covariance_matrix=covariance.astype(dtype), **arguments
+        )
+        by_factor = FoldedGaussian(
+            loc.astype(dtype), np.linalg.cholesky(covariance).astype(dtype), **arguments
+        )
+        for dist in (by_covariance, by_factor):
+            log_prob = LOG_PROB(dist, x.astype(dtype))
+            assert log_prob.dtype == dtype
+            _close(log_prob, expected.logpdf(x), tolerance)
+
+
+@settings(max_examples=15, deadline=None)
+@given(degree=st.integers(0, 5), power=st.sampled_from([0.0, 1.0, 2.0]), seed=st.integers(0, 2**20))
+def test_log_prob_equals_the_paper_written_out(degree, power, seed):
+    rng = np.random.default_rng(seed)
+    tril, coefficients = np.tril(rng.uniform(0.3, 1.0, (2, 2))), rng.normal(size=(degree, 2))
+    loc, time_loc, time_scale = rng.normal(size=2), rng.normal(), rng.uniform(0.3, 2)
+    x = np.c_[rng.normal(size=(10, 2)), time_loc + 1.5 * time_scale * rng.uniform(-1, 1, 10)]
+    twin = {"loc": loc, "time_loc": time_loc, "time_scale": time_scale}
+    expected = _twin_log_prob(x, tril=tril, coefficients=coefficients, power=power, **twin)
+    with jax.enable_x64(True):
+        dist = FoldedGaussian(
+            **twin, scale_tril=tril, fold=PolynomialFold(coefficients), envelope=TimeLikelihood(power)
+        )
+        np.testing.assert_allclose(LOG_PROB(dist, x), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.usefixtures("x64")
+def test_density_integrates_to_one():
+    power, floor = np.array([1.0, 2.0, 1.0, 2.0]), np.array([0.0, 0.0, 0.3, 0.05])
+    dist = _dist(1, power=power, floor=floor)
+    nodes, weights = np.polynomial.legendre.leggauss(120)
+    t, time_weights = 0.4 + 0.3 * 7 * nodes, 0.3 * 7 * weights
+    # Space is integrated around the ridge with the ridge's own width: far out it is narrower than any grid.
+    u = (0.4 - t)[:, None]
+    centre = 0.1 + BEND[0][0] * u + BEND[1][0] * u**2
+    width = 8 * 0.3 * np.sqrt(floor + (1 - floor) * np.exp(-power * (u / 0.3) ** 2 / 2))
+    s = centre + width * nodes[:, None, None]
+    x = np.stack([s, np.broadcast_to(t[:, None], s.shape)], axis=-1)
+    total = np.einsum("t,tb,s,stb->b", time_weights, width, weights, PDF(dist, x))
+    np.testing.assert_allclose(total, 1, atol=1e-8)
+
+
+@pytest.mark.usefixtures("x64")
+def test_density_integrates_to_one_on_a_plain_grid():
+    dist = _dist(1, envelope=Constant())
+    s, t = np.linspace(-12, 12, 1500), np.linspace(-2.3, 3.1, 600)
+    x = np.stack(np.meshgrid(s, t), axis=-1)
+    total = PDF(dist, x).sum() * (s[1] - s[0]) * (t[1] - t[0])
+    assert abs(total - 1) < 1e-8
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.usefixtures("x64")
+def test_chain_rule(dim):
+    dist = _dist(dim)
+    x = jax.random.normal(jax.random.key(3), (20, dim + 1))
+    conditional, marginal = dist.condition_time(x[:, -1]), dist.time_marginal
+    assert conditional.batch_shape == (20,)
+    assert conditional.event_shape == (dim,)
+    assert isinstance(marginal, Normal)
+    assert (marginal.batch_shape, marginal.event_shape) == ((), ())
+    parts = eqx.filter_jit(lambda s, t: conditional.log_prob(s) + marginal.log_prob(t))(x[:, :-1], x[:, -1])
+    _close(LOG_PROB(dist, x), parts, 1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+def test_condition_time_is_the_fold_equation():
+    at = _dist(power=2.0).condition_time(0.7)
+    u = 0.4 - 0.7
+    _close(at.loc, jnp.array([0.1, -0.4]) + u * jnp.array(BEND[0]) + u**2 * jnp.array(BEND[1]), 1e-14)
+    tril = jnp.asarray(TRIL)
+    _close(at.covariance_matrix, jnp.exp(-1.0 * 2 / 2) * tril @ tril.T, 1e-14)
+    _close(at.scale_tril @ at.scale_tril.T, at.covariance_matrix, 1e-14)
+    _close(
+        at.log_prob(jnp.zeros(2)),
+        stats.multivariate_normal(at.loc, at.covariance_matrix).logpdf([0, 0]),
+        1e-12,
+    )
+
+
+@pytest.mark.usefixtures("x64")
+def test_normal_is_scipys():
+    x = np.linspace(-3, 3, 7)
+    _close(Normal(0.5, 2.0).log_prob(x), stats.norm(0.5, 2.0).logpdf(x), 1e-13)
+    _close(Normal(0.5, 2.0).pdf(x), stats.norm(0.5, 2.0).pdf(x), 1e-13)
+    draws = Normal(jnp.array([0.5, -1.0]), 2.0).sample(jax.random.key(0), (4, 3))
+    assert draws.shape == (4, 3, 2)
+
+
+# --- samples ----------------------------------------------------------------------------------------------
+
+
+def _smallest_p_value(x, *, loc, tril, time_loc, time_scale, coefficients, power):
+    """Undo the fold in NumPy: each whitened coordinate is standard normal, overall and in time slices."""
+    s, u = x[:, :-1], time_loc - x[:, -1]
+    tau = -u / time_scale
+    shift = sum(c * u[:, None] ** (k + 1) for k, c in enumerate(coefficients))
+    white = np.linalg.solve(tril, (s - loc - shift).T) * np.exp(power * tau**2 / 4)
+    slices = [tau < -1, np.abs(tau) <= 1, tau > 1]
+    samples = [tau, *white, *(row[keep] for row in white for keep in slices)]
+    return min(stats.kstest(sample, "norm").pvalue for sample in samples) * len(samples)  # Bonferroni
+
+
+RIGHT = {
+    "loc": np.array([0.1, -0.4]),
+    "tril": np.array(TRIL),
+    "time_loc": 0.4,
+    "time_scale": 0.3,
+    "coefficients": np.array(BEND),
+    "power": 1.0,
+}
+
+
+@pytest.fixture(scope="module")
+def draws():
+    return np.asarray(_dist().sample(jax.random.key(11), (100_000,)), np.float64)
+
+
+def test_unfolded_samples_are_standard_normal(draws):
+    # Fixed seed; for a fresh one the rate of false alarms is 1e-4.
+    assert draws.shape == (100_000, 3)
+    assert _smallest_p_value(draws, **RIGHT) > 1e-4
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"coefficients": -RIGHT["coefficients"]},
+        {"coefficients": RIGHT["coefficients"] * np.array([[-1], [1]])},  # f(t - m_t): the sign of t
+        {"coefficients": RIGHT["coefficients"] * 1.02},
+        {"power": 2.0},
+        {"power": 0.0},
+        {"power": 1.1},
+        {"tril": RIGHT["tril"].T},
+        {"time_loc": 0.41},
+    ],
+    ids=["sign of f", "sign of t", "f 2% off", "power 2", "power 0", "power 10% off", "transposed", "time"],
+)
+def test_the_sample_test_has_power(draws, wrong):
+    assert _smallest_p_value(draws, **(RIGHT | wrong)) < 1e-4
+
+
+def test_sample_shapes_and_independence_over_the_batch():
+    loc = jnp.zeros((4, 2))
+    dist = _dist(loc=loc, fold=ZeroFold(2))  # only loc carries a batch: times must still differ
+    sample = jax.jit(lambda d: d.sample(jax.random.key(0), (3,)))
+    x = sample(dist)
+    assert x.shape == (3, 4, 3)
+    assert len(np.unique(x[..., -1])) == 12
+    assert jax.eval_shape(dist.sample, jax.random.key(0)).shape == (4, 3)
+
+
+def test_samples_have_pathwise_gradients():
+    def mean(dist):
+        return dist.sample(jax.random.key(0), (5,)).mean()
+
+    grad = jax.jit(jax.grad(mean))(_dist())
+    assert all(jnp.isfinite(g).all() for g in jax.tree.leaves(grad))
+    _close(grad.loc, jnp.full(2, 1 / 3), 1e-6)
+
+
+# --- gradients and extremes -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 10])
+@pytest.mark.usefixtures("x64")
+def test_gradients_equal_finite_differences(dim):
+    rng = np.random.default_rng(0)
+    tril = jnp.asarray(np.tril(rng.uniform(0.3, 0.6, (dim, dim))) + np.eye(dim))
+    fold = PolynomialFold(rng.normal(size=(2, dim)))
+    dist = _dist(dim, floor=0.1, fold=fold, scale_tril=tril)
+    vector, rebuild = jax.flatten_util.ravel_pytree((dist, jnp.append(dist.loc + 0.2, 0.6)))
+    free = jnp.asarray(rng.normal(size=vector.size))
+    free = jax.flatten_util.ravel_pytree(  # a direction that leaves the factor lower-triangular
+        eqx.tree_at(lambda pair: pair[0].scale_tril, rebuild(free), replace_fn=jnp.tril)
+    )[0]
+    log_prob = jax.jit(lambda e: (lambda dist, x: dist.log_prob(x))(*rebuild(vector + e * free)))
+    first, second = jax.jit(jax.grad(log_prob)), jax.jit(jax.jacrev(jax.grad(log_prob)))
+    zero, step = jnp.zeros(()), 1e-5
+    difference = lambda f: (f(zero + step) - f(zero - step)) / (2 * step)  # noqa: E731
+    np.testing.assert_allclose(first(zero), difference(log_prob), rtol=1e-6)
+    np.testing.assert_allclose(second(zero), difference(first), rtol=1e-6)
+    _close(jax.jit(jax.jacfwd(log_prob))(zero), first(zero), 1e-12)
+    _close(jax.jit(jax.jacfwd(jax.grad(log_prob)))(zero), second(zero), 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_extremes_are_finite_or_minus_infinity_and_never_nan(dtype):
+    axes = ([1.0, 2.0], [0.0, 1e-3], TAUS + [-tau for tau in TAUS], [0, 1e-30, 1e-12, 1e-2, 1, 1e20])
+    with jax.enable_x64(dtype == jnp.float64):
+        cases = [jnp.asarray(axis.ravel(), dtype) for axis in np.meshgrid(*axes)]
+
+        def log_prob(power, floor, tau, residual, dist, moved):
+            dist = eqx.tree_at(lambda d: d.envelope, dist, TimeLikelihood(power, floor))
+            t = dist.time_loc + tau * dist.time_scale
+            s = dist.condition_time(t).loc + residual * jnp.array([1.0, -1.0], dtype)
+            return dist.log_prob(jax.lax.stop_gradient(jnp.append(s, t)) + moved)
+
+        over = jax.vmap(jax.value_and_grad(log_prob, argnums=(0, 4, 5)), in_axes=(0, 0, 0, 0, None, None))
+        values, grads = jax.jit(over)(*cases, _dist(), jnp.zeros(3, dtype))
+        assert values.dtype == dtype
+        assert (jnp.isfinite(values) | jnp.isneginf(values)).all()
+        for grad in jax.tree.leaves(grads):
+            assert not jnp.isnan(grad).any()
+            assert (grad[jnp.isneginf(values)] == 0).all()
+        # On the ridge nothing is far away: the log-density is representable at every tau.
+        assert jnp.isfinite(values[cases[3] == 0]).all()
+
+
+def test_float32_agrees_with_float64_where_the_plain_form_is_nan():
+    # tau = 14: exp(-tau^2/2) is 0 in float32 and the plain quotient 0/0, the true values are representable.
+    tau, residual = 14.0, np.array([3e-20, -5e-20])
+    grads = {}
+    for dtype in (np.float32, np.float64):
+        with jax.enable_x64(dtype == np.float64):
+            dist = FoldedGaussian(np.zeros(2, dtype), np.eye(2, dtype=dtype), time_loc=0.0, time_scale=1.0)
+            x = np.append(residual, tau).astype(dtype)
+            grads[dtype] = jax.jit(lambda x, dist=dist: jax.value_and_grad(dist.log_prob)(x))(x)
+    for single, double in zip(*(jax.tree.leaves(grads[d]) for d in (np.float32, np.float64)), strict=True):
+        np.testing.assert_allclose(single, double, rtol=5e-5)
+
+
+def test_gradient_saturates_at_the_largest_number():
+    at = Gaussian(jnp.zeros(2), jnp.eye(2), log_scale=-49.0)
+    grad = eqx.filter_jit(jax.grad(at.log_prob))(
+        jnp.array([1e-3, -1e-4])
+    )  # 1e-3 e^98 is beyond float32, the density is not
+    assert jnp.isfinite(at.log_prob(jnp.array([1e-3, -1e-4])))
+    np.testing.assert_array_equal(grad, [-np.finfo(np.float32).max, np.finfo(np.float32).max])
+
+
+@pytest.mark.parametrize("fold", [PolynomialFold(jnp.ones((12, 2))), ZeroFold(2)])
+def test_absurd_times_are_minus_infinity(fold):
+    both = jax.vmap(jax.value_and_grad(FoldedGaussian.log_prob, argnums=(0, 1)), in_axes=(None, 0))
+    x = jnp.array([[0.0, 1.0, t] for t in (1e20, -1e30, 3e38)])
+    values, grads = jax.jit(both)(_dist(fold=fold), x)
+    assert jnp.isneginf(values).all()
+    assert all((g == 0).all() for g in jax.tree.leaves(grads))
+
+
+def test_nan_in_nan_out():
+    assert jnp.isnan(_dist().log_prob(jnp.array([0.0, jnp.nan, 0.3])))
+    assert jnp.isnan(_dist().log_prob(jnp.array([0.0, 0.0, jnp.nan])))
+    assert jnp.isnan(_dist(loc=jnp.array([0.0, jnp.nan])).log_prob(jnp.zeros(3)))
+    assert jnp.isnan(_dist(time_scale=jnp.nan).log_prob(jnp.zeros(3)))
+
+
+def test_an_envelope_of_minus_infinity_is_no_nan():
+    class Nothing(AbstractEnvelope):
+        @property
+        def leaf_ranks(self):
+            return ()
+
+        def log_a(self, t, *, time_loc, time_scale):
+            return jnp.full(jnp.broadcast_shapes(t.shape, time_loc.shape), -jnp.inf, t.dtype)
+
+    assert jnp.isneginf(_dist(envelope=Nothing()).log_prob(jnp.array([1.0, 1.0, 0.0])))
+
+
+# --- transformations and batches --------------------------------------------------------------------------
+
+
+def test_jit_equals_eager():
+    dist, x, key = _dist(1), jnp.array([0.3, 0.5]), jax.random.key(2)
+    _close(LOG_PROB(dist, x), dist.log_prob(x), 1e-5)
+    eager, jitted = dist.condition_time(0.3), jax.jit(lambda d, t: d.condition_time(t))(dist, 0.3)
+    _close(jitted.covariance_matrix, eager.covariance_matrix, 1e-6)
+    _close(jax.jit(lambda d: d.sample(key, (2,)))(dist), dist.sample(key, (2,)), 1e-5)
+
+
+def test_batches_equal_a_loop_and_vmap():
+    dist, x = _batched((3, 4)), jax.random.normal(jax.random.key(1), (3, 4, 3))
+    together = LOG_PROB(dist, x)
+    double = jax.jit(jax.vmap(jax.vmap(FoldedGaussian.log_prob)))(dist, x)
+    loop = [[LOG_PROB(jax.tree.map(itemgetter((i, j)), dist), x[i, j]) for j in range(4)] for i in range(3)]
+    assert dist.batch_shape == together.shape == (3, 4)
+    _close(double, together, 1e-5)
+    _close(jnp.array(loop), together, 1e-5)
+    assert jax.eval_shape(lambda: dist.log_prob(jnp.zeros((5, 1, 1, 3)))).shape == (5, 3, 4)
+    assert jax.eval_shape(lambda: dist.condition_time(jnp.zeros((7, 1, 1)))).batch_shape == (7, 3, 4)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"loc": jnp.zeros((5, 2))},
+        {"scale_tril": jnp.broadcast_to(jnp.eye(2), (5, 2, 2))},
+        {"time_loc": jnp.zeros(5)},
+        {"time_scale": jnp.ones(5)},
+        {"fold": PolynomialFold(jnp.ones((5, 3, 2)))},
+        {"envelope": TimeLikelihood(jnp.ones(5))},
+        {"loc": jnp.zeros((5, 1, 2)), "time_loc": jnp.zeros(3)},
+    ],
+)
+def test_any_parameter_may_carry_the_batch(changes):
+    dist = _dist(**changes, validate_args=False)
+    batch = (5, 3) if len(changes) == 2 else (5,)
+    shape = lambda call: jax.eval_shape(call).shape  # noqa: E731
+    key = jax.random.key(0)
+    assert dist.batch_shape == batch
+    assert shape(lambda: dist.log_prob(jnp.zeros(3))) == batch
+    assert shape(lambda: dist.sample(key, (2,))) == (2, *batch, 3)
+    assert jax.eval_shape(lambda: dist.condition_time(0.1)).batch_shape == batch
+    assert shape(lambda: dist.condition_time(0.1).sample(key)) == (*batch, 2)
+
+
+def test_batch_shape_is_true_under_vmap():
+    make = lambda loc, time_loc: _dist(loc=loc, time_loc=time_loc)  # noqa: E731
+    mapped = jax.vmap(make)(jnp.zeros((6, 4, 2)), jnp.linspace(0.0, 1.0, 6))  # inner batch 4 in loc alone
+    assert mapped.batch_shape == (6, 4)
+    assert jax.vmap(jax.vmap(make))(jnp.zeros((7, 6, 2)), jnp.zeros((7, 6))).batch_shape == (7, 6)
+    x = jax.random.normal(jax.random.key(0), (6, 4, 3))
+    loop = jnp.stack(
+        [LOG_PROB(make(jnp.zeros((4, 2)), m), v) for m, v in zip(jnp.linspace(0.0, 1.0, 6), x, strict=True)]
+    )
+    _close(LOG_PROB(mapped, x), loop, 1e-5)
+    inside = []
+    jax.vmap(lambda d: inside.append(d.batch_shape))(_batched((3, 4)))
+    assert inside == [(4,)]
+
+
+def test_empty_batches():
+    dist = _batched((0,))
+    assert LOG_PROB(dist, jnp.zeros((0, 3))).shape == (0,)
+    assert jax.eval_shape(lambda: dist.condition_time(0.2).covariance_matrix).shape == (0, 2, 2)
+    assert jax.jit(lambda d: d.sample(jax.random.key(0), (0,)))(_dist()).shape == (0, 3)
+
+
+@pytest.mark.parametrize("dist", [_batched((3,)), _dist(), _dist(fold=CallableFold(_column), dim=1)])
+def test_round_trips(dist):
+    x = jnp.full(dist.event_shape, 0.2)
+    leaves, treedef = jax.tree.flatten(dist)
+    np.testing.assert_array_equal(LOG_PROB(jax.tree.unflatten(treedef, leaves), x), LOG_PROB(dist, x))
+    np.testing.assert_array_equal(LOG_PROB(pickle.loads(pickle.dumps(dist)), x), LOG_PROB(dist, x))
+    assert jax.tree.structure(jax.tree.unflatten(treedef, [object()] * len(leaves))) == treedef
+    assert len(leaves) == len(dist.leaf_ranks)
+
+
+@pytest.mark.parametrize("call", [lambda d: d.log_prob(jnp.zeros(3)), lambda d: d.condition_time(0.3)])
+def test_compiles_once(call):
+    traces = []
+
+    @jax.jit
+    def counted(dist):
+        traces.append(1)
+        return call(dist)
+
+    for key in range(3):
+        jax.block_until_ready(counted(_batched((5,), key)))
+    assert len(traces) == 1
+
+
+def test_callables_are_folds():
+    slope = jnp.array([0.5, -1.0])
+
+    def log_prob(slope):
+        return _dist(fold=lambda u: slope * u).log_prob(jnp.array([0.1, 0.2, 0.6]))
+
+    def polynomial(slope):
+        return _dist(fold=PolynomialFold(slope[None])).log_prob(jnp.array([0.1, 0.2, 0.6]))
+
+    _close(log_prob(slope), polynomial(slope), 1e-6)
+    _close(jax.grad(log_prob)(slope), jax.grad(polynomial)(slope), 1e-5)  # also through a closure
+    network = eqx.nn.MLP("scalar", 2, 4, 1, key=jax.random.key(0))
+    dist = _dist(fold=network)
+    assert jax.jit(lambda d: d.log_prob(jnp.zeros(3)))(dist).shape == ()
+    stack = jax.vmap(lambda loc: _dist(fold=network, loc=loc))(jnp.zeros((3, 2)))
+    _close(
+        stack.log_prob(jnp.zeros(3)),
+        jnp.full(3, _dist(fold=network, loc=jnp.zeros(2)).log_prob(jnp.zeros(3))),
+        1e-5,
+    )
+
+
+def test_degree_zero_and_none_are_the_zero_fold():
+    x = jax.random.normal(jax.random.key(0), (4, 3))
+    plain = LOG_PROB(_dist(fold=ZeroFold(2)), x)
+    np.testing.assert_array_equal(LOG_PROB(_dist(fold=PolynomialFold(jnp.zeros((0, 2)))), x), plain)
+    default = FoldedGaussian(jnp.linspace(0.1, -0.4, 2), TRIL, time_loc=0.4, time_scale=0.3)
+    np.testing.assert_array_equal(LOG_PROB(default, x), plain)
+    assert isinstance(default.fold, ZeroFold)
+    assert default.envelope.power == 1  # the paper's text
+
+
+def test_dtype_follows_the_arrays():
+    assert FoldedGaussian([0], [[1]], time_loc=0, time_scale=1).loc.dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert FoldedGaussian([0], [[1]], time_loc=0, time_scale=1).time_loc.dtype == jnp.float64
+        single = FoldedGaussian(
+            np.zeros(1, np.float32), [[1]], time_loc=0.5, time_scale=1, fold=PolynomialFold([[1.0]])
+        )
+        assert jax.eval_shape(lambda: single.log_prob([0.0, 0.0])).dtype == jnp.float32
+        assert jax.eval_shape(single.sample, jax.random.key(0)).dtype == jnp.float32
+    assert (
+        FoldedGaussian(np.zeros(1), [[1.0]], time_loc=0.0, time_scale=1.0).loc.dtype == jnp.float32
+    )  # no x64
+
+
+# --- doors ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"time_scale": 0.0}, "time_scale"),
+        ({"time_scale": jnp.array([1.0, -1.0])}, "time_scale"),
+        ({"scale_tril": jnp.ones((2, 2))}, "scale_tril"),
+        ({"scale_tril": jnp.diag(jnp.array([1.0, -1.0]))}, "scale_tril"),
+        ({"scale_tril": jnp.eye(3)}, "scale_tril"),
+        ({"scale_tril": None}, "scale_tril and covariance_matrix"),
+        ({"covariance_matrix": jnp.eye(2)}, "scale_tril and covariance_matrix"),
+        ({"scale_tril": None, "covariance_matrix": jnp.eye(3)}, "covariance_matrix"),
+        ({"scale_tril": None, "covariance_matrix": jnp.array([[1.0, 0.5], [0.0, 1.0]])}, "covariance_matrix"),
+        ({"scale_tril": None, "covariance_matrix": jnp.array([[1.0, 2.0], [2.0, 1.0]])}, "covariance_matrix"),
+        ({"loc": 0.0}, "loc"),
+        ({"loc": jnp.zeros((3, 2)), "time_loc": jnp.zeros(4)}, "batch"),
+        ({"fold": PolynomialFold(jnp.ones((3, 1)))}, "fold"),
+        ({"fold": lambda u: u}, "fold"),
+        ({"fold": 3}, "function"),
+        ({"envelope": "time"}, "envelope"),
+    ],
+)
+def test_bad_input_names_the_parameter(changes, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected .*, got "):
+        _dist(**changes)
+
+
+def test_bad_values_name_the_parameter():
+    with pytest.raises(ValueError, match=r"^x: expected shape \(\*batch, 3\), got "):
+        _dist().log_prob(jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"^scale_tril: expected a positive diagonal"):
+        Gaussian(jnp.zeros(2), jnp.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"^scale: expected positive numbers"):
+        Normal(0.0, -1.0)
+
+
+def test_values_are_not_looked_at_under_tracing_or_on_request():
+    jax.jit(lambda scale: _dist(time_scale=scale).log_prob(jnp.zeros(3)))(-1.0)
+    _dist(time_scale=-1.0, validate_args=False)

@@ -1,0 +1,117 @@
+"""Envelopes: their closed forms, the floor, and what happens far away."""
+
+import math
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+
+TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
+
+
+def _at(envelope, tau):
+    return envelope.log_a(jnp.asarray(tau), time_loc=0.0, time_scale=1.0)
+
+
+@pytest.mark.parametrize("envelope", [Constant(), TimeLikelihood(), TimeLikelihood(2.0, floor=0.1)])
+def test_every_envelope_keeps_the_protocol(envelope):
+    assert isinstance(envelope, AbstractEnvelope)
+    t, time_loc, time_scale = jnp.linspace(-2, 2, 6).reshape(3, 2), jnp.zeros(2), jnp.ones((3, 1))
+    log_a = envelope.log_a(t, time_loc=time_loc, time_scale=time_scale)
+    assert log_a.shape == (3, 2)
+    assert (log_a <= 0).all()
+    assert _at(envelope, 0.0) == 0
+    copy = pickle.loads(pickle.dumps(envelope))
+    np.testing.assert_array_equal(copy.log_a(t, time_loc=time_loc, time_scale=time_scale), log_a)
+    assert len(envelope.leaf_ranks) == len(jax.tree.leaves(envelope))
+
+
+def test_paper_is_power_one_and_its_code_power_two():
+    tau = np.array([-2.0, -0.5, 0.0, 1.0])
+    with jax.enable_x64(True):
+        # eq:a_func_2d: the density of time over its peak
+        np.testing.assert_allclose(jnp.exp(_at(TimeLikelihood(), tau)), np.exp(-(tau**2) / 2), rtol=1e-14)
+        # the code multiplies standard deviations by that, so the covariance by its square
+        np.testing.assert_allclose(_at(TimeLikelihood(2), tau), -(tau**2), rtol=1e-14)
+        scaled = TimeLikelihood().log_a(jnp.asarray(1.5), time_loc=0.5, time_scale=0.25)
+        np.testing.assert_allclose(scaled, -8.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize("floor", [0.0, 1e-12, 0.01, 0.9])
+def test_floor_in_log_space_equals_the_plain_form(floor):
+    tau = np.linspace(-5, 5, 21)
+    with jax.enable_x64(True):
+        plain = np.log(floor + (1 - floor) * np.exp(-(tau**2) / 2))
+        np.testing.assert_allclose(_at(TimeLikelihood(1, floor), tau), plain, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("floor", [0.0, 0.01])
+def test_far_away_values_and_gradients_are_finite(floor, dtype):
+    with jax.enable_x64(dtype == jnp.float64):
+
+        def log_a(t, power, floor, time_loc, time_scale):
+            envelope = TimeLikelihood(power, floor)
+            return envelope.log_a(t, time_loc=time_loc, time_scale=time_scale)
+
+        taus = jnp.asarray([*TAUS, 1e25], dtype)
+        arguments = [jnp.broadcast_to(jnp.asarray(x, dtype), taus.shape) for x in (1.5, floor, 0.25, 0.5)]
+        values, grads = jax.jit(jax.vmap(jax.value_and_grad(log_a, argnums=range(5))))(taus, *arguments)
+        assert values.dtype == dtype
+        assert jnp.isfinite(values).all()
+        assert all(jnp.isfinite(g).all() for g in grads)
+        if floor:
+            assert (values >= math.log(floor) - 1e-6).all()
+
+
+@pytest.mark.parametrize("tau", [0.3, 2.0])
+def test_gradients_equal_finite_differences(tau):
+    with jax.enable_x64(True):
+
+        @jax.jit
+        def log_a(x):
+            t, power, floor, time_loc, time_scale = x
+            return TimeLikelihood(power, floor).log_a(t, time_loc=time_loc, time_scale=time_scale)
+
+        x, step = jnp.array([0.5 + 0.7 * tau, 1.5, 0.2, 0.5, 0.7]), 1e-5
+        for function, order in ((log_a, 1), (jax.jit(jax.grad(log_a)), 2)):
+            steps = step * jnp.eye(5)
+            differences = jnp.stack([(function(x + h) - function(x - h)) / (2 * step) for h in steps])
+            exact = jax.jacfwd(function)(x) if order == 1 else jax.jacrev(function)(x)
+            np.testing.assert_allclose(exact, differences, rtol=1e-6, atol=1e-8)
+
+
+def test_slope_at_floor_zero_is_exact():
+    with jax.enable_x64(True):
+        slope = jax.grad(lambda floor: _at(TimeLikelihood(1.0, floor), 2.0))(jnp.asarray(0.0))
+        np.testing.assert_allclose(slope, np.expm1(2.0), rtol=1e-12)
+
+
+def test_power_and_floor_may_be_batched():
+    envelope = TimeLikelihood(jnp.array([1.0, 2.0]), jnp.array([[0.0], [0.1], [0.2]]))
+    log_a = _at(envelope, jnp.array([1.0, 2.0]))
+    assert log_a.shape == (3, 2)
+    np.testing.assert_allclose(log_a[2, 1], _at(TimeLikelihood(2.0, 0.2), 2.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"power": -1.0}, "power"),
+        ({"floor": -0.1}, "floor"),
+        ({"floor": 1.0}, "floor"),
+        ({"floor": [0.5, 2]}, "floor"),
+    ],
+)
+def test_bad_input_names_the_parameter(arguments, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected .*, got "):
+        TimeLikelihood(**arguments)
+
+
+def test_nan_propagates():
+    assert jnp.isnan(_at(TimeLikelihood(jnp.nan), 1.0))
+    assert jnp.isnan(_at(TimeLikelihood(1.0, 0.1), jnp.nan))
