@@ -239,8 +239,8 @@ class FoldedGaussian(eqx.Module):
         fold = _checked_fold(_cast(fold, dtype), loc)
         envelope = TimeLikelihood(power=1.0) if envelope is None else envelope
         envelope = _cast(_checked_envelope(envelope), dtype)
-        # Every leaf is given the whole batch, so that `vmap` over the distribution, its slices, and a new axis
-        # put in front by `vmap` over this constructor are all well defined.
+        # Every leaf is given the whole batch, so that slices, `vmap` over the distribution, and an axis that
+        # `vmap` over this constructor puts in front, are all well defined.
         parts = [(loc, 1), (tril, 2), (time_loc, 0), (time_scale, 0)]
         batch = _checked_batch([*parts, *_parts(fold), *_parts(envelope)])
         self.loc, self.scale_tril, self.time_loc, self.time_scale = _broadcast(parts, batch)

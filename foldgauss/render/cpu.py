@@ -8,7 +8,7 @@ How a picture is made, and why so:
 * Inside a tile only the pixel rows that the splat's cutoff ellipse reaches are visited, and a row of 16 pixels is
   one AVX-512 vector. The loops are written for the vectoriser: unsigned indices into one scratch buffer at
   constant offsets, no branches, an exponential made of a polynomial and a bit cast.
-* The backward pass walks in the same order as the forward one. With R the light still to come, colour times
+* The backward pass walks in the same order as the forward one. With R the colour still to come, colour times
   incoming gradient, dL/dalpha_i = T_i (c_i . g) - R_i / (1 - alpha_i): no per-splat state is stored. Gradients
   go to one slot per (splat, row) and are summed per splat afterwards: deterministic, no atomics.
 """
@@ -41,12 +41,14 @@ _inline = nb.njit(inline="always", error_model="numpy", fastmath=_FASTMATH)
 _f, _i, _u = nb.float32, nb.int32, nb.uint64
 
 # Columns of the per-splat geometry. The exponent is kept in powers of two, log2 of the opacity included:
-# alpha = 2^(XX dx^2 + XY dx dy + YY dy^2 + LOG).
-_X, _Y, _XX, _XY, _YY, _LOG, _RX, _RY = range(8)
-# Columns of a gradient slot: three colours, then the sums of p = dL/dalpha * alpha against 1, dx, dy, dx^2, dx dy, dy^2.
+# alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2). Whitened before it is squared: the three terms of the usual conic
+# cancel for thin, slanted splats. RX and RY are the half-sizes of the cutoff ellipse's box.
+_X, _Y, _P, _Q, _R, _LOG, _RX, _RY = range(8)
+# Columns of a gradient slot: three colours, then the sums of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where
+# v = P dx + Q dy and w = R dy: in whitened coordinates the moments of thin splats do not cancel either.
 _SLOTS = 9
 # Offsets of the planes in the backward scratch: light, incoming gradient, light to come, pixel coordinates.
-_G, _R, _PX, _PY = PIXELS, 4 * PIXELS, 5 * PIXELS, 6 * PIXELS
+_G, _REST, _PX, _PY = PIXELS, 4 * PIXELS, 5 * PIXELS, 6 * PIXELS
 
 
 @intrinsic
@@ -76,7 +78,7 @@ def _exp2(x):
 @_jit
 def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff, geometry, span):
     """Geometry of splats start..stop and the rows of tiles each one reaches (none: it is not seen)."""
-    log2e = _f(math.log2(math.e))
+    half_log2e = _f(0.5 * math.log2(math.e))
     for i in range(start, stop):
         span[i, 0] = 0
         span[i, 1] = 0
@@ -96,9 +98,10 @@ def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff
             continue
         geometry[i, _X] = x
         geometry[i, _Y] = y
-        geometry[i, _XX] = _f(-0.5) * log2e * yy / det
-        geometry[i, _XY] = log2e * xy / det
-        geometry[i, _YY] = _f(-0.5) * log2e * xx / det
+        across = math.sqrt(half_log2e / (det * yy))
+        geometry[i, _P] = yy * across
+        geometry[i, _Q] = -xy * across
+        geometry[i, _R] = math.sqrt(half_log2e / yy)
         geometry[i, _LOG] = math.log2(opacity[i])
         geometry[i, _RX] = radius_x
         geometry[i, _RY] = radius_y
@@ -137,11 +140,9 @@ def _bucket_rows(span, num_rows):
 
 
 @_inline
-def _edge(xx, xy, yy, level, dy):
-    """Right edge of the ellipse xx dx^2 + xy dx dy + yy dy^2 = level on the line dy (negative-definite entries)."""
-    half = _f(0.5) * xy * dy
-    inside = max(half * half - xx * (yy * dy * dy - level), _f(0.0))
-    return (-half - math.sqrt(inside)) / xx
+def _edge(p, q, r, level, dy):
+    """Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy."""
+    return (math.sqrt(max(level - r * dy * r * dy, _f(0.0))) - q * dy) / p
 
 
 @_jit
@@ -154,13 +155,13 @@ def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff
     upper, lower = _f(top) + _f(0.5), _f(min(top + TILE, height)) - _f(0.5)
     for e in range(count):
         i = entries[start + e]
-        xx, xy, yy = geometry[i, _XX], geometry[i, _XY], geometry[i, _YY]
+        p, q, r = geometry[i, _P], geometry[i, _Q], geometry[i, _R]
         x, y, radius = geometry[i, _X], geometry[i, _Y], geometry[i, _RX]
-        level = (log_cutoff - geometry[i, _LOG]) * (_f(1.0) + SLACK) - SLACK
+        level = (geometry[i, _LOG] - log_cutoff) * (_f(1.0) + SLACK) + SLACK
         # The ellipse is widest to the right at dy = turn and to the left at -turn; within the band, at the nearest line.
-        turn = _f(-0.5) * xy * radius / yy
-        right = x + _edge(xx, xy, yy, level, min(max(turn, upper - y), lower - y))
-        left = x - _edge(xx, -xy, yy, level, min(max(-turn, upper - y), lower - y))
+        turn = -p * q * radius / (q * q + r * r)
+        right = x + _edge(p, q, r, level, min(max(turn, upper - y), lower - y))
+        left = x - _edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
         first = int(math.ceil(max(left - _f(0.5), _f(0.0))))
         last = int(math.floor(min(right - _f(0.5), _f(width - 1))))
         reach[e, 0] = first // TILE
@@ -190,17 +191,18 @@ def _pixel_rows(y, radius):
 def _blend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, finished):
     """Add splat i to the tile: scratch holds the light left, then the colours, 16 x 16 each."""
     x, y = geometry[i, _X] - left - _f(0.5), geometry[i, _Y] - top - _f(0.5)
-    xx, xy, yy, log = geometry[i, _XX], geometry[i, _XY], geometry[i, _YY], geometry[i, _LOG]
+    p, q, r, log = geometry[i, _P], geometry[i, _Q], geometry[i, _R], geometry[i, _LOG]
     red, green, blue = color[i, 0], color[i, 1], color[i, 2]
     share = _f(1.0) if over else _f(0.0)
     first, last = _pixel_rows(y, geometry[i, _RY])
     for row in range(first, last):
         dy = _f(row) - y
-        slope, offset = xy * dy, yy * dy * dy + log
+        shear, drop = q * dy, log - r * dy * r * dy
         base = _u(row * TILE)
         for column in range(_u(TILE)):
             dx = _f(_i(column)) - x
-            power = (xx * dx + slope) * dx + offset
+            across = p * dx + shear
+            power = drop - across * across
             light = scratch[base + column]
             seen = (power >= log_cutoff) & (light > finished)
             alpha = min(_exp2(max(power, _f(-100.0))), ceiling)
@@ -259,17 +261,18 @@ def _forward_row(
 def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, finished, slot):
     """Gradient sums of splat i over one tile, added to its slot; the scratch moves on behind the splat."""
     x, y = geometry[i, _X] - left - _f(0.5), geometry[i, _Y] - top - _f(0.5)
-    xx, xy, yy, log = geometry[i, _XX], geometry[i, _XY], geometry[i, _YY], geometry[i, _LOG]
+    white_x, white_xy, white_y, log = geometry[i, _P], geometry[i, _Q], geometry[i, _R], geometry[i, _LOG]
     red, green, blue = color[i, 0], color[i, 1], color[i, 2]
     share = _f(1.0) if over else _f(0.0)
     s_red, s_green, s_blue = _f(0.0), _f(0.0), _f(0.0)
-    s_1, s_x, s_y, s_xx, s_xy, s_yy = _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0)
+    s_1, s_v, s_w, s_vv, s_vw, s_ww = _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0)
     first, last = _pixel_rows(y, geometry[i, _RY])
     base = _u(first * TILE)
     for q in range(_u((last - first) * TILE if last > first else 0)):
         p = base + q
         dx, dy = scratch[p + _u(_PX)] - x, scratch[p + _u(_PY)] - y
-        power = (xx * dx + xy * dy) * dx + (yy * dy * dy + log)
+        across, along = white_x * dx + white_xy * dy, white_y * dy
+        power = log - across * across - along * along
         light = scratch[p]
         seen = (power >= log_cutoff) & (light > finished)
         free = _exp2(max(power, _f(-100.0)))
@@ -281,8 +284,8 @@ def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, 
         )
         own = red * g_red + green * g_green + blue * g_blue
         weight = alpha * light
-        behind = scratch[p + _u(_R)] - share * weight * own
-        scratch[p + _u(_R)] = behind
+        behind = scratch[p + _u(_REST)] - share * weight * own
+        scratch[p + _u(_REST)] = behind
         scratch[p] = light - share * weight
         slope = (light * own - share * behind / (_f(1.0) - alpha)) * alpha
         slope = slope if free < ceiling else _f(0.0)
@@ -290,20 +293,20 @@ def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, 
         s_green += weight * g_green
         s_blue += weight * g_blue
         s_1 += slope
-        s_x += slope * dx
-        s_y += slope * dy
-        s_xx += slope * dx * dx
-        s_xy += slope * dx * dy
-        s_yy += slope * dy * dy
+        s_v += slope * across
+        s_w += slope * along
+        s_vv += slope * across * across
+        s_vw += slope * across * along
+        s_ww += slope * along * along
     slot[0] += s_red
     slot[1] += s_green
     slot[2] += s_blue
     slot[3] += s_1
-    slot[4] += s_x
-    slot[5] += s_y
-    slot[6] += s_xx
-    slot[7] += s_xy
-    slot[8] += s_yy
+    slot[4] += s_v
+    slot[5] += s_w
+    slot[6] += s_vv
+    slot[7] += s_vw
+    slot[8] += s_ww
 
 
 @_jit
@@ -343,7 +346,7 @@ def _backward_row(
                     g = grad_image[c, top + y, left + x]
                     scratch[_G + c * PIXELS + p] = g
                     if over:
-                        scratch[_R + p] += g * image[c, top + y, left + x]
+                        scratch[_REST + p] += g * image[c, top + y, left + x]
         for k in range(tile_start[tile], used[tile]):
             e = start + listed[k]
             _unblend(
@@ -366,7 +369,7 @@ def _gather(
     start, stop, first_slot, slot_position, slots, geometry, factor, opacity, d_mean, d_factor, d_opacity, d_color
 ):
     """Sum the slots of splats start..stop and carry the sums back to mean, factor, opacity and colour."""
-    ln2 = _f(math.log(2.0))
+    c = _f(2.0 * math.log(2.0))
     total = np.empty(_SLOTS, np.float32)
     for i in range(start, stop):
         total[:] = 0.0
@@ -379,24 +382,19 @@ def _gather(
             d_mean[i] = 0.0
             d_factor[i] = 0.0
             continue
-        # Conic entries K = Sigma^-1 from the stored powers of two.
-        k_xx = _f(-2.0) * ln2 * geometry[i, _XX]
-        k_xy = -ln2 * geometry[i, _XY]
-        k_yy = _f(-2.0) * ln2 * geometry[i, _YY]
+        # With W = [[P, Q], [0, R]]: Sigma^-1 = c W^T W, dL/dmean = c W^T (v, w), dL/dF = c^2 W^T M W F, M the
+        # second moments of (v, w).
+        p, q, r = geometry[i, _P], geometry[i, _Q], geometry[i, _R]
         d_opacity[i] = total[3] / opacity[i]
-        d_mean[i, 0] = k_xx * total[4] + k_xy * total[5]
-        d_mean[i, 1] = k_xy * total[4] + k_yy * total[5]
-        # dL/dSigma = K S K / 2 with S the second moments of p, and dL/dF = 2 dL/dSigma F.
-        m_xx = k_xx * total[6] + k_xy * total[7]
-        m_xy = k_xx * total[7] + k_xy * total[8]
-        m_yx = k_xy * total[6] + k_yy * total[7]
-        m_yy = k_xy * total[7] + k_yy * total[8]
-        c_xx = m_xx * k_xx + m_xy * k_xy
-        c_xy = m_xx * k_xy + m_xy * k_yy
-        c_yy = m_yx * k_xy + m_yy * k_yy
+        d_mean[i, 0] = c * p * total[4]
+        d_mean[i, 1] = c * (q * total[4] + r * total[5])
         for k in range(2):
-            d_factor[i, 0, k] = c_xx * factor[i, 0, k] + c_xy * factor[i, 1, k]
-            d_factor[i, 1, k] = c_xy * factor[i, 0, k] + c_yy * factor[i, 1, k]
+            v = c * (p * factor[i, 0, k] + q * factor[i, 1, k])
+            w = c * r * factor[i, 1, k]
+            by_v = total[6] * v + total[7] * w
+            by_w = total[7] * v + total[8] * w
+            d_factor[i, 0, k] = c * p * by_v
+            d_factor[i, 1, k] = c * (q * by_v + r * by_w)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -417,6 +415,17 @@ class Trace:
         return sum(len(listed) for _, listed, _ in self.lists) * PIXELS
 
 
+def check_options(options: RenderOptions) -> None:
+    """Raise ValueError for options that this engine cannot keep its accuracy with."""
+    if options.alpha_ceiling > HIGHEST_CEILING:
+        raise invalid(
+            "options.alpha_ceiling",
+            expected=f"at most {HIGHEST_CEILING} for engine 'cpu'",
+            got=options.alpha_ceiling,
+            cure="Use engine='reference' for more.",
+        )
+
+
 def forward(
     mean: np.ndarray,
     factor: np.ndarray,
@@ -433,13 +442,7 @@ def forward(
     Returns the trace, whose `image` is planar, (3, height, width).
     """
     options = RenderOptions() if options is None else options
-    if options.alpha_ceiling > HIGHEST_CEILING:
-        raise invalid(
-            "options.alpha_ceiling",
-            expected=f"at most {HIGHEST_CEILING} for engine 'cpu'",
-            got=options.alpha_ceiling,
-            cure="Use engine='reference' for more.",
-        )
+    check_options(options)
     (height, width), num = size, len(opacity)
     geometry, span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
     low_pass, cutoff = np.float32(options.low_pass), np.float32(options.alpha_cutoff)

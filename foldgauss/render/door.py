@@ -63,6 +63,7 @@ def render(
         )
     if channels != 3:
         raise invalid("color", expected="3 channels for engine 'cpu'", got=channels, cure="Use 'reference'.")
+    cpu.check_options(options)
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
     image = _render_cpu((height, width), compositing, options, *(leaf.astype(jnp.float32) for leaf in leaves))
     return image.astype(dtype)

@@ -4,27 +4,30 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def conic(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Inverse of F F^T + low_pass I as (xx, xy, yy), and the determinant it was divided by.
+def whitening(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    r"""(p, q, r) with (p dx + q dy)^2 + (r dy)^2 the squared Mahalanobis distance, and the covariance's determinant.
 
-    The determinant is written as a sum of squares, det(F)^2 + low_pass |F|^2 + low_pass^2, which cannot cancel.
+    The covariance is F F^T + low_pass I. Its determinant is written as a sum of squares, which cannot cancel, and the
+    distance is centred before it is squared: the three terms of the usual conic cancel for thin, slanted splats.
     """
-    squared = jnp.sum(factor**2)
     xx = jnp.sum(factor[0] ** 2) + low_pass
     xy = jnp.sum(factor[0] * factor[1])
     yy = jnp.sum(factor[1] ** 2) + low_pass
-    det = (factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]) ** 2 + low_pass * (squared + low_pass)
-    safe = jnp.where(det > 0, det, jnp.ones_like(det))
-    return jnp.stack([yy, -xy, xx]) / safe, det
+    area = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
+    det = area**2 + low_pass * (xx + yy - low_pass)
+    kept = (det > 0) & (yy > 0)
+    det_safe, yy_safe = jnp.where(kept, det, jnp.ones_like(det)), jnp.where(kept, yy, jnp.ones_like(yy))
+    across = jnp.sqrt(det_safe * yy_safe)
+    return jnp.stack([yy / across, -xy / across, 1 / jnp.sqrt(yy_safe)]), det
 
 
 def exponent(
-    offset: Float[Array, "*pixels 2"], conic_entries: Float[Array, "3"]
+    offset: Float[Array, "*pixels 2"], whitener: Float[Array, "3"]
 ) -> Float[Array, "*pixels"]:
-    """-1/2 (x - m)^T K (x - m) for offsets x - m and K given as (xx, xy, yy)."""
+    """Minus half the squared Mahalanobis distance of offsets x - m."""
     dx, dy = offset[..., 0], offset[..., 1]
-    xx, xy, yy = conic_entries
-    return -(xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy) / 2
+    p, q, r = whitener
+    return -((p * dx + q * dy) ** 2 + (r * dy) ** 2) / 2
 
 
 def pixel_centres(size: tuple[int, int], dtype: jnp.dtype) -> Float[Array, "height width 2"]:

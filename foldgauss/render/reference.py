@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss.render.footprint import conic, exponent, pixel_centres
+from foldgauss.render.footprint import exponent, pixel_centres, whitening
 from foldgauss.render.splats import RenderOptions, Splats2D
 
 
@@ -37,8 +37,8 @@ def splat_alpha(
     splat: Splats2D, centres: Float[Array, "height width 2"], options: RenderOptions
 ) -> Float[Array, "height width"]:
     """Alpha of one splat at every pixel centre: capped, and zero below the cutoff."""
-    entries, det = conic(splat.factor, options.low_pass)
-    alpha = splat.opacity * jnp.exp(exponent(centres - splat.mean[None, None, :], entries))
+    whitener, det = whitening(splat.factor, options.low_pass)
+    alpha = splat.opacity * jnp.exp(exponent(centres - splat.mean[None, None, :], whitener))
     kept = (alpha >= options.alpha_cutoff) & (det > 0)
     return jnp.where(kept, jnp.minimum(alpha, options.alpha_ceiling), jnp.zeros_like(alpha))
 

@@ -29,13 +29,13 @@ class LearningRates:
     """Adam rates at the first step, by leaf; model space (the frame's longer side is 1)."""
 
     loc: float = 6.9e-4
-    coefficients: float = 2.4e-3
+    coefficients: float = 4e-3
     log_scale: float = 0.06
-    angle_logit: float = 0.03
+    angle_logit: float = 0.06
     opacity_logit: float = 0.15
     color_dc: float = 0.06
-    time_loc_logit: float = 3e-3
-    log_time_scale: float = 0.03
+    time_loc_logit: float = 0.02
+    log_time_scale: float = 0.1
     frame_times: float = 3e-3
 
     def __post_init__(self) -> None:
@@ -61,7 +61,7 @@ class FitConfig:
     seed: int = 0
     learn_frame_times: bool = True
     rates: LearningRates = LearningRates()
-    final_rate: float = 0.05  # all rates fall exponentially to this share of themselves
+    final_rate: float = 0.07  # all rates fall exponentially to this share of themselves
     options: RenderOptions = RenderOptions(low_pass=0.1)  # 0.1 px^2 fits finer detail than the usual 0.3
 
     def __post_init__(self) -> None:

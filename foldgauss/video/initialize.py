@@ -7,12 +7,12 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.model import SH_C0, TAU_MAX, FoldedSplats
 
 #: Share of the starts that is spread evenly, so that flat parts are covered too.
-EVEN_SHARE = 0.3
+EVEN_SHARE = 0.15
 #: Starting standard deviation in units of the distance to the neighbours alive at the same time.
-SCALE_FACTOR = 1.0
+SCALE_FACTOR = 1.3
 START_OPACITY = 0.3
 #: sigma_t is drawn log-uniformly between these, in units of the clip's duration.
-TIME_SCALES = (0.02, 0.6)
+TIME_SCALES = (0.02, 0.4)
 
 
 def initialize(

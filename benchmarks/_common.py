@@ -1,0 +1,161 @@
+"""What the benchmarks share: arguments, scenes, timing side by side, and the file of figures."""
+
+import argparse
+import importlib.metadata
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from foldgauss._threads import available_cores, num_threads
+from foldgauss.io._atomic import atomic_path, check_writable
+
+console = Console(width=140)
+
+#: Opacities and standard deviations (px) of the random scenes: design section 6, about 4.4 bounding-box tiles per splat.
+OPACITIES, SIGMAS = (0.05, 1.0), (1.0, 6.0)
+SEED = 0
+#: Seconds of rest before each timed call: XLA gives its memory back on threads of its own after a result is ready, which
+#: was seen to slow the next 10 ms of another engine by half.
+PAUSE = 0.05
+
+
+class Task(NamedTuple):
+    """Something to time. `run` must return only when its results are there; `prepare` is not timed."""
+
+    run: Callable[[], object]
+    prepare: Callable[[], None] = lambda: None
+
+
+class Scene(NamedTuple):
+    """Random splats in pixels: what `foldgauss.render.cpu.forward` takes, and a gradient to send back."""
+
+    name: str
+    size: tuple[int, int]
+    leaves: tuple[np.ndarray, ...]  # mean, factor, opacity, color, background
+    grad_image: np.ndarray  # (3, height, width)
+
+    @property
+    def num_splats(self) -> int:
+        return len(self.leaves[0])
+
+
+def random_scene(num: int, size: tuple[int, int], name: str = "", seed: int = SEED) -> Scene:
+    """`num` splats: means uniform over the picture, both axes log-uniform in `SIGMAS`, any angle, `OPACITIES` uniform."""
+    rng = np.random.default_rng(seed)
+    height, width = size
+    sigma = np.exp(rng.uniform(*np.log(SIGMAS), (num, 2)))
+    angle = rng.uniform(0, np.pi, num)
+    turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(num, 2, 2)
+    leaves = (
+        rng.uniform(0, 1, (num, 2)) * [width, height],
+        turn * sigma[:, None, :],
+        rng.uniform(*OPACITIES, num),
+        rng.uniform(0, 1, (num, 3)),
+        np.zeros(3),
+    )
+    single = tuple(np.ascontiguousarray(leaf, np.float32) for leaf in leaves)
+    return Scene(name, size, single, rng.normal(size=(3, height, width)).astype(np.float32))
+
+
+def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[str, float]:
+    """Median seconds of each task over `rounds` rounds that run all tasks in turn, after `warmup` rounds.
+
+    In turn, so that a noisy minute hits all of them; each round starts with another task.
+    """
+    names, seconds = list(tasks), {name: [] for name in tasks}
+    for round_ in range(-warmup, rounds):
+        first = round_ % len(names)
+        for name in names[first:] + names[:first]:
+            tasks[name].prepare()
+            time.sleep(PAUSE)
+            begun = time.perf_counter()
+            result = tasks[name].run()
+            passed = time.perf_counter() - begun
+            del result  # after the clock has stopped
+            if round_ >= 0:
+                seconds[name].append(passed)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def parser(doc: str) -> argparse.ArgumentParser:
+    """A parser with --json; `doc` is the module's docstring, shown by --help."""
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    return made
+
+
+def parse(made: argparse.ArgumentParser, arguments: list[str] | None) -> argparse.Namespace:
+    """Parse, and find out before the work whether the figures can be written."""
+    options = made.parse_args(arguments)
+    if options.json is not None:
+        try:
+            check_writable(options.json)
+        except OSError as error:
+            made.error(str(error))
+    return options
+
+
+def whole(text: str) -> int:
+    """argparse type: a whole number >= 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number >= 1, got {text!r}")
+    return int(text)
+
+
+def size(text: str) -> tuple[int, int]:
+    """argparse type: HxW."""
+    height, _, width = text.lower().partition("x")
+    return whole(height), whole(width)
+
+
+def machine() -> dict[str, object]:
+    """Facts a timing depends on; no names of hosts or users."""
+    packages = ("jax", "jaxlib", "numba", "numpy", "optax")
+    return {
+        "cpu": _cpu_model(),
+        "cores": available_cores(),
+        "threads": num_threads(),
+        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # not Linux
+        return platform.processor() or "unknown"
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, "unknown")
+
+
+def table(title: str, *columns: str) -> Table:
+    """An empty table: the first column is text, the others are numbers."""
+    made = Table(title=title, title_justify="left")
+    for k, column in enumerate(columns):
+        made.add_column(column, justify="left" if k == 0 else "right", no_wrap=k == 0)
+    return made
+
+
+def finish(path: Path | None, figures: dict[str, float], facts: dict[str, object], **more: object) -> None:
+    """Print the figures and the machine, and write them to `path`, whole or not at all."""
+    figures = {name: float(value) for name, value in figures.items()}
+    shown = table("Figures", "name", "value")
+    for name, value in figures.items():
+        shown.add_row(name, f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}")
+    console.print(shown)
+    console.print("machine: " + ", ".join(f"{name} {value}" for name, value in facts.items()), style="dim")
+    if path is not None:
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps({"figures": figures, "machine": facts, **more}, indent=2) + "\n")

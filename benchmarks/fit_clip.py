@@ -1,0 +1,119 @@
+"""Quality of a fit against time, on one clip.
+
+    python -m benchmarks.fit_clip [--json FILE] [--clip bunny|bikes|carphone|PATH] [--size HxW] [--frames A:B]
+                                  [--gaussians N] [--degree K] [--steps N | --seconds S] [--seed S]
+
+Without options: all 132 Bunny frames at 160x320, 40,000 Gaussians, degree 3, 110 seconds. Other clips keep their own size
+and get `default_num_gaussians` by it.
+
+The way there is the running PSNR of the fit itself (about one pass through the frames, before rounding to 8 bits). The end is
+`foldgauss.video.metrics.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean over all frames.
+`fit_seconds` is the wall time of the whole fit, starting positions and compilation included, reading and evaluation not.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import _common
+from benchmarks._common import console
+from foldgauss.datasets import sample_clip
+from foldgauss.io.video_file import Clip, read_video
+from foldgauss.video.fit import FitConfig, FitInfo, fit
+from foldgauss.video.metrics import Evaluation, evaluate
+from foldgauss.video.model import VideoModel
+
+SAMPLES = ("bunny", "bikes", "carphone")
+BUNNY_SIZE, BUNNY_GAUSSIANS = (160, 320), 40_000  # the line of the design, section 7
+SECONDS = 110.0
+POINTS = 8
+
+
+def read(options: argparse.Namespace) -> Clip:
+    path = sample_clip(options.clip) if options.clip in SAMPLES else Path(options.clip)
+    size = BUNNY_SIZE if options.clip == "bunny" and options.size is None else options.size
+    return read_video(path, frames=options.frames, size=size)
+
+
+def configuration(options: argparse.Namespace) -> FitConfig:
+    num = BUNNY_GAUSSIANS if options.clip == "bunny" and options.size is None else None
+    seconds = SECONDS if options.seconds is None else options.seconds
+    return FitConfig(
+        num_gaussians=num if options.gaussians is None else options.gaussians,
+        degree=options.degree,
+        steps=options.steps,
+        minutes=None if options.steps is not None else seconds / 60,
+        seed=options.seed,
+    )
+
+
+def run(clip: Clip, config: FitConfig) -> tuple[VideoModel, list[FitInfo], float]:
+    """The model, the infos of `POINTS` moments, and the wall seconds of the fit."""
+    kept = []
+
+    def observe(_state, info: FitInfo) -> None:
+        before = kept[-1].progress if kept else 0.0
+        if int(info.progress * POINTS) > int(before * POINTS):
+            kept.append(info)
+            console.print(f"{info.seconds:6.1f} s  step {info.step:6,}  {info.psnr:.2f} dB", style="dim")
+
+    begun = time.perf_counter()
+    model = fit(clip.frames, config, fps=clip.fps, observers=[observe]).model
+    return model, kept, time.perf_counter() - begun
+
+
+def show(kept: list[FitInfo], scores: Evaluation, seconds: float, title: str) -> None:
+    table = _common.table(title, "moment", "seconds", "steps", "alive", "PSNR, dB", "SSIM")
+    for info in kept:
+        numbers = f"{info.seconds:.1f}", f"{info.step:,}", f"{info.num_alive:,}", f"{info.psnr:.2f}"
+        table.add_row("while fitting", *numbers, "")
+    table.add_section()
+    last = f"{seconds:.1f}", f"{kept[-1].step:,}", ""
+    table.add_row("all frames, mean", *last, f"{scores.mean_psnr:.2f}", f"{scores.mean_ssim:.4f}")
+    worst = int(np.argmin(scores.psnr))
+    table.add_row(f"worst frame, {worst}", "", "", "", f"{scores.psnr[worst]:.2f}", f"{scores.ssim[worst]:.4f}")
+    console.print(table)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    options = _common.parse(_parser(), arguments)
+    facts, clip, config = _common.machine(), read(options), configuration(options)
+    model, kept, seconds = run(clip, config)
+    scores = evaluate(model, clip.frames)
+    num, steps = model.splats.num_gaussians, kept[-1].step
+    height, width = clip.size
+    title = f"{options.clip}: {clip.num_frames} frames of {height}x{width}, {num:,} Gaussians, degree {config.degree}"
+    show(kept, scores, seconds, title)
+    figures = {"psnr": scores.mean_psnr, "ssim": scores.mean_ssim, "fit_seconds": seconds, "steps": steps}
+    figures |= {"worst_frame_psnr": min(scores.psnr), "ms_per_step": 1e3 * kept[-1].seconds / steps}
+    setting = {"clip": Path(options.clip).name, "size": clip.size, "num_frames": clip.num_frames}
+    setting |= {"num_gaussians": num, "degree": config.degree, "seed": config.seed}
+    course = [{"seconds": info.seconds, "step": info.step, "psnr": info.psnr} for info in kept]
+    _common.finish(options.json, figures, facts, setting=setting, course=course)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _common.parser(__doc__)
+    parser.add_argument("--clip", default="bunny", help="a sample clip or a path [bunny]")
+    parser.add_argument("--size", type=_common.size, metavar="HxW", help="[160x320 for bunny, else the clip's]")
+    parser.add_argument("--frames", type=_frames, metavar="A:B", help="frames A <= i < B [all]")
+    parser.add_argument("--gaussians", type=_common.whole, help="[40000 for bunny, else by the frame's size]")
+    parser.add_argument("--degree", type=int, default=3, help="of the folds [3]")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=_common.whole, help="how long, in steps")
+    length.add_argument("--seconds", type=float, help=f"how long, in seconds of fitting [{SECONDS:g}]")
+    parser.add_argument("--seed", type=int, default=0, help="[0]")
+    return parser
+
+
+def _frames(text: str) -> tuple[int | None, int | None]:
+    first, colon, last = text.partition(":")
+    if not colon or any(part and not part.isdecimal() for part in (first, last)):
+        raise argparse.ArgumentTypeError(f"expected A:B with whole numbers >= 0, got {text!r}")
+    return (int(first) if first else None), (int(last) if last else None)
+
+
+if __name__ == "__main__":
+    main()
