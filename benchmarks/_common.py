@@ -5,7 +5,6 @@ import importlib.metadata
 import json
 import os
 import platform
-import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,11 +19,12 @@ from foldgauss.io._atomic import atomic_path, check_writable
 
 console = Console(width=140)
 
-#: Opacities and standard deviations (px) of the random scenes: design section 6, about 4.4 bounding-box tiles per splat.
+#: Opacities and standard deviations (px) of the random scenes, as in the design's section 6: about 4.4
+#: bounding-box tiles per splat.
 OPACITIES, SIGMAS = (0.05, 1.0), (1.0, 6.0)
 SEED = 0
-#: Seconds of rest before each timed call: XLA gives its memory back on threads of its own after a result is ready, which
-#: was seen to slow the next 10 ms of another engine by half.
+#: Seconds of rest before each timed call: XLA goes on working on threads of its own after a large result is
+#: ready, which was seen to slow the next 10 ms of another engine by half.
 PAUSE = 0.05
 
 
@@ -49,7 +49,7 @@ class Scene(NamedTuple):
 
 
 def random_scene(num: int, size: tuple[int, int], name: str = "", seed: int = SEED) -> Scene:
-    """`num` splats: means uniform over the picture, both axes log-uniform in `SIGMAS`, any angle, `OPACITIES` uniform."""
+    """`num` splats: means and angles uniform, axes log-uniform in `SIGMAS`, opacity in `OPACITIES`."""
     rng = np.random.default_rng(seed)
     height, width = size
     sigma = np.exp(rng.uniform(*np.log(SIGMAS), (num, 2)))
@@ -66,8 +66,8 @@ def random_scene(num: int, size: tuple[int, int], name: str = "", seed: int = SE
     return Scene(name, size, single, rng.normal(size=(3, height, width)).astype(np.float32))
 
 
-def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[str, float]:
-    """Median seconds of each task over `rounds` rounds that run all tasks in turn, after `warmup` rounds.
+def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[str, list[float]]:
+    """Seconds of each task over `rounds` rounds that run all tasks in turn, after `warmup` rounds.
 
     In turn, so that a noisy minute hits all of them; each round starts with another task.
     """
@@ -83,7 +83,7 @@ def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[st
             del result  # after the clock has stopped
             if round_ >= 0:
                 seconds[name].append(passed)
-    return {name: statistics.median(values) for name, values in seconds.items()}
+    return seconds
 
 
 def parser(doc: str) -> argparse.ArgumentParser:

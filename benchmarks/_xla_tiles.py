@@ -1,9 +1,9 @@
-"""A tile renderer in plain XLA: what JAX alone makes of the same work, as a yardstick for `foldgauss.render.cpu`.
+"""A tile renderer in plain XLA, what JAX alone makes of the same work: a yardstick for `render/cpu.py`.
 
-The lists are those of the CPU engine's own trace, padded to the longest: XLA pays neither for making them nor for the
-tiles that a bounding box would add. A `lax.scan` over list position blends one splat per tile, all tiles of a band at
-once, 256 pixels each; a band is the whole picture (the textbook form) or one row of tiles after another, whose state
-stays in the cache. The constants are `RenderOptions`'.
+The lists are those of the CPU engine's own trace, padded to the longest: XLA pays neither for making them nor
+for the tiles that a bounding box would add. A `lax.scan` over list position blends one splat per tile, all
+tiles of a band at once, 256 pixels each; a band is the whole picture (the textbook form) or one row of tiles
+after another, whose state stays in the cache. The constants are `RenderOptions`'.
 """
 
 import functools
@@ -43,7 +43,7 @@ def tile_lists(trace: Trace, *, by_row: bool) -> TileLists:
 
 @functools.partial(jax.jit, static_argnames=("size", "options"))
 def render_tiles(mean, factor, opacity, color, background, lists, *, size, options=None):
-    """Picture (3, height, width) of float32 splats in pixels; differentiable. Sizes must be multiples of 16."""
+    """Picture (3, height, width) of float32 splats in pixels; differentiable. Sizes: multiples of 16."""
     options = RenderOptions() if options is None else options
     splats = _columns(mean, factor, opacity, color, options.low_pass)
     # Row -1, the padding's, is a splat without opacity.
@@ -71,7 +71,7 @@ def _columns(mean, factor, opacity, color, low_pass):
 
 
 def _blend(splats, left, top, options):
-    """Light left and colours (4, tiles, 256) of tiles whose splats are given by position: (longest, tiles, 9)."""
+    """Light left and colours (4, tiles, 256) of tiles with their splats by position, (longest, tiles, 9)."""
     pixel = jnp.arange(TILE * TILE)
     x = left[:, None] + (pixel % TILE)[None, :].astype(jnp.float32) + 0.5
     y = top[:, None] + (pixel // TILE)[None, :].astype(jnp.float32) + 0.5

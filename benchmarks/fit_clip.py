@@ -3,12 +3,13 @@
     python -m benchmarks.fit_clip [--json FILE] [--clip bunny|bikes|carphone|PATH] [--size HxW] [--frames A:B]
                                   [--gaussians N] [--degree K] [--steps N | --seconds S] [--seed S]
 
-Without options: all 132 Bunny frames at 160x320, 40,000 Gaussians, degree 3, 110 seconds. Other clips keep their own size
-and get `default_num_gaussians` by it.
+Without options: all 132 Bunny frames at 160x320, 40,000 Gaussians, degree 3, 110 seconds. Other clips keep
+their own size and get `default_num_gaussians` by it.
 
-The way there is the running PSNR of the fit itself (about one pass through the frames, before rounding to 8 bits). The end is
-`foldgauss.video.metrics.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean over all frames.
-`fit_seconds` is the wall time of the whole fit, starting positions and compilation included, reading and evaluation not.
+The way there is the running PSNR of the fit itself (about one pass through the frames, before rounding to 8
+bits). The end is `foldgauss.video.metrics.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean
+over all frames. `fit_seconds` is the wall time of the whole fit, starting positions and compilation included,
+reading and evaluation not.
 """
 
 import argparse
@@ -73,7 +74,9 @@ def show(kept: list[FitInfo], scores: Evaluation, seconds: float, title: str) ->
     last = f"{seconds:.1f}", f"{kept[-1].step:,}", ""
     table.add_row("all frames, mean", *last, f"{scores.mean_psnr:.2f}", f"{scores.mean_ssim:.4f}")
     worst = int(np.argmin(scores.psnr))
-    table.add_row(f"worst frame, {worst}", "", "", "", f"{scores.psnr[worst]:.2f}", f"{scores.ssim[worst]:.4f}")
+    table.add_row(
+        f"worst frame, {worst}", "", "", "", f"{scores.psnr[worst]:.2f}", f"{scores.ssim[worst]:.4f}"
+    )
     console.print(table)
 
 
@@ -84,8 +87,8 @@ def main(arguments: list[str] | None = None) -> None:
     scores = evaluate(model, clip.frames)
     num, steps = model.splats.num_gaussians, kept[-1].step
     height, width = clip.size
-    title = f"{options.clip}: {clip.num_frames} frames of {height}x{width}, {num:,} Gaussians, degree {config.degree}"
-    show(kept, scores, seconds, title)
+    what = f"{clip.num_frames} frames of {height}x{width}, {num:,} Gaussians, degree {config.degree}"
+    show(kept, scores, seconds, f"{options.clip}: {what}")
     figures = {"psnr": scores.mean_psnr, "ssim": scores.mean_ssim, "fit_seconds": seconds, "steps": steps}
     figures |= {"worst_frame_psnr": min(scores.psnr), "ms_per_step": 1e3 * kept[-1].seconds / steps}
     setting = {"clip": Path(options.clip).name, "size": clip.size, "num_frames": clip.num_frames}
@@ -97,7 +100,9 @@ def main(arguments: list[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = _common.parser(__doc__)
     parser.add_argument("--clip", default="bunny", help="a sample clip or a path [bunny]")
-    parser.add_argument("--size", type=_common.size, metavar="HxW", help="[160x320 for bunny, else the clip's]")
+    parser.add_argument(
+        "--size", type=_common.size, metavar="HxW", help="[160x320 for bunny, else the clip's]"
+    )
     parser.add_argument("--frames", type=_frames, metavar="A:B", help="frames A <= i < B [all]")
     parser.add_argument("--gaussians", type=_common.whole, help="[40000 for bunny, else by the frame's size]")
     parser.add_argument("--degree", type=int, default=3, help="of the folds [3]")

@@ -2,14 +2,15 @@
 
     python -m benchmarks.step [--json FILE] [--gaussians 200000] [--size 160x320] [--steps 24]
 
-The real fit (`foldgauss.video.fit.fit_steps`) runs on the sample clip Bunny, degree 3, one frame a step; every function
-it calls is wrapped in a clock that waits for the result. The total is the time of a whole step, its own
-bookkeeping included; "target" (bytes to floats) is timed on its own, side by side; "other" is what remains of the
-total. All times are medians over the steps after the warm-up, which compiles.
+The real fit (`foldgauss.video.fit.fit_steps`) runs on the sample clip Bunny, degree 3, one frame a step;
+every function it calls is wrapped in a clock that waits for the result. The total is the time of a whole
+step, its own bookkeeping included; "target" (bytes to floats) is timed on its own, side by side; "other" is
+what remains of the total. All times are medians over the steps after the warm-up, which compiles.
 
 Figures: `rendering_ms` (forward and backward), `ssim_ms` (the loss with its gradient), `rest_ms` (total less
-both: conditioning, optimiser, frame times, target, bookkeeping), `rest_over_rendering_and_ssim` (at most 2), and for
-comparison `naive_adam_ms`: optax's Adam in XLA on all Gaussians, dead or alive, without buffer donation.
+both: conditioning, optimiser, frame times, target, bookkeeping), `rest_over_rendering_and_ssim` (at most 2),
+and for comparison `naive_adam_ms`: optax's Adam in XLA on all Gaussians, dead or alive, without buffer
+donation.
 """
 
 import contextlib
@@ -76,7 +77,8 @@ class Clock:
 def wrapped_fit(clock: Clock) -> Iterator[None]:
     """The functions that `foldgauss.video.fit` calls, timed while the block runs."""
     kernels = types.SimpleNamespace(
-        forward=clock.timed("raster forward", cpu.forward), backward=clock.timed("raster backward", cpu.backward)
+        forward=clock.timed("raster forward", cpu.forward),
+        backward=clock.timed("raster backward", cpu.backward),
     )
     parts = {
         "_frame_times": "frame times",
@@ -133,7 +135,7 @@ def naive_adam(state: FitState, config: FitConfig, rounds: int) -> float:
     def run():
         held[:] = jax.block_until_ready(update(*held, gradients))
 
-    return _common.interleaved({"naive": _common.Task(run)}, rounds, warmup=2)["naive"]
+    return statistics.median(_common.interleaved({"naive": _common.Task(run)}, rounds, warmup=2)["naive"])
 
 
 def median_ms(records: list[dict], parts: tuple[str, ...]) -> float:
@@ -145,7 +147,9 @@ def show(records: list[dict], naive: float, title: str) -> None:
     table = _common.table(title, "part of a step", "ms", "share")
     total = median_ms(records, ("total",))
     for part, words in PARTS.items():
-        table.add_row(words, f"{median_ms(records, (part,)):.2f}", f"{median_ms(records, (part,)) / total:.0%}")
+        table.add_row(
+            words, f"{median_ms(records, (part,)):.2f}", f"{median_ms(records, (part,)) / total:.0%}"
+        )
     table.add_section()
     rest = tuple(part for part in PARTS if part not in RENDERING + LOSS)
     for words, parts in (("rendering", RENDERING), ("L1 + SSIM", LOSS), ("the rest", rest)):
@@ -177,7 +181,9 @@ def figures_of(records: list[dict], naive: float, num_alive: float) -> dict[str,
 def main(arguments: list[str] | None = None) -> None:
     parser = _common.parser(__doc__)
     parser.add_argument("--gaussians", type=_common.whole, default=200_000, help="Gaussians [200000]")
-    parser.add_argument("--size", type=_common.size, default=(160, 320), metavar="HxW", help="frames [160x320]")
+    parser.add_argument(
+        "--size", type=_common.size, default=(160, 320), metavar="HxW", help="frames [160x320]"
+    )
     parser.add_argument("--steps", type=_common.whole, default=24, help="steps that are timed [24]")
     options = _common.parse(parser, arguments)
     facts = _common.machine()
@@ -186,7 +192,11 @@ def main(arguments: list[str] | None = None) -> None:
     records, state, num_alive = measure(frames, config, options.steps)
     naive = naive_adam(state, config, max(7, options.steps // 2))
     height, width = options.size
-    show(records, naive, f"{options.gaussians:,} Gaussians ({num_alive:,.0f} alive), one frame of {height}x{width}")
+    show(
+        records,
+        naive,
+        f"{options.gaussians:,} Gaussians ({num_alive:,.0f} alive), one frame of {height}x{width}",
+    )
     _common.finish(options.json, figures_of(records, naive, num_alive), facts, steps=options.steps)
 
 

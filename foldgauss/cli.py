@@ -13,7 +13,14 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 
 from foldgauss._checks import invalid
@@ -22,9 +29,17 @@ from foldgauss.datasets import sample_clip
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable
 from foldgauss.io.model_file import read_header
 from foldgauss.io.pictures import comparison
-from foldgauss.io.video_file import Clip, read_video, write_image, write_video
+from foldgauss.io.video_file import VIDEO_SUFFIXES, Clip, read_video, write_image, write_video
 from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
-from foldgauss.video.fit import FitConfig, FitInfo, FitState, default_num_gaussians, fit_steps, planned_steps, to_model
+from foldgauss.video.fit import (
+    FitConfig,
+    FitInfo,
+    FitState,
+    default_num_gaussians,
+    fit_steps,
+    planned_steps,
+    to_model,
+)
 from foldgauss.video.frame_times import interpolated_times
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
@@ -72,7 +87,9 @@ def demo(
     model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
     scores, pictures = _evaluate_with_progress(model, clip.frames)
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
-    path = save_video_model(out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores))
+    path = save_video_model(
+        out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores)
+    )
     figures["file_bytes"] = path.stat().st_size
     write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
@@ -112,7 +129,9 @@ def fit(
     ] = FitConfig.power,
     seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
     overwrite: Overwrite = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")
+    ] = False,
 ) -> None:
     """Fit a model to a clip. A stopped fit is kept and goes on with --resume."""
     try:
@@ -131,7 +150,9 @@ def fit(
     kept = target.with_name(f"{target.name}.checkpoint")
     _refuse_existing(target, overwrite)
     if kept.exists() and not (resume or overwrite):
-        raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
+        raise WrongUse(
+            f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite."
+        )
     if resume and not kept.exists():
         raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
     check_writable(target)
@@ -140,7 +161,10 @@ def fit(
     source = {"clip": clip.source, "num_frames": clip.num_frames, "size": list(clip.size)}
     state = load_checkpoint(kept, config=config, source=source) if resume else None
     state, info = _fit_with_progress(
-        clip.frames, config, state, keep=lambda state: save_checkpoint(kept, state, config=config, source=source)
+        clip.frames,
+        config,
+        state,
+        keep=lambda state: save_checkpoint(kept, state, config=config, source=source),
     )
     model = to_model(state, config, clip.size, clip.fps)
     scores, _ = _evaluate_with_progress(model, clip.frames)
@@ -163,8 +187,14 @@ def render(
     if upsample < 1:
         raise WrongUse(str(invalid("--upsample", expected="a whole number >= 1", got=upsample)))
     picture_size = _parse_size(size)
-    if out_path.is_file():
+    if out_path.suffix and not out_path.is_dir():
+        if out_path.suffix.lower() not in VIDEO_SUFFIXES:
+            wanted = " or ".join(VIDEO_SUFFIXES)
+            raise WrongUse(
+                str(invalid("--out", expected=f"{wanted}, or a folder without extension", got=out_path))
+            )
         _refuse_existing(out_path, overwrite)
+        check_writable(out_path)
     model = load_video_model(model_path)
     times = interpolated_times(np.asarray(model.frame_times.times()), upsample)
     with _bar("Rendering", len(times)) as advance:
@@ -252,7 +282,9 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
+        raise OutputError(
+            f"--out: cannot make the folder {path} ({error.strerror}). Choose another."
+        ) from error
     check_writable(path / "model.safetensors")
 
 
@@ -268,8 +300,8 @@ class _FitColumn(ProgressColumn):
             return "compiling" if not task.finished else ""
         left = f"{info.seconds_left:.0f} s left" if np.isfinite(info.seconds_left) else ""
         return (
-            f"step {info.step}  loss {info.loss:.4f}  {info.psnr:.2f} dB  "
-            f"{info.num_gaussians:,} Gaussians ({info.num_alive:,} alive)  {left}"
+            f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  "
+            f"{info.num_gaussians:,} Gaussians  {left}"
         )
 
 
@@ -280,7 +312,7 @@ def _fit_with_progress(
     keep: Callable[[FitState], object] | None = None,
 ) -> tuple[FitState, FitInfo]:
     """Run the fit under a bar; `keep` is called now and then, and before leaving on a signal."""
-    columns = TextColumn("Fitting"), BarColumn(bar_width=24), _FitColumn()
+    columns = TextColumn("Fitting"), BarColumn(bar_width=12), _FitColumn()
     with Progress(*columns, console=err) as progress, _signals() as asked:
         task = progress.add_task("fit", total=1.0)
         kept_at, shown_at = time.monotonic(), 0.0
@@ -296,7 +328,9 @@ def _fit_with_progress(
                 if keep is None:
                     raise Stopped(f"stopped by {asked[0]} after step {info.step}; nothing was kept.")
                 keep(state)
-                raise Stopped(f"stopped by {asked[0]} after step {info.step}; add --resume to go on from there.")
+                raise Stopped(
+                    f"stopped by {asked[0]} after step {info.step}; add --resume to go on from there."
+                )
     return state, info
 
 
@@ -321,7 +355,12 @@ def _signals() -> Iterator[list[str]]:
 
 @contextmanager
 def _bar(title: str, total: int) -> Iterator[Callable[[], None]]:
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=err) as progress:
         task = progress.add_task(title, total=total)
         yield lambda: progress.advance(task)

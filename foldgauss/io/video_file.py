@@ -112,7 +112,7 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> t
         kept = [prepare(frame) for frame in _same_size(_decoded(capture, start, stop), path)]
     num_decoded = num_skipped + len(kept)
     num_total = max(declared, num_decoded)
-    if num_total == 0:
+    if num_decoded == 0:
         raise _error(
             "path",
             expected="a video with frames that decode",

@@ -244,9 +244,7 @@ def _forward_row(
                 used[tile] = k
                 break
             i = entries[start + listed[k]]
-            _blend(
-                geometry, color, i, _f(tile * TILE), _f(top), scratch, over, log_cutoff, ceiling, finished
-            )
+            _blend(geometry, color, i, _f(tile * TILE), _f(top), scratch, over, log_cutoff, ceiling, finished)
         left = tile * TILE
         for y in range(min(TILE, height - top)):
             for x in range(min(TILE, width - left)):
@@ -366,7 +364,18 @@ def _backward_row(
 
 @_jit
 def _gather(
-    start, stop, first_slot, slot_position, slots, geometry, factor, opacity, d_mean, d_factor, d_opacity, d_color
+    start,
+    stop,
+    first_slot,
+    slot_position,
+    slots,
+    geometry,
+    factor,
+    opacity,
+    d_mean,
+    d_factor,
+    d_opacity,
+    d_color,
 ):
     """Sum the slots of splats start..stop and carry the sums back to mean, factor, opacity and colour."""
     c = _f(2.0 * math.log(2.0))

@@ -58,9 +58,7 @@ def render(
         engine = "cpu" if channels == 3 else "reference"
     height, width = map(int, size)
     if engine == "reference":
-        return render_reference(
-            splats, (height, width), background, compositing=compositing, options=options
-        )
+        return render_reference(splats, (height, width), background, compositing=compositing, options=options)
     if channels != 3:
         raise invalid("color", expected="3 channels for engine 'cpu'", got=channels, cure="Use 'reference'.")
     cpu.check_options(options)

@@ -21,9 +21,7 @@ def whitening(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array
     return jnp.stack([yy / across, -xy / across, 1 / jnp.sqrt(yy_safe)]), det
 
 
-def exponent(
-    offset: Float[Array, "*pixels 2"], whitener: Float[Array, "3"]
-) -> Float[Array, "*pixels"]:
+def exponent(offset: Float[Array, "*pixels 2"], whitener: Float[Array, "3"]) -> Float[Array, "*pixels"]:
     """Minus half the squared Mahalanobis distance of offsets x - m."""
     dx, dy = offset[..., 0], offset[..., 1]
     p, q, r = whitener

@@ -184,9 +184,7 @@ def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> C
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
-        _condition(
-            start, stop, alive, rows, shape.degree, t, unit, *constants, mean, factor, opacity, color
-        )
+        _condition(start, stop, alive, rows, shape.degree, t, unit, *constants, mean, factor, opacity, color)
 
     run_tasks(work, range(0, num, CHUNK))
     return Conditioned(alive, t, unit, mean, factor, opacity, color)

@@ -329,5 +329,6 @@ def _frame_times(logits):
 def _update_times(logits, moments, by_time, rate):
     """Adam on the softmax weights, given dL/dt_k."""
     _, pull = jax.vjp(lambda w: FrameTimes(w).times(), logits)
-    update, moments = TIME_ADAM.update(pull(by_time)[0], moments)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
+        update, moments = TIME_ADAM.update(pull(by_time)[0], moments)
     return logits - rate * update, moments

@@ -226,7 +226,10 @@ def ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """SSIM at every pixel of two float32 planes (height, width), zero padding: what the loss averages."""
     height, width = x.shape
     out = np.empty((height, width), np.float32)
-    moments, padded = np.empty((5, width + 2 * RADIUS), np.float32), np.zeros((3, width + 2 * RADIUS), np.float32)
+    moments, padded = (
+        np.empty((5, width + 2 * RADIUS), np.float32),
+        np.zeros((3, width + 2 * RADIUS), np.float32),
+    )
     for row in range(height):
         _vertical_moments(x, y, row, moments)
         _similarity_row(moments, out[row], padded[0], padded[1], padded[2])

@@ -83,9 +83,7 @@ class FoldedSplats(eqx.Module):
         return Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
 
 
-def rotated_scale_tril(
-    scale: Float[Array, "num 2"], angle: Float[Array, "num"]
-) -> Float[Array, "num 2 2"]:
+def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, "num"]) -> Float[Array, "num 2 2"]:
     """Lower-triangular factor of R(angle) diag(scale)^2 R(angle)^T, in closed form.
 
     The determinant is the product of the scales, so nothing is subtracted and the factor exists for any scales > 0.

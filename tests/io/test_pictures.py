@@ -1,0 +1,17 @@
+"""The comparison people look at."""
+
+import numpy as np
+
+from foldgauss.io.pictures import ERROR_GAIN, comparison
+
+
+def test_layout_and_error():
+    original = np.full((40, 60, 3), 100, np.uint8)
+    picture = original.copy()
+    picture[10:20, 10:20] = 103
+    montage = comparison([original, original], [picture, original], ["a", "b"])
+    assert montage.dtype == np.uint8
+    assert montage.shape[0] > 80
+    assert montage.shape[1] > 180
+    assert np.any(np.all(montage == 3 * ERROR_GAIN, axis=-1))  # the magnified error
+    assert np.any(np.all(montage == 103, axis=-1))

@@ -1,0 +1,104 @@
+"""Fitted videos and running fits on disk: exact, and refused where they do not belong."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import ModelFileError, load_video_model, save_video_model
+from foldgauss.io.model_file import read_header
+from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.render import RenderOptions
+from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit_steps
+from foldgauss.video.fit import to_model
+from foldgauss.video.packing import unpack
+
+CONFIG = FitConfig(num_gaussians=60, steps=8, degree=2)
+SOURCE = {"clip": "somewhere.mp4", "num_frames": 3, "size": [24, 32]}
+
+
+def frames():
+    return np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3)).astype(np.uint8)
+
+
+def random_model(degree=3):
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(50, 11 + 2 * degree)).astype(np.float32)
+    times = FrameTimes(rng.normal(size=4).astype(np.float32))
+    splats = unpack(rows, degree, TimeLikelihood(1.7, 0.01))
+    return VideoModel(splats, times, (48, 80), 29.97, RenderOptions(low_pass=0.123))
+
+
+def same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 7])
+def test_model_round_trip_is_exact(tmp_path, degree):
+    model = random_model(degree)
+    save_video_model(tmp_path / "m.safetensors", model, metadata={"clip": "x"})
+    again = load_video_model(tmp_path / "m.safetensors")
+    same(model, again)
+    assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
+    np.testing.assert_array_equal(again.render(0.4), model.render(0.4))
+    assert read_header(tmp_path / "m.safetensors")["metadata"]["clip"] == "x"
+
+
+def test_every_leaf_is_saved(tmp_path):
+    """By traversal, not by a list: a change to any one leaf changes the file."""
+    model = random_model()
+    leaves, tree = jax.tree.flatten(model)
+    path = tmp_path / "m.safetensors"
+    save_video_model(path, model)
+    plain = path.read_bytes()
+    for k, leaf in enumerate(leaves):
+        changed = jax.tree.unflatten(tree, leaves[:k] + [np.asarray(leaf) + np.float32(1)] + leaves[k + 1 :])
+        save_video_model(path, changed)
+        assert path.read_bytes() != plain
+
+
+def test_checkpoint_goes_on_to_the_same_bits(tmp_path):
+    path = tmp_path / "c"
+    for state, info in fit_steps(frames(), CONFIG):
+        if info.step == 3:
+            save_checkpoint(path, state, config=CONFIG, source=SOURCE)
+    whole = to_model(state, CONFIG, (24, 32), 25.0)
+    kept = load_checkpoint(path, config=CONFIG, source=SOURCE)
+    assert kept.step == 3
+    for state, _ in fit_steps(frames(), CONFIG, kept):
+        pass
+    same(whole, to_model(state, CONFIG, (24, 32), 25.0))
+
+
+def test_checkpoint_of_another_fit_is_refused(tmp_path):
+    path = tmp_path / "c"
+    state, _ = next(fit_steps(frames(), CONFIG))
+    save_checkpoint(path, state, config=CONFIG, source=SOURCE)
+    with pytest.raises(ValueError, match=r"resume: expected degree=2, got degree=3"):
+        load_checkpoint(path, config=dataclasses.replace(CONFIG, degree=3), source=SOURCE)
+    with pytest.raises(ValueError, match="num_frames"):
+        load_checkpoint(path, config=CONFIG, source=SOURCE | {"num_frames": 4})
+
+
+def test_kinds_are_not_mixed_up(tmp_path):
+    state, _ = next(fit_steps(frames(), CONFIG))
+    save_checkpoint(tmp_path / "c", state, config=CONFIG, source=SOURCE)
+    with pytest.raises(ModelFileError, match="fit-checkpoint"):
+        load_video_model(tmp_path / "c")
+    save_video_model(tmp_path / "m", random_model())
+    with pytest.raises(ValueError, match="resume|kind"):
+        load_checkpoint(tmp_path / "m", config=CONFIG, source=SOURCE)
+
+
+@pytest.mark.parametrize("cut", [0, 4, 8, 100, 600, -1, -100])
+def test_truncated(tmp_path, cut):
+    path = tmp_path / "m.safetensors"
+    save_video_model(path, random_model())
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(ModelFileError):
+        load_video_model(path)

@@ -1,0 +1,261 @@
+"""The command as a user meets it: real files, exit codes, one-line errors, nothing half-written."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from foldgauss import cli
+from foldgauss.io import load_video_model, read_video, write_image, write_video
+
+SIZE = (48, 64)
+QUICK = ["--gaussians", "400", "--steps", "30"]
+
+
+def blobs(num_frames=6, height=48, width=64):
+    y, x = np.mgrid[0:height, 0:width]
+    t = np.linspace(0.2, 0.7, num_frames)[:, None, None]
+    blob = np.exp(-((x - t * width) ** 2 + (y - height / 2) ** 2) / 40)
+    return np.stack([255 * blob, 128 + 0 * blob, 255 - 200 * blob], -1).astype(np.uint8)
+
+
+def run(*arguments):
+    """Exit code of the command, run in this process."""
+    with pytest.raises(SystemExit) as done:
+        cli.main([str(argument) for argument in arguments])
+    return done.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A clip and a model fitted to it."""
+    folder = tmp_path_factory.mktemp("work")
+    write_video(folder / "clip.mp4", blobs(), 12.0)
+    assert run("fit", folder / "clip.mp4", "--out", folder / "model.safetensors", *QUICK) == 0
+    return folder
+
+
+def test_fit_render_evaluate_info(work, tmp_path, capsys):
+    model = load_video_model(work / "model.safetensors")
+    assert (model.num_frames, model.size, model.fps) == (6, SIZE, 12.0)
+    assert not list(work.glob("*.checkpoint"))
+
+    assert run("render", work / "model.safetensors", "--out", tmp_path / "slow.mp4", "--upsample", 4) == 0
+    slow = read_video(tmp_path / "slow.mp4")
+    assert (slow.num_frames, slow.size, slow.fps) == (21, SIZE, 48.0)
+
+    assert run("render", work / "model.safetensors", "--out", tmp_path / "frames", "--size", "96x128") == 0
+    assert len(list((tmp_path / "frames").glob("*.png"))) == 6
+    assert cv2.imread(str(tmp_path / "frames" / "00000.png")).shape == (96, 128, 3)
+
+    capsys.readouterr()
+    figures = tmp_path / "figures.json"
+    assert run("evaluate", work / "model.safetensors", work / "clip.mp4", "--json", figures) == 0
+    scores = json.loads(figures.read_text())
+    assert len(scores["psnr"]) == len(scores["ssim"]) == 6
+    assert scores["mean_psnr"] == pytest.approx(np.mean(scores["psnr"]), abs=1e-3)
+    assert scores["mean_psnr"] > 20
+    num_bytes = (work / "model.safetensors").stat().st_size
+    assert scores["bits_per_pixel"] == pytest.approx(8 * num_bytes / (6 * 48 * 64))
+    assert "bits per pixel" in capsys.readouterr().out
+
+    assert run("info", work / "model.safetensors") == 0
+    told = capsys.readouterr().out
+    assert "400" in told
+    assert "power 2" in told
+
+
+def test_frames_size_and_default_name(work, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("fit", work / "clip.mp4", "--frames", "1:5", "--size", "24x32", *QUICK) == 0
+    model = load_video_model(tmp_path / "clip.safetensors")
+    assert (model.num_frames, model.size) == (4, (24, 32))
+    # The frames it was fitted to are remembered.
+    assert run("evaluate", "clip.safetensors", work / "clip.mp4") == 0
+    assert run("evaluate", "clip.safetensors", work / "clip.mp4", "--frames", "0:3") == 2
+
+
+def test_folder_of_images_in_natural_order(tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, frame in enumerate(blobs(11)):
+        write_image(folder / f"img{k}.png", frame)
+    assert (
+        run("fit", folder, "--out", tmp_path / "m.safetensors", *QUICK, "--degree", "1", "--batch-size", "2")
+        == 0
+    )
+    assert run("evaluate", tmp_path / "m.safetensors", folder) == 0
+
+
+def test_existing_output_is_refused_and_replaced_on_demand(work, tmp_path, capsys):
+    target = tmp_path / "m.safetensors"
+    target.write_bytes(b"precious")
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 2
+    assert target.read_bytes() == b"precious"
+    assert "--overwrite" in capsys.readouterr().err
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--overwrite") == 0
+    load_video_model(target)
+    video = tmp_path / "v.mp4"
+    video.write_bytes(b"precious")
+    assert run("render", target, "--out", video) == 2
+    assert video.read_bytes() == b"precious"
+
+
+def broken_inputs(tmp_path, work):
+    """Arguments that cannot work: (name, arguments, exit code, what the message says)."""
+    text = tmp_path / "notes.mp4"
+    text.write_text("not a video")
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes((work / "clip.mp4").read_bytes()[:300])
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    write_image(mixed / "1.png", np.zeros((40, 40, 3), np.uint8))
+    write_image(mixed / "2.png", np.zeros((40, 50, 3), np.uint8))
+    single = tmp_path / "single"
+    single.mkdir()
+    write_image(single / "1.png", np.zeros((40, 40, 3), np.uint8))
+    other = tmp_path / "other.safetensors"
+    other.write_bytes(b"ply\nformat ascii 1.0\n")
+    short = tmp_path / "short.safetensors"
+    short.write_bytes((work / "model.safetensors").read_bytes()[:-50])
+    later = tmp_path / "later.safetensors"
+    later.write_bytes((work / "model.safetensors").read_bytes().replace(b'"version":"1"', b'"version":"9"'))
+    clip, model, out = work / "clip.mp4", work / "model.safetensors", tmp_path / "out.safetensors"
+    return {
+        "missing file": (["fit", tmp_path / "none.mp4", "--out", out], 2, "missing"),
+        "not a video": (["fit", text, "--out", out], 1, "notes.mp4"),
+        "truncated to nothing": (["fit", cut, "--out", out], 1, "cut.mp4"),
+        "one frame": (["fit", clip, "--out", out, "--frames", "2:3"], 2, "at least 2"),
+        "one image": (["fit", single, "--out", out], 1, "at least 2"),
+        "mixed sizes": (["fit", mixed, "--out", out], 1, "40x50|50x40"),
+        "frames beyond": (["fit", clip, "--out", out, "--frames", "0:99"], 2, "frames"),
+        "frames reversed": (["fit", clip, "--out", out, "--frames", "4:2"], 2, "frames"),
+        "frames misspelt": (["fit", clip, "--out", out, "--frames", "4"], 2, "A:B"),
+        "size zero": (["fit", clip, "--out", out, "--size", "0x10"], 2, "HxW"),
+        "size misspelt": (["fit", clip, "--out", out, "--size", "48"], 2, "HxW"),
+        "no gaussians": (["fit", clip, "--out", out, "--gaussians", "0"], 2, "num_gaussians"),
+        "steps and minutes": (
+            ["fit", clip, "--out", out, "--steps", "5", "--minutes", "1"],
+            2,
+            "at most one",
+        ),
+        "nothing to resume": (["fit", clip, "--out", out, "--resume"], 2, "stopped fit"),
+        "no such folder": (["fit", clip, "--out", tmp_path / "no" / "m.safetensors"], 1, "folder"),
+        "out is a folder": (["fit", clip, "--out", mixed, "--overwrite"], 1, "file"),
+        "unknown option": (["fit", clip, "--speed", "9"], 2, "--speed"),
+        "another kind of file": (["info", other], 1, "other.safetensors"),
+        "truncated model": (["info", short], 1, "short.safetensors"),
+        "another version": (["info", later], 1, "version"),
+        "missing model": (["render", tmp_path / "none", "--out", tmp_path / "v.mp4"], 2, "none"),
+        "unknown container": (["render", model, "--out", tmp_path / "v.avi"], 2, "mp4"),
+        "upsample zero": (["render", model, "--out", tmp_path / "v.mp4", "--upsample", "0"], 2, "upsample"),
+        "render size zero": (["render", model, "--out", tmp_path / "v.mp4", "--size", "0x0"], 2, "HxW"),
+        "evaluate another clip": (["evaluate", model, clip, "--frames", "0:3"], 2, "6 frames"),
+    }
+
+
+def test_bad_input(work, tmp_path, capsys):
+    for name, (arguments, code, says) in broken_inputs(tmp_path, work).items():
+        before = sorted(tmp_path.rglob("*"))
+        assert run(*arguments) == code, name
+        message = capsys.readouterr().err
+        assert re.search(says, message), (name, message)
+        assert "Traceback" not in message, name
+        if "Usage:" not in message:  # typer's own words on usage take several lines
+            assert len(message.strip().splitlines()) == 1, (name, message)
+        assert sorted(tmp_path.rglob("*")) == before, name  # nothing is left behind
+
+
+def test_read_only_folder(work, tmp_path, capsys):
+    if os.geteuid() == 0:
+        target = "/proc/model.safetensors"  # root may write anywhere else
+    else:
+        (tmp_path / "locked").mkdir(mode=0o500)
+        target = tmp_path / "locked" / "model.safetensors"
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 1
+    message = capsys.readouterr().err
+    assert "model.safetensors" in message
+    assert len(message.strip().splitlines()) == 1
+
+
+def test_damaged_video_uses_the_frames_that_decode(tmp_path, capsys):
+    noise = np.random.default_rng(0).integers(0, 256, (12, 48, 64, 3)).astype(np.uint8)
+    write_video(tmp_path / "whole.webm", noise, 10)
+    data = (tmp_path / "whole.webm").read_bytes()
+    (tmp_path / "cut.webm").write_bytes(data[: len(data) * 3 // 4])
+    assert run("fit", tmp_path / "cut.webm", "--out", tmp_path / "m.safetensors", *QUICK) == 0
+    assert re.search(r"only \d+ of 12 frames", capsys.readouterr().err)
+    assert 2 <= load_video_model(tmp_path / "m.safetensors").num_frames < 12
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        cli.main(["info", str(tmp_path / "none"), "--debug"])
+
+
+def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
+    def missing(name):
+        raise FileNotFoundError('Try: pip install "foldgauss[samples]"')
+
+    monkeypatch.setattr(cli, "sample_clip", missing)
+    assert run("demo", "--out", tmp_path / "demo") == 2
+    assert "foldgauss[samples]" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()
+
+
+def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
+    """The real clip, fewer steps."""
+    monkeypatch.setattr(cli, "DEMO_CONFIG", cli.FitConfig(num_gaussians=5000, steps=40))
+    assert run("demo", "--out", tmp_path) == 0
+    names = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["mean_psnr"] > 22
+    assert len(figures["psnr"]) == 24
+    assert read_video(tmp_path / "reconstruction.mp4").frames.shape == (24, 160, 320, 3)
+    assert "mean PSNR" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_demo_reaches_its_quality(tmp_path):
+    assert run("demo", "--out", tmp_path) == 0
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["mean_psnr"] >= 30
+    assert figures["fit_seconds"] <= 90
+
+
+def start(*arguments):
+    command = [sys.executable, "-m", "foldgauss.cli", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_stopped_and_resumed(work, tmp_path, capsys):
+    """Ctrl-C keeps the fit; --resume ends it; the model equals that of a fit that was never stopped."""
+    target = tmp_path / "m.safetensors"
+    arguments = ["fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "4000"]
+    child = start(*arguments)
+    kept = tmp_path / "m.safetensors.checkpoint"
+    assert "Gaussians" in child.stdout.readline()  # about to begin
+    time.sleep(2)
+    child.send_signal(signal.SIGINT)
+    _, told = child.communicate(timeout=60)
+    assert child.returncode == 1, told
+    assert "--resume" in told
+    assert "Traceback" not in told
+    assert not target.exists()
+    assert run(*arguments) == 2  # a kept fit is not thrown away by accident
+    assert "--resume" in capsys.readouterr().err
+    assert run(*arguments[:-1], "3900", "--resume") == 2  # nor continued as another
+    assert run(*arguments, "--resume") == 0
+    assert not kept.exists()
+    whole = tmp_path / "whole.safetensors"
+    assert run(*arguments[:3], whole, *arguments[4:]) == 0
+    assert target.read_bytes() == whole.read_bytes()

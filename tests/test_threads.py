@@ -1,0 +1,60 @@
+"""The pool that every kernel runs on."""
+
+import threading
+import time
+
+import pytest
+
+from foldgauss import _threads
+
+
+@pytest.fixture(autouse=True)
+def default_threads():
+    yield
+    _threads.set_num_threads(None)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+@pytest.mark.parametrize("num_items", [0, 1, 3, 100])
+def test_every_item_once(count, num_items):
+    _threads.set_num_threads(count)
+    done = []
+    _threads.run_tasks(done.append, range(num_items))
+    assert sorted(done) == list(range(num_items))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_error_reaches_the_caller_and_the_pool_lives_on(count):
+    _threads.set_num_threads(count)
+
+    def fail(k):
+        if k == 5:
+            raise RuntimeError("five")
+
+    with pytest.raises(RuntimeError, match="five"):
+        _threads.run_tasks(fail, range(20))
+    done = []
+    _threads.run_tasks(done.append, range(4))
+    assert len(done) == 4
+
+
+def test_work_is_shared():
+    _threads.set_num_threads(3)
+    names = set()
+
+    def work(_):
+        names.add(threading.current_thread().name)
+        time.sleep(0.02)
+
+    _threads.run_tasks(work, range(12))
+    assert len(names) == 3
+
+
+def test_environment_variable(monkeypatch):
+    monkeypatch.setenv("FOLDGAUSS_NUM_THREADS", "3")
+    assert _threads.num_threads() == 3
+    monkeypatch.setenv("FOLDGAUSS_NUM_THREADS", "many")
+    with pytest.raises(ValueError, match="FOLDGAUSS_NUM_THREADS"):
+        _threads.num_threads()
+    with pytest.raises(ValueError, match="count"):
+        _threads.set_num_threads(0)

@@ -1,0 +1,117 @@
+"""The fused twin against the fold equation's one home, values and gradients."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import RenderOptions
+from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video.conditioning import Shape, condition, pull_back, update_windows
+from foldgauss.video.model import FoldedSplats
+from foldgauss.video.packing import columns, pack, unpack
+
+SIZE, T = (48, 80), np.float32(0.4)
+
+
+def random_splats(num=300, degree=3, power=2.0, floor=0.0, seed=0) -> FoldedSplats:
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape, scale=1.0):
+        return jnp.asarray(rng.normal(size=(num, *shape)) * scale, jnp.float32)
+
+    return FoldedSplats(
+        loc=normal(2, scale=0.3),
+        log_scale=normal(2, scale=0.5) - 3,
+        angle_logit=normal(),
+        time_loc_logit=normal(),
+        log_time_scale=normal(scale=0.7) - 1.5,
+        coefficients=normal(degree, 2),
+        opacity_logit=normal(),
+        color_dc=normal(3),
+        envelope=TimeLikelihood(power, floor),
+    )
+
+
+def twin(splats, power, floor):
+    rows, window = pack(splats), np.empty((splats.num_gaussians, 2), np.float32)
+    update_windows(rows, np.arange(len(rows)), window)
+    shape = Shape(splats.degree, power, floor, SIZE)
+    return rows, shape, condition(rows, window, T, shape)
+
+
+def in_pixels(splats):
+    model = VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions())
+    return model.at(jnp.asarray(T))
+
+
+@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.0), (2.0, 0.05), (0.0, 0.0)])
+@pytest.mark.parametrize("degree", [0, 1, 3, 7])
+def test_values(degree, power, floor):
+    splats = random_splats(degree=degree, power=power, floor=floor)
+    home = jax.jit(in_pixels)(splats)
+    _, _, done = twin(splats, power, floor)
+    alive = np.flatnonzero(np.asarray(home.opacity) > 0)
+    assert 50 < len(alive) < splats.num_gaussians  # some are too far away in time
+    np.testing.assert_array_equal(done.alive, alive)
+    np.testing.assert_allclose(done.mean, home.mean[alive], rtol=1e-5, atol=2e-4)
+    np.testing.assert_allclose(done.opacity, home.opacity[alive], rtol=1e-5)
+    np.testing.assert_allclose(done.color, home.color[alive], atol=1e-6)
+    cov = done.factor @ np.swapaxes(done.factor, 1, 2)  # the factors differ by a rotation
+    home_cov = np.asarray(home.factor @ jnp.swapaxes(home.factor, 1, 2))[alive]
+    np.testing.assert_allclose(cov, home_cov, rtol=2e-4, atol=1e-5 * np.abs(home_cov).max())
+
+
+@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.0), (2.0, 0.05)])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gradients(degree, power, floor):
+    """Of a loss that looks at mean, covariance, opacity and colour with random weights; and of time."""
+    splats = random_splats(degree=degree, power=power, floor=floor)
+    rows, shape, done = twin(splats, power, floor)
+    rng = np.random.default_rng(1)
+    w_mean, w_cov = rng.normal(size=done.mean.shape), rng.normal(size=done.factor.shape) / 50
+    w_opacity, w_color = rng.normal(size=done.opacity.shape), rng.normal(size=done.color.shape)
+    weights = [w.astype(np.float32) for w in (w_mean, w_cov + np.swapaxes(w_cov, 1, 2), w_opacity, w_color)]
+
+    def loss(splats, t):
+        model = VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions())
+        home = model.at(t)
+        cov = home.factor @ jnp.swapaxes(home.factor, 1, 2)
+        parts = zip((home.mean, cov, home.opacity, home.color), weights, strict=True)
+        return sum(jnp.sum(part[done.alive] * weight) for part, weight in parts)
+
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), splats)
+        weights = [w.astype(np.float64) for w in weights]
+        by_splats, by_time = jax.tree.map(np.asarray, jax.jit(jax.grad(loss, (0, 1)))(wide, jnp.float64(T)))
+        weights = [w.astype(np.float32) for w in weights]
+
+    grad = np.zeros_like(rows)
+    d_factor = 2 * weights[1] @ done.factor  # of sum(W * F F^T), W symmetric
+    d_time = pull_back(rows, done, (weights[0], d_factor, weights[2], weights[3]), shape, grad)
+    for name, place in columns(degree).items():
+        truth = np.asarray(getattr(by_splats, name)).reshape(len(rows), -1)
+        largest = max(np.abs(truth).max(initial=0), 1e-3)
+        np.testing.assert_allclose(grad[:, place] / largest, truth / largest, atol=1e-5, err_msg=name)
+    assert d_time == pytest.approx(float(by_time), rel=1e-3, abs=1e-6 * float(np.abs(grad).sum()))
+
+
+def test_wrong_fold_sign_is_caught():
+    splats = random_splats()
+    flipped = dataclasses.replace(splats, coefficients=-splats.coefficients)
+    home = in_pixels(splats)
+    _, _, done = twin(flipped, 2.0, 0.0)
+    assert np.abs(done.mean - np.asarray(home.mean)[done.alive]).max() > 1
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_pack_and_unpack(degree):
+    splats = random_splats(degree=degree)
+    again = unpack(pack(splats), degree, splats.envelope)
+    for one, other in zip(jax.tree.leaves(splats), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(one, other)
+    places = np.concatenate([np.arange(place.start, place.stop) for place in columns(degree).values()])
+    np.testing.assert_array_equal(np.sort(places), np.arange(11 + 2 * degree))

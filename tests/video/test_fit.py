@@ -1,0 +1,167 @@
+"""The fit on small clips: it learns, repeats itself to the bit, stops and goes on."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss import _threads
+from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video.fit import check_frames, planned_steps, to_model
+
+CONFIG = FitConfig(num_gaussians=800, steps=60)
+
+
+def leaves_of(model):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(model)]
+
+
+def test_learns_a_clip():
+    frames = moving_blobs()
+    seen = []
+    config = dataclasses.replace(CONFIG, steps=300)
+    result = fit(frames, config, fps=12.5, observers=[lambda state, info: seen.append(info)])
+    assert [info.step for info in seen] == list(range(1, 301))
+    assert seen[-1].progress == 1
+    assert seen[-1].seconds_left == 0
+    assert len(result.history) == 30
+    assert result.model.fps == 12.5
+    scores = evaluate(result.model, frames)
+    assert scores.mean_psnr > 34
+    assert scores.mean_ssim > 0.95
+    assert abs(result.history[-1].psnr - scores.mean_psnr) < 3  # what the bar says is what comes out
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"degree": 0},
+        {"degree": 7},
+        {"batch_size": 3},
+        {"batch_size": 9},  # more than the clip has frames
+        {"power": 1.0},
+        {"ssim_share": 0.0},
+        {"learn_frame_times": False},
+        {"num_gaussians": 1},
+        {"final_rate": 0.0},
+        {"steps": None, "minutes": 0.01},
+    ],
+    ids=str,
+)
+def test_every_setting_works(changes):
+    frames = moving_blobs(num_frames=4, height=33, width=41)
+    model = fit(frames, dataclasses.replace(CONFIG, **({"steps": 30} | changes))).model
+    assert all(np.isfinite(leaf).all() for leaf in leaves_of(model))
+    if changes.get("num_gaussians") != 1:
+        assert evaluate(model, frames).mean_psnr > 18
+
+
+@pytest.mark.parametrize("shape", [(2, 20, 20), (3, 16, 90), (2, 100, 17)])
+def test_odd_clips(shape):
+    frames = moving_blobs(*shape)
+    assert evaluate(fit(frames, CONFIG).model, frames).mean_psnr > 18
+
+
+def test_flat_clip():
+    """No gradient anywhere: starts are spread evenly, and one colour is all there is to learn."""
+    frames = np.full((3, 32, 32, 3), 128, np.uint8)
+    assert evaluate(fit(frames, CONFIG).model, frames).mean_psnr > 30
+
+
+def test_same_bits_for_any_number_of_threads():
+    frames, models = moving_blobs(), []
+    try:
+        for count in (1, 2):
+            _threads.set_num_threads(count)
+            models.append(
+                leaves_of(fit(frames, dataclasses.replace(CONFIG, num_gaussians=5000, steps=20)).model)
+            )
+    finally:
+        _threads.set_num_threads(None)
+    for one, other in zip(*models, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_seed_matters():
+    frames = moving_blobs()
+    one, other = (fit(frames, dataclasses.replace(CONFIG, seed=seed, steps=2)).model for seed in (0, 1))
+    assert not np.array_equal(one.splats.loc, other.splats.loc)
+
+
+def test_a_stopped_fit_goes_on_to_the_same_bits():
+    frames = moving_blobs()
+    whole = leaves_of(fit(frames, CONFIG).model)
+    for state, info in fit_steps(frames, CONFIG):
+        if info.step == 25:
+            break
+    kept = jax.tree.map(np.array, state)
+    for state, info in fit_steps(frames, CONFIG, kept):
+        pass
+    assert info.step == 60
+    for one, other in zip(whole, leaves_of(to_model(state, CONFIG, (48, 64), 25.0)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_frame_times_are_learned():
+    """Frames sampled unevenly in time: the learned times move towards the true ones."""
+    frames = moving_blobs(num_frames=21)
+    chosen = np.array([0, 1, 2, 3, 4, 12, 20])
+    config = FitConfig(num_gaussians=800, steps=700, degree=1, rates=LearningRates(frame_times=0.02))
+    model = fit(frames[chosen], config).model
+    times = np.asarray(model.frame_times.times())
+    true, even = chosen / 20, np.linspace(0, 1, 7)
+    assert np.all(np.diff(times) > 0)
+    assert np.linalg.norm(times - true) < 0.9 * np.linalg.norm(even - true)
+
+
+def test_planned_steps():
+    assert planned_steps(FitConfig(), 24) == 3000
+    assert planned_steps(FitConfig(), 1000) == 12_000
+    assert planned_steps(FitConfig(batch_size=4), 1000) == 3000
+    assert planned_steps(FitConfig(steps=7), 1000) == 7
+    assert planned_steps(FitConfig(minutes=1), 1000) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_gaussians": 0}, "num_gaussians"),
+        ({"degree": -1}, "degree"),
+        ({"degree": 2.5}, "degree"),
+        ({"steps": 0}, "steps"),
+        ({"minutes": 0}, "minutes"),
+        ({"minutes": float("nan")}, "minutes"),
+        ({"steps": 10, "minutes": 1.0}, "at most one"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"power": -1.0}, "power"),
+        ({"ssim_share": 2.0}, "ssim_share"),
+        ({"final_rate": float("inf")}, "final_rate"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_bad_settings(changes, message):
+    with pytest.raises(ValueError, match=message):
+        FitConfig(**changes)
+
+
+def test_bad_rates():
+    with pytest.raises(ValueError, match=r"rates\.loc"):
+        LearningRates(loc=-1.0)
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.zeros((1, 20, 20, 3), np.uint8),
+        np.zeros((3, 20, 20, 4), np.uint8),
+        np.zeros((3, 20, 20), np.uint8),
+        np.zeros((3, 20, 20, 3), np.float32),
+        np.zeros((3, 0, 20, 3), np.uint8),
+        [[1, 2]],
+    ],
+)
+def test_bad_frames(frames):
+    with pytest.raises(ValueError, match="frames"):
+        check_frames(frames)

@@ -1,0 +1,58 @@
+"""Frame times: start 0, end 1, increasing, whatever the weights."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from foldgauss.video import FrameTimes, interpolated_times
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(-8, 8, width=32), min_size=1, max_size=200))
+def test_start_end_and_order(logits):
+    times = np.asarray(FrameTimes(jnp.asarray(logits, jnp.float32)).times())
+    assert times[0] == 0
+    assert times[-1] == 1
+    assert len(times) == len(logits) + 1
+    assert np.all(np.diff(times) >= 0)
+    if len(logits) < 50 and np.ptp(logits) < 10:  # e^-10 / 50 is still well above the spacing of float32 at 1
+        assert np.all(np.diff(times) > 0)
+
+
+@pytest.mark.parametrize("extreme", [100.0, -100.0, 1e30])
+def test_extreme_weights_stay_in_order(extreme):
+    times = np.asarray(FrameTimes(jnp.asarray([0.0, extreme, 1.0])).times())
+    assert np.all(np.isfinite(times))
+    assert np.all(np.diff(times) >= 0)
+    assert times[-1] == 1
+
+
+def test_uniform_and_formula():
+    np.testing.assert_allclose(FrameTimes.uniform(5).times(), np.arange(5) / 4, atol=1e-7)
+    weights = jnp.asarray([0.3, -1.0, 2.0])
+    share = np.exp(weights) / np.exp(weights).sum()
+    np.testing.assert_allclose(FrameTimes(weights).times()[1:], np.cumsum(share), rtol=1e-6)
+
+
+def test_gradient_is_finite():
+    gradient = jax.jacobian(lambda w: FrameTimes(w).times())(jnp.asarray([0.0, 50.0, -50.0]))
+    assert bool(jnp.all(jnp.isfinite(gradient)))
+    np.testing.assert_array_equal(gradient[0], 0)
+
+
+def test_interpolation():
+    times = np.array([0.0, 0.2, 1.0], np.float32)
+    np.testing.assert_allclose(
+        interpolated_times(times, 4), [0, 0.05, 0.1, 0.15, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-6
+    )
+    np.testing.assert_array_equal(interpolated_times(times, 1), times)
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="num_frames"):
+        FrameTimes.uniform(1)
+    with pytest.raises(ValueError, match="upsample"):
+        interpolated_times(np.array([0.0, 1.0]), 0)

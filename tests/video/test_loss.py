@@ -1,0 +1,92 @@
+"""The fused loss against scikit-image (map) and JAX (value and gradient)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from foldgauss import _threads
+from foldgauss.video.loss import C1, C2, RADIUS, SIGMA, image_loss, ssim_map
+
+SIZES = [(97, 83), (40, 16), (41, 200), (11, 11), (3, 50), (1, 1)]
+
+
+def pictures(height, width, seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(0, 1, (3, height, width))
+    return x.astype(np.float32), np.clip(x + rng.normal(0, 0.2, x.shape), 0, 1).astype(np.float32)
+
+
+def loss_in_jax(x, y, share):
+    taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
+    kernel = jnp.asarray(np.outer(taps, taps) / taps.sum() ** 2, x.dtype)
+
+    def blur(a):
+        return jax.lax.conv_general_dilated(a[:, None], kernel[None, None], (1, 1), [(RADIUS, RADIUS)] * 2)[
+            :, 0
+        ]
+
+    mean_x, mean_y = blur(x), blur(y)
+    var_x, var_y, cov = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2, blur(x * y) - mean_x * mean_y
+    top = (2 * mean_x * mean_y + C1) * (2 * cov + C2)
+    ssim = top / ((mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2))
+    return (1 - share) * jnp.mean(jnp.abs(x - y)) + share * (1 - jnp.mean(ssim))
+
+
+def test_map_agrees_with_scikit_image():
+    x, y = (picture[0] for picture in pictures(97, 83))
+    options = {"gaussian_weights": True, "sigma": SIGMA, "use_sample_covariance": False, "data_range": 1}
+    _, truth = structural_similarity(x.astype(np.float64), y.astype(np.float64), full=True, **options)
+    inner = (slice(RADIUS, -RADIUS),) * 2  # the border is padded with zeros here, mirrored there
+    np.testing.assert_allclose(ssim_map(x, y)[inner], truth[inner], atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_value_and_gradient_agree_with_jax(height, width, share):
+    x, y = pictures(height, width)
+    with jax.enable_x64(True):
+        wide = jnp.asarray(x, jnp.float64), jnp.asarray(y, jnp.float64)
+        value, gradient = jax.value_and_grad(loss_in_jax)(*wide, share)
+        value, gradient = float(value), np.asarray(gradient)
+    ours = image_loss(x, y, ssim_share=share)
+    assert ours.value == pytest.approx(value, abs=2e-6)
+    assert ours.mean_squared_error == pytest.approx(np.mean((x - y) ** 2), rel=1e-5)
+    np.testing.assert_allclose(ours.gradient, gradient, atol=1e-4 * np.abs(gradient).max())
+
+
+def test_wrong_tap_would_be_caught():
+    """Power of the comparison above: SSIM with a window off by 10% differs by far more than its tolerance."""
+    x, y = (picture[0] for picture in pictures(97, 83))
+    options = {"gaussian_weights": True, "use_sample_covariance": False, "data_range": 1, "full": True}
+    _, right = structural_similarity(x, y, sigma=SIGMA, **options)
+    _, wrong = structural_similarity(x, y, sigma=1.1 * SIGMA, truncate=5 / (1.1 * SIGMA), **options)
+    assert np.abs(right - wrong)[RADIUS:-RADIUS, RADIUS:-RADIUS].max() > 1e-3
+
+
+def test_equal_pictures_are_a_stationary_best():
+    x, _ = pictures(60, 50)
+    loss = image_loss(x, x.copy())
+    assert loss.value == pytest.approx(0, abs=1e-6)
+    assert loss.ssim == pytest.approx(1, abs=1e-6)
+    assert np.abs(loss.gradient).max() < 1e-7
+
+
+def test_bits_do_not_depend_on_threads():
+    x, y = pictures(97, 83)
+    try:
+        _threads.set_num_threads(1)
+        one = image_loss(x, y)
+        _threads.set_num_threads(3)
+        three = image_loss(x, y)
+    finally:
+        _threads.set_num_threads(None)
+    assert one.value == three.value
+    np.testing.assert_array_equal(one.gradient, three.gradient)
+
+
+def test_shapes_are_checked():
+    x, y = pictures(20, 20)
+    with pytest.raises(ValueError, match="rendered, target"):
+        image_loss(x, y[:, :-1])

@@ -1,0 +1,42 @@
+"""Figures people compare: they must mean what others mean by them."""
+
+import numpy as np
+import pytest
+from clips import moving_blobs
+from test_conditioning import SIZE, random_splats
+
+from foldgauss.render import RenderOptions
+from foldgauss.video import FrameTimes, VideoModel, evaluate, psnr, ssim
+
+
+def test_psnr_by_hand():
+    black = np.zeros((20, 20, 3), np.uint8)
+    assert psnr(black, black + 10) == pytest.approx(20 * np.log10(255 / 10))
+    assert psnr(black, black) == 100
+
+
+def test_ssim_of_equal_and_of_unrelated_pictures():
+    one, other = moving_blobs()[0], np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    assert ssim(one, one) == pytest.approx(1)
+    assert ssim(one, other) < 0.2
+
+
+def test_evaluate_compares_frame_by_frame():
+    model = VideoModel(random_splats(), FrameTimes.uniform(3), SIZE, 25.0, RenderOptions())
+    frames = np.stack(list(model.frames()))
+    assert frames.dtype == np.uint8
+    scores = evaluate(model, frames)
+    assert scores.psnr == (100, 100, 100)
+    assert evaluate(model, frames[::-1].copy()).psnr[1] == 100
+    assert evaluate(model, frames[::-1].copy()).psnr[0] < 50
+    with pytest.raises(ValueError, match="frames"):
+        evaluate(model, frames[:2])
+
+
+def test_frames_at_other_times_and_sizes():
+    model = VideoModel(random_splats(), FrameTimes.uniform(3), SIZE, 25.0, RenderOptions())
+    (picture,) = model.frames(np.array([0.37]), (96, 160))
+    assert picture.shape == (96, 160, 3)
+    small = np.asarray(model.render(0.37))
+    halved = picture.reshape(48, 2, 80, 2, 3).mean((1, 3)) / 255
+    assert np.abs(halved - small).mean() < 0.05  # the same picture, finer
