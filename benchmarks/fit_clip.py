@@ -74,9 +74,7 @@ def show(kept: list[FitInfo], scores: Evaluation, seconds: float, title: str) ->
     last = f"{seconds:.1f}", f"{kept[-1].step:,}", ""
     table.add_row("all frames, mean", *last, f"{scores.mean_psnr:.2f}", f"{scores.mean_ssim:.4f}")
     worst = int(np.argmin(scores.psnr))
-    table.add_row(
-        f"worst frame, {worst}", "", "", "", f"{scores.psnr[worst]:.2f}", f"{scores.ssim[worst]:.4f}"
-    )
+    table.add_row(f"worst frame, {worst}", "", "", "", f"{scores.psnr[worst]:.2f}", f"{scores.ssim[worst]:.4f}")
     console.print(table)
 
 
@@ -100,9 +98,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = _common.parser(__doc__)
     parser.add_argument("--clip", default="bunny", help="a sample clip or a path [bunny]")
-    parser.add_argument(
-        "--size", type=_common.size, metavar="HxW", help="[160x320 for bunny, else the clip's]"
-    )
+    parser.add_argument("--size", type=_common.size, metavar="HxW", help="[160x320 for bunny, else the clip's]")
     parser.add_argument("--frames", type=_frames, metavar="A:B", help="frames A <= i < B [all]")
     parser.add_argument("--gaussians", type=_common.whole, help="[40000 for bunny, else by the frame's size]")
     parser.add_argument("--degree", type=int, default=3, help="of the folds [3]")

@@ -203,9 +203,7 @@ def check_agreement(case: Case) -> float:
         difference = np.abs(image - case.trace.image)
         share = np.mean(difference > TOLERANCE)
         worst = max(worst, float(difference.max()))
-        assert share <= CUTOFF_SHARE, (
-            f"xla and cpu: {share:.2%} of the pixels differ by more than {TOLERANCE:g}"
-        )
+        assert share <= CUTOFF_SHARE, f"xla and cpu: {share:.2%} of the pixels differ by more than {TOLERANCE:g}"
     assert worst < 1 / 255, f"xla and cpu differ by {worst:g}, more than a splat at the cutoff may"
     return worst
 

@@ -147,9 +147,7 @@ def show(records: list[dict], naive: float, title: str) -> None:
     table = _common.table(title, "part of a step", "ms", "share")
     total = median_ms(records, ("total",))
     for part, words in PARTS.items():
-        table.add_row(
-            words, f"{median_ms(records, (part,)):.2f}", f"{median_ms(records, (part,)) / total:.0%}"
-        )
+        table.add_row(words, f"{median_ms(records, (part,)):.2f}", f"{median_ms(records, (part,)) / total:.0%}")
     table.add_section()
     rest = tuple(part for part in PARTS if part not in RENDERING + LOSS)
     for words, parts in (("rendering", RENDERING), ("L1 + SSIM", LOSS), ("the rest", rest)):
@@ -181,9 +179,7 @@ def figures_of(records: list[dict], naive: float, num_alive: float) -> dict[str,
 def main(arguments: list[str] | None = None) -> None:
     parser = _common.parser(__doc__)
     parser.add_argument("--gaussians", type=_common.whole, default=200_000, help="Gaussians [200000]")
-    parser.add_argument(
-        "--size", type=_common.size, default=(160, 320), metavar="HxW", help="frames [160x320]"
-    )
+    parser.add_argument("--size", type=_common.size, default=(160, 320), metavar="HxW", help="frames [160x320]")
     parser.add_argument("--steps", type=_common.whole, default=24, help="steps that are timed [24]")
     options = _common.parse(parser, arguments)
     facts = _common.machine()

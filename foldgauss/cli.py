@@ -87,9 +87,7 @@ def demo(
     model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
     scores, pictures = _evaluate_with_progress(model, clip.frames)
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
-    path = save_video_model(
-        out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores)
-    )
+    path = save_video_model(out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores))
     figures["file_bytes"] = path.stat().st_size
     write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
@@ -115,13 +113,9 @@ def fit(
     ] = None,
     size: Size = None,
     frames: Frames = None,
-    gaussians: Annotated[
-        int | None, typer.Option(help="Number of Gaussians [default: by the frame's size].")
-    ] = None,
+    gaussians: Annotated[int | None, typer.Option(help="Number of Gaussians [default: by the frame's size].")] = None,
     degree: Annotated[int, typer.Option(help="Degree of the fold polynomial.")] = FitConfig.degree,
-    steps: Annotated[
-        int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips].")
-    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips].")] = None,
     minutes: Annotated[float | None, typer.Option(help="Time to fit for, instead of steps.")] = None,
     batch_size: Annotated[int, typer.Option(help="Frames per step.")] = FitConfig.batch_size,
     power: Annotated[
@@ -129,9 +123,7 @@ def fit(
     ] = FitConfig.power,
     seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
     overwrite: Overwrite = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
 ) -> None:
     """Fit a model to a clip. A stopped fit is kept and goes on with --resume."""
     try:
@@ -150,9 +142,7 @@ def fit(
     kept = target.with_name(f"{target.name}.checkpoint")
     _refuse_existing(target, overwrite)
     if kept.exists() and not (resume or overwrite):
-        raise WrongUse(
-            f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite."
-        )
+        raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
     if resume and not kept.exists():
         raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
     check_writable(target)
@@ -190,9 +180,7 @@ def render(
     if out_path.suffix and not out_path.is_dir():
         if out_path.suffix.lower() not in VIDEO_SUFFIXES:
             wanted = " or ".join(VIDEO_SUFFIXES)
-            raise WrongUse(
-                str(invalid("--out", expected=f"{wanted}, or a folder without extension", got=out_path))
-            )
+            raise WrongUse(str(invalid("--out", expected=f"{wanted}, or a folder without extension", got=out_path)))
         _refuse_existing(out_path, overwrite)
         check_writable(out_path)
     model = load_video_model(model_path)
@@ -282,9 +270,7 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"--out: cannot make the folder {path} ({error.strerror}). Choose another."
-        ) from error
+        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
     check_writable(path / "model.safetensors")
 
 
@@ -299,16 +285,13 @@ class _FitColumn(ProgressColumn):
         if info is None:
             return "compiling" if not task.finished else ""
         left = f"{info.seconds_left:.0f} s left" if np.isfinite(info.seconds_left) else ""
-        return (
-            f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  "
-            f"{info.num_gaussians:,} Gaussians  {left}"
-        )
+        return f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  {info.num_gaussians:,} Gaussians  {left}"
 
 
 def _fit_with_progress(
     frames: np.ndarray,
     config: FitConfig,
-    state: FitState | None = None,
+    resumed: FitState | None = None,
     keep: Callable[[FitState], object] | None = None,
 ) -> tuple[FitState, FitInfo]:
     """Run the fit under a bar; `keep` is called now and then, and before leaving on a signal."""
@@ -316,7 +299,7 @@ def _fit_with_progress(
     with Progress(*columns, console=err) as progress, _signals() as asked:
         task = progress.add_task("fit", total=1.0)
         kept_at, shown_at = time.monotonic(), 0.0
-        for state, info in fit_steps(frames, config, state):
+        for state, info in fit_steps(frames, config, resumed):
             now = time.monotonic()
             if now - shown_at > 0.1 or info.progress >= 1:
                 progress.update(task, completed=info.progress, info=info)
@@ -328,9 +311,7 @@ def _fit_with_progress(
                 if keep is None:
                     raise Stopped(f"stopped by {asked[0]} after step {info.step}; nothing was kept.")
                 keep(state)
-                raise Stopped(
-                    f"stopped by {asked[0]} after step {info.step}; add --resume to go on from there."
-                )
+                raise Stopped(f"stopped by {asked[0]} after step {info.step}; add --resume to go on from there.")
     return state, info
 
 

@@ -150,9 +150,7 @@ class Gaussian(eqx.Module):
         """log N(loc, Sigma)(value)."""
         value = _value(value, self.loc.dtype)
         _check_event("value", value, self.event_shape)
-        value, loc, tril, log_scale = _align(
-            [(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
-        )
+        value, loc, tril, log_scale = _align([(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         half_square = _half_mahalanobis(value, loc, tril, log_scale)
         dim = loc.shape[-1]
         half_log_det = jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1) + dim * log_scale
@@ -169,9 +167,7 @@ class Gaussian(eqx.Module):
         """Draws of shape (*sample_shape, *batch, dim), differentiable in the parameters."""
         shape = (*sample_shape, *self.batch_shape, *self.event_shape)
         noise = jax.random.normal(key, shape, self.loc.dtype)
-        noise, loc, tril, log_scale = _align(
-            [(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
-        )
+        noise, loc, tril, log_scale = _align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         return loc + jnp.exp(log_scale)[..., None] * _lower_times(tril, noise)
 
 
@@ -226,9 +222,7 @@ class FoldedGaussian(eqx.Module):
     ):
         name, matrix = _the_one_given(scale_tril=scale_tril, covariance_matrix=covariance_matrix)
         dtype = _common_dtype(loc, matrix, time_loc, time_scale)
-        loc, matrix, time_loc, time_scale = (
-            jnp.asarray(x, dtype) for x in (loc, matrix, time_loc, time_scale)
-        )
+        loc, matrix, time_loc, time_scale = (jnp.asarray(x, dtype) for x in (loc, matrix, time_loc, time_scale))
         _check_space(loc, name, matrix)
         if validate_args:
             _check_scale("time_scale", time_scale)
@@ -520,9 +514,7 @@ def _the_one_given(**given: ArrayLike | None) -> tuple[str, ArrayLike]:
     if len(present) != 1:
         names = " and ".join(given)
         got = "both" if present else "neither"
-        raise invalid(
-            names, expected="exactly one of them", got=got, cure="Sigma is one matrix, given one way."
-        )
+        raise invalid(names, expected="exactly one of them", got=got, cure="Sigma is one matrix, given one way.")
     return present[0]
 
 
@@ -595,9 +587,7 @@ def _checked_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
     shape = jax.eval_shape(fold, jax.ShapeDtypeStruct((), loc.dtype)).shape
     if shape[-1:] != loc.shape[-1:]:
         expected = f"shifts of shape (*batch, {loc.shape[-1]})"
-        raise invalid(
-            "fold", expected=expected, got=f"shape {shape}", cure="It takes u to d-1 space coordinates."
-        )
+        raise invalid("fold", expected=expected, got=f"shape {shape}", cure="It takes u to d-1 space coordinates.")
     return fold
 
 

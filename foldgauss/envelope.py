@@ -83,9 +83,7 @@ class TimeLikelihood(AbstractEnvelope):
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
         if _any(self.power, lambda x: x < 0):
-            raise invalid(
-                "power", expected="a number >= 0", got=power, cure="The paper's text is 1, its code 2."
-            )
+            raise invalid("power", expected="a number >= 0", got=power, cure="The paper's text is 1, its code 2.")
         if _any(self.floor, lambda x: (x < 0) | (x >= 1)):
             raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
 
@@ -94,16 +92,12 @@ class TimeLikelihood(AbstractEnvelope):
         return (0, 0)
 
     def log_a(self, t, *, time_loc, time_scale):
-        t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(
-            t, time_loc, time_scale, self.power, self.floor
-        )
+        t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)
         tau = _bounded_tau(t - time_loc, time_scale)
         return _log_floored(0.5 * power * tau * tau, floor)
 
 
-def _bounded_tau(
-    offset: Float[Array, "*batch"], time_scale: Float[Array, "*batch"]
-) -> Float[Array, "*batch"]:
+def _bounded_tau(offset: Float[Array, "*batch"], time_scale: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """offset / time_scale, held where its square is representable (no density is, out there)."""
     bound = float(np.sqrt(jnp.finfo(offset.dtype).max)) * 1e-2
     far = jnp.abs(offset) > bound * time_scale

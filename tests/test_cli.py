@@ -87,10 +87,7 @@ def test_folder_of_images_in_natural_order(tmp_path):
     folder.mkdir()
     for k, frame in enumerate(blobs(11)):
         write_image(folder / f"img{k}.png", frame)
-    assert (
-        run("fit", folder, "--out", tmp_path / "m.safetensors", *QUICK, "--degree", "1", "--batch-size", "2")
-        == 0
-    )
+    assert run("fit", folder, "--out", tmp_path / "m.safetensors", *QUICK, "--degree", "1", "--batch-size", "2") == 0
     assert run("evaluate", tmp_path / "m.safetensors", folder) == 0
 
 

@@ -90,12 +90,8 @@ def test_without_fold_and_envelope_it_is_a_gaussian(dim, dtype, tolerance):
     expected = stats.multivariate_normal(np.append(loc, 0.3), joint)
     with jax.enable_x64(dtype == np.float64):
         arguments = {"time_loc": 0.3, "time_scale": 0.7, "envelope": Constant()}
-        by_covariance = FoldedGaussian(
-            loc.astype(dtype), covariance_matrix=covariance.astype(dtype), **arguments
-        )
-        by_factor = FoldedGaussian(
-            loc.astype(dtype), np.linalg.cholesky(covariance).astype(dtype), **arguments
-        )
+        by_covariance = FoldedGaussian(loc.astype(dtype), covariance_matrix=covariance.astype(dtype), **arguments)
+        by_factor = FoldedGaussian(loc.astype(dtype), np.linalg.cholesky(covariance).astype(dtype), **arguments)
         for dist in (by_covariance, by_factor):
             log_prob = LOG_PROB(dist, x.astype(dtype))
             assert log_prob.dtype == dtype
@@ -367,9 +363,7 @@ def test_batches_equal_a_loop_and_vmap():
     together = LOG_PROB(dist, x)
     flat, points = jax.tree.map(np.asarray, (dist, x))
     double = jax.jit(jax.vmap(jax.vmap(FoldedGaussian.log_prob)))(dist, x)
-    loop = [
-        [LOG_PROB(jax.tree.map(itemgetter((i, j)), flat), points[i, j]) for j in range(4)] for i in range(3)
-    ]
+    loop = [[LOG_PROB(jax.tree.map(itemgetter((i, j)), flat), points[i, j]) for j in range(4)] for i in range(3)]
     assert dist.batch_shape == together.shape == (3, 4)
     _close(double, together, 1e-5)
     _close(jnp.array(loop), together, 1e-5)
@@ -485,9 +479,7 @@ def test_dtype_follows_the_arrays():
         )
         assert jax.eval_shape(lambda: single.log_prob([0.0, 0.0])).dtype == jnp.float32
         assert jax.eval_shape(single.sample, jax.random.key(0)).dtype == jnp.float32
-    assert (
-        FoldedGaussian(np.zeros(1), [[1.0]], time_loc=0.0, time_scale=1.0).loc.dtype == jnp.float32
-    )  # no x64
+    assert FoldedGaussian(np.zeros(1), [[1.0]], time_loc=0.0, time_scale=1.0).loc.dtype == jnp.float32  # no x64
 
 
 # --- doors ------------------------------------------------------------------------------------------------

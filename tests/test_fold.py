@@ -68,9 +68,7 @@ def test_every_fold_round_trips(fold):
     jax.tree.unflatten(treedef, [object()] * len(flat))  # as vmap and friends do
 
 
-@pytest.mark.parametrize(
-    ("leading", "shape"), [((), (4,)), ((5,), ()), ((5,), (5,)), ((5, 1), (3,)), ((3,), (5, 1))]
-)
+@pytest.mark.parametrize(("leading", "shape"), [((), (4,)), ((5,), ()), ((5,), (5,)), ((5, 1), (3,)), ((3,), (5, 1))])
 def test_polynomial_batches_broadcast(leading, shape):
     coefficients = jax.random.normal(jax.random.key(0), (*leading, 3, 2))
     u = jax.random.normal(jax.random.key(1), shape)

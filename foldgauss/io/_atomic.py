@@ -34,9 +34,7 @@ def temporary_name(path: Path, suffix: str) -> Path:
 def not_writable(path: Path, error: OSError) -> OutputError:
     """The one-line form of a refusal by the operating system."""
     reason = error.strerror or str(error)
-    return OutputError(
-        f"path: expected a writable place, got {str(path)!r} ({reason}). Choose another output path."
-    )
+    return OutputError(f"path: expected a writable place, got {str(path)!r} ({reason}). Choose another output path.")
 
 
 def _new_file(path: Path, suffix: str) -> Path:

@@ -138,9 +138,7 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name: it has no bits to store, and the skeleton brings its own
         if key in found or key == _RESERVED:
-            raise _error(
-                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
-            )
+            raise _error(key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key.")
         found[key] = leaf
     return found
 
@@ -269,11 +267,7 @@ def read_header(path: str | os.PathLike) -> dict:
         raise _unreadable(path, f"a damaged or truncated file ({_line(error)})") from error
     _check_version(path, strings)
     about = {name: strings[name] for name in ("format", "version", "kind")}
-    return (
-        about
-        | {name: _from_json(path, name, strings) for name in ("header", "metadata")}
-        | {"tensors": tensors}
-    )
+    return about | {name: _from_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
 
 
 def _check_container(path: Path) -> None:
@@ -296,9 +290,7 @@ def _check_container(path: Path) -> None:
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
         raise _unreadable(path, "a file of another kind, or one cut off within its first bytes")
     if length > size - _PREFIX:
-        raise _unreadable(
-            path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
-        )
+        raise _unreadable(path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged")
 
 
 def _check_version(path: Path, strings: dict[str, str]) -> None:

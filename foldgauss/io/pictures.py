@@ -8,9 +8,7 @@ ERROR_GAIN = 8
 _MARGIN, _BAND, _INK, _PAPER = 8, 26, (40, 40, 40), 250
 
 
-def comparison(
-    originals: list[np.ndarray], reconstructions: list[np.ndarray], captions: list[str]
-) -> np.ndarray:
+def comparison(originals: list[np.ndarray], reconstructions: list[np.ndarray], captions: list[str]) -> np.ndarray:
     """One row per frame: original, reconstruction, and their absolute difference magnified.
 
     Pictures are uint8 RGB of one size; `captions` stand above each row. Returns uint8 (height, width, 3).

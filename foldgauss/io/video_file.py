@@ -433,9 +433,7 @@ def _check_replaceable(folder: Path, overwrite: bool) -> None:
     if not os.path.exists(folder):
         return
     if not folder.is_dir():
-        raise OutputError(
-            f"path: expected a folder for PNG frames, got the file {str(folder)!r}. Choose another name."
-        )
+        raise OutputError(f"path: expected a folder for PNG frames, got the file {str(folder)!r}. Choose another name.")
     try:
         names = [entry.name for entry in folder.iterdir()]
     except OSError as error:
@@ -483,13 +481,9 @@ def _checked_range(frames: Range | None) -> tuple[int, int | None]:
     start, stop = (None, None) if frames is None else frames
     start = 0 if start is None else start
     if start < 0 or (stop is not None and stop < 0):
-        raise _error(
-            "frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more."
-        )
+        raise _error("frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more.")
     if stop is not None and stop - start < 2:
-        raise _error(
-            "frames", expected="A:B with at least 2 frames", got=_text(start, stop), cure="Choose B >= A + 2."
-        )
+        raise _error("frames", expected="A:B with at least 2 frames", got=_text(start, stop), cure="Choose B >= A + 2.")
     return start, stop
 
 

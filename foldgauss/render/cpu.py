@@ -106,8 +106,8 @@ def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff
         geometry[i, _RX] = radius_x
         geometry[i, _RY] = radius_y
         # Pixel rows whose centres lie within the radius; clipped before the cast, so no float is too large for it.
-        first = int(math.ceil(max(y - radius_y - _f(0.5), _f(0.0))))
-        last = int(math.floor(min(y + radius_y - _f(0.5), _f(height - 1))))
+        first = math.ceil(max(y - radius_y - _f(0.5), _f(0.0)))
+        last = math.floor(min(y + radius_y - _f(0.5), _f(height - 1)))
         if last >= first:
             span[i, 0] = first // TILE
             span[i, 1] = last // TILE + 1
@@ -158,12 +158,12 @@ def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff
         p, q, r = geometry[i, _P], geometry[i, _Q], geometry[i, _R]
         x, y, radius = geometry[i, _X], geometry[i, _Y], geometry[i, _RX]
         level = (geometry[i, _LOG] - log_cutoff) * (_f(1.0) + SLACK) + SLACK
-        # The ellipse is widest to the right at dy = turn and to the left at -turn; within the band, at the nearest line.
+        # The ellipse is widest to the right at dy = turn, to the left at -turn; within the band, at the nearest line.
         turn = -p * q * radius / (q * q + r * r)
         right = x + _edge(p, q, r, level, min(max(turn, upper - y), lower - y))
         left = x - _edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
-        first = int(math.ceil(max(left - _f(0.5), _f(0.0))))
-        last = int(math.floor(min(right - _f(0.5), _f(width - 1))))
+        first = math.ceil(max(left - _f(0.5), _f(0.0)))
+        last = math.floor(min(right - _f(0.5), _f(width - 1)))
         reach[e, 0] = first // TILE
         reach[e, 1] = last // TILE + 1 if last >= first else first // TILE
         for tile in range(reach[e, 0], reach[e, 1]):
@@ -182,8 +182,8 @@ def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff
 @_inline
 def _pixel_rows(y, radius):
     """Pixel rows of a tile (y is relative to its first row's centre) whose centres lie within the radius."""
-    first = max(0, int(math.ceil(max(y - radius, _f(-1.0)))))
-    last = min(TILE - 1, int(math.floor(min(y + radius, _f(TILE)))))
+    first = max(0, math.ceil(max(y - radius, _f(-1.0))))
+    last = min(TILE - 1, math.floor(min(y + radius, _f(TILE))))
     return first, last + 1
 
 
@@ -229,9 +229,7 @@ def _forward_row(
     """Blend one row of tiles into `image` (3, height, width) and `light` (height, width); return its lists."""
     height, width = light.shape
     top, start = row * TILE, row_start[row]
-    tile_start, listed = _bucket_tiles(
-        geometry, entries, start, row_start[row + 1], top, height, width, log_cutoff
-    )
+    tile_start, listed = _bucket_tiles(geometry, entries, start, row_start[row + 1], top, height, width, log_cutoff)
     used = np.empty(len(tile_start) - 1, np.int64)
     scratch = np.empty(4 * PIXELS, np.float32)
     for tile in range(len(used)):

@@ -167,9 +167,7 @@ class Shape:
 def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
     """Write the spans of time of the named rows into `window` (num, 2)."""
     num = len(indices)
-    run_tasks(
-        lambda start: _windows(start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK)
-    )
+    run_tasks(lambda start: _windows(start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK))
 
 
 def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> Conditioned:

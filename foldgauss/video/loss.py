@@ -202,7 +202,7 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_share: float = 
             got=f"{rendered.shape}, {target.shape}",
         )
     gradient = np.empty_like(rendered)
-    channels, height, width = rendered.shape
+    channels, height, _width = rendered.shape
     strips = [(c, r, min(r + STRIP, height)) for c in range(channels) for r in range(0, height, STRIP)]
     sums = np.zeros((len(strips), 3))
     by_l1 = np.float32((1 - ssim_share) / rendered.size)

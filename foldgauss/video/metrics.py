@@ -48,9 +48,7 @@ class Evaluation:
         return float(np.mean(self.ssim))
 
 
-def evaluate(
-    model: VideoModel, frames: np.ndarray, on_frame: Callable[[np.ndarray], None] | None = None
-) -> Evaluation:
+def evaluate(model: VideoModel, frames: np.ndarray, on_frame: Callable[[np.ndarray], None] | None = None) -> Evaluation:
     """Compare `model` at its frame times with `frames`, uint8 (num_frames, *model.size, 3).
 
     Pictures are rounded to 8 bits first, as anyone who watches them gets them. `on_frame` is called with each picture.

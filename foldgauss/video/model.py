@@ -132,9 +132,7 @@ class VideoModel(eqx.Module):
         splats = _splats_in_pixels(self, jnp.asarray(t, jnp.float32), tuple(size))
         return render(splats, size, engine=engine, options=self.options)
 
-    def frames(
-        self, times: np.ndarray | None = None, size: tuple[int, int] | None = None
-    ) -> Iterator[np.ndarray]:
+    def frames(self, times: np.ndarray | None = None, size: tuple[int, int] | None = None) -> Iterator[np.ndarray]:
         """Pictures at `times` (default: the frame times) one by one, uint8 (height, width, 3)."""
         for t in np.asarray(self.frame_times.times() if times is None else times):
             yield to_bytes(np.asarray(self.render(t, size)))

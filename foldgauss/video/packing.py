@@ -39,8 +39,5 @@ def unpack(rows: np.ndarray, degree: int, envelope: TimeLikelihood) -> FoldedSpl
     """Rows to leaves (copies), the inverse of `pack`."""
     num = len(rows)
     shapes = {"loc": (num, 2), "log_scale": (num, 2), "color_dc": (num, 3), "coefficients": (num, degree, 2)}
-    leaves = {
-        name: rows[:, place].reshape(shapes.get(name, (num,))).copy()
-        for name, place in columns(degree).items()
-    }
+    leaves = {name: rows[:, place].reshape(shapes.get(name, (num,))).copy() for name, place in columns(degree).items()}
     return FoldedSplats(**leaves, envelope=envelope)

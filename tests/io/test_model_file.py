@@ -117,9 +117,7 @@ def test_every_dtype_layout_and_kind_of_leaf(tmp_path):
     path = save_model(tmp_path / "all.safetensors", model)
     _assert_same(model, load_model(path))
     # An independent reader agrees, key by key.
-    assert set(load_file(path)) == (
-        {"inner.weight", "layers.0", "layers.1"} | {f"parts.{name}" for name in parts}
-    )
+    assert set(load_file(path)) == ({"inner.weight", "layers.0", "layers.1"} | {f"parts.{name}" for name in parts})
 
 
 _dtypes = st.sampled_from(["float32", "float64", "int32", "int64", "uint8", "bool", ">f8"])

@@ -453,9 +453,7 @@ try:
 except OSError as error:
     print(type(error).__name__)
 """
-    ran = subprocess.run(
-        [sys.executable, "-c", program, tmp_path / name], capture_output=True, text=True, timeout=60
-    )
+    ran = subprocess.run([sys.executable, "-c", program, tmp_path / name], capture_output=True, text=True, timeout=60)
     assert ran.stderr == ""
     assert ran.stdout.strip() in ("OutputError", "OSError")
     assert list(tmp_path.iterdir()) == []

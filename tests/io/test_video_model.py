@@ -57,7 +57,7 @@ def test_every_leaf_is_saved(tmp_path):
     save_video_model(path, model)
     plain = path.read_bytes()
     for k, leaf in enumerate(leaves):
-        changed = jax.tree.unflatten(tree, leaves[:k] + [np.asarray(leaf) + np.float32(1)] + leaves[k + 1 :])
+        changed = jax.tree.unflatten(tree, [*leaves[:k], np.asarray(leaf) + np.float32(1), *leaves[k + 1 :]])
         save_video_model(path, changed)
         assert path.read_bytes() != plain
 
@@ -91,7 +91,7 @@ def test_kinds_are_not_mixed_up(tmp_path):
     with pytest.raises(ModelFileError, match="fit-checkpoint"):
         load_video_model(tmp_path / "c")
     save_video_model(tmp_path / "m", random_model())
-    with pytest.raises(ValueError, match="resume|kind"):
+    with pytest.raises(ValueError, match=r"resume|kind"):
         load_checkpoint(tmp_path / "m", config=CONFIG, source=SOURCE)
 
 

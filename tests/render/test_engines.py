@@ -65,9 +65,7 @@ def test_cpu_agrees_with_reference(kind, compositing, options):
     scale = max(1.0, np.abs(truth).max())
     difference = np.abs(picture - truth)
     assert difference[~avoid].max(initial=0) <= 1e-5 * scale
-    assert (
-        difference[avoid].max(initial=0) <= 2.5 * options.alpha_cutoff
-    )  # the stated band: a splat more or less
+    assert difference[avoid].max(initial=0) <= 2.5 * options.alpha_cutoff  # the stated band: a splat more or less
     names = ("mean", "factor", "opacity", "color", "background")
     for name, one, other in zip(names, jax.tree.leaves(grads), jax.tree.leaves(true_grads), strict=True):
         size_of = max(1.0, np.abs(other).max(initial=0))
@@ -210,9 +208,7 @@ def test_jit_vmap_and_dtypes():
     truth = render(splats, size)
     np.testing.assert_array_equal(jax.jit(lambda s: render(s, size))(splats), truth)
     moved = jnp.stack([splats.mean, splats.mean + 3])
-    stack = jax.vmap(lambda mean: render(Splats2D(mean, splats.factor, splats.opacity, splats.color), size))(
-        moved
-    )
+    stack = jax.vmap(lambda mean: render(Splats2D(mean, splats.factor, splats.opacity, splats.color), size))(moved)
     np.testing.assert_array_equal(stack[0], truth)
     assert jnp.abs(stack[1] - truth).max() > 1e-2
     with jax.enable_x64(True):
@@ -227,9 +223,7 @@ def test_nothing_breaks_on_degenerate_splats():
     bad = jnp.asarray([jnp.nan, jnp.inf, 0.0, 1e30])
     mean = splats.mean.at[:2, 0].set(bad[:2]).at[2].set(1e30)
     factor = splats.factor.at[3].set(0.0).at[4].set(jnp.nan).at[5].set(1e25)
-    picture = render(
-        Splats2D(mean, factor, splats.opacity, splats.color), size, options=RenderOptions(low_pass=0.0)
-    )
+    picture = render(Splats2D(mean, factor, splats.opacity, splats.color), size, options=RenderOptions(low_pass=0.0))
     assert bool(jnp.all(jnp.isfinite(picture)))
     assert float(picture.max()) > 0.1
 

@@ -75,9 +75,7 @@ def test_same_bits_for_any_number_of_threads():
     try:
         for count in (1, 2):
             _threads.set_num_threads(count)
-            models.append(
-                leaves_of(fit(frames, dataclasses.replace(CONFIG, num_gaussians=5000, steps=20)).model)
-            )
+            models.append(leaves_of(fit(frames, dataclasses.replace(CONFIG, num_gaussians=5000, steps=20)).model))
     finally:
         _threads.set_num_threads(None)
     for one, other in zip(*models, strict=True):

@@ -45,9 +45,7 @@ def test_gradient_is_finite():
 
 def test_interpolation():
     times = np.array([0.0, 0.2, 1.0], np.float32)
-    np.testing.assert_allclose(
-        interpolated_times(times, 4), [0, 0.05, 0.1, 0.15, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-6
-    )
+    np.testing.assert_allclose(interpolated_times(times, 4), [0, 0.05, 0.1, 0.15, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-6)
     np.testing.assert_array_equal(interpolated_times(times, 1), times)
 
 

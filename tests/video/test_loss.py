@@ -23,9 +23,7 @@ def loss_in_jax(x, y, share):
     kernel = jnp.asarray(np.outer(taps, taps) / taps.sum() ** 2, x.dtype)
 
     def blur(a):
-        return jax.lax.conv_general_dilated(a[:, None], kernel[None, None], (1, 1), [(RADIUS, RADIUS)] * 2)[
-            :, 0
-        ]
+        return jax.lax.conv_general_dilated(a[:, None], kernel[None, None], (1, 1), [(RADIUS, RADIUS)] * 2)[:, 0]
 
     mean_x, mean_y = blur(x), blur(y)
     var_x, var_y, cov = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2, blur(x * y) - mean_x * mean_y

@@ -39,9 +39,7 @@ def test_rows_that_take_no_part_are_untouched_and_count_their_own_steps():
     sparse_adam(rows, grad, first, second, counts, touched, rates)
     others = np.setdiff1d(np.arange(100), touched)
     np.testing.assert_array_equal(rows[others], before[others])
-    np.testing.assert_allclose(
-        rows[touched], before[touched] - 0.1, atol=1e-5
-    )  # a first step is the rate itself
+    np.testing.assert_allclose(rows[touched], before[touched] - 0.1, atol=1e-5)  # a first step is the rate itself
     assert counts.sum() == 3
     grad[3] = 1
     sparse_adam(rows, grad, first, second, counts, np.array([3]), rates)
@@ -51,7 +49,5 @@ def test_rows_that_take_no_part_are_untouched_and_count_their_own_steps():
 def test_zero_gradient_is_no_step():
     rows = np.ones((4, 11), np.float32)
     moments = np.zeros_like(rows), np.zeros_like(rows)
-    sparse_adam(
-        rows, np.zeros_like(rows), *moments, np.zeros(4, np.int32), np.arange(4), np.ones(11, np.float32)
-    )
+    sparse_adam(rows, np.zeros_like(rows), *moments, np.zeros(4, np.int32), np.arange(4), np.ones(11, np.float32))
     np.testing.assert_array_equal(rows, 1)
