@@ -1,7 +1,8 @@
 """A tile renderer in plain XLA, what JAX alone makes of the same work: a yardstick for `render/cpu.py`.
 
-The lists are those of the CPU engine's own trace, padded to the longest: XLA pays neither for making them nor
-for the tiles that a bounding box would add. A `lax.scan` over list position blends one splat per tile, all
+The lists are made on the host and padded to the longest; XLA does not pay for making them. The plain form lists a
+splat in every tile that its bounding box touches; the stronger one takes the exact lists of the CPU engine's trace.
+A `lax.scan` over list position blends one splat per tile, all
 tiles of a band at once, 256 pixels each; a band is the whole picture (the textbook form) or one row of tiles
 after another, whose state stays in the cache. The constants are `RenderOptions`'.
 """
@@ -28,15 +29,30 @@ class TileLists(NamedTuple):
 def tile_lists(trace: Trace, *, by_row: bool) -> TileLists:
     """The trace's lists as rectangles: one band per row of tiles, or a single band."""
     row_start, entries, _, _ = trace.buckets
-    lists, places = [], []
+    lists = []
     for row, (tile_start, listed, _) in enumerate(trace.lists):
         for tile in range(len(tile_start) - 1):
             lists.append(entries[row_start[row] + listed[tile_start[tile] : tile_start[tile + 1]]])
-            places.append((tile * TILE, row * TILE))
+    return _padded(lists, trace.image.shape[1:], bands=len(trace.lists) if by_row else 1)
+
+
+def box_lists(first: np.ndarray, last: np.ndarray, size: tuple[int, int]) -> TileLists:
+    """Lists by bounding box, one band: splat i is in tiles first[i] <= (column, row) < last[i]."""
+    lists: list[list[int]] = [[] for _ in range(-(-size[1] // TILE) * -(-size[0] // TILE))]
+    for i, ((left, top), (right, bottom)) in enumerate(zip(first.astype(int), last.astype(int), strict=True)):
+        for row in range(top, bottom):
+            for column in range(left, right):
+                lists[row * -(-size[1] // TILE) + column].append(i)
+    return _padded([np.array(own, np.int32) for own in lists], size, bands=1)
+
+
+def _padded(lists: list[np.ndarray], size: tuple[int, int], *, bands: int) -> TileLists:
+    """Lists of the tiles, row by row, as rectangles."""
+    num_columns = -(-size[1] // TILE)
+    places = [(k % num_columns * TILE, k // num_columns * TILE) for k in range(len(lists))]
     padded = np.full((max(map(len, lists)), len(lists)), -1, np.int32)
     for k, splats in enumerate(lists):
         padded[: len(splats), k] = splats
-    bands = len(trace.lists) if by_row else 1
     left, top = np.array(places, np.float32).reshape(bands, -1, 2).transpose(2, 0, 1)
     return TileLists(padded.reshape(len(padded), bands, -1).transpose(1, 0, 2).copy(), left, top)
 

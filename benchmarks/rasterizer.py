@@ -7,14 +7,15 @@ Scenes: 20k random splats at 160x320 and 100k at 640x1280 (`_common.random_scene
 lists (exact ellipse-tile tests: fewer pairs than bounding boxes, so the stricter unit), the table gives both.
 
 Timed: wall seconds of a whole call from float32 NumPy (cpu) or device (XLA) arrays to finished results,
-median over rounds that run all engines in turn. Listing and binning count for `cpu`; the XLA loop gets
-`cpu`'s lists for nothing. XLA uses all cores, `cpu` is timed with one thread and with all. Backward is the
+median over rounds that run all engines in turn. Listing and binning count for `cpu`; the XLA loops get
+their lists for nothing. XLA uses all cores, `cpu` is timed with one thread and with all. Backward is the
 gradient of <image, g> by mean, factor, opacity, colour and background, the forward pass included. The
 reference is dense, so it draws only as many splats as make about 1e7 pairs of its own, pixels times splats.
 Engines must agree: see `check_agreement`.
 
-`xla` blends all tiles at once (the textbook loop; forward only, its backward would keep some GB), `xla by
-row` one row of tiles after another, kinder to the cache.
+`xla` blends all tiles at once from lists by bounding box (the plain loop; forward only, its backward would keep
+some GB). Two stronger forms stand beside it: `xla exact` takes `cpu`'s exact lists, `xla by row` those too and
+one row of tiles after another, kinder to the cache.
 
 What bounds `cpu`: per 16 pixels visited (the pixel rows of a tile that the ellipse reaches, until the tile is
 opaque), as LLVM 20 compiles it for AVX-512, forward takes 24 vector instructions (13 multiply-adds), 4 loads
@@ -34,7 +35,7 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import Scene, Task, console, interleaved, random_scene
-from benchmarks._xla_tiles import TileLists, render_tiles, tile_lists
+from benchmarks._xla_tiles import TileLists, box_lists, render_tiles, tile_lists
 from foldgauss._threads import available_cores, run_tasks, set_num_threads
 from foldgauss.render import RenderOptions, Splats2D, cpu, render
 
@@ -83,13 +84,8 @@ def count_pairs(scene: Scene, trace: cpu.Trace) -> Pairs:
     left, top = lists.left[0, tile], lists.top[0, tile]
     used = np.concatenate([used - start[:-1] for start, _, used in trace.lists])
     mean, opacity = scene.leaves[0], scene.leaves[2]
-    covariance, reach = _covariance(scene), _reach(scene)
-    radius_y = np.sqrt(reach * covariance[:, 1, 1])[splat]
-    offset = mean[splat, 1] - top - 0.5
-    first = np.maximum(np.ceil(offset - radius_y), 0)
-    last = np.minimum(np.floor(offset + radius_y), cpu.TILE - 1)
-    rows = np.maximum(last - first + 1, 0) * (position < used[tile])
-    conic, above = np.linalg.inv(covariance), 0
+    conic, above = np.linalg.inv(_covariance(scene)), 0
+    rows = _num_rows(mean[splat], conic[splat], _reach(scene)[splat], left, top) * (position < used[tile])
     for part in np.array_split(np.arange(len(splat)), -(-len(splat) // 20_000)):
         i = splat[part]
         above += _num_above(mean[i], conic[i], opacity[i], left[part], top[part])
@@ -106,14 +102,36 @@ def _reach(scene: Scene) -> np.ndarray:
     return 2 * np.log(scene.leaves[2].astype(np.float64) / RenderOptions().alpha_cutoff)
 
 
-def _num_boxes(scene: Scene) -> int:
-    """Tiles touched by the bounding boxes of the cutoff ellipses."""
+def _boxes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """First and last (column, row) of the tiles that each cutoff ellipse's bounding box touches."""
     variances = np.diagonal(_covariance(scene), axis1=1, axis2=2)
     radius, mean = np.sqrt(_reach(scene)[:, None] * variances), scene.leaves[0]
     most = [-(-scene.size[1] // cpu.TILE), -(-scene.size[0] // cpu.TILE)]
     first = np.clip(np.floor((mean - radius) / cpu.TILE), 0, most)
     last = np.clip(np.floor((mean + radius) / cpu.TILE) + 1, 0, most)
+    return first, last
+
+
+def _num_boxes(scene: Scene) -> int:
+    first, last = _boxes(scene)
     return int((last - first).prod(axis=1).sum())
+
+
+def _num_rows(mean, conic, reach, left, top) -> np.ndarray:
+    """Pixel rows of a tile that the cutoff ellipse reaches within the tile's columns, by entry.
+
+    On the column dx the ellipse spans dy = (-xy dx -+ sqrt(yy reach - det dx^2)) / yy; it is highest and lowest where
+    dx = -+ xy sqrt(reach / (yy det)), or at the nearest column of the tile.
+    """
+    xx, xy, yy = conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1]
+    det, x, y = xx * yy - xy**2, mean[:, 0] - left - 0.5, mean[:, 1] - top - 0.5
+    turn = xy * np.sqrt(reach / (xx * det))
+    ends = []
+    for side in (-1, 1):
+        dx = np.clip(-side * turn, -x, cpu.TILE - 1 - x)
+        ends.append(y + (-xy * dx + side * np.sqrt(np.maximum(yy * reach - det * dx**2, 0))) / yy)
+    first, last = np.maximum(np.ceil(ends[0]), 0), np.minimum(np.floor(ends[1]), cpu.TILE - 1)
+    return np.maximum(last - first + 1, 0)
 
 
 def _num_above(mean, conic, opacity, left, top) -> int:
@@ -157,6 +175,7 @@ def _use_threads(threads: int) -> None:
 def xla_tasks(case: Case) -> dict[str, Task]:
     scene = case.scene
     leaves, gradient = jax.device_put((scene.leaves, scene.grad_image))
+    boxes = jax.device_put(box_lists(*_boxes(scene), scene.size))
     whole = jax.device_put(tile_lists(case.trace, by_row=False))
     rows = jax.device_put(tile_lists(case.trace, by_row=True))
 
@@ -168,7 +187,8 @@ def xla_tasks(case: Case) -> dict[str, Task]:
         return jax.grad(lambda own: jnp.vdot(render_tiles(*own, lists, size=scene.size), gradient))(leaves)
 
     return {
-        "xla forward": Task(lambda: forward(whole).block_until_ready()),
+        "xla forward": Task(lambda: forward(boxes).block_until_ready()),
+        "xla exact forward": Task(lambda: forward(whole).block_until_ready()),
         "xla by row forward": Task(lambda: forward(rows).block_until_ready()),
         "xla by row both": Task(lambda: jax.block_until_ready(both(leaves, rows, gradient))),
     }
@@ -197,8 +217,8 @@ def reference_tasks(case: Case) -> dict[str, Task]:
 def check_agreement(case: Case) -> float:
     """Largest difference of the XLA loops from the CPU engine; AssertionError where they do not agree."""
     worst = 0.0
-    for by_row in (False, True):
-        lists = tile_lists(case.trace, by_row=by_row)
+    boxes = box_lists(*_boxes(case.scene), case.scene.size)
+    for lists in (boxes, tile_lists(case.trace, by_row=False), tile_lists(case.trace, by_row=True)):
         image = np.asarray(render_tiles(*case.scene.leaves, lists, size=case.scene.size))
         difference = np.abs(image - case.trace.image)
         share = np.mean(difference > TOLERANCE)
@@ -264,6 +284,7 @@ def scene_figures(case: Case, seconds: dict[str, float]) -> dict[str, float]:
         "cpu_forward_ms": forward * 1e3,
         "cpu_forward_backward_ms": both * 1e3,
         "xla_over_cpu_forward": seconds["xla forward"] / forward,
+        "xla_exact_over_cpu_forward": seconds["xla exact forward"] / forward,
         "xla_by_row_over_cpu_forward": seconds["xla by row forward"] / forward,
         "xla_by_row_over_cpu_forward_backward": seconds["xla by row both"] / both,
         "reference_forward_ns_per_pair": seconds["reference forward"] * 1e9 / own,

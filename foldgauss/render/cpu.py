@@ -44,6 +44,9 @@ _f, _i, _u = nb.float32, nb.int32, nb.uint64
 # alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2). Whitened before it is squared: the three terms of the usual conic
 # cancel for thin, slanted splats. RX and RY are the half-sizes of the cutoff ellipse's box.
 _X, _Y, _P, _Q, _R, _LOG, _RX, _RY = range(8)
+# A tile is blended in blocks of splats, whose parameters are laid out one after another: those above without the
+# half-sizes, and three colours. Between blocks the tile is left if no light is.
+BLOCK, _RED, _BLOCK_PARTS = 64, 6, 9
 # Columns of a gradient slot: three colours, then the sums of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where
 # v = P dx + Q dy and w = R dy: in whitened coordinates the moments of thin splats do not cancel either.
 _SLOTS = 9
@@ -63,7 +66,10 @@ def _bits_as_float(typing_context, bits):
 
 @_inline
 def _exp2(x):
-    """2^x for -126 < x <= 0 within 3e-7: polynomial on the fraction in (-1, 0], integer part into the exponent."""
+    """2^x for -126 < x <= 0 within 3e-7: polynomial on the fraction in (-1, 0], integer part into the exponent.
+
+    Anything else gives a number without meaning, for the caller to drop.
+    """
     whole = _i(x)
     part = x - _f(whole)
     y = _f(9.418212e-4)
@@ -180,32 +186,96 @@ def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff
 
 
 @_inline
-def _pixel_rows(y, radius):
-    """Pixel rows of a tile (y is relative to its first row's centre) whose centres lie within the radius."""
-    first = max(0, math.ceil(max(y - radius, _f(-1.0))))
-    last = min(TILE - 1, math.floor(min(y + radius, _f(TILE))))
-    return first, last + 1
+def _pixel_rows(x, y, p, q, r, level):
+    """Pixel rows of a tile that the ellipse (p dx + q dy)^2 + (r dy)^2 = level reaches within its columns: (first, end).
+
+    The centre (x, y) is relative to the centre of the tile's first pixel. The ellipse is highest at dx = turn and
+    lowest at -turn; within the columns, at the nearest one.
+    """
+    square = q * q + r * r
+    inverse, shear = _f(1.0) / square, p * q
+    turn = -q * math.sqrt(level) / (p * r)
+    left, right = -x, _f(TILE - 1) - x
+    above, below = min(max(turn, left), right), min(max(-turn, left), right)
+    half_above = math.sqrt(max(square * level - (p * r * above) * (p * r * above), _f(0.0)))
+    half_below = math.sqrt(max(square * level - (p * r * below) * (p * r * below), _f(0.0)))
+    # Held within the tile before the cast; truncated, as ceil and floor would be calls into libm here.
+    low = min(max(y - (shear * below + half_below) * inverse, _f(0.0)), _f(TILE))
+    high = min(max(y - (shear * above - half_above) * inverse, _f(-1.0)), _f(TILE - 1))
+    first = _i(low)
+    first += _i(_f(first) < low)
+    return first, _i(high + _f(1.0))
+
+
+@_inline
+def _aligned(size):
+    """Room for `size` floats that starts on a cache line, so that no vector of 16 straddles two."""
+    room = np.empty(size + TILE, np.float32)
+    skip = (-room.ctypes.data // 4) % TILE
+    return room[skip : skip + size]
 
 
 @_jit
-def _blend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, finished):
-    """Add splat i to the tile: scratch holds the light left, then the colours, 16 x 16 each."""
-    x, y = geometry[i, _X] - left - _f(0.5), geometry[i, _Y] - top - _f(0.5)
-    p, q, r, log = geometry[i, _P], geometry[i, _Q], geometry[i, _R], geometry[i, _LOG]
-    red, green, blue = color[i, 0], color[i, 1], color[i, 2]
+def _load_block(geometry, color, entries, listed, left, top, block):
+    """The geometry and colours of up to BLOCK splats of a tile, parameter by parameter; positions within the tile."""
+    for e in range(_u(len(listed))):
+        i = entries[listed[e]]
+        block[_X * BLOCK + e] = geometry[i, _X] - left - _f(0.5)
+        block[_Y * BLOCK + e] = geometry[i, _Y] - top - _f(0.5)
+        block[_P * BLOCK + e] = geometry[i, _P]
+        block[_Q * BLOCK + e] = geometry[i, _Q]
+        block[_R * BLOCK + e] = geometry[i, _R]
+        block[_LOG * BLOCK + e] = geometry[i, _LOG]
+        for c in range(_u(3)):
+            block[_u(_RED * BLOCK) + c * _u(BLOCK) + e] = color[i, c]
+
+
+@_jit
+def _list_rows(num, block, log_cutoff, first, last, items, shear, drop):
+    """Write an item for every pixel row that a splat of the block reaches; returns their number.
+
+    Along a row alpha = 2^(drop - (P column + shear)^2). One flat list, since a loop over each splat's own few rows
+    would mispredict its end for every splat.
+    """
+    for e in range(_u(num)):
+        log = block[_u(_LOG * BLOCK) + e]
+        first[e], last[e] = _pixel_rows(
+            block[_u(_X * BLOCK) + e],
+            block[_u(_Y * BLOCK) + e],
+            block[_u(_P * BLOCK) + e],
+            block[_u(_Q * BLOCK) + e],
+            block[_u(_R * BLOCK) + e],
+            (log - log_cutoff) * (_f(1.0) + SLACK) + SLACK,
+        )
+    stop = _u(0)
+    for e in range(_u(num)):
+        x, y, log = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e], block[_u(_LOG * BLOCK) + e]
+        p, q, r = block[_u(_P * BLOCK) + e], block[_u(_Q * BLOCK) + e], block[_u(_R * BLOCK) + e]
+        for k in range(_u(TILE)):  # always all 16, one vector: what is too much the next splat writes over
+            row = first[e] + _i(k)
+            dy = _f(row) - y
+            items[stop + k] = (row << _i(8)) | _i(e)
+            shear[stop + k] = q * dy - p * x
+            drop[stop + k] = log - r * dy * r * dy
+        stop += _u(max(last[e] - first[e], _i(0)))
+    return stop
+
+
+@_jit
+def _blend(num_items, items, shear, drop, block, scratch, over, log_cutoff, ceiling, finished):
+    """Add the listed rows of a block's splats to the tile: scratch holds the light left, then the colours."""
     share = _f(1.0) if over else _f(0.0)
-    first, last = _pixel_rows(y, geometry[i, _RY])
-    for row in range(first, last):
-        dy = _f(row) - y
-        shear, drop = q * dy, log - r * dy * r * dy
-        base = _u(row * TILE)
+    for n in range(_u(num_items)):
+        e, base = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(TILE)
+        p, red = block[_u(_P * BLOCK) + e], block[_u(_RED * BLOCK) + e]
+        green, blue = block[_u((_RED + 1) * BLOCK) + e], block[_u((_RED + 2) * BLOCK) + e]
+        start, top = shear[n], drop[n]
         for column in range(_u(TILE)):
-            dx = _f(_i(column)) - x
-            across = p * dx + shear
-            power = drop - across * across
+            across = p * _f(_i(column)) + start
+            power = top - across * across
             light = scratch[base + column]
             seen = (power >= log_cutoff) & (light > finished)
-            alpha = min(_exp2(max(power, _f(-100.0))), ceiling)
+            alpha = min(_exp2(power), ceiling)
             weight = alpha * light if seen else _f(0.0)
             scratch[base + column] = light - share * weight
             scratch[base + column + _u(PIXELS)] += weight * red
@@ -223,6 +293,20 @@ def _dark(scratch, finished):
 
 
 @_jit
+def _write_tile(scratch, background, image, light, top, left):
+    height, width = light.shape
+    columns = min(TILE, width - left)
+    for y in range(min(TILE, height - top)):
+        base, out = _u(y * TILE), light[top + y, left : left + columns]
+        for x in range(_u(columns)):
+            out[x] = scratch[base + x]
+        for c in range(3):
+            plane, out = _u((c + 1) * PIXELS), image[c, top + y, left : left + columns]
+            for x in range(_u(columns)):
+                out[x] = scratch[base + plane + x] + scratch[base + x] * background[c]
+
+
+@_jit
 def _forward_row(
     row, row_start, entries, geometry, color, background, over, log_cutoff, ceiling, finished, image, light
 ):
@@ -231,25 +315,24 @@ def _forward_row(
     top, start = row * TILE, row_start[row]
     tile_start, listed = _bucket_tiles(geometry, entries, start, row_start[row + 1], top, height, width, log_cutoff)
     used = np.empty(len(tile_start) - 1, np.int64)
-    scratch = np.empty(4 * PIXELS, np.float32)
+    scratch = _aligned(4 * PIXELS)
+    block, items = _aligned(_BLOCK_PARTS * BLOCK), np.empty((BLOCK + 1) * TILE, np.int32)
+    first, last = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    shear, drop = np.empty((BLOCK + 1) * TILE, np.float32), np.empty((BLOCK + 1) * TILE, np.float32)
+    entries = entries[start : row_start[row + 1]]
     for tile in range(len(used)):
         scratch[:PIXELS] = 1.0
         scratch[PIXELS:] = 0.0
         used[tile] = tile_start[tile + 1]
-        for k in range(tile_start[tile], tile_start[tile + 1]):
-            # Looking costs about as much as half a splat: every 32nd is often enough.
-            if over and (k - tile_start[tile]) % 32 == 31 and _dark(scratch, finished):
+        for k in range(tile_start[tile], tile_start[tile + 1], BLOCK):
+            if over and k > tile_start[tile] and _dark(scratch, finished):
                 used[tile] = k
                 break
-            i = entries[start + listed[k]]
-            _blend(geometry, color, i, _f(tile * TILE), _f(top), scratch, over, log_cutoff, ceiling, finished)
-        left = tile * TILE
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
-                p = y * TILE + x
-                light[top + y, left + x] = scratch[p]
-                for c in range(3):
-                    image[c, top + y, left + x] = scratch[(c + 1) * PIXELS + p] + scratch[p] * background[c]
+            part = listed[k : min(k + BLOCK, tile_start[tile + 1])]
+            _load_block(geometry, color, entries, part, _f(tile * TILE), _f(top), block)
+            num_items = _list_rows(len(part), block, log_cutoff, first, last, items, shear, drop)
+            _blend(num_items, items, shear, drop, block, scratch, over, log_cutoff, ceiling, finished)
+        _write_tile(scratch, background, image, light, top, tile * TILE)
     return tile_start, listed, used
 
 
@@ -262,17 +345,17 @@ def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, 
     share = _f(1.0) if over else _f(0.0)
     s_red, s_green, s_blue = _f(0.0), _f(0.0), _f(0.0)
     s_1, s_v, s_w, s_vv, s_vw, s_ww = _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0), _f(0.0)
-    first, last = _pixel_rows(y, geometry[i, _RY])
-    base = _u(first * TILE)
-    for q in range(_u((last - first) * TILE if last > first else 0)):
-        p = base + q
+    level = (log - log_cutoff) * (_f(1.0) + SLACK) + SLACK
+    first, last = _pixel_rows(x, y, white_x, white_xy, white_y, level)
+    base = _u(first * _i(TILE))
+    for k in range(_u((last - first) * _i(TILE) if last > first else _i(0))):
+        p = base + k
         dx, dy = scratch[p + _u(_PX)] - x, scratch[p + _u(_PY)] - y
         across, along = white_x * dx + white_xy * dy, white_y * dy
         power = log - across * across - along * along
         light = scratch[p]
         seen = (power >= log_cutoff) & (light > finished)
-        free = _exp2(max(power, _f(-100.0)))
-        alpha = min(free, ceiling) if seen else _f(0.0)
+        alpha = min(_exp2(power), ceiling) if seen else _f(0.0)
         g_red, g_green, g_blue = (
             scratch[p + _u(_G)],
             scratch[p + _u(_G + PIXELS)],
@@ -284,7 +367,7 @@ def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, 
         scratch[p + _u(_REST)] = behind
         scratch[p] = light - share * weight
         slope = (light * own - share * behind / (_f(1.0) - alpha)) * alpha
-        slope = slope if free < ceiling else _f(0.0)
+        slope = slope if alpha < ceiling else _f(0.0)
         s_red += weight * g_red
         s_green += weight * g_green
         s_blue += weight * g_blue
@@ -327,7 +410,7 @@ def _backward_row(
     height, width = image.shape[1:]
     top, start = row * TILE, row_start[row]
     slots[start : row_start[row + 1]] = 0.0
-    scratch = np.empty(7 * PIXELS, np.float32)
+    scratch = _aligned(7 * PIXELS)
     for p in range(PIXELS):
         scratch[_PX + p] = p % TILE
         scratch[_PY + p] = p // TILE
