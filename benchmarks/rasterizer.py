@@ -121,7 +121,7 @@ def _num_rows(mean, conic, reach, left, top) -> np.ndarray:
     """Pixel rows of a tile that the cutoff ellipse reaches within the tile's columns, by entry.
 
     On the column dx the ellipse spans dy = (-xy dx -+ sqrt(yy reach - det dx^2)) / yy; it is highest and lowest where
-    dx = -+ xy sqrt(reach / (yy det)), or at the nearest column of the tile.
+    dx = -+ xy sqrt(reach / (xx det)), or at the nearest column of the tile.
     """
     xx, xy, yy = conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1]
     det, x, y = xx * yy - xy**2, mean[:, 0] - left - 0.5, mean[:, 1] - top - 0.5

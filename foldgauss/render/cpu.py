@@ -187,7 +187,7 @@ def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff
 
 @_inline
 def _pixel_rows(x, y, p, q, r, level):
-    """Pixel rows of a tile that the ellipse (p dx + q dy)^2 + (r dy)^2 = level reaches within its columns: (first, end).
+    """Pixel rows (first, end) of a tile that the ellipse (p dx + q dy)^2 + (r dy)^2 = level reaches within its columns.
 
     The centre (x, y) is relative to the centre of the tile's first pixel. The ellipse is highest at dx = turn and
     lowest at -turn; within the columns, at the nearest one.
