@@ -85,7 +85,8 @@ def demo(
     out.print(f"[bold]Bunny[/], frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
     state, info = _fit_with_progress(clip.frames, DEMO_CONFIG)
     model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
-    scores, pictures = _evaluate_with_progress(model, clip.frames)
+    pictures: list[np.ndarray] = []
+    scores = _evaluate_with_progress(model, clip.frames, pictures.append)
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
     path = save_video_model(out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores))
     figures["file_bytes"] = path.stat().st_size
@@ -157,7 +158,7 @@ def fit(
         keep=lambda state: save_checkpoint(kept, state, config=config, source=source),
     )
     model = to_model(state, config, clip.size, clip.fps)
-    scores, _ = _evaluate_with_progress(model, clip.frames)
+    scores = _evaluate_with_progress(model, clip.frames)
     metadata = _provenance(clip, config, scores) | {"frames": _parse_frames(frames)}
     save_video_model(target, model, metadata=metadata)
     kept.unlink(missing_ok=True)
@@ -208,7 +209,7 @@ def evaluate_command(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
             "Name the frames it was fitted to."
         )
-    scores, _ = _evaluate_with_progress(model, clip.frames)
+    scores = _evaluate_with_progress(model, clip.frames)
     num_bytes = model_path.stat().st_size
     figures = _figures(model, scores) | {"file_bytes": num_bytes}
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
@@ -353,17 +354,17 @@ def _counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]
         advance()
 
 
-def _evaluate_with_progress(model: VideoModel, frames: np.ndarray) -> tuple[Evaluation, list[np.ndarray]]:
-    """Scores, and the pictures they were read off."""
-    pictures: list[np.ndarray] = []
-
+def _evaluate_with_progress(
+    model: VideoModel, frames: np.ndarray, keep: Callable[[np.ndarray], None] = lambda picture: None
+) -> Evaluation:
+    """Scores of every frame; `keep` is handed the pictures they were read off."""
     with _bar("Evaluating", model.num_frames) as advance:
 
         def on_frame(picture: np.ndarray) -> None:
-            pictures.append(picture)
+            keep(picture)
             advance()
 
-        return evaluate(model, frames, on_frame), pictures
+        return evaluate(model, frames, on_frame)
 
 
 # --------------------------------------------------------------------------------------------- results

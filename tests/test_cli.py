@@ -136,6 +136,7 @@ def broken_inputs(tmp_path, work):
         "frames reversed": (["fit", clip, "--out", out, "--frames", "4:2"], 2, "frames"),
         "frames misspelt": (["fit", clip, "--out", out, "--frames", "4"], 2, "A:B"),
         "size zero": (["fit", clip, "--out", out, "--size", "0x10"], 2, "HxW"),
+        "size beyond memory": (["fit", clip, "--out", out, "--size", "100000x100000"], 2, "GiB"),
         "size misspelt": (["fit", clip, "--out", out, "--size", "48"], 2, "HxW"),
         "no gaussians": (["fit", clip, "--out", out, "--gaussians", "0"], 2, "num_gaussians"),
         "steps and minutes": (
