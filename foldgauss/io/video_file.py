@@ -92,6 +92,13 @@ def read_video(
         _check_fps(fps)
     read = _read_folder if path.is_dir() else _read_file
     kept, num_declared, found_fps = read(path, start, stop, prepare)
+    if min(kept[0].shape[:2]) < MIN_SIZE:
+        raise _error(
+            "path",
+            expected=f"frames of at least {MIN_SIZE}x{MIN_SIZE}",
+            got=f"{_shape_text(kept[0].shape)} in {str(path)!r}",
+            cure="Enlarge it with --size, or size=(height, width).",
+        )
     if len(kept) < 2:
         raise _error(
             "path",
@@ -252,7 +259,7 @@ def _declared_frames(capture: cv2.VideoCapture) -> int:
     return round(count) if math.isfinite(count) and 0 < count < 2**31 else 0
 
 
-def _memory_limit() -> int:
+def memory_limit() -> int:
     """Bytes that a clip may take: a third of the machine's memory, since a fit holds it twice."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 3
@@ -262,7 +269,7 @@ def _memory_limit() -> int:
 
 def _fit_to(size: tuple[int, int] | None) -> Callable[[np.ndarray], np.ndarray]:
     """BGR of any size -> RGB of `size` = (height, width): centre crop to the aspect, then resize."""
-    limit, taken, num_frames = _memory_limit(), 0, 0
+    limit, taken, num_frames = memory_limit(), 0, 0
 
     def prepare(image: np.ndarray) -> np.ndarray:
         nonlocal taken, num_frames
