@@ -45,6 +45,8 @@ class LearningRates:
                 raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
 
 
+#: Their state alone takes 20 GB at degree 3, two hundred times what the paper's largest fit needs.
+MAX_GAUSSIANS = 100_000_000
 #: Beyond, powers of u and their gradients no longer tell the coefficients apart in float32.
 MAX_DEGREE = 16
 #: 0.1 px^2 of low pass fits finer detail than the usual 0.3.
@@ -81,8 +83,9 @@ class FitConfig:
             if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
                 raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
             object.__setattr__(self, name, int(value))  # NumPy's integers have no place in a checkpoint
-        if self.degree > MAX_DEGREE:
-            raise invalid("degree", expected=f"at most {MAX_DEGREE}", got=self.degree)
+        for name, most in {"degree": MAX_DEGREE, "num_gaussians": MAX_GAUSSIANS}.items():
+            if (getattr(self, name) or 0) > most:
+                raise invalid(name, expected=f"at most {most:,}", got=f"{getattr(self, name):,}")
         if self.steps is not None and self.minutes is not None:
             raise invalid("steps, minutes", expected="at most one of them", got="both")
         # "[" includes the bound, "(" does not.

@@ -180,6 +180,7 @@ def test_planned_steps():
         ({"final_rate": float("inf")}, "final_rate"),
         ({"seed": -1}, "seed"),
         ({"degree": 99}, "degree"),
+        ({"num_gaussians": 10**12}, "num_gaussians"),
         ({"power": "2"}, "power"),
         ({"minutes": "1"}, "minutes"),
         ({"floor": 1.0}, "floor"),
