@@ -23,6 +23,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from foldgauss import __version__
 from foldgauss._checks import invalid
 from foldgauss._threads import num_threads
 from foldgauss.datasets import sample_clip
@@ -45,12 +46,13 @@ from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 
 WRONG_USE, FAILURE = 2, 1
+MAX_UPSAMPLE = 100_000  # above, a clip of seconds plays for days
 #: A running fit is kept on disk this often, in seconds.
 CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 # No markup: names of files may hold brackets.
 out = Console(markup=False, highlight=False)
 err = Console(stderr=True, markup=False, highlight=False)
@@ -68,12 +70,21 @@ class Stopped(Exception):
     """The user asked a fit to stop; the message says how to go on."""
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"foldgauss {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def root(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+    ] = False,
 ) -> None:
     """Videos as mixtures of folded Gaussians: fit, render, evaluate."""
-    del debug  # read by `main`, before typer runs
+    del debug, version  # read by `main`, before typer runs, and by the callback
 
 
 @app.command()
@@ -144,6 +155,8 @@ def fit(
         raise WrongUse(str(error)) from error
     target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
     kept = target.with_name(f"{target.name}.checkpoint")
+    if target.exists() and video.exists() and target.samefile(video):
+        raise WrongUse(f"--out: expected another file than the clip, got {target}.")
     _refuse_existing(target, overwrite)
     if kept.exists() and not (resume or overwrite):
         raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
@@ -180,6 +193,8 @@ def render(
     """Draw a model as a video, in between its frames too."""
     if upsample < 1:
         raise WrongUse(str(invalid("--upsample", expected="a whole number >= 1", got=upsample)))
+    if upsample > MAX_UPSAMPLE:
+        raise WrongUse(str(invalid("--upsample", expected=f"at most {MAX_UPSAMPLE:,}", got=upsample)))
     picture_size = _parse_size(size)
     if out_path.suffix and not out_path.is_dir():
         if out_path.suffix.lower() not in VIDEO_SUFFIXES:
@@ -210,6 +225,8 @@ def evaluate_command(
     frames: Frames = None,
 ) -> None:
     """Compare a model with its clip: PSNR and SSIM per frame, size of the file, bits per pixel."""
+    if json_path is not None:
+        check_writable(json_path)
     model = load_video_model(model_path)
     kept = read_header(model_path)["metadata"].get("frames")
     wanted = _parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)

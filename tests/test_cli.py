@@ -136,6 +136,9 @@ def broken_inputs(tmp_path, work):
         "tiny images": (["fit", tiny, "--out", out], 1, "16x16"),
         "degree beyond": (["fit", clip, "--out", out, "--degree", "99"], 2, "degree"),
         "picture beyond memory": (["render", model, "--out", tmp_path / "v.mp4", "--size", "90000x90000"], 2, "memory"),
+        "out is the clip": (["fit", clip, "--out", clip, "--overwrite"], 2, "another file"),
+        "upsample beyond": (["render", model, "--out", tmp_path / "f", "--upsample", "1000000000"], 2, "at most"),
+        "no such folder for json": (["evaluate", model, clip, "--json", tmp_path / "no" / "f.json"], 1, "folder"),
         "mixed sizes": (["fit", mixed, "--out", out], 1, "40x50|50x40"),
         "frames beyond": (["fit", clip, "--out", out, "--frames", "0:99"], 2, "frames"),
         "frames reversed": (["fit", clip, "--out", out, "--frames", "4:2"], 2, "frames"),
@@ -196,6 +199,13 @@ def test_damaged_video_uses_the_frames_that_decode(tmp_path, capsys):
     assert run("fit", tmp_path / "cut.webm", "--out", tmp_path / "m.safetensors", *QUICK) == 0
     assert re.search(r"only \d+ of 12 frames", capsys.readouterr().err)
     assert 2 <= load_video_model(tmp_path / "m.safetensors").num_frames < 12
+
+
+def test_help_and_version(capsys):
+    assert run("fit", "--help") == 0
+    assert "[default:" in capsys.readouterr().out  # brackets are not eaten as markup
+    assert run("--version") == 0
+    assert "foldgauss 0.1" in capsys.readouterr().out
 
 
 def test_debug_shows_the_traceback(tmp_path):
