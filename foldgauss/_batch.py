@@ -103,3 +103,28 @@ def check_positive(name: str, scale: Array) -> None:
     if scale is not None and (scale <= 0).any():  # a NaN passes, and propagates
         got, cure = f"a least of {np.nanmin(scale)}", "It is a standard deviation."
         raise invalid(name, expected="positive numbers", got=got, cure=cure)
+
+
+# --- one at a time --------------------------------------------------------------------------------------------
+
+# So many integrals are held in memory at once.
+_CHUNK = 64
+
+
+@eqx.filter_jit
+def over_batch(function: Callable, *items):
+    """`function` of unbatched things, over all their batch dimensions together; compiled.
+
+    `function` is one of a module's own: a new closure each time would be compiled each time. Each item is a module
+    with `leaf_ranks`, or a pair (array, event rank).
+    """
+    arrays = [parts_of(x) if isinstance(x, eqx.Module) else [x] for x in items]
+    batch = checked_batch([part for parts in arrays for part in parts])
+    size = int(np.prod(batch))
+    flat = [fill(x, batch) if isinstance(x, eqx.Module) else broadcast([x], batch)[0] for x in items]
+    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[len(batch) :]), flat)
+    if size <= _CHUNK:
+        result = jax.vmap(function)(*flat)
+    else:
+        result = lax.map(lambda x: function(*x), flat, batch_size=_CHUNK)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), result)

@@ -6,8 +6,10 @@ Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *centre* is 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from foldgauss import moments
 from foldgauss._batch import (
     align,
     as_value,
@@ -23,7 +25,10 @@ from foldgauss._batch import (
     parts_of,
 )
 from foldgauss._checks import invalid
-from foldgauss._factor import check_space, check_tril, checked_cholesky, the_one_given
+from foldgauss._factor import check_loc, given_factor
+from foldgauss._restrict import checked_indices, restricted_fold, restricted_tril
+from foldgauss._triangular import columns_of, lower_times, solve_lower, stacked
+from foldgauss.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold
 from foldgauss.gaussian import Gaussian, Normal
@@ -41,9 +46,10 @@ class FoldedGaussian(eqx.Module):
     Mind the sign of the fold's argument. The default envelope is the paper's text, `TimeLikelihood(power=1)`;
     the paper's published code is `TimeLikelihood(power=2)`.
 
-    **Shapes:** `loc` (*batch, d-1); `scale_tril` or `covariance_matrix` (*batch, d-1, d-1), exactly one of
-    them; `time_loc`, `time_scale` (*batch,); leading dimensions broadcast. `event_shape == (d,)`. `fold` is a
-    fold (None is `ZeroFold`) or any callable from one scalar u to (d-1,).
+    **Shapes:** `loc` (*batch, d-1); exactly one of `scale_tril`, `covariance_matrix`, `precision_matrix`
+    (*batch, d-1, d-1) and `scale` (*batch, d-1), the paper's standard deviations per coordinate; `time_loc`,
+    `time_scale` (*batch,); leading dimensions broadcast. `event_shape == (d,)`. `fold` is a fold (None is
+    `ZeroFold`) or any callable from one scalar u to (d-1,).
 
     **Units:** space for `loc` and `scale_tril`, time for `time_loc` and `time_scale`.
 
@@ -74,21 +80,26 @@ class FoldedGaussian(eqx.Module):
         scale_tril: ArrayLike | None = None,
         *,
         covariance_matrix: ArrayLike | None = None,
+        precision_matrix: ArrayLike | None = None,
+        scale: ArrayLike | None = None,
         time_loc: ArrayLike,
         time_scale: ArrayLike,
         fold=None,
         envelope: AbstractEnvelope | None = None,
         validate_args: bool = True,
     ):
-        name, matrix = the_one_given(scale_tril=scale_tril, covariance_matrix=covariance_matrix)
-        dtype = common_dtype(loc, matrix, time_loc, time_scale)
-        loc, matrix, time_loc, time_scale = (jnp.asarray(x, dtype) for x in (loc, matrix, time_loc, time_scale))
-        check_space(loc, name, matrix)
+        given = {
+            "scale_tril": scale_tril,
+            "covariance_matrix": covariance_matrix,
+            "precision_matrix": precision_matrix,
+            "scale": scale,
+        }
+        dtype = common_dtype(loc, *(x for x in given.values() if x is not None), time_loc, time_scale)
+        loc, time_loc, time_scale = (jnp.asarray(x, dtype) for x in (loc, time_loc, time_scale))
+        check_loc(loc)
+        tril = given_factor(given, dim=loc.shape[-1], dtype=dtype, validate=validate_args)
         if validate_args:
             check_positive("time_scale", time_scale)
-        if validate_args and name == "scale_tril":
-            check_tril(matrix)
-        tril = matrix if name == "scale_tril" else checked_cholesky(matrix, validate_args)
         fold = ZeroFold(loc.shape[-1]) if fold is None else as_fold(fold)
         fold = _checked_fold(cast(fold, dtype), loc)
         envelope = TimeLikelihood(power=1.0) if envelope is None else envelope
@@ -165,6 +176,10 @@ class FoldedGaussian(eqx.Module):
         unreachable = overflown | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
 
+    def logpdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
+        """`log_prob` under scipy's name."""
+        return self.log_prob(x)
+
     def pdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """FN(x), shapes as in `log_prob`. **Source:** eq:foldgauss."""
         return jnp.exp(self.log_prob(x))
@@ -186,6 +201,246 @@ class FoldedGaussian(eqx.Module):
         t = time_loc + time_scale * noise
         s = self.condition_time(t).sample(space_key)
         return jnp.concatenate([s, t[..., None]], axis=-1)
+
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+        """The draws of `sample`, with their `log_prob`. **Shapes:** -> (*sample_shape, *batch, d) and without d."""
+        x = self.sample(key, sample_shape)
+        return x, self.log_prob(x)
+
+    # --- derivatives and whitening ----------------------------------------------------------------------------
+
+    def grad_log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d"]:
+        """The score in x, d log FN(x) / dx.
+
+        **Shapes:** x (*sample, *batch, d) -> the same. **Example:** `dist.grad_log_prob(dist.mode)  # 0`
+
+        **Source:** eq:foldgauss, differentiated. **Raises:** as `log_prob`.
+        """
+        return jax.grad(lambda x: self.log_prob(x).sum())(self._whole(x))
+
+    def observed_information(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d d"]:
+        """The negative Hessian of `log_prob` in x: a precision matrix where the density is locally Gaussian.
+
+        **Shapes:** x (*sample, *batch, d) -> (*sample, *batch, d, d). **Units:** 1 / (unit of x_i x_j).
+
+        **Example:** `dist.observed_information(dist.mode)`
+
+        **Source:** eq:foldgauss, differentiated twice. **Raises:** as `log_prob`.
+        """
+        x = self._whole(x)
+        directions = jnp.eye(x.shape[-1], dtype=x.dtype)
+        column = lambda e: jax.jvp(self.grad_log_prob, (x,), (jnp.broadcast_to(e, x.shape),))[1]  # noqa: E731
+        return -jax.vmap(column, out_axes=-1)(directions)
+
+    def fold_to_normal(self, x: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
+        """Whitened x, standard normal if x is a draw, and the log-determinant: unfold, then scale.
+
+            z = (L^-1 (s - loc - f(time_loc - t)) / sqrt(a(t)), (t - time_loc) / time_scale),   log |dz/dx|
+
+        **Shapes:** x (*sample, *batch, d) -> the same and (*sample, *batch). **Units:** none.
+
+        **Example:** `z, log_det = dist.fold_to_normal(x)  # log_prob(x) = sum log N(z) + log_det`
+
+        **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of x is not d.
+        """
+        x = self._whole(x)
+        at = self.condition_time(x[..., -1])
+        z, log_det = _whitened(at, x[..., :-1])
+        loc, scale = (jnp.broadcast_to(y, log_det.shape) for y in (self.time_loc, self.time_scale))
+        z = jnp.concatenate([z, ((x[..., -1] - loc) / scale)[..., None]], axis=-1)
+        return z, log_det - jnp.log(scale)
+
+    def normal_to_fold(self, z: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
+        """The inverse of `fold_to_normal`: x, and log |dx/dz|.
+
+        **Shapes:** z (*sample, *batch, d) -> the same and (*sample, *batch).
+
+        **Example:** `dist.normal_to_fold(jax.random.normal(key, (1000, 3)))[0]  # draws`
+
+        **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of z is not d.
+        """
+        z = self._whole(z)
+        loc, scale = (jnp.broadcast_to(y, z.shape[:-1]) for y in (self.time_loc, self.time_scale))
+        t = loc + scale * z[..., -1]
+        s, log_det = _coloured(self.condition_time(t), z[..., :-1])
+        return jnp.concatenate([s, t[..., None]], axis=-1), log_det + jnp.log(scale)
+
+    def _whole(self, x) -> Array:
+        """A checked value, with all batch dimensions."""
+        x = as_value(x, self.loc.dtype)
+        check_event("x", x, self.event_shape)
+        return jnp.broadcast_to(x, (*jnp.broadcast_shapes(x.shape[:-1], self.batch_shape), *self.event_shape))
+
+    # --- moments --------------------------------------------------------------------------------------------
+
+    def moments(self, order: int = 64) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
+        """Mean and covariance of x = (s, t).
+
+            E s = loc + E f(u),  Cov s = E[a] Sigma + Cov f(u),  Cov(s, t) = -E[f(u) u],  u ~ N(0, time_scale^2)
+
+        Exact for zero and polynomial folds; `order` is that of the Gauss-Hermite rule for others. E[a] is exact for
+        the built-in envelopes, a fixed quadrature for others.
+
+        **Shapes:** (*batch, d) and (*batch, d, d). **Example:** `mean, covariance = dist.moments()`
+
+        **Source:** eq:cond_dens, by total mean and covariance. **Raises:** nothing.
+        """
+        return moments.moments(self, order)
+
+    @property
+    def mean(self) -> Float[Array, "*batch d"]:
+        """E x, as `moments`."""
+        return self.moments()[0]
+
+    @property
+    def variance(self) -> Float[Array, "*batch d"]:
+        """Var x per coordinate, as `moments`."""
+        return jnp.diagonal(self.moments()[1], axis1=-2, axis2=-1)
+
+    @property
+    def covariance_matrix(self) -> Float[Array, "*batch d d"]:
+        """Cov x of space and time together, as `moments`; that of space at one time is `condition_time(t)`'s."""
+        return self.moments()[1]
+
+    @property
+    def mode(self) -> Float[Array, "*batch d"]:
+        """The highest point of the density, (loc, time_loc), where it is the only one: `power (d-1) < 2`.
+
+        On the ridge s = loc + f(u) the density goes as exp(tau^2 (power (d-1) - 2) / 4).
+
+        **Source:** eq:foldgauss at s = loc + f(u). **Raises:** ValueError that says whether there is a ridge of
+        modes, two of them (a floor), or none (unbounded); NaN under tracing.
+        """
+        return moments.mode(self)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        """Differential entropy; it does not depend on the fold.
+
+            H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2
+
+        Exact without a floor, where E[log a] = -power / 2; else that is a fixed quadrature. **Units:** nats.
+
+        **Source:** the chain rule of eq:foldgauss. **Example:** `dist.entropy()`. **Raises:** nothing.
+        """
+        return moments.entropy(self)
+
+    # --- parts ----------------------------------------------------------------------------------------------
+
+    def marginal(self, indices) -> "FoldedGaussian | Gaussian | TimeMixture":
+        """The distribution of some coordinates; the indices are kept.
+
+        With time among them it is exact, a FoldedGaussian (time alone: a Gaussian); without time it is outside the
+        family, a `TimeMixture`, integrated numerically.
+
+        **Shapes:** `indices`: whole numbers, in the order wanted, time last; -1 is time.
+
+        **Example:** `dist.marginal([0, -1])  # first space coordinate, and time`
+
+        **Source:** eq:integral_proof. **Raises:** ValueError on indices that are none.
+        """
+        indices = checked_indices(indices, self.event_shape[0])
+        space = tuple(i for i in indices if i != self._time_index)
+        if len(space) == len(indices):
+            return time_mixture(self, space, (), jnp.zeros((0,), self.loc.dtype), keeps_time=False)
+        if indices[-1] != self._time_index:
+            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        if not space:
+            return Gaussian(self.time_loc[..., None], self.time_scale[..., None, None], validate_args=False)
+        return FoldedGaussian(
+            self.loc[..., np.array(space)],
+            restricted_tril(self.scale_tril, space),
+            time_loc=self.time_loc,
+            time_scale=self.time_scale,
+            fold=restricted_fold(self.fold, space),
+            envelope=self.envelope,
+            validate_args=False,
+        )
+
+    def condition(self, indices, values: ArrayLike) -> "Gaussian | TimeMixture":
+        """The other coordinates, given these.
+
+        With time among the given it is exact, a Gaussian; without, it is outside the family: a `TimeMixture` of the
+        other coordinates and time (last), integrated numerically.
+
+        **Shapes:** `indices`: n whole numbers, -1 is time; `values` (*batch, n) in their order; the result has the
+        other coordinates, in ascending order.
+
+        **Example:** `dist.condition([0], [0.3]).sample(key)  # the other space coordinates, and time`
+
+        **Source:** eq:cond_dens. **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
+        """
+        indices = checked_indices(indices, self.event_shape[0])
+        values = as_value(values, self.loc.dtype)
+        check_event("values", values, (len(indices),))
+        rest = tuple(i for i in range(self._time_index) if i not in indices)
+        if self._time_index not in indices:
+            return time_mixture(self, rest, indices, values, keeps_time=True)
+        if not rest:
+            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+        where = indices.index(self._time_index)
+        given = tuple(i for i in indices if i != self._time_index)
+        ordered = self.marginal((*given, *rest, self._time_index))
+        others = values[..., np.array([k for k in range(len(indices)) if k != where], int)]
+        return conditional_gaussian(ordered, others, values[..., where])
+
+    def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> TimeDensity:
+        """The density of time where space is known, by quadrature: its modes, samples, quantiles, moments.
+
+        **Shapes:** s (*batch, d-1); the result has `event_shape == ()`.
+
+        **Example:** `dist.time_given_space([0.1, -0.4]).modes()`
+
+        **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
+        """
+        s = as_value(s, self.loc.dtype)
+        check_event("s", s, self.loc.shape[-1:])
+        return time_density(self, s)
+
+    @property
+    def _time_index(self) -> int:
+        return self.event_shape[0] - 1
+
+    # --- fits and bridges: imported when asked for -----------------------------------------------------------
+
+    @staticmethod
+    def fit(x: Float[Array, "n d"], **options):
+        """Maximum likelihood from points x = (s, t): see `foldgauss.likelihood.fit` for options and result.
+
+        **Example:** `FoldedGaussian.fit(x, degree=2).distribution`
+        """
+        from foldgauss import likelihood
+
+        return likelihood.fit(x, **options)
+
+    def to_numpyro(self):
+        """This distribution for numpyro models: see `foldgauss.bridges.to_numpyro`."""
+        from foldgauss import bridges
+
+        return bridges.to_numpyro(self)
+
+    def to_scipy(self):
+        """This distribution, frozen, with scipy's methods: see `foldgauss.bridges.to_scipy`."""
+        from foldgauss import bridges
+
+        return bridges.to_scipy(self)
+
+
+def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:
+    """Standard normal coordinates of s, and log |dz/ds|."""
+    y = stacked(solve_lower(at.base_tril, columns_of(s - at.loc)))
+    half = jnp.exp(-0.5 * at.log_scale)[..., None]  # twice: the product may fit where exp(-log_scale) does not
+    return y * half * half, -_log_det(at)
+
+
+def _coloured(at: Gaussian, z: Array) -> tuple[Array, Array]:
+    """The inverse: s, and log |ds/dz|."""
+    half = jnp.exp(0.5 * at.log_scale)[..., None]
+    return at.loc + stacked(lower_times(at.base_tril, columns_of(z))) * half * half, _log_det(at)
+
+
+def _log_det(at: Gaussian) -> Array:
+    log_diagonal = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1)
+    return jnp.broadcast_to(log_diagonal + at.loc.shape[-1] * at.log_scale, at.batch_shape)
 
 
 def _checked_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
