@@ -5,12 +5,14 @@ gradient is 0 where it is -inf, and never NaN; the gradient with respect to the 
 finite number.
 """
 
+import functools
+import operator
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from foldgauss._batch import (
     align,
@@ -23,16 +25,11 @@ from foldgauss._batch import (
     parts_of,
 )
 from foldgauss._factor import check_space, check_tril
+from foldgauss._triangular import UNROLLED_SIZE, Columns, columns_of, lower_times, solve_lower, solve_upper, stacked
 
 __all__ = ["Gaussian", "Normal"]
 
-_Vector = Float[Array, "*#batch dim"]
-_Matrix = Float[Array, "*#batch dim dim"]
-
 _LOG_2PI = float(np.log(2 * np.pi))
-# Up to this size triangular systems are written out: XLA's CPU solver is called once per matrix and is 10x
-# slower.
-_UNROLLED_SIZE = 8
 # Saturated gradients with respect to *parameters* stop this far below the largest finite number: chain rule
 # factors (powers of u, 1/scale) and sums over a batch then still have room, where inf - inf would be NaN.
 _CHAIN_HEADROOM = 2.0**-24
@@ -144,7 +141,7 @@ class Gaussian(eqx.Module):
     def covariance_matrix(self) -> Float[Array, "*#batch dim dim"]:
         """exp(2 log_scale) L L^T: it may underflow to 0."""
         factor = self.scale_tril
-        if factor.shape[-1] > _UNROLLED_SIZE:
+        if factor.shape[-1] > UNROLLED_SIZE:
             return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
         return (factor[..., :, None, :] * factor[..., None, :, :]).sum(-1)
 
@@ -170,7 +167,8 @@ class Gaussian(eqx.Module):
         shape = (*sample_shape, *self.batch_shape, *self.event_shape)
         noise = jax.random.normal(key, shape, self.loc.dtype)
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
-        return loc + jnp.exp(log_scale)[..., None] * _lower_times(tril, noise)
+        scale = jnp.exp(log_scale)[..., None]
+        return loc + stacked([scale * y for y in lower_times(tril, columns_of(noise))])
 
 
 # --- densities ----------------------------------------------------------------------------------------------
@@ -183,35 +181,48 @@ def _as_gaussian(normal: Normal) -> Gaussian:
 @jax.custom_jvp
 def _half_mahalanobis(value, loc, tril, log_scale):
     """|L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; all arguments of one batch rank."""
-    z = _times_exp(_solve_lower(tril, value - loc), -log_scale)
-    half = (0.5 * z * z).sum(-1)
+    residual = columns_of(value - loc)
+    z = [_times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
     # A residual that is infinite in one coordinate meets zeros of L as 0 * inf; it is simply far away.
-    return jnp.where(jnp.isinf(value - loc).any(-1), jnp.inf, half)
+    beyond = _any([jnp.isinf(r) for r in residual])
+    return jnp.where(beyond, jnp.inf, _sum([0.5 * y * y for y in z]))
 
 
 @_half_mahalanobis.defjvp
 def _half_mahalanobis_jvp(primals, tangents):
     # d(|y|^2/2 e^2c) = g.(dr - dL y) + |y|^2 e^2c dc with y = L^-1 r, c = -log_scale, g = L^-T y e^2c. By
     # hand, since e^2c alone overflows long before g does, and because g must be 0, not inf * 0, where the
-    # result is inf.
+    # result is inf. Where g overflows, g dL y need not: it is taken as (L^-T z) dL z with z = y e^c.
     value, loc, tril, log_scale = primals
     value_dot, loc_dot, tril_dot, log_scale_dot = tangents
     half = _half_mahalanobis(value, loc, tril, log_scale)
-    unreachable = jnp.isposinf(half)[..., None]
-    y = jnp.where(unreachable, 0, _solve_lower(tril, jnp.where(unreachable, 0, value - loc)))
-    z = _times_exp(y, -log_scale)
-    by_value = _times_exp(_saturated(_solve_upper(tril, z)), -log_scale)
-    by_parameter = _saturated(by_value, _CHAIN_HEADROOM)
-    by_log_scale = -_saturated((z * z).sum(-1), _CHAIN_HEADROOM)
-    half_dot = (by_value * value_dot).sum(-1) - (by_parameter * (loc_dot + _lower_times(tril_dot, y))).sum(-1)
-    return half, half_dot + by_log_scale * log_scale_dot
+    unreachable, c = jnp.isposinf(half)[..., None], -log_scale[..., None]
+    residual = [jnp.where(unreachable, 0, r) for r in columns_of(value - loc)]
+    z = [_times_exp(jnp.where(unreachable, 0, y), c) for y in solve_lower(tril, residual)]
+    w = [_saturated(y) for y in solve_upper(tril, z)]
+    by_value = [_times_exp(y, c) for y in w]
+    by_log_scale = -_saturated(_sum([y * y for y in z]), _CHAIN_HEADROOM)
+    return half, (
+        _sum([g * dx for g, dx in zip(by_value, columns_of(value_dot), strict=True)])
+        - _sum([_saturated(g, _CHAIN_HEADROOM) * dx for g, dx in zip(by_value, columns_of(loc_dot), strict=True)])
+        - _sum([g * dx for g, dx in zip(w, lower_times(tril_dot, z), strict=True)])
+        + by_log_scale * log_scale_dot
+    )
+
+
+def _sum(terms: Columns) -> Float[Array, "*#batch"]:
+    return functools.reduce(operator.add, terms).sum(-1)
+
+
+def _any(flags: Columns) -> Bool[Array, "*#batch"]:
+    return functools.reduce(operator.or_, flags).any(-1)
 
 
 @jax.custom_jvp
-def _times_exp(y: _Vector, c: Float[Array, "*#batch"]) -> _Vector:
+def _times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
     """y exp(c) where the product fits but exp(c) need not; saturates where the product does not fit."""
     largest = _log_largest(y.dtype)
-    half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))[..., None]
+    half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))
     return _saturated(y * half * half)
 
 
@@ -219,8 +230,8 @@ def _times_exp(y: _Vector, c: Float[Array, "*#batch"]) -> _Vector:
 def _times_exp_jvp(primals, tangents):
     (y, c), (y_dot, c_dot) = primals, tangents
     product = _times_exp(y, c)
-    slope = jnp.exp(jnp.minimum(c, _log_largest(y.dtype)))[..., None]
-    return product, slope * y_dot + _saturated(product, _CHAIN_HEADROOM) * c_dot[..., None]
+    slope = jnp.exp(jnp.minimum(c, _log_largest(y.dtype)))
+    return product, slope * y_dot + _saturated(product, _CHAIN_HEADROOM) * c_dot
 
 
 def _log_largest(dtype) -> float:
@@ -230,54 +241,3 @@ def _log_largest(dtype) -> float:
 def _saturated(x: Array, fraction: float = 1.0) -> Array:
     largest = float(jnp.finfo(x.dtype).max) * fraction
     return jnp.clip(x, -largest, largest)
-
-
-# --- small triangular algebra -------------------------------------------------------------------------------
-
-
-def _solve_lower(tril: _Matrix, b: _Vector) -> _Vector:
-    """L^-1 b by forward substitution."""
-    dim = b.shape[-1]
-    if dim > _UNROLLED_SIZE:
-        return _solve_large(tril, b, transpose=False)
-    x: list[Array] = []
-    for i in range(dim):
-        rest = b[..., i]
-        for j in range(i):
-            rest = rest - tril[..., i, j] * x[j]
-        x.append(rest / tril[..., i, i])
-    return jnp.stack(x, axis=-1)
-
-
-def _solve_upper(tril: _Matrix, b: _Vector) -> _Vector:
-    """L^-T b by back substitution."""
-    dim = b.shape[-1]
-    if dim > _UNROLLED_SIZE:
-        return _solve_large(tril, b, transpose=True)
-    x: list[Array] = []
-    for i in reversed(range(dim)):
-        rest = b[..., i]
-        for j, known in zip(reversed(range(i + 1, dim)), x, strict=True):
-            rest = rest - tril[..., j, i] * known
-        x.append(rest / tril[..., i, i])
-    return jnp.stack(x[::-1], axis=-1)
-
-
-def _solve_large(tril, b, *, transpose: bool):
-    """One solve with all of b as right-hand sides if there is one matrix, else a solve per matrix."""
-    dim = b.shape[-1]
-    solve = lambda a, b: lax.linalg.triangular_solve(a, b, left_side=True, lower=True, transpose_a=transpose)  # noqa: E731
-    if all(size == 1 for size in tril.shape[:-2]):
-        return solve(tril.reshape(dim, dim), b.reshape(-1, dim).T).T.reshape(b.shape)
-    batch = jnp.broadcast_shapes(tril.shape[:-2], b.shape[:-1])
-    tril, b = jnp.broadcast_to(tril, (*batch, dim, dim)), jnp.broadcast_to(b, (*batch, dim))
-    return solve(tril, b[..., None])[..., 0]
-
-
-def _lower_times(tril: _Matrix, x: _Vector) -> _Vector:
-    """L x, reading the lower triangle only."""
-    dim = x.shape[-1]
-    if dim > _UNROLLED_SIZE:
-        return jnp.matmul(jnp.tril(tril), x[..., None])[..., 0]
-    rows = [sum(tril[..., i, j] * x[..., j] for j in range(i + 1)) for i in range(dim)]
-    return jnp.stack(jnp.broadcast_arrays(*rows), axis=-1)
