@@ -81,7 +81,7 @@ def test_scipy_draws_follow_scipys_conventions():
 
 
 def test_scipy_samples_belong_to_the_density():
-    frozen = to_scipy(_dist())
+    frozen = _dist().to_scipy()
     x = frozen.rvs(20_000, random_state=0)
     score = -frozen.logpdf(x)
     # The mean of -log p is the entropy; 5 standard errors, false alarm 6e-7.
@@ -130,11 +130,11 @@ def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
 
     def model(x):
         bend = numpyro.sample("bend", distributions.Normal(0, 1).expand([2, 2]).to_event(2))
-        numpyro.sample("x", to_numpyro(_dist(fold=PolynomialFold(bend))), obs=x)
+        numpyro.sample("x", _dist(fold=PolynomialFold(bend)).to_numpyro(), obs=x)
         # The same family as a latent variable, not only as a likelihood (a = 1: else it is a funnel).
         numpyro.sample("latent", to_numpyro(_dist(envelope=Constant())))
 
-    mcmc = MCMC(NUTS(model), num_warmup=200, num_samples=300, progress_bar=False)
+    mcmc = MCMC(NUTS(model), num_warmup=150, num_samples=200, progress_bar=False)
     mcmc.run(jax.random.key(1), x)
     draws = mcmc.get_samples()
     mean, error = draws["bend"].mean(0), draws["bend"].std(0)
@@ -143,8 +143,8 @@ def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
     assert (error < 0.1).all()
     # Power: a fold of the wrong sign lies far outside the posterior.
     assert (np.abs(mean + truth) > 5 * error).all()
-    assert draws["latent"].shape == (300, 3)
-    np.testing.assert_allclose(draws["latent"][:, 2].mean(), 0.4, atol=0.15)
+    assert draws["latent"].shape == (200, 3)
+    np.testing.assert_allclose(draws["latent"][:, 2].mean(), 0.4, atol=0.15)  # sd 0.02 to 0.03
 
 
 def test_missing_numpyro_names_the_extra(monkeypatch):

@@ -79,6 +79,13 @@ def test_closed_form_is_generalised_least_squares(x64, covariance):
     assert (dist.time_loc, dist.time_scale) == (0.35, 0.28)
 
 
+def test_the_class_knows_how_to_fit(x64):
+    x = _points()
+    here, there = FoldedGaussian.fit(x, degree=2), fit(x, degree=2)
+    assert here.log_likelihood == there.log_likelihood
+    assert here.distribution.event_shape == (3,)
+
+
 def test_own_estimates_of_time_are_mean_and_standard_deviation(x64):
     x, weights = _points(), jnp.linspace(0.5, 2.0, 60)
     dist = fit(x, degree=2, weights=weights).checked().distribution
@@ -105,7 +112,7 @@ def test_weights_are_repetitions_and_absent_rows_may_be_nan(x64):
 
 
 def test_fit_moves_with_the_units_of_space_and_time():
-    x = _points(60)
+    x = _points(20_000)
     dist = fit(x, degree=2).distribution
     stretch, shift = jnp.array([1e18, 1e-12, 1e4]), jnp.array([1e18, 1e-12, 1e7])
     moved = fit(x * stretch[None] + shift[None], degree=2).checked()
