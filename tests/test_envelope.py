@@ -152,7 +152,7 @@ class _Slope(eqx.Module):
 def test_callable_envelope_is_its_function_and_batches_and_trains():
     t, scale = jnp.linspace(-2.0, 2.0, 6).reshape(3, 2), jnp.array([[0.5], [1.0], [2.0]])
     got = CallableEnvelope(_laplace).log_a(t, time_loc=jnp.array([0.1, 0.2]), time_scale=scale)
-    np.testing.assert_allclose(got, -np.abs(t - np.array([0.1, 0.2])) / scale, rtol=1e-6)
+    np.testing.assert_allclose(got, -np.abs(np.asarray(t) - np.array([0.1, 0.2])) / np.asarray(scale), rtol=1e-6)
     mapped = jax.vmap(lambda rate: CallableEnvelope(_Slope(rate)))(jnp.arange(3.0))
     np.testing.assert_allclose(_at(mapped, jnp.full(3, 2.0)), [0, -2, -4])
     slope = jax.grad(lambda e: _at(e, 2.0))(CallableEnvelope(_Slope(jnp.array(1.5))))
