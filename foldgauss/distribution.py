@@ -29,7 +29,7 @@ from foldgauss._factor import check_loc, given_factor
 from foldgauss._restrict import checked_indices, restricted_fold, restricted_tril
 from foldgauss._triangular import columns_of, lower_times, solve_lower, stacked
 from foldgauss.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
-from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
+from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
 from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold
 from foldgauss.gaussian import Gaussian, Normal
 
@@ -49,7 +49,8 @@ class FoldedGaussian(eqx.Module):
     **Shapes:** `loc` (*batch, d-1); exactly one of `scale_tril`, `covariance_matrix`, `precision_matrix`
     (*batch, d-1, d-1) and `scale` (*batch, d-1), the paper's standard deviations per coordinate; `time_loc`,
     `time_scale` (*batch,); leading dimensions broadcast. `event_shape == (d,)`. `fold` is a fold (None is
-    `ZeroFold`) or any callable from one scalar u to (d-1,).
+    `ZeroFold`) or any callable from one scalar u to (d-1,). `envelope` is an envelope or any callable from scalars
+    (t, time_loc, time_scale) to log a; for one that gives a itself there is `envelope.plain_envelope`.
 
     **Units:** space for `loc` and `scale_tril`, time for `time_loc` and `time_scale`.
 
@@ -85,7 +86,7 @@ class FoldedGaussian(eqx.Module):
         time_loc: ArrayLike,
         time_scale: ArrayLike,
         fold=None,
-        envelope: AbstractEnvelope | None = None,
+        envelope=None,
         validate_args: bool = True,
     ):
         given = {
@@ -451,8 +452,8 @@ def _checked_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
     return fold
 
 
-def _checked_envelope(envelope: AbstractEnvelope) -> AbstractEnvelope:
-    if not isinstance(envelope, AbstractEnvelope):
-        cure = "Constant(), TimeLikelihood(power=...), or a subclass."
-        raise invalid("envelope", expected="an AbstractEnvelope", got=repr(envelope), cure=cure)
-    return envelope
+def _checked_envelope(envelope) -> AbstractEnvelope:
+    if not (isinstance(envelope, AbstractEnvelope) or callable(envelope)):
+        cure = "Constant(), TimeLikelihood(power=...), a callable that gives log a, or plain_envelope(a)."
+        raise invalid("envelope", expected="an envelope or a callable", got=repr(envelope), cure=cure)
+    return as_envelope(envelope)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
-from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, plain_envelope
 from foldgauss.fold import CallableFold, PolynomialFold, ZeroFold
 
 TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
@@ -458,6 +458,14 @@ def test_callables_are_folds():
     stack = jax.jit(jax.vmap(lambda loc: _dist(fold=network, loc=loc)))(jnp.zeros((3, 2)))
     alone = LOG_PROB(_dist(fold=network, loc=jnp.zeros(2)), jnp.zeros(3))
     _close(LOG_PROB(stack, jnp.zeros(3)), jnp.full(3, alone), 1e-5)
+
+
+def test_callables_are_envelopes():
+    x = jnp.array([0.1, 0.2, 0.6])
+    expected = LOG_PROB(_dist(), x)
+    log_a = lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2  # noqa: E731
+    _close(LOG_PROB(_dist(envelope=log_a), x), expected, 1e-6)
+    _close(LOG_PROB(_dist(envelope=plain_envelope(lambda *args: jnp.exp(log_a(*args)))), x), expected, 1e-5)
 
 
 def test_degree_zero_and_none_are_the_zero_fold():
