@@ -1,5 +1,6 @@
 """The command `foldgauss`: arguments, progress and exit codes. The work is done on the floors below."""
 
+import hashlib
 import json
 import signal
 import sys
@@ -12,7 +13,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -29,7 +29,7 @@ from foldgauss.datasets import sample_clip
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable
 from foldgauss.io.model_file import read_header
 from foldgauss.io.pictures import comparison
-from foldgauss.io.video_file import VIDEO_SUFFIXES, Clip, read_video, write_image, write_video
+from foldgauss.io.video_file import MAX_FPS, VIDEO_SUFFIXES, Clip, memory_limit, read_video, write_image, write_video
 from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
 from foldgauss.video.fit import (
     FitConfig,
@@ -51,8 +51,9 @@ DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
-out = Console()
-err = Console(stderr=True)
+# No markup: names of files may hold brackets.
+out = Console(markup=False, highlight=False)
+err = Console(stderr=True, markup=False, highlight=False)
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
@@ -82,12 +83,15 @@ def demo(
     """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out."""
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
     _make_folder(out_dir)
-    out.print(f"[bold]Bunny[/], frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
+    out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
     state, info = _fit_with_progress(clip.frames, DEMO_CONFIG)
     model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
-    scores, pictures = _evaluate_with_progress(model, clip.frames)
+    pictures: list[np.ndarray] = []
+    scores = _evaluate_with_progress(model, clip.frames, pictures.append)
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
-    path = save_video_model(out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG, scores))
+    path = save_video_model(
+        out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG) | _scores(scores)
+    )
     figures["file_bytes"] = path.stat().st_size
     write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
@@ -102,7 +106,7 @@ def demo(
         ("model.safetensors", "the model: try `foldgauss render` on it with --upsample 4"),
         ("metrics.json", "the figures above, and by frame"),
     ):
-        out.print(f"  {out_dir / name}  [dim]{what}[/]", highlight=False, soft_wrap=True)
+        out.print(f"  {out_dir / name}  {what}", soft_wrap=True)
 
 
 @app.command()
@@ -148,19 +152,19 @@ def fit(
     check_writable(target)
     clip = read_video(video, frames=_parse_frames(frames), size=_parse_size(size))
     _say_clip(clip, config)
-    source = {"clip": clip.source, "num_frames": clip.num_frames, "size": list(clip.size)}
+    source = _fingerprint(clip)
     state = load_checkpoint(kept, config=config, source=source) if resume else None
-    state, info = _fit_with_progress(
-        clip.frames,
-        config,
-        state,
-        keep=lambda state: save_checkpoint(kept, state, config=config, source=source),
-    )
+
+    def keep(state: FitState) -> None:
+        save_checkpoint(kept, state, config=config, source=source)
+
+    state, info = _fit_with_progress(clip.frames, config, state, keep)
     model = to_model(state, config, clip.size, clip.fps)
-    scores, _ = _evaluate_with_progress(model, clip.frames)
-    metadata = _provenance(clip, config, scores) | {"frames": _parse_frames(frames)}
-    save_video_model(target, model, metadata=metadata)
+    about = _provenance(clip, config) | {"frames": _parse_frames(frames)}
+    save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
     kept.unlink(missing_ok=True)
+    scores = _evaluate_with_progress(model, clip.frames)
+    save_video_model(target, model, metadata=about | _scores(scores))
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
     _print_figures(str(target), figures | {"file_bytes": target.stat().st_size})
 
@@ -183,12 +187,19 @@ def render(
             raise WrongUse(str(invalid("--out", expected=f"{wanted}, or a folder without extension", got=out_path)))
         _refuse_existing(out_path, overwrite)
         check_writable(out_path)
+    _refuse_huge(picture_size)
     model = load_video_model(model_path)
     times = interpolated_times(np.asarray(model.frame_times.times()), upsample)
+    fps = model.fps * upsample
+    if out_path.suffix and fps > MAX_FPS:
+        raise WrongUse(
+            f"--upsample: expected at most {int(MAX_FPS / model.fps)} for a video of {model.fps:g} frames a second, "
+            f"got {upsample}. Write to a folder instead."
+        )
     with _bar("Rendering", len(times)) as advance:
         pictures = _counted(model.frames(times, picture_size), advance)
-        path = write_video(out_path, pictures, model.fps * upsample, overwrite=overwrite)
-    out.print(f"{path}: {len(times)} frames at {model.fps * upsample:g} frames a second", soft_wrap=True)
+        path = write_video(out_path, pictures, min(fps, MAX_FPS), overwrite=overwrite)
+    out.print(f"{path}: {len(times)} frames at {fps:g} frames a second", soft_wrap=True)
 
 
 @app.command(name="evaluate")
@@ -208,7 +219,7 @@ def evaluate_command(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
             "Name the frames it was fitted to."
         )
-    scores, _ = _evaluate_with_progress(model, clip.frames)
+    scores = _evaluate_with_progress(model, clip.frames)
     num_bytes = model_path.stat().st_size
     figures = _figures(model, scores) | {"file_bytes": num_bytes}
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
@@ -261,6 +272,12 @@ def _parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     return (int(first) if first else None), (int(last) if last else None)
 
 
+def _refuse_huge(size: tuple[int, int] | None) -> None:
+    """A picture is held in floats, some copies of it."""
+    if size is not None and 64 * size[0] * size[1] > memory_limit():
+        raise WrongUse(f"--size: expected a picture that fits in memory, got {size[0]}x{size[1]}. Take a smaller one.")
+
+
 def _refuse_existing(path: Path, overwrite: bool) -> None:
     if path.exists() and not overwrite:
         raise WrongUse(f"--out: {path} exists. Choose another path, or add --overwrite.")
@@ -305,14 +322,27 @@ def _fit_with_progress(
                 progress.update(task, completed=info.progress, info=info)
                 shown_at = now
             if keep is not None and now - kept_at > CHECKPOINT_SECONDS:
-                keep(state)
+                _keep_if_possible(keep, state)
                 kept_at = time.monotonic()
-            if asked:
-                if keep is None:
-                    raise Stopped(f"stopped by {asked[0]} after step {info.step}; nothing was kept.")
-                keep(state)
-                raise Stopped(f"stopped by {asked[0]} after step {info.step}; add --resume to go on from there.")
+            if asked and info.progress < 1:
+                raise _stopped(asked[0], state, info, keep)
     return state, info
+
+
+def _keep_if_possible(keep: Callable[[FitState], object], state: FitState) -> None:
+    """A full disk now is no reason to lose the fit: say so, and go on."""
+    try:
+        keep(state)
+    except OSError as error:
+        err.print(f"warning: the fit could not be kept at step {state.step}: {error}", soft_wrap=True)
+
+
+def _stopped(name: str, state: FitState, info: FitInfo, keep: Callable[[FitState], object] | None) -> Stopped:
+    """Keep the fit and say how to go on."""
+    if keep is None:
+        return Stopped(f"stopped by {name} after step {info.step}; nothing was kept.")
+    keep(state)
+    return Stopped(f"stopped by {name} after step {info.step}; add --resume to go on from there.")
 
 
 @contextmanager
@@ -353,17 +383,17 @@ def _counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]
         advance()
 
 
-def _evaluate_with_progress(model: VideoModel, frames: np.ndarray) -> tuple[Evaluation, list[np.ndarray]]:
-    """Scores, and the pictures they were read off."""
-    pictures: list[np.ndarray] = []
-
+def _evaluate_with_progress(
+    model: VideoModel, frames: np.ndarray, keep: Callable[[np.ndarray], None] = lambda picture: None
+) -> Evaluation:
+    """Scores of every frame; `keep` is handed the pictures they were read off."""
     with _bar("Evaluating", model.num_frames) as advance:
 
         def on_frame(picture: np.ndarray) -> None:
-            pictures.append(picture)
+            keep(picture)
             advance()
 
-        return evaluate(model, frames, on_frame), pictures
+        return evaluate(model, frames, on_frame)
 
 
 # --------------------------------------------------------------------------------------------- results
@@ -373,8 +403,7 @@ def _say_clip(clip: Clip, config: FitConfig) -> None:
     height, width = clip.size
     if clip.num_declared > clip.num_frames:
         err.print(
-            f"[yellow]warning:[/] only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; "
-            "those are used.",
+            f"warning: only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; those are used.",
             soft_wrap=True,
         )
     num = config.num_gaussians or default_num_gaussians(height, width)
@@ -384,7 +413,6 @@ def _say_clip(clip: Clip, config: FitConfig) -> None:
         f"{clip.source}: {clip.num_frames} frames of {height}x{width}, {num:,} Gaussians of degree {config.degree}, "
         f"{plan}, {num_threads()} threads",
         soft_wrap=True,
-        highlight=False,
     )
 
 
@@ -401,13 +429,18 @@ def _figures(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
     }
 
 
-def _provenance(clip: Clip, config: FitConfig, scores: Evaluation) -> dict[str, Any]:
-    return {
-        "clip": Path(clip.source).name,
-        "seed": config.seed,
-        "mean_psnr": round(scores.mean_psnr, 3),
-        "mean_ssim": round(scores.mean_ssim, 4),
-    }
+def _provenance(clip: Clip, config: FitConfig) -> dict[str, Any]:
+    return {"clip": Path(clip.source).name, "seed": config.seed}
+
+
+def _scores(scores: Evaluation) -> dict[str, Any]:
+    return {"mean_psnr": round(scores.mean_psnr, 3), "mean_ssim": round(scores.mean_ssim, 4)}
+
+
+def _fingerprint(clip: Clip) -> dict[str, Any]:
+    """What a resumed fit must find again: the frames themselves, whatever they are called now."""
+    digest = hashlib.blake2b(clip.frames, digest_size=16).hexdigest()
+    return {"num_frames": clip.num_frames, "size": list(clip.size), "frames_digest": digest}
 
 
 _LABELS = {
@@ -460,11 +493,13 @@ def main(arguments: list[str] | None = None) -> None:
     debug = "--debug" in arguments  # taken out, so that it may stand anywhere
     try:
         app([argument for argument in arguments if argument != "--debug"], standalone_mode=True)
-    except (ValueError, OSError, MemoryError, Stopped, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt) as error:
         if debug:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
-        err.print(f"[red]error:[/] {escape(text)}", soft_wrap=True, highlight=False)
+        if not isinstance(error, ValueError | OSError | MemoryError | Stopped | KeyboardInterrupt):
+            text = f"{type(error).__name__}: {text[:300]} (--debug shows where)"
+        err.print(f"error: {text}", style="red", soft_wrap=True)
         sys.exit(_exit_code(error))
 
 

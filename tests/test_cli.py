@@ -4,9 +4,7 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 
 import cv2
 import numpy as np
@@ -124,6 +122,10 @@ def broken_inputs(tmp_path, work):
     short.write_bytes((work / "model.safetensors").read_bytes()[:-50])
     later = tmp_path / "later.safetensors"
     later.write_bytes((work / "model.safetensors").read_bytes().replace(b'"version":"1"', b'"version":"9"'))
+    tiny = tmp_path / "tiny"
+    tiny.mkdir()
+    for k in range(3):
+        write_image(tiny / f"{k}.png", np.zeros((8, 8, 3), np.uint8))
     clip, model, out = work / "clip.mp4", work / "model.safetensors", tmp_path / "out.safetensors"
     return {
         "missing file": (["fit", tmp_path / "none.mp4", "--out", out], 2, "missing"),
@@ -131,11 +133,15 @@ def broken_inputs(tmp_path, work):
         "truncated to nothing": (["fit", cut, "--out", out], 1, "cut.mp4"),
         "one frame": (["fit", clip, "--out", out, "--frames", "2:3"], 2, "at least 2"),
         "one image": (["fit", single, "--out", out], 1, "at least 2"),
+        "tiny images": (["fit", tiny, "--out", out], 1, "16x16"),
+        "degree beyond": (["fit", clip, "--out", out, "--degree", "99"], 2, "degree"),
+        "picture beyond memory": (["render", model, "--out", tmp_path / "v.mp4", "--size", "90000x90000"], 2, "memory"),
         "mixed sizes": (["fit", mixed, "--out", out], 1, "40x50|50x40"),
         "frames beyond": (["fit", clip, "--out", out, "--frames", "0:99"], 2, "frames"),
         "frames reversed": (["fit", clip, "--out", out, "--frames", "4:2"], 2, "frames"),
         "frames misspelt": (["fit", clip, "--out", out, "--frames", "4"], 2, "A:B"),
         "size zero": (["fit", clip, "--out", out, "--size", "0x10"], 2, "HxW"),
+        "size beyond memory": (["fit", clip, "--out", out, "--size", "100000x100000"], 2, "GiB"),
         "size misspelt": (["fit", clip, "--out", out, "--size", "48"], 2, "HxW"),
         "no gaussians": (["fit", clip, "--out", out, "--gaussians", "0"], 2, "num_gaussians"),
         "steps and minutes": (
@@ -228,31 +234,113 @@ def test_demo_reaches_its_quality(tmp_path):
     assert figures["fit_seconds"] <= 90
 
 
-def start(*arguments):
-    command = [sys.executable, "-m", "foldgauss.cli", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+@pytest.fixture
+def interrupted(monkeypatch):
+    """Make the fit send its own process a signal after step 40."""
+
+    def arm(number):
+        steps = cli.fit_steps
+
+        def stepping(*arguments):
+            for state, info in steps(*arguments):
+                if info.step == 40:
+                    os.kill(os.getpid(), number)
+                yield state, info
+
+        monkeypatch.setattr(cli, "fit_steps", stepping)
+        return lambda: monkeypatch.setattr(cli, "fit_steps", steps)
+
+    return arm
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_stopped_and_resumed(work, tmp_path, capsys):
-    """Ctrl-C keeps the fit; --resume ends it; the model equals that of a fit that was never stopped."""
-    target = tmp_path / "m.safetensors"
-    arguments = ["fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "4000"]
-    child = start(*arguments)
-    kept = tmp_path / "m.safetensors.checkpoint"
-    assert "Gaussians" in child.stdout.readline()  # about to begin
-    time.sleep(2)
-    child.send_signal(signal.SIGINT)
-    _, told = child.communicate(timeout=60)
-    assert child.returncode == 1, told
-    assert "--resume" in told
-    assert "Traceback" not in told
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
+    """A signal keeps the fit; --resume ends it; the model equals that of a fit that was never stopped."""
+    target, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
+    arguments = ["fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "80"]
+    disarm = interrupted(number)
+    assert run(*arguments) == 1
+    disarm()
+    assert "--resume" in capsys.readouterr().err
+    assert kept.exists()
     assert not target.exists()
     assert run(*arguments) == 2  # a kept fit is not thrown away by accident
-    assert "--resume" in capsys.readouterr().err
-    assert run(*arguments[:-1], "3900", "--resume") == 2  # nor continued as another
+    assert run(*arguments[:-1], "90", "--resume") == 2  # nor continued as another
+    assert run(*arguments, "--frames", "0:5", "--resume") == 2  # nor with other frames
     assert run(*arguments, "--resume") == 0
     assert not kept.exists()
     whole = tmp_path / "whole.safetensors"
     assert run(*arguments[:3], whole, *arguments[4:]) == 0
     assert target.read_bytes() == whole.read_bytes()
+
+
+def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypatch, capsys):
+    target = tmp_path / "m.safetensors"
+    monkeypatch.setattr(cli, "CHECKPOINT_SECONDS", 0.0)
+    kept, save = [], cli.save_checkpoint
+
+    def keep(path, state, **options):
+        if state.step == 5:
+            raise OSError(28, "No space left on device")
+        kept.append(state.step)
+        save(path, state, **options)
+
+    monkeypatch.setattr(cli, "save_checkpoint", keep)
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 0
+    assert kept == [step for step in range(1, 31) if step != 5]
+    assert "No space left" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+def test_a_fit_kept_at_its_last_step_is_finished(work, tmp_path, monkeypatch):
+    """Killed between the last step and the saving of the model."""
+    target = tmp_path / "m.safetensors"
+    monkeypatch.setattr(cli, "CHECKPOINT_SECONDS", 0.0)
+    save = cli.save_video_model
+    monkeypatch.setattr(cli, "save_video_model", lambda *a, **k: (_ for _ in ()).throw(OSError("killed")))
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 1
+    monkeypatch.setattr(cli, "save_video_model", save)
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--resume") == 0
+    assert load_video_model(target).num_frames == 6
+
+
+def test_the_model_is_saved_before_it_is_evaluated(work, tmp_path, monkeypatch):
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    target = tmp_path / "m.safetensors"
+    monkeypatch.setattr(cli, "evaluate", stopped)
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK) != 0
+    assert load_video_model(target).num_frames == 6
+
+
+def test_names_with_brackets_are_names(tmp_path, capsys):
+    folder = tmp_path / "x[red]"
+    folder.mkdir()
+    write_video(folder / "show [x264] [b].mp4", blobs(), 12.0)
+    assert run("fit", folder / "show [x264] [b].mp4", "--out", folder / "m [b].safetensors", *QUICK) == 0
+    assert "show [x264] [b].mp4" in capsys.readouterr().out
+    assert run("info", folder / "m [b].safetensors") == 0
+    assert run("info", folder / "none[/b].safetensors") == 2
+    assert "none[/b]" in capsys.readouterr().err
+
+
+def test_upsampling_beyond_any_frame_rate(work, tmp_path, capsys):
+    model = work / "model.safetensors"
+    assert run("render", model, "--out", tmp_path / "v.mp4", "--upsample", "100") == 2
+    assert "folder" in capsys.readouterr().err
+    assert run("render", model, "--out", tmp_path / "frames", "--upsample", "100") == 0
+    assert len(list((tmp_path / "frames").glob("*.png"))) == 501
+
+
+def test_an_unforeseen_error_is_one_line(work, tmp_path, monkeypatch, capsys):
+    def broken(*arguments, **options):
+        raise RuntimeError("surprise\nand more")
+
+    monkeypatch.setattr(cli, "load_video_model", broken)
+    assert run("info", work / "model.safetensors") == 1
+    message = capsys.readouterr().err
+    assert "RuntimeError: surprise and more" in message
+    assert "--debug" in message
+    assert "Traceback" not in message

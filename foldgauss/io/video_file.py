@@ -73,7 +73,7 @@ def read_video(
     frame to that aspect around its centre (to whole pixels), then resizes it, by area where it shrinks and
     by cubic interpolation where it grows: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides
     the rate of the container (25 for images). Decoding is frame by frame: the memory taken is the output's
-    plus one source frame.
+    plus one source frame, and a clip that would take over a third of the machine's memory is refused.
 
     Images of 16 bits are scaled to 8, grey ones get three equal channels; 4 channels are refused.
     A damaged video yields the frames that decode; see `Clip.num_declared`.
@@ -92,6 +92,13 @@ def read_video(
         _check_fps(fps)
     read = _read_folder if path.is_dir() else _read_file
     kept, num_declared, found_fps = read(path, start, stop, prepare)
+    if min(kept[0].shape[:2]) < MIN_SIZE:
+        raise _error(
+            "path",
+            expected=f"frames of at least {MIN_SIZE}x{MIN_SIZE}",
+            got=f"{_shape_text(kept[0].shape)} in {str(path)!r}",
+            cure="Enlarge it with --size, or size=(height, width).",
+        )
     if len(kept) < 2:
         raise _error(
             "path",
@@ -252,10 +259,29 @@ def _declared_frames(capture: cv2.VideoCapture) -> int:
     return round(count) if math.isfinite(count) and 0 < count < 2**31 else 0
 
 
+def memory_limit() -> int:
+    """Bytes that a clip may take: a third of the machine's memory, since a fit holds it twice."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 3
+    except (AttributeError, ValueError, OSError):  # not POSIX
+        return 8 << 30
+
+
 def _fit_to(size: tuple[int, int] | None) -> Callable[[np.ndarray], np.ndarray]:
     """BGR of any size -> RGB of `size` = (height, width): centre crop to the aspect, then resize."""
+    limit, taken, num_frames = memory_limit(), 0, 0
 
     def prepare(image: np.ndarray) -> np.ndarray:
+        nonlocal taken, num_frames
+        height, width = image.shape[:2] if size is None else size
+        taken, num_frames = taken + 3 * height * width, num_frames + 1
+        if taken > limit:
+            raise _error(
+                "size",
+                expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
+                got=f"more, at frame {num_frames} of {height}x{width}",
+                cure="Take fewer frames or a smaller size.",
+            )
         if size is not None and image.shape[:2] != size:
             image = _resized(image[_centre_crop(image.shape[:2], size)], size)
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

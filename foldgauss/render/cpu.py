@@ -23,6 +23,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from foldgauss._checks import invalid
+from foldgauss._kernels import inline, kernel
 from foldgauss._threads import run_tasks
 from foldgauss.render.splats import RenderOptions
 
@@ -31,13 +32,12 @@ PIXELS = TILE * TILE
 CHUNK = 8192  # splats per task where splats, not rows, are shared out
 #: (1 - alpha) is divided by in the backward pass; above this ceiling float32 loses the third digit.
 HIGHEST_CEILING = 0.999
+#: A splat is drawn if its standard deviations, along x at fixed y and along y, are between about 1e-6 and 1e12 px:
+#: what is thinner no pixel's centre meets but by design, what is wider float32 cannot follow.
+WIDEST, THINNEST = 1e-12, 1e6
 #: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
 SLACK = np.float32(1e-3)
 
-# Not "fast": NaN and infinity keep their meaning; sums may be reordered, which vector sums need.
-_FASTMATH = {"nsz", "contract", "reassoc", "arcp"}
-_jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=_FASTMATH)
-_inline = nb.njit(inline="always", error_model="numpy", fastmath=_FASTMATH)
 _f, _i, _u = nb.float32, nb.int32, nb.uint64
 
 # Columns of the per-splat geometry. The exponent is kept in powers of two, log2 of the opacity included:
@@ -64,7 +64,7 @@ def _bits_as_float(typing_context, bits):
     return types.float32(types.int32), generate
 
 
-@_inline
+@inline
 def _exp2(x):
     """2^x for -126 < x <= 0 within 3e-7: polynomial on the fraction in (-1, 0], integer part into the exponent.
 
@@ -81,20 +81,25 @@ def _exp2(x):
     return y * _bits_as_float((whole + _i(127)) << _i(23))
 
 
-@_jit
+@kernel
 def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff, geometry, span):
     """Geometry of splats start..stop and the rows of tiles each one reaches (none: it is not seen)."""
     half_log2e = _f(0.5 * math.log2(math.e))
     for i in range(start, stop):
         span[i, 0] = 0
         span[i, 1] = 0
-        a, b, c, d = factor[i, 0, 0], factor[i, 0, 1], factor[i, 1, 0], factor[i, 1, 1]
+        # In double precision: fourth powers of a standard deviation stand in the determinant.
+        a, b = nb.float64(factor[i, 0, 0]), nb.float64(factor[i, 0, 1])
+        c, d = nb.float64(factor[i, 1, 0]), nb.float64(factor[i, 1, 1])
         xx = a * a + b * b + low_pass
         xy = a * c + b * d
         yy = c * c + d * d + low_pass
         area = a * d - b * c
         det = area * area + low_pass * (xx + yy - low_pass)
-        if not (det > 0.0 and det < np.inf and opacity[i] >= cutoff):
+        p, r = math.sqrt(half_log2e * (yy / det)), math.sqrt(half_log2e / yy)
+        # Also false for NaN, and for a determinant of 0.
+        drawable = p > WIDEST and p < THINNEST and r > WIDEST and r < THINNEST
+        if not (drawable and opacity[i] >= cutoff):
             continue
         reach = _f(2.0) * math.log(opacity[i] / cutoff) * (_f(1.0) + SLACK) + SLACK
         radius_x, radius_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
@@ -104,10 +109,9 @@ def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff
             continue
         geometry[i, _X] = x
         geometry[i, _Y] = y
-        across = math.sqrt(half_log2e / (det * yy))
-        geometry[i, _P] = yy * across
-        geometry[i, _Q] = -xy * across
-        geometry[i, _R] = math.sqrt(half_log2e / yy)
+        geometry[i, _P] = p
+        geometry[i, _Q] = -xy / yy * p
+        geometry[i, _R] = r
         geometry[i, _LOG] = math.log2(opacity[i])
         geometry[i, _RX] = radius_x
         geometry[i, _RY] = radius_y
@@ -119,7 +123,7 @@ def _project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff
             span[i, 1] = last // TILE + 1
 
 
-@_jit
+@kernel
 def _bucket_rows(span, num_rows):
     """Counting pass: the splats of every row in array order, and where each splat's entries stand."""
     num = len(span)
@@ -145,13 +149,13 @@ def _bucket_rows(span, num_rows):
     return start, entries, first_slot, slot_position
 
 
-@_inline
+@inline
 def _edge(p, q, r, level, dy):
     """Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy."""
     return (math.sqrt(max(level - r * dy * r * dy, _f(0.0))) - q * dy) / p
 
 
-@_jit
+@kernel
 def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff):
     """Exact ellipse-tile test within one row: which tiles each entry reaches, listed by tile in array order."""
     num_tiles = (width + TILE - 1) // TILE
@@ -185,7 +189,7 @@ def _bucket_tiles(geometry, entries, start, stop, top, height, width, log_cutoff
     return tile_start, listed
 
 
-@_inline
+@inline
 def _pixel_rows(x, y, p, q, r, level):
     """Pixel rows (first, end) of a tile that the ellipse (p dx + q dy)^2 + (r dy)^2 = level reaches within its columns.
 
@@ -207,7 +211,7 @@ def _pixel_rows(x, y, p, q, r, level):
     return first, _i(high + _f(1.0))
 
 
-@_inline
+@inline
 def _aligned(size):
     """Room for `size` floats that starts on a cache line, so that no vector of 16 straddles two."""
     room = np.empty(size + TILE, np.float32)
@@ -215,7 +219,7 @@ def _aligned(size):
     return room[skip : skip + size]
 
 
-@_jit
+@kernel
 def _load_block(geometry, color, entries, listed, left, top, block):
     """The geometry and colours of up to BLOCK splats of a tile, parameter by parameter; positions within the tile."""
     for e in range(_u(len(listed))):
@@ -230,7 +234,7 @@ def _load_block(geometry, color, entries, listed, left, top, block):
             block[_u(_RED * BLOCK) + c * _u(BLOCK) + e] = color[i, c]
 
 
-@_jit
+@kernel
 def _list_rows(num, block, log_cutoff, first, last, items, shear, drop):
     """Write an item for every pixel row that a splat of the block reaches; returns their number.
 
@@ -261,7 +265,7 @@ def _list_rows(num, block, log_cutoff, first, last, items, shear, drop):
     return stop
 
 
-@_jit
+@kernel
 def _blend(num_items, items, shear, drop, block, scratch, over, log_cutoff, ceiling, finished):
     """Add the listed rows of a block's splats to the tile: scratch holds the light left, then the colours."""
     share = _f(1.0) if over else _f(0.0)
@@ -283,7 +287,7 @@ def _blend(num_items, items, shear, drop, block, scratch, over, log_cutoff, ceil
             scratch[base + column + _u(3 * PIXELS)] += weight * blue
 
 
-@_jit
+@kernel
 def _dark(scratch, finished):
     """Whether no pixel of the tile has light left."""
     brightest = _f(0.0)
@@ -292,7 +296,7 @@ def _dark(scratch, finished):
     return brightest <= finished
 
 
-@_jit
+@kernel
 def _write_tile(scratch, background, image, light, top, left):
     height, width = light.shape
     columns = min(TILE, width - left)
@@ -306,7 +310,23 @@ def _write_tile(scratch, background, image, light, top, left):
                 out[x] = scratch[base + plane + x] + scratch[base + x] * background[c]
 
 
-@_jit
+@kernel
+def _kept_lists(tile_start, listed, used):
+    """The lists without what lies behind the splats that took all light, once that is worth a copy."""
+    total = 0
+    for tile in range(len(used)):
+        total += used[tile] - tile_start[tile]
+    if 2 * total > len(listed):
+        return tile_start, listed, used
+    kept, start, stop = np.empty(total, listed.dtype), np.zeros_like(tile_start), np.empty_like(used)
+    for tile in range(len(used)):
+        stop[tile] = start[tile] + used[tile] - tile_start[tile]
+        start[tile + 1] = stop[tile]
+        kept[start[tile] : stop[tile]] = listed[tile_start[tile] : used[tile]]
+    return start, kept, stop
+
+
+@kernel
 def _forward_row(
     row, row_start, entries, geometry, color, background, over, log_cutoff, ceiling, finished, image, light
 ):
@@ -333,10 +353,10 @@ def _forward_row(
             num_items = _list_rows(len(part), block, log_cutoff, first, last, items, shear, drop)
             _blend(num_items, items, shear, drop, block, scratch, over, log_cutoff, ceiling, finished)
         _write_tile(scratch, background, image, light, top, tile * TILE)
-    return tile_start, listed, used
+    return *_kept_lists(tile_start, listed, used), len(listed)
 
 
-@_jit
+@kernel
 def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, finished, slot):
     """Gradient sums of splat i over one tile, added to its slot; the scratch moves on behind the splat."""
     x, y = geometry[i, _X] - left - _f(0.5), geometry[i, _Y] - top - _f(0.5)
@@ -388,7 +408,7 @@ def _unblend(geometry, color, i, left, top, scratch, over, log_cutoff, ceiling, 
     slot[8] += s_ww
 
 
-@_jit
+@kernel
 def _backward_row(
     row,
     row_start,
@@ -443,7 +463,7 @@ def _backward_row(
             )
 
 
-@_jit
+@kernel
 def _gather(
     start,
     stop,
@@ -498,11 +518,7 @@ class Trace:
     constants: tuple  # over, log_cutoff, ceiling, finished
     image: np.ndarray  # (3, height, width)
     light: np.ndarray  # (height, width)
-
-    @property
-    def num_pairs(self) -> int:
-        """Pixels times splats over the tiles' lists: the unit that speed is counted in."""
-        return sum(len(listed) for _, listed, _ in self.lists) * PIXELS
+    num_pairs: int  # pixels times splats over the tiles' lists as made: the unit that speed is counted in
 
 
 def check_options(options: RenderOptions) -> None:
@@ -551,13 +567,18 @@ def forward(
         np.float32(options.transmittance_stop if compositing == "over" else -1.0),
     )
     image, light = np.empty((3, height, width), np.float32), np.empty((height, width), np.float32)
-    lists: list = [None] * num_rows
+    lists: list = [[] for _ in range(num_rows)]
+    num_listed = np.zeros(num_rows, np.int64)
 
     def blend(row: int) -> None:
-        lists[row] = _forward_row(row, *buckets[:2], geometry, color, background, *constants, image, light)
+        *lists[row], num_listed[row] = _forward_row(
+            row, *buckets[:2], geometry, color, background, *constants, image, light
+        )
 
     run_tasks(blend, range(num_rows))
-    return Trace((factor, opacity, color), geometry, buckets, lists, constants, image, light)
+    return Trace(
+        (factor, opacity, color), geometry, buckets, lists, constants, image, light, int(num_listed.sum()) * PIXELS
+    )
 
 
 def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:

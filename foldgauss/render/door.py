@@ -1,6 +1,7 @@
 """`render`: the one door to every engine, differentiable, usable inside jit and vmap."""
 
 import functools
+from numbers import Integral
 
 import jax
 import jax.numpy as jnp
@@ -47,8 +48,11 @@ def render(
     """
     one_of("engine", engine, ENGINES)
     one_of("compositing", compositing, COMPOSITINGS)
-    if len(size) != 2 or any(int(n) != n or n < 1 for n in size):
-        raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
+    _check_size(size)
+    if splats.mean.ndim != 2:
+        raise invalid(
+            "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
+        )
     options = RenderOptions() if options is None else options
     channels, dtype = splats.color.shape[-1], splats.mean.dtype
     background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
@@ -65,6 +69,12 @@ def render(
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
     image = _render_cpu((height, width), compositing, options, *(leaf.astype(jnp.float32) for leaf in leaves))
     return image.astype(dtype)
+
+
+def _check_size(size: tuple[int, int]) -> None:
+    whole = isinstance(size, tuple | list) and all(isinstance(n, Integral) and n >= 1 for n in size)
+    if not (whole and len(size) == 2):
+        raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))

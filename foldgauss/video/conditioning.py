@@ -7,10 +7,12 @@ holds both to the same values and gradients. Only the polynomial fold and the ti
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
+from foldgauss._kernels import inline, kernel
 from foldgauss._threads import run_tasks
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.model import SH_C0, TAU_MAX
@@ -18,26 +20,45 @@ from foldgauss.video.packing import columns
 
 CHUNK = 4096  # Gaussians per task
 
-_jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "contract", "reassoc", "arcp"})
-_inline = nb.njit(inline="always", error_model="numpy")
 _f = nb.float32
 
-_place = columns(0)
-_LOC, _SCALE, _COLOR = _place["loc"].start, _place["log_scale"].start, _place["color_dc"].start
-_ANGLE, _OPACITY = _place["angle_logit"].start, _place["opacity_logit"].start
-_TIME, _SPREAD, _FOLD = (
-    _place["time_loc_logit"].start,
-    _place["log_time_scale"].start,
-    _place["coefficients"].start,
+
+class _Layout(NamedTuple):
+    """Columns of a row and constants of the model, handed to the kernels as arguments: see `_kernels.kernel`."""
+
+    loc: int
+    scale: int
+    color: int
+    angle: int
+    opacity: int
+    time: int
+    spread: int
+    fold: int
+    tau_max: np.float32
+    sh_c0: np.float32
+
+
+_place = {name: place.start for name, place in columns(0).items()}
+_LAYOUT = _Layout(
+    loc=_place["loc"],
+    scale=_place["log_scale"],
+    color=_place["color_dc"],
+    angle=_place["angle_logit"],
+    opacity=_place["opacity_logit"],
+    time=_place["time_loc_logit"],
+    spread=_place["log_time_scale"],
+    fold=_place["coefficients"],
+    tau_max=np.float32(TAU_MAX),
+    sh_c0=np.float32(SH_C0),
 )
 
 
-@_inline
+@inline
 def _sigmoid(x):
     return _f(1.0) / (_f(1.0) + math.exp(-x))
 
 
-@_inline
+@inline
 def _shrink(u, spread, power, floor):
     """Half of log a(t), and its derivative by -tau^2/2: standard deviations are scaled by exp of the first."""
     tau = u / spread
@@ -46,41 +67,42 @@ def _shrink(u, spread, power, floor):
     return _f(0.5) * math.log(a), _f(0.5) * power * decay / a
 
 
-@_jit
-def _windows(start, stop, indices, rows, window):
+@kernel
+def _windows(at, start, stop, indices, rows, window):
     """The span of time in which each of the named Gaussians is drawn."""
     for k in range(start, stop):
         i = indices[k]
-        centre, reach = _sigmoid(rows[i, _TIME]), _f(TAU_MAX) * math.exp(rows[i, _SPREAD])
+        centre, reach = _sigmoid(rows[i, at.time]), at.tau_max * math.exp(rows[i, at.spread])
         window[i, 0] = centre - reach
         window[i, 1] = centre + reach
 
 
-@_jit
-def _condition(start, stop, alive, rows, degree, t, unit, cx, cy, power, floor, mean, factor, opacity, color):
+@kernel
+def _condition(at, start, stop, alive, rows, degree, t, unit, cx, cy, power, floor, mean, factor, opacity, color):
     for k in range(start, stop):
         i = alive[k]
         row = rows[i]
-        u = _sigmoid(row[_TIME]) - t
+        u = _sigmoid(row[at.time]) - t
         x, y = _f(0.0), _f(0.0)
         for j in range(degree - 1, -1, -1):  # Horner
-            x = u * (x + row[_FOLD + 2 * j])
-            y = u * (y + row[_FOLD + 2 * j + 1])
-        mean[k, 0] = (row[_LOC] + x) * unit + cx
-        mean[k, 1] = (row[_LOC + 1] + y) * unit + cy
-        shrink, _ = _shrink(u, math.exp(row[_SPREAD]), power, floor)
-        first, second = math.exp(row[_SCALE] + shrink) * unit, math.exp(row[_SCALE + 1] + shrink) * unit
-        angle = _f(2 * math.pi) * _sigmoid(row[_ANGLE])
+            x = u * (x + row[at.fold + 2 * j])
+            y = u * (y + row[at.fold + 2 * j + 1])
+        mean[k, 0] = (row[at.loc] + x) * unit + cx
+        mean[k, 1] = (row[at.loc + 1] + y) * unit + cy
+        shrink, _ = _shrink(u, math.exp(row[at.spread]), power, floor)
+        first, second = math.exp(row[at.scale] + shrink) * unit, math.exp(row[at.scale + 1] + shrink) * unit
+        angle = _f(2 * math.pi) * _sigmoid(row[at.angle])
         cos, sin = math.cos(angle), math.sin(angle)
         factor[k, 0, 0], factor[k, 0, 1] = cos * first, -sin * second
         factor[k, 1, 0], factor[k, 1, 1] = sin * first, cos * second
-        opacity[k] = _sigmoid(row[_OPACITY])
+        opacity[k] = _sigmoid(row[at.opacity])
         for c in range(3):
-            color[k, c] = max(_f(0.5) + _f(SH_C0) * row[_COLOR + c], _f(0.0))
+            color[k, c] = max(_f(0.5) + at.sh_c0 * row[at.color + c], _f(0.0))
 
 
-@_jit
+@kernel
 def _pull_back(
+    at,
     start,
     stop,
     alive,
@@ -105,39 +127,39 @@ def _pull_back(
         i = alive[k]
         row, out = rows[i], grad[i]
         gx, gy = d_mean[k, 0] * unit, d_mean[k, 1] * unit
-        out[_LOC] += gx
-        out[_LOC + 1] += gy
-        centre = _sigmoid(row[_TIME])
+        out[at.loc] += gx
+        out[at.loc + 1] += gy
+        centre = _sigmoid(row[at.time])
         u = centre - t
         # Fold: dL/dc_j = g u^j, and dL/du by the derivative of the polynomial.
         d_u, u_power = _f(0.0), _f(1.0)
         for j in range(degree):
-            d_u += _f(j + 1) * u_power * (gx * row[_FOLD + 2 * j] + gy * row[_FOLD + 2 * j + 1])
+            d_u += _f(j + 1) * u_power * (gx * row[at.fold + 2 * j] + gy * row[at.fold + 2 * j + 1])
             u_power *= u
-            out[_FOLD + 2 * j] += gx * u_power
-            out[_FOLD + 2 * j + 1] += gy * u_power
+            out[at.fold + 2 * j] += gx * u_power
+            out[at.fold + 2 * j + 1] += gy * u_power
         # Scales and angle, from the columns of F = R diag(scales).
         by_first = d_factor[k, 0, 0] * factor[k, 0, 0] + d_factor[k, 1, 0] * factor[k, 1, 0]
         by_second = d_factor[k, 0, 1] * factor[k, 0, 1] + d_factor[k, 1, 1] * factor[k, 1, 1]
-        out[_SCALE] += by_first
-        out[_SCALE + 1] += by_second
+        out[at.scale] += by_first
+        out[at.scale + 1] += by_second
         by_angle = d_factor[k, 1, 0] * factor[k, 0, 0] - d_factor[k, 0, 0] * factor[k, 1, 0]
         by_angle += d_factor[k, 1, 1] * factor[k, 0, 1] - d_factor[k, 0, 1] * factor[k, 1, 1]
-        turn = _sigmoid(row[_ANGLE])
-        out[_ANGLE] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
+        turn = _sigmoid(row[at.angle])
+        out[at.angle] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
         # Envelope: -tau^2/2 moves with u and with the spread.
-        spread = math.exp(row[_SPREAD])
+        spread = math.exp(row[at.spread])
         _, slope = _shrink(u, spread, power, floor)
         by_exponent = (by_first + by_second) * slope
         square = u * u / (spread * spread)
-        out[_SPREAD] += by_exponent * square
+        out[at.spread] += by_exponent * square
         d_u -= by_exponent * u / (spread * spread)
-        out[_TIME] += d_u * centre * (_f(1.0) - centre)
+        out[at.time] += d_u * centre * (_f(1.0) - centre)
         d_time -= d_u
-        out[_OPACITY] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
+        out[at.opacity] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
         for c in range(3):
             if color[k, c] > _f(0.0):
-                out[_COLOR + c] += d_color[k, c] * _f(SH_C0)
+                out[at.color + c] += d_color[k, c] * at.sh_c0
     return d_time
 
 
@@ -167,7 +189,9 @@ class Shape:
 def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
     """Write the spans of time of the named rows into `window` (num, 2)."""
     num = len(indices)
-    run_tasks(lambda start: _windows(start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK))
+    run_tasks(
+        lambda start: _windows(_LAYOUT, start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK)
+    )
 
 
 def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> Conditioned:
@@ -182,7 +206,7 @@ def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> C
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
-        _condition(start, stop, alive, rows, shape.degree, t, unit, *constants, mean, factor, opacity, color)
+        _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, mean, factor, opacity, color)
 
     run_tasks(work, range(0, num, CHUNK))
     return Conditioned(alive, t, unit, mean, factor, opacity, color)
@@ -199,6 +223,7 @@ def pull_back(
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
         by_time[start // CHUNK] = _pull_back(
+            _LAYOUT,
             start,
             stop,
             done.alive,

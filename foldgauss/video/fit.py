@@ -5,6 +5,7 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
+from numbers import Integral, Real
 from typing import NamedTuple
 
 import jax
@@ -44,6 +45,8 @@ class LearningRates:
                 raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
 
 
+#: Beyond, powers of u and their gradients no longer tell the coefficients apart in float32.
+MAX_DEGREE = 16
 #: 0.1 px^2 of low pass fits finer detail than the usual 0.3.
 FINE = RenderOptions(low_pass=0.1)
 
@@ -61,6 +64,7 @@ class FitConfig:
     minutes: float | None = None
     batch_size: int = 1
     power: float = 2.0  # of the envelope: 1 as in the paper's text, 2 as in its code
+    floor: float = 0.0  # of the envelope
     ssim_share: float = 0.2
     seed: int = 0
     learn_frame_times: bool = True
@@ -74,23 +78,42 @@ class FitConfig:
             value = getattr(self, name)
             if value is None and name in ("num_gaussians", "steps"):
                 continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
                 raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
+            object.__setattr__(self, name, int(value))  # NumPy's integers have no place in a checkpoint
+        if self.degree > MAX_DEGREE:
+            raise invalid("degree", expected=f"at most {MAX_DEGREE}", got=self.degree)
         if self.steps is not None and self.minutes is not None:
             raise invalid("steps, minutes", expected="at most one of them", got="both")
+        # "[" includes the bound, "(" does not.
         ranges = {
-            "minutes": (0, math.inf),
-            "power": (0, 16),
-            "ssim_share": (0, 1),
-            "final_rate": (0, 1),
+            "minutes": "(0, inf)",
+            "power": "[0, 16]",
+            "floor": "[0, 1)",
+            "ssim_share": "[0, 1]",
+            "final_rate": "[0, 1]",
         }
-        for name, (low, high) in ranges.items():
+        for name, bounds in ranges.items():
             value = getattr(self, name)
             if value is None and name == "minutes":
                 continue
-            allowed = low < value < math.inf if name == "minutes" else low <= value <= high
-            if not allowed:
-                raise invalid(name, expected=f"a number between {low} and {high}", got=value)
+            if not _within(value, bounds):
+                raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
+            object.__setattr__(self, name, float(value))
+        kinds = {"learn_frame_times": bool, "rates": LearningRates, "options": RenderOptions}
+        for name, kind in kinds.items():
+            if not isinstance(getattr(self, name), kind):
+                raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
+
+
+def _within(value: object, bounds: str) -> bool:
+    """Whether `value` is a finite number in an interval written as "[0, 1)"."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+        return False
+    low, high = (float(part) for part in bounds[1:-1].split(","))
+    return (low < value or (bounds[0] == "[" and low == value)) and (
+        value < high or (bounds[-1] == "]" and value == high)
+    )
 
 
 #: Steps where neither steps nor minutes are given: this many, and at least so many visits to every frame.
@@ -160,6 +183,8 @@ def fit(
     """
     config = FitConfig() if config is None else config
     observers, history = list(observers), []
+    if every < 1:
+        raise invalid("every", expected="a whole number >= 1", got=every)
     for state, info in fit_steps(frames, config):
         for observe in observers:
             observe(state, info)
@@ -177,6 +202,8 @@ def fit_steps(
     planes = np.ascontiguousarray(np.moveaxis(frames, -1, 1))  # planar, as the kernels want them
     step = _Stepper(planes, config, state)
     progress = _progress(state, config, len(frames))
+    if progress >= 1:  # a kept state that needs no more steps
+        yield state, _info(state, progress, loss=math.nan, num_alive=0)
     while progress < 1:
         begun = time.perf_counter()
         loss, squared_error, num_alive = step(state, progress)
@@ -185,12 +212,13 @@ def fit_steps(
         state.step += 1
         state.seconds += time.perf_counter() - begun
         progress = _progress(state, config, len(frames))
-        left = state.seconds * (1 - progress) / progress if progress > 0 else math.inf
-        psnr = -10 * math.log10(max(state.error, 1e-12))
-        yield (
-            state,
-            FitInfo(state.step, progress, loss, psnr, len(state.rows), num_alive, state.seconds, left),
-        )
+        yield state, _info(state, progress, loss, num_alive)
+
+
+def _info(state: FitState, progress: float, loss: float, num_alive: int) -> FitInfo:
+    left = state.seconds * (1 - progress) / progress if progress > 0 else math.inf
+    psnr = -10 * math.log10(max(state.error, 1e-12))
+    return FitInfo(state.step, progress, loss, psnr, len(state.rows), num_alive, state.seconds, left)
 
 
 def start(frames: np.ndarray, config: FitConfig) -> FitState:
@@ -246,7 +274,7 @@ class _Stepper:
         self.planes, self.config = planes, config
         num_frames, _, height, width = planes.shape
         self.num_frames = num_frames
-        self.shape = Shape(config.degree, config.power, 0.0, (height, width))
+        self.shape = Shape(config.degree, config.power, config.floor, (height, width))
         self.rates = np.empty(state.rows.shape[1], np.float32)
         for name, place in columns(config.degree).items():
             self.rates[place] = getattr(config.rates, name)
@@ -262,7 +290,8 @@ class _Stepper:
         by_time = np.zeros_like(times)
         losses, alive = [], []
         for k in self._batch(state.step):
-            loss, done, by_time[k] = self._frame(state.rows, int(k), times[k])
+            loss, done, d_time = self._frame(state.rows, int(k), times[k])
+            by_time[k] += d_time  # a batch may hold a frame twice
             losses.append(loss)
             alive.append(done.alive)
         touched = alive[0] if len(alive) == 1 else np.unique(np.concatenate(alive))
@@ -316,7 +345,7 @@ def _progress(state: FitState, config: FitConfig, num_frames: int) -> float:
 
 
 def _envelope(config: FitConfig) -> TimeLikelihood:
-    return TimeLikelihood(power=np.float32(config.power))
+    return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
 
 
 TIME_ADAM = optax.scale_by_adam(eps=1e-15)

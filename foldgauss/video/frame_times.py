@@ -33,7 +33,10 @@ class FrameTimes(eqx.Module):
         return self.logits.shape[0] + 1
 
     def times(self) -> Float[Array, "num_frames"]:
-        """The times t_k: 0 at the first frame, exactly 1 at the last, increasing between."""
+        """The times t_k: 0 at the first frame, exactly 1 at the last, never decreasing.
+
+        Neighbours are equal only where a weight is too small for the dtype to show.
+        """
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1]])
 

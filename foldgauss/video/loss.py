@@ -13,6 +13,7 @@ import numba as nb
 import numpy as np
 
 from foldgauss._checks import invalid
+from foldgauss._kernels import inline, kernel
 from foldgauss._threads import run_tasks
 
 RADIUS = 5  # 11 taps
@@ -24,9 +25,6 @@ STRIP = 40
 _taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(RADIUS + 1)]
 _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(tap / (2 * sum(_taps) - _taps[0])) for tap in _taps)
 
-_FASTMATH = {"nsz", "contract", "reassoc", "arcp"}
-_jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=_FASTMATH)
-_inline = nb.njit(inline="always", error_model="numpy", fastmath=_FASTMATH)
 _f, _u = nb.float32, nb.uint64
 
 
@@ -39,7 +37,7 @@ class ImageLoss(NamedTuple):
     ssim: float | None  # None where its share in the loss is zero: it was not computed
 
 
-@_inline
+@inline
 def _blur(row, x):
     """The 11 taps around x of a row that carries RADIUS entries of padding on either side."""
     c = _u(x + _u(RADIUS))
@@ -53,7 +51,7 @@ def _blur(row, x):
     )
 
 
-@_inline
+@inline
 def _tap(k):
     """Weight of the tap k rows away."""
     k = abs(k)
@@ -70,7 +68,7 @@ def _tap(k):
     return _W5
 
 
-@_jit
+@kernel
 def _vertical_moments(x, y, row, moments):
     """Blur x, y, x^2, y^2, x y down the columns at one row, into the padded rows of `moments` (5, ...)."""
     height, width = x.shape
@@ -88,7 +86,7 @@ def _vertical_moments(x, y, row, moments):
             m_xy[p] += tap * a * b
 
 
-@_jit
+@kernel
 def _similarity_row(moments, ssim, d_mean, d_square, d_product):
     """SSIM along one row, and its derivatives by the blurs of x, x^2 and x y (into padded rows)."""
     b_x, b_y, b_xx, b_yy, b_xy = moments[0], moments[1], moments[2], moments[3], moments[4]
@@ -114,13 +112,13 @@ def _similarity_row(moments, ssim, d_mean, d_square, d_product):
         )
 
 
-@_jit
+@kernel
 def _blur_row(padded, out):
     for c in range(_u(len(out))):
         out[c] = _blur(padded, c)
 
 
-@_jit
+@kernel
 def _finish_row(x, y, row, top, blurred, scratch, scale_l1, scale_ssim, gradient):
     """Blur the derivatives down the columns and put the gradient of one row together."""
     height, width = x.shape
@@ -140,7 +138,7 @@ def _finish_row(x, y, row, top, blurred, scratch, scale_l1, scale_ssim, gradient
         gradient[row, c] = scale_l1 * sign - scale_ssim * by_ssim
 
 
-@_jit
+@kernel
 def _errors(x, y, start, stop):
     """Sums of |x - y| and (x - y)^2 over rows start..stop."""
     absolute, squared = 0.0, 0.0
@@ -155,7 +153,7 @@ def _errors(x, y, start, stop):
     return absolute, squared
 
 
-@_jit
+@kernel
 def _strip(x, y, start, stop, scale_l1, scale_ssim, gradient):
     """Gradient of rows start..stop of one plane; returns their sums of |x - y|, (x - y)^2 and SSIM."""
     height, width = x.shape
@@ -178,7 +176,7 @@ def _strip(x, y, start, stop, scale_l1, scale_ssim, gradient):
     return absolute, squared, total
 
 
-@_jit
+@kernel
 def _strip_l1(x, y, start, stop, scale, gradient):
     """As `_strip`, with no SSIM in the loss."""
     for r in range(start, stop):

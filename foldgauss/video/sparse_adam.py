@@ -8,16 +8,16 @@ import math
 import numba as nb
 import numpy as np
 
+from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
 
 CHUNK = 2048  # rows per task
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
 
-_jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "contract", "reassoc", "arcp"})
 _f, _u = nb.float32, nb.uint64
 
 
-@_jit
+@kernel
 def _update(start, stop, touched, rows, grad, first, second, counts, rates):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     width = _u(rows.shape[1])

@@ -72,6 +72,27 @@ def test_cpu_agrees_with_reference(kind, compositing, options):
         np.testing.assert_allclose(one / size_of, other / size_of, atol=2e-5, err_msg=name)
 
 
+def test_cpu_in_chunks(monkeypatch):
+    """Splats are shared out in chunks; a scene of several gives the same picture and gradients as one."""
+    splats, size = scene("plain")
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
+    weights = np.random.default_rng(0).normal(size=(3, *size)).astype(np.float32)
+    results = []
+    for chunk in (cpu.CHUNK, 32):
+        monkeypatch.setattr(cpu, "CHUNK", chunk)
+        trace = cpu.forward(*leaves, size)
+        results.append([trace.image, *cpu.backward(trace, weights)])
+    for one, two in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_lists_are_cut_behind_the_last_light():
+    splats, size = scene("curtain")
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
+    trace = cpu.forward(*leaves, size)
+    assert sum(len(listed) for _, listed, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
+
+
 def test_mutant_is_caught():
     """The comparison above has power: splats in the opposite order are another picture."""
     splats, size = scene("plain")
@@ -228,6 +249,19 @@ def test_nothing_breaks_on_degenerate_splats():
     assert float(picture.max()) > 0.1
 
 
+@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-20, 3e-7, 1e-5, 1e5, 2.7e6, 1e15, 1e25, np.inf, np.nan])
+@pytest.mark.parametrize("other", [1.0, None])
+def test_gradients_of_extreme_splats_are_finite(scale, other):
+    """On a pixel's centre, where a thin splat's alpha does not vanish; with no low pass to save it."""
+    factor = jnp.diag(jnp.asarray([scale, scale if other is None else other]))[None]
+    splats = Splats2D(jnp.asarray([[8.5, 8.5]]), factor, jnp.asarray([0.5]), jnp.ones((1, 3)))
+    options = RenderOptions(low_pass=0.0)
+    grads = jax.grad(lambda s: jnp.sum(render(s, (17, 17), options=options) ** 2))(splats)
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(grads))
+    if 1e-5 <= scale <= 1e8:
+        assert float(render(splats, (17, 17), options=options)[8, 8, 0]) == pytest.approx(0.5, abs=1e-4)
+
+
 def test_more_channels_take_the_reference():
     splats, size = scene("plain")
     two = Splats2D(splats.mean, splats.factor, splats.opacity, splats.color[:, :2])
@@ -241,6 +275,9 @@ def test_more_channels_take_the_reference():
         ({"compositing": "under"}, "compositing"),
         ({"size": (0, 10)}, "size"),
         ({"size": (10,)}, "size"),
+        ({"size": ("a", 3)}, "size"),
+        ({"size": None}, "size"),
+        ({"size": (float("inf"), 3)}, "size"),
         ({"background": jnp.zeros(4)}, "background"),
         ({"engine": "cpu", "options": RenderOptions(alpha_ceiling=0.9999)}, "alpha_ceiling"),
     ],
@@ -263,6 +300,12 @@ def test_two_channels_refused_by_cpu():
 def test_bad_options(field, value):
     with pytest.raises(ValueError, match=field):
         RenderOptions(**{field: value})
+
+
+def test_a_batch_is_refused_with_a_cure():
+    splats, size = scene("plain")
+    with pytest.raises(ValueError, match="vmap"):
+        render(jax.tree.map(lambda leaf: leaf[None], splats), size)
 
 
 def test_bad_shapes():

@@ -1,6 +1,7 @@
 """The fit on small clips: it learns, repeats itself to the bit, stops and goes on."""
 
 import dataclasses
+import sys
 
 import jax
 import numpy as np
@@ -9,7 +10,9 @@ from clips import moving_blobs
 
 from foldgauss import _threads
 from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps
-from foldgauss.video.fit import check_frames, planned_steps, to_model
+from foldgauss.video.fit import check_frames, planned_steps, start, to_model
+
+fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
 
@@ -46,6 +49,7 @@ def test_learns_a_clip():
         {"learn_frame_times": False},
         {"num_gaussians": 1},
         {"final_rate": 0.0},
+        {"floor": 0.1},
         {"steps": None, "minutes": 0.01},
     ],
     ids=str,
@@ -80,6 +84,44 @@ def test_same_bits_for_any_number_of_threads():
         _threads.set_num_threads(None)
     for one, other in zip(*models, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_frame_twice_in_a_batch_counts_twice(monkeypatch):
+    frames, steps, seen = moving_blobs(num_frames=3), [], {}
+    for batch in ([1], [1, 1]):
+        config = dataclasses.replace(CONFIG, batch_size=len(batch))
+        state = start(frames, config)
+        planes = np.ascontiguousarray(np.moveaxis(frames, -1, 1))
+        monkeypatch.setattr(fit_module, "_update_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m))
+        stepper = fit_module._Stepper(planes, config, state)
+        monkeypatch.setattr(stepper, "_batch", lambda step, batch=batch: np.array(batch))
+        stepper(state, 0.0)
+        steps.append((seen["t"], state.rows.copy()))
+    assert abs(steps[0][0][1]) > 0
+    np.testing.assert_allclose(steps[0][0], steps[1][0], rtol=1e-5)
+    np.testing.assert_allclose(steps[0][1], steps[1][1], atol=1e-6)
+
+
+def test_rates_decay():
+    """The last step is as much shorter as `final_rate` says."""
+    frames, moved = moving_blobs(), {}
+    for final_rate in (1.0, 0.01):
+        config = dataclasses.replace(CONFIG, final_rate=final_rate)
+        before = None
+        for state, info in fit_steps(frames, config):
+            if info.step == 60:
+                moved[final_rate] = np.abs(state.rows - before).mean()
+            before = state.rows.copy()
+    assert moved[0.01] < 0.1 * moved[1.0]
+
+
+def test_a_finished_state_yields_once():
+    frames = moving_blobs()
+    for state, _ in fit_steps(frames, CONFIG):
+        pass
+    again = list(fit_steps(frames, CONFIG, state))
+    assert len(again) == 1
+    assert again[0][1].progress == 1
 
 
 def test_seed_matters():
@@ -137,11 +179,29 @@ def test_planned_steps():
         ({"ssim_share": 2.0}, "ssim_share"),
         ({"final_rate": float("inf")}, "final_rate"),
         ({"seed": -1}, "seed"),
+        ({"degree": 99}, "degree"),
+        ({"power": "2"}, "power"),
+        ({"minutes": "1"}, "minutes"),
+        ({"floor": 1.0}, "floor"),
+        ({"rates": 3}, "rates"),
+        ({"options": None}, "options"),
+        ({"learn_frame_times": "no"}, "learn_frame_times"),
     ],
 )
 def test_bad_settings(changes, message):
     with pytest.raises(ValueError, match=message):
         FitConfig(**changes)
+
+
+def test_numpy_numbers_are_numbers():
+    config = FitConfig(num_gaussians=np.int64(5), power=np.float32(1))
+    assert (config.num_gaussians, config.power) == (5, 1.0)
+    assert type(config.num_gaussians) is int
+
+
+def test_every_must_be_positive():
+    with pytest.raises(ValueError, match="every"):
+        fit(moving_blobs(), CONFIG, every=0)
 
 
 def test_bad_rates():

@@ -1,0 +1,23 @@
+"""How kernels are compiled: serial, without the GIL, kept on disk where that is possible."""
+
+from collections.abc import Callable
+
+import numba as nb
+
+# Not "fast": NaN and infinity keep their meaning; sums may be reordered, which vector sums need.
+_OPTIONS = {"error_model": "numpy", "fastmath": {"nsz", "contract", "reassoc", "arcp"}}
+
+#: For small functions used inside kernels.
+inline = nb.njit(inline="always", **_OPTIONS)
+
+
+def kernel(function: Callable) -> Callable:
+    """Compile `function` at its first call and keep the code beside its source, or in NUMBA_CACHE_DIR.
+
+    Numba looks at the function's own file to tell whether kept code is stale: a constant from another module must be
+    handed in as an argument. Where nothing can be written, code is compiled anew by every process.
+    """
+    try:
+        return nb.njit(nogil=True, cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no place to keep it: a read-only installation with no home
+        return nb.njit(nogil=True, **_OPTIONS)(function)
