@@ -1,174 +1,39 @@
-"""The Folded-Gaussian FN(m, Sigma, a, f) and the Gaussians it is made of (the paper's "Folded-Gaussians").
+"""The Folded-Gaussian FN(m, Sigma, a, f) (the paper's "Folded-Gaussians").
 
 Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *centre* is bent along a curve in time.
-
-Numerics: `a` is never formed, only `log a`. A log-density is finite or -inf for every finite input. Its
-gradient is 0 where it is -inf, and never NaN; the gradient with respect to the value saturates at the largest
-finite number.
 """
-
-from collections.abc import Callable
-from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from foldgauss import moments
+from foldgauss._batch import (
+    align,
+    as_value,
+    batch_of,
+    broadcast,
+    cast,
+    check_event,
+    check_positive,
+    checked_batch,
+    common_dtype,
+    expand,
+    fill,
+    parts_of,
+)
 from foldgauss._checks import invalid
-from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
+from foldgauss._factor import check_loc, given_factor
+from foldgauss._restrict import checked_indices, restricted_fold, restricted_tril
+from foldgauss._triangular import columns_of, lower_times, solve_lower, stacked
+from foldgauss.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
+from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
 from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold
+from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
-
-_ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
-_Vector = Float[Array, "*#batch dim"]
-_Matrix = Float[Array, "*#batch dim dim"]
-
-_LOG_2PI = float(np.log(2 * np.pi))
-# Up to this size triangular systems are written out: XLA's CPU solver is called once per matrix and is 10x
-# slower.
-_UNROLLED_SIZE = 8
-# Saturated gradients with respect to *parameters* stop this far below the largest finite number: chain rule
-# factors (powers of u, 1/scale) and sums over a batch then still have room, where inf - inf would be NaN.
-_CHAIN_HEADROOM = 2.0**-24
-
-
-class Normal(eqx.Module):
-    """A normal distribution on the line: what a Folded-Gaussian says about time alone.
-
-        N(loc, scale^2)(t) = exp(-((t - loc) / scale)^2 / 2) / (sqrt(2 pi) scale)
-
-    **Shapes:** `loc`, `scale` (*batch,), broadcast; `event_shape == ()`, so values have shape (*sample,
-    *batch).
-
-    **Example:** `Normal(0.0, 1.0).log_prob(0.0)  # -0.9189`
-
-    **Source:** eq:normal_pdf. **Raises:** ValueError if `scale` is not positive.
-    """
-
-    loc: Float[Array, "*#batch"]
-    scale: Float[Array, "*#batch"]
-
-    def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
-        dtype = _common_dtype(loc, scale)
-        self.loc, self.scale = _align([(jnp.asarray(loc, dtype), 0), (jnp.asarray(scale, dtype), 0)])
-        if validate_args:
-            _check_scale("scale", self.scale)
-
-    @property
-    def event_shape(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (0, 0)
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return _batch_shape(_parts(self))
-
-    def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """log N(loc, scale^2)(value)."""
-        return _as_gaussian(self).log_prob(_value(value, self.loc.dtype)[..., None])
-
-    def pdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """N(loc, scale^2)(value)."""
-        return jnp.exp(self.log_prob(value))
-
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws of shape (*sample_shape, *batch), differentiable in the parameters."""
-        return _as_gaussian(self).sample(key, sample_shape)[..., 0]
-
-
-class Gaussian(eqx.Module):
-    """A Gaussian in any dimension, by its factor and a scale kept in log space.
-
-        N(loc, exp(2 log_scale) L L^T),   L = base_tril
-
-    `log_scale` is there for Folded-Gaussians seen far from their time, where the product `exp(log_scale) L`
-    (given by `scale_tril`) is 0 in floating point and the density is not.
-
-    **Shapes:** `loc` (*batch, dim), `scale_tril` (*batch, dim, dim) lower-triangular with a positive
-    diagonal, `log_scale` (*batch,), all broadcast; `event_shape == (dim,)`.
-
-    **Example:** `Gaussian(jnp.zeros(2), jnp.eye(2)).log_prob(jnp.zeros(2))  # -1.8379`
-
-    **Source:** eq:cond_dens. **Raises:** ValueError on a wrong shape or a factor that is none.
-    """
-
-    loc: Float[Array, "*#batch dim"]
-    base_tril: Float[Array, "*#batch dim dim"]
-    log_scale: Float[Array, "*#batch"]
-
-    def __init__(
-        self,
-        loc: ArrayLike,
-        scale_tril: ArrayLike,
-        *,
-        log_scale: ArrayLike = 0.0,
-        validate_args: bool = True,
-    ):
-        dtype = _common_dtype(loc, scale_tril, log_scale)
-        loc, tril, log_scale = (jnp.asarray(x, dtype) for x in (loc, scale_tril, log_scale))
-        _check_space(loc, "scale_tril", tril)
-        if validate_args:
-            _check_tril(tril)
-        parts = [(loc, 1), (tril, 2), (log_scale, 0)]
-        _checked_batch(parts)
-        # Ones in front instead of copies: one factor may serve a million times.
-        self.loc, self.base_tril, self.log_scale = _align(parts)
-
-    @property
-    def event_shape(self) -> tuple[int, ...]:
-        return self.loc.shape[-1:]
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (1, 2, 0)
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return _batch_shape(_parts(self))
-
-    @property
-    def scale_tril(self) -> Float[Array, "*#batch dim dim"]:
-        """Factor of the covariance, exp(log_scale) L: it may underflow to 0."""
-        return jnp.exp(self.log_scale)[..., None, None] * self.base_tril
-
-    @property
-    def covariance_matrix(self) -> Float[Array, "*#batch dim dim"]:
-        """exp(2 log_scale) L L^T: it may underflow to 0."""
-        factor = self.scale_tril
-        if factor.shape[-1] > _UNROLLED_SIZE:
-            return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
-        return (factor[..., :, None, :] * factor[..., None, :, :]).sum(-1)
-
-    def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
-        """log N(loc, Sigma)(value)."""
-        value = _value(value, self.loc.dtype)
-        _check_event("value", value, self.event_shape)
-        value, loc, tril, log_scale = _align([(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
-        half_square = _half_mahalanobis(value, loc, tril, log_scale)
-        dim = loc.shape[-1]
-        half_log_det = jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1) + dim * log_scale
-        unreachable = jnp.isposinf(half_square)
-        # Double where: 0 for the gradient of everything where the log-density is -inf.
-        log_density = -jnp.where(unreachable, 0, half_square) - half_log_det - 0.5 * dim * _LOG_2PI
-        return jnp.where(unreachable, -jnp.inf, log_density)
-
-    def pdf(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
-        """N(loc, Sigma)(value)."""
-        return jnp.exp(self.log_prob(value))
-
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws of shape (*sample_shape, *batch, dim), differentiable in the parameters."""
-        shape = (*sample_shape, *self.batch_shape, *self.event_shape)
-        noise = jax.random.normal(key, shape, self.loc.dtype)
-        noise, loc, tril, log_scale = _align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
-        return loc + jnp.exp(log_scale)[..., None] * _lower_times(tril, noise)
 
 
 class FoldedGaussian(eqx.Module):
@@ -181,9 +46,11 @@ class FoldedGaussian(eqx.Module):
     Mind the sign of the fold's argument. The default envelope is the paper's text, `TimeLikelihood(power=1)`;
     the paper's published code is `TimeLikelihood(power=2)`.
 
-    **Shapes:** `loc` (*batch, d-1); `scale_tril` or `covariance_matrix` (*batch, d-1, d-1), exactly one of
-    them; `time_loc`, `time_scale` (*batch,); leading dimensions broadcast. `event_shape == (d,)`. `fold` is a
-    fold (None is `ZeroFold`) or any callable from one scalar u to (d-1,).
+    **Shapes:** `loc` (*batch, d-1); exactly one of `scale_tril`, `covariance_matrix`, `precision_matrix`
+    (*batch, d-1, d-1) and `scale` (*batch, d-1), the paper's standard deviations per coordinate; `time_loc`,
+    `time_scale` (*batch,); leading dimensions broadcast. `event_shape == (d,)`. `fold` is a fold (None is
+    `ZeroFold`) or any callable from one scalar u to (d-1,). `envelope` is an envelope or any callable from scalars
+    (t, time_loc, time_scale) to log a; for one that gives a itself there is `envelope.plain_envelope`.
 
     **Units:** space for `loc` and `scale_tril`, time for `time_loc` and `time_scale`.
 
@@ -214,33 +81,38 @@ class FoldedGaussian(eqx.Module):
         scale_tril: ArrayLike | None = None,
         *,
         covariance_matrix: ArrayLike | None = None,
+        precision_matrix: ArrayLike | None = None,
+        scale: ArrayLike | None = None,
         time_loc: ArrayLike,
         time_scale: ArrayLike,
         fold=None,
-        envelope: AbstractEnvelope | None = None,
+        envelope=None,
         validate_args: bool = True,
     ):
-        name, matrix = _the_one_given(scale_tril=scale_tril, covariance_matrix=covariance_matrix)
-        dtype = _common_dtype(loc, matrix, time_loc, time_scale)
-        loc, matrix, time_loc, time_scale = (jnp.asarray(x, dtype) for x in (loc, matrix, time_loc, time_scale))
-        _check_space(loc, name, matrix)
+        given = {
+            "scale_tril": scale_tril,
+            "covariance_matrix": covariance_matrix,
+            "precision_matrix": precision_matrix,
+            "scale": scale,
+        }
+        dtype = common_dtype(loc, *(x for x in given.values() if x is not None), time_loc, time_scale)
+        loc, time_loc, time_scale = (jnp.asarray(x, dtype) for x in (loc, time_loc, time_scale))
+        check_loc(loc)
+        tril = given_factor(given, dim=loc.shape[-1], dtype=dtype, validate=validate_args)
         if validate_args:
-            _check_scale("time_scale", time_scale)
-        if validate_args and name == "scale_tril":
-            _check_tril(matrix)
-        tril = matrix if name == "scale_tril" else _checked_cholesky(matrix, validate_args)
+            check_positive("time_scale", time_scale)
         fold = ZeroFold(loc.shape[-1]) if fold is None else as_fold(fold)
-        fold = _checked_fold(_cast(fold, dtype), loc)
+        fold = _checked_fold(cast(fold, dtype), loc)
         envelope = TimeLikelihood(power=1.0) if envelope is None else envelope
-        envelope = _cast(_checked_envelope(envelope), dtype)
+        envelope = cast(_checked_envelope(envelope), dtype)
         # Every leaf is given the whole batch, so that slices, `vmap` over the distribution, and an axis that
         # `vmap` over this constructor puts in front, are all well defined.
         parts = [(loc, 1), (tril, 2), (time_loc, 0), (time_scale, 0)]
-        batch = _checked_batch([*parts, *_parts(fold), *_parts(envelope)])
-        self.loc, self.scale_tril, self.time_loc, self.time_scale = _broadcast(parts, batch)
-        self.envelope = _fill(envelope, batch)
+        batch = checked_batch([*parts, *parts_of(fold), *parts_of(envelope)])
+        self.loc, self.scale_tril, self.time_loc, self.time_scale = broadcast(parts, batch)
+        self.envelope = fill(envelope, batch)
         # But a network's parameters are not copied per component: they keep axes of size 1.
-        self.fold = _expand(fold, len(batch)) if isinstance(fold, CallableFold) else _fill(fold, batch)
+        self.fold = expand(fold, len(batch)) if isinstance(fold, CallableFold) else fill(fold, batch)
 
     @property
     def event_shape(self) -> tuple[int, ...]:
@@ -253,7 +125,7 @@ class FoldedGaussian(eqx.Module):
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """Broadcast leading dimensions of all leaves, the fold's and the envelope's included."""
-        return _batch_shape(_parts(self))
+        return batch_of(parts_of(self))
 
     @property
     def time_marginal(self) -> Normal:
@@ -275,9 +147,9 @@ class FoldedGaussian(eqx.Module):
         **Source:** eq:cond_dens, eq:cond_proof. **Raises:** nothing; a t far away only underflows
         `scale_tril`.
         """
-        t = _value(t, self.loc.dtype)
-        dist = _expand(self, t.ndim)
-        (t,) = _align([(t, 0)], dist.time_loc.ndim)
+        t = as_value(t, self.loc.dtype)
+        dist = expand(self, t.ndim)
+        (t,) = align([(t, 0)], dist.time_loc.ndim)
         shift = dist.fold(dist.time_loc - t)
         log_a = dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
         largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would make inf - inf of the density
@@ -294,16 +166,20 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:foldgauss. **Raises:** ValueError if the last dimension of x is not d.
         """
-        x = _value(x, self.loc.dtype)
-        _check_event("x", x, self.event_shape)
+        x = as_value(x, self.loc.dtype)
+        check_event("x", x, self.event_shape)
         s, t = x[..., :-1], x[..., -1]
         log_time = self.time_marginal.log_prob(t)
         overflown = jnp.isinf(self.condition_time(t).loc).any(-1)
         # Double where: at a time so far away that the fold overflows, gradients are taken at f(0) instead.
-        near, time_loc = _align([(t, 0), (self.time_loc, 0)], overflown.ndim)
+        near, time_loc = align([(t, 0), (self.time_loc, 0)], overflown.ndim)
         log_space = self.condition_time(jnp.where(overflown, time_loc, near)).log_prob(s)
         unreachable = overflown | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
+
+    def logpdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
+        """`log_prob` under scipy's name."""
+        return self.log_prob(x)
 
     def pdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """FN(x), shapes as in `log_prob`. **Source:** eq:foldgauss."""
@@ -322,265 +198,250 @@ class FoldedGaussian(eqx.Module):
         # Every batch element draws its own t, also where only loc or the fold carries the batch.
         shape = (*sample_shape, *self.batch_shape)
         noise = jax.random.normal(time_key, shape, self.loc.dtype)
-        noise, time_loc, time_scale = _align([(noise, 0), (self.time_loc, 0), (self.time_scale, 0)])
+        noise, time_loc, time_scale = align([(noise, 0), (self.time_loc, 0), (self.time_scale, 0)])
         t = time_loc + time_scale * noise
         s = self.condition_time(t).sample(space_key)
         return jnp.concatenate([s, t[..., None]], axis=-1)
 
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+        """The draws of `sample`, with their `log_prob`. **Shapes:** -> (*sample_shape, *batch, d) and without d."""
+        x = self.sample(key, sample_shape)
+        return x, self.log_prob(x)
 
-# --- densities ----------------------------------------------------------------------------------------------
-
-
-def _as_gaussian(normal: Normal) -> Gaussian:
-    return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
-
-
-@jax.custom_jvp
-def _half_mahalanobis(value, loc, tril, log_scale):
-    """|L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; all arguments of one batch rank."""
-    z = _times_exp(_solve_lower(tril, value - loc), -log_scale)
-    half = (0.5 * z * z).sum(-1)
-    # A residual that is infinite in one coordinate meets zeros of L as 0 * inf; it is simply far away.
-    return jnp.where(jnp.isinf(value - loc).any(-1), jnp.inf, half)
+    # --- derivatives and whitening ----------------------------------------------------------------------------
 
+    def grad_log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d"]:
+        """The score in x, d log FN(x) / dx.
 
-@_half_mahalanobis.defjvp
-def _half_mahalanobis_jvp(primals, tangents):
-    # d(|y|^2/2 e^2c) = g.(dr - dL y) + |y|^2 e^2c dc with y = L^-1 r, c = -log_scale, g = L^-T y e^2c. By
-    # hand, since e^2c alone overflows long before g does, and because g must be 0, not inf * 0, where the
-    # result is inf.
-    value, loc, tril, log_scale = primals
-    value_dot, loc_dot, tril_dot, log_scale_dot = tangents
-    half = _half_mahalanobis(value, loc, tril, log_scale)
-    unreachable = jnp.isposinf(half)[..., None]
-    y = jnp.where(unreachable, 0, _solve_lower(tril, jnp.where(unreachable, 0, value - loc)))
-    z = _times_exp(y, -log_scale)
-    by_value = _times_exp(_saturated(_solve_upper(tril, z)), -log_scale)
-    by_parameter = _saturated(by_value, _CHAIN_HEADROOM)
-    by_log_scale = -_saturated((z * z).sum(-1), _CHAIN_HEADROOM)
-    half_dot = (by_value * value_dot).sum(-1) - (by_parameter * (loc_dot + _lower_times(tril_dot, y))).sum(-1)
-    return half, half_dot + by_log_scale * log_scale_dot
+        **Shapes:** x (*sample, *batch, d) -> the same. **Example:** `dist.grad_log_prob(dist.mode)  # 0`
 
+        **Source:** eq:foldgauss, differentiated. **Raises:** as `log_prob`.
+        """
+        return jax.grad(lambda x: self.log_prob(x).sum())(self._whole(x))
 
-@jax.custom_jvp
-def _times_exp(y: _Vector, c: Float[Array, "*#batch"]) -> _Vector:
-    """y exp(c) where the product fits but exp(c) need not; saturates where the product does not fit."""
-    largest = _log_largest(y.dtype)
-    half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))[..., None]
-    return _saturated(y * half * half)
+    def observed_information(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d d"]:
+        """The negative Hessian of `log_prob` in x: a precision matrix where the density is locally Gaussian.
 
+        **Shapes:** x (*sample, *batch, d) -> (*sample, *batch, d, d). **Units:** 1 / (unit of x_i x_j).
 
-@_times_exp.defjvp
-def _times_exp_jvp(primals, tangents):
-    (y, c), (y_dot, c_dot) = primals, tangents
-    product = _times_exp(y, c)
-    slope = jnp.exp(jnp.minimum(c, _log_largest(y.dtype)))[..., None]
-    return product, slope * y_dot + _saturated(product, _CHAIN_HEADROOM) * c_dot[..., None]
+        **Example:** `dist.observed_information(dist.mode)`
 
+        **Source:** eq:foldgauss, differentiated twice. **Raises:** as `log_prob`.
+        """
+        x = self._whole(x)
+        directions = jnp.eye(x.shape[-1], dtype=x.dtype)
+        column = lambda e: jax.jvp(self.grad_log_prob, (x,), (jnp.broadcast_to(e, x.shape),))[1]  # noqa: E731
+        return -jax.vmap(column, out_axes=-1)(directions)
 
-def _log_largest(dtype) -> float:
-    return float(np.log(jnp.finfo(dtype).max)) * 0.999  # a little less: exp of it must not round to inf
+    def fold_to_normal(self, x: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
+        """Whitened x, standard normal if x is a draw, and the log-determinant: unfold, then scale.
 
+            z = (L^-1 (s - loc - f(time_loc - t)) / sqrt(a(t)), (t - time_loc) / time_scale),   log |dz/dx|
 
-def _saturated(x: Array, fraction: float = 1.0) -> Array:
-    largest = float(jnp.finfo(x.dtype).max) * fraction
-    return jnp.clip(x, -largest, largest)
+        **Shapes:** x (*sample, *batch, d) -> the same and (*sample, *batch). **Units:** none.
 
+        **Example:** `z, log_det = dist.fold_to_normal(x)  # log_prob(x) = sum log N(z) + log_det`
 
-# --- small triangular algebra -------------------------------------------------------------------------------
+        **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of x is not d.
+        """
+        x = self._whole(x)
+        at = self.condition_time(x[..., -1])
+        z, log_det = _whitened(at, x[..., :-1])
+        loc, scale = (jnp.broadcast_to(y, log_det.shape) for y in (self.time_loc, self.time_scale))
+        z = jnp.concatenate([z, ((x[..., -1] - loc) / scale)[..., None]], axis=-1)
+        return z, log_det - jnp.log(scale)
 
+    def normal_to_fold(self, z: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
+        """The inverse of `fold_to_normal`: x, and log |dx/dz|.
 
-def _solve_lower(tril: _Matrix, b: _Vector) -> _Vector:
-    """L^-1 b by forward substitution."""
-    dim = b.shape[-1]
-    if dim > _UNROLLED_SIZE:
-        return _solve_large(tril, b, transpose=False)
-    x: list[Array] = []
-    for i in range(dim):
-        rest = b[..., i]
-        for j in range(i):
-            rest = rest - tril[..., i, j] * x[j]
-        x.append(rest / tril[..., i, i])
-    return jnp.stack(x, axis=-1)
+        **Shapes:** z (*sample, *batch, d) -> the same and (*sample, *batch).
 
+        **Example:** `dist.normal_to_fold(jax.random.normal(key, (1000, 3)))[0]  # draws`
 
-def _solve_upper(tril: _Matrix, b: _Vector) -> _Vector:
-    """L^-T b by back substitution."""
-    dim = b.shape[-1]
-    if dim > _UNROLLED_SIZE:
-        return _solve_large(tril, b, transpose=True)
-    x: list[Array] = []
-    for i in reversed(range(dim)):
-        rest = b[..., i]
-        for j, known in zip(reversed(range(i + 1, dim)), x, strict=True):
-            rest = rest - tril[..., j, i] * known
-        x.append(rest / tril[..., i, i])
-    return jnp.stack(x[::-1], axis=-1)
+        **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of z is not d.
+        """
+        z = self._whole(z)
+        loc, scale = (jnp.broadcast_to(y, z.shape[:-1]) for y in (self.time_loc, self.time_scale))
+        t = loc + scale * z[..., -1]
+        s, log_det = _coloured(self.condition_time(t), z[..., :-1])
+        return jnp.concatenate([s, t[..., None]], axis=-1), log_det + jnp.log(scale)
 
+    def _whole(self, x) -> Array:
+        """A checked value, with all batch dimensions."""
+        x = as_value(x, self.loc.dtype)
+        check_event("x", x, self.event_shape)
+        return jnp.broadcast_to(x, (*jnp.broadcast_shapes(x.shape[:-1], self.batch_shape), *self.event_shape))
 
-def _solve_large(tril, b, *, transpose: bool):
-    """One solve with all of b as right-hand sides if there is one matrix, else a solve per matrix."""
-    dim = b.shape[-1]
-    solve = lambda a, b: lax.linalg.triangular_solve(a, b, left_side=True, lower=True, transpose_a=transpose)  # noqa: E731
-    if all(size == 1 for size in tril.shape[:-2]):
-        return solve(tril.reshape(dim, dim), b.reshape(-1, dim).T).T.reshape(b.shape)
-    batch = jnp.broadcast_shapes(tril.shape[:-2], b.shape[:-1])
-    tril, b = jnp.broadcast_to(tril, (*batch, dim, dim)), jnp.broadcast_to(b, (*batch, dim))
-    return solve(tril, b[..., None])[..., 0]
+    # --- moments --------------------------------------------------------------------------------------------
 
+    def moments(self, order: int = 64) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
+        """Mean and covariance of x = (s, t).
 
-def _lower_times(tril: _Matrix, x: _Vector) -> _Vector:
-    """L x, reading the lower triangle only."""
-    dim = x.shape[-1]
-    if dim > _UNROLLED_SIZE:
-        return jnp.matmul(jnp.tril(tril), x[..., None])[..., 0]
-    rows = [sum(tril[..., i, j] * x[..., j] for j in range(i + 1)) for i in range(dim)]
-    return jnp.stack(jnp.broadcast_arrays(*rows), axis=-1)
+            E s = loc + E f(u),  Cov s = E[a] Sigma + Cov f(u),  Cov(s, t) = -E[f(u) u],  u ~ N(0, time_scale^2)
 
+        Exact for zero and polynomial folds; `order` is that of the Gauss-Hermite rule for others. E[a] is exact for
+        the built-in envelopes, a fixed quadrature for others.
 
-# --- batches: every leaf has a rank of its own, what stands in front of it is batch -------------------------
+        **Shapes:** (*batch, d) and (*batch, d, d). **Example:** `mean, covariance = dist.moments()`
 
+        **Source:** eq:cond_dens, by total mean and covariance. **Raises:** nothing.
+        """
+        return moments.moments(self, order)
 
-def _batch_rank(parts: list[tuple[Array, int]]) -> int:
-    return max(x.ndim - event for x, event in parts)
+    @property
+    def mean(self) -> Float[Array, "*batch d"]:
+        """E x, as `moments`."""
+        return self.moments()[0]
 
+    @property
+    def variance(self) -> Float[Array, "*batch d"]:
+        """Var x per coordinate, as `moments`."""
+        return jnp.diagonal(self.moments()[1], axis1=-2, axis2=-1)
 
-def _align(parts: list[tuple[Array, int]], rank: int | None = None) -> list[Array]:
-    """The arrays of (array, event rank) with equal batch ranks, by ones in front."""
-    rank = _batch_rank(parts) if rank is None else rank
-    return [lax.expand_dims(x, range(rank + event - x.ndim)) for x, event in parts]
+    @property
+    def covariance_matrix(self) -> Float[Array, "*batch d d"]:
+        """Cov x of space and time together, as `moments`; that of space at one time is `condition_time(t)`'s."""
+        return self.moments()[1]
 
-
-def _broadcast(parts: list[tuple[Array, int]], batch: tuple[int, ...]) -> list[Array]:
-    return [jnp.broadcast_to(x, batch + x.shape[x.ndim - event :]) for x, event in parts]
-
-
-def _parts(module: eqx.Module) -> list[tuple[Array, int]]:
-    """(leaf, event rank) of every leaf."""
-    return list(zip(jax.tree.leaves(module), module.leaf_ranks, strict=True))
-
-
-def _map_parts(function: Callable[[tuple[Array, int]], Array], module: _ModuleT) -> _ModuleT:
-    return jax.tree.unflatten(jax.tree.structure(module), [function(part) for part in _parts(module)])
-
-
-def _expand(module: _ModuleT, rank: int) -> _ModuleT:
-    """`module` with at least `rank` batch dimensions on each leaf, by ones in front."""
-    return _map_parts(lambda part: _align([part], max(rank, _batch_rank([part])))[0], module)
-
-
-def _fill(module: _ModuleT, batch: tuple[int, ...]) -> _ModuleT:
-    """`module` with every leaf broadcast to the whole batch."""
-    return _map_parts(lambda part: _broadcast([part], batch)[0], module)
-
-
-def _batch_shape(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
-    return jnp.broadcast_shapes(*(x.shape[: x.ndim - event] for x, event in parts))
-
-
-# --- dtypes -------------------------------------------------------------------------------------------------
-
-
-def _common_dtype(*inputs: ArrayLike):
-    """The float type of the arrays among the inputs; Python numbers and lists follow, they do not lead."""
-    dtypes = [x.dtype for x in inputs if hasattr(x, "dtype") and not isinstance(x, float)]
-    floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
-    if not floats:
-        return jnp.result_type(float)
-    return jax.dtypes.canonicalize_dtype(np.result_type(*floats))
-
-
-def _value(x: ArrayLike, dtype) -> Array:
-    """A value as an array: float arrays keep their type, all else takes that of the distribution."""
-    own = getattr(x, "dtype", None)
-    keeps = own is not None and jnp.issubdtype(own, jnp.floating) and not isinstance(x, float)
-    return jnp.asarray(x) if keeps else jnp.asarray(x, dtype)
-
-
-def _cast(module: _ModuleT, dtype) -> _ModuleT:
-    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, module)
-
-
-# --- checks: shapes always, values only where there are values ----------------------------------------------
-
-
-def _value_of(x: Array) -> np.ndarray | None:
-    """The numbers, in NumPy (nothing to compile); None under tracing, where there are none to look at."""
-    return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
-
-
-def _the_one_given(**given: ArrayLike | None) -> tuple[str, ArrayLike]:
-    present = [(name, x) for name, x in given.items() if x is not None]
-    if len(present) != 1:
-        names = " and ".join(given)
-        got = "both" if present else "neither"
-        raise invalid(names, expected="exactly one of them", got=got, cure="Sigma is one matrix, given one way.")
-    return present[0]
-
-
-def _check_space(loc: Array, name: str, matrix: Array) -> None:
-    if loc.ndim < 1 or loc.shape[-1] < 1:
-        cure = "A single space coordinate still needs its own axis."
-        raise invalid("loc", expected="shape (*batch, d-1)", got=f"shape {loc.shape}", cure=cure)
-    dim = loc.shape[-1]
-    if matrix.ndim < 2 or matrix.shape[-2:] != (dim, dim):
-        cure = "Its size must be that of loc; for scales per coordinate use jnp.diag(scale)."
-        raise invalid(name, expected=f"shape (*batch, {dim}, {dim})", got=f"shape {matrix.shape}", cure=cure)
-
-
-def _checked_batch(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
-    try:
-        return _batch_shape(parts)
-    except ValueError:
-        shapes = ", ".join(str(x.shape[: x.ndim - event]) for x, event in parts)
-        cure = "Batch dimensions come first in every parameter."
-        raise invalid("batch", expected="leading dimensions that broadcast", got=shapes, cure=cure) from None
-
-
-def _check_event(name: str, value: Array, event_shape: tuple[int, ...]) -> None:
-    if value.shape[-1:] != event_shape:
-        expected = f"shape (*batch, {event_shape[0]})"
-        raise invalid(name, expected=expected, got=f"shape {value.shape}", cure="Time, if any, is last.")
-
-
-def _check_scale(name: str, scale: Array) -> None:
-    scale = _value_of(scale)
-    if scale is not None and (scale <= 0).any():  # a NaN passes, and propagates
-        got, cure = f"a least of {np.nanmin(scale)}", "It is a standard deviation."
-        raise invalid(name, expected="positive numbers", got=got, cure=cure)
-
-
-def _check_tril(tril: Array) -> None:
-    tril = _value_of(tril)
-    if tril is None:
-        return
-    if (np.triu(tril, 1) != 0).any():
-        cure = "Take jnp.tril of it, or pass covariance_matrix."
-        got = "entries above the diagonal"
-        raise invalid("scale_tril", expected="lower-triangular matrices", got=got, cure=cure)
-    diagonal = np.diagonal(tril, axis1=-2, axis2=-1)
-    if (diagonal <= 0).any():
-        got, cure = (
-            f"a least entry of {np.nanmin(diagonal)}",
-            "Flip the sign of its column: Sigma stays the same.",
+    @property
+    def mode(self) -> Float[Array, "*batch d"]:
+        """The highest point of the density, (loc, time_loc), where it is the only one: `power (d-1) < 2`.
+
+        On the ridge s = loc + f(u) the density goes as exp(tau^2 (power (d-1) - 2) / 4).
+
+        **Source:** eq:foldgauss at s = loc + f(u). **Raises:** ValueError that says whether there is a ridge of
+        modes, two of them (a floor), or none (unbounded); NaN under tracing.
+        """
+        return moments.mode(self)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        """Differential entropy; it does not depend on the fold.
+
+            H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2
+
+        Exact without a floor, where E[log a] = -power / 2; else that is a fixed quadrature. **Units:** nats.
+
+        **Source:** the chain rule of eq:foldgauss. **Example:** `dist.entropy()`. **Raises:** nothing.
+        """
+        return moments.entropy(self)
+
+    # --- parts ----------------------------------------------------------------------------------------------
+
+    def marginal(self, indices) -> "FoldedGaussian | Gaussian | TimeMixture":
+        """The distribution of some coordinates; the indices are kept.
+
+        With time among them it is exact, a FoldedGaussian (time alone: a Gaussian); without time it is outside the
+        family, a `TimeMixture`, integrated numerically.
+
+        **Shapes:** `indices`: whole numbers, in the order wanted, time last; -1 is time.
+
+        **Example:** `dist.marginal([0, -1])  # first space coordinate, and time`
+
+        **Source:** eq:integral_proof. **Raises:** ValueError on indices that are none.
+        """
+        indices = checked_indices(indices, self.event_shape[0])
+        space = tuple(i for i in indices if i != self._time_index)
+        if len(space) == len(indices):
+            return time_mixture(self, space, (), jnp.zeros((0,), self.loc.dtype), keeps_time=False)
+        if indices[-1] != self._time_index:
+            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        if not space:
+            return Gaussian(self.time_loc[..., None], self.time_scale[..., None, None], validate_args=False)
+        return FoldedGaussian(
+            self.loc[..., np.array(space)],
+            restricted_tril(self.scale_tril, space),
+            time_loc=self.time_loc,
+            time_scale=self.time_scale,
+            fold=restricted_fold(self.fold, space),
+            envelope=self.envelope,
+            validate_args=False,
         )
-        raise invalid("scale_tril", expected="a positive diagonal", got=got, cure=cure)
+
+    def condition(self, indices, values: ArrayLike) -> "Gaussian | TimeMixture":
+        """The other coordinates, given these.
+
+        With time among the given it is exact, a Gaussian; without, it is outside the family: a `TimeMixture` of the
+        other coordinates and time (last), integrated numerically.
+
+        **Shapes:** `indices`: n whole numbers, -1 is time; `values` (*batch, n) in their order; the result has the
+        other coordinates, in ascending order.
+
+        **Example:** `dist.condition([0], [0.3]).sample(key)  # the other space coordinates, and time`
+
+        **Source:** eq:cond_dens. **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
+        """
+        indices = checked_indices(indices, self.event_shape[0])
+        values = as_value(values, self.loc.dtype)
+        check_event("values", values, (len(indices),))
+        rest = tuple(i for i in range(self._time_index) if i not in indices)
+        if self._time_index not in indices:
+            return time_mixture(self, rest, indices, values, keeps_time=True)
+        if not rest:
+            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+        where = indices.index(self._time_index)
+        given = tuple(i for i in indices if i != self._time_index)
+        ordered = self.marginal((*given, *rest, self._time_index))
+        others = values[..., np.array([k for k in range(len(indices)) if k != where], int)]
+        return conditional_gaussian(ordered, others, values[..., where])
+
+    def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> TimeDensity:
+        """The density of time where space is known, by quadrature: its modes, samples, quantiles, moments.
+
+        **Shapes:** s (*batch, d-1); the result has `event_shape == ()`.
+
+        **Example:** `dist.time_given_space([0.1, -0.4]).modes()`
+
+        **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
+        """
+        s = as_value(s, self.loc.dtype)
+        check_event("s", s, self.loc.shape[-1:])
+        return time_density(self, s)
+
+    @property
+    def _time_index(self) -> int:
+        return self.event_shape[0] - 1
+
+    # --- fits and bridges: imported when asked for -----------------------------------------------------------
+
+    @staticmethod
+    def fit(x: Float[Array, "n d"], **options):
+        """Maximum likelihood from points x = (s, t): see `foldgauss.likelihood.fit` for options and result.
+
+        **Example:** `FoldedGaussian.fit(x, degree=2).distribution`
+        """
+        from foldgauss import likelihood
+
+        return likelihood.fit(x, **options)
+
+    def to_numpyro(self):
+        """This distribution for numpyro models: see `foldgauss.bridges.to_numpyro`."""
+        from foldgauss import bridges
+
+        return bridges.to_numpyro(self)
+
+    def to_scipy(self):
+        """This distribution, frozen, with scipy's methods: see `foldgauss.bridges.to_scipy`."""
+        from foldgauss import bridges
+
+        return bridges.to_scipy(self)
 
 
-def _checked_cholesky(covariance: Array, validate: bool) -> Array:
-    tril, value = jnp.linalg.cholesky(covariance), _value_of(covariance)
-    if not validate or value is None:
-        return tril
-    # Rounding of the user's own arithmetic is no asymmetry.
-    tolerance = 1e3 * np.finfo(value.dtype).eps * np.abs(value).max((-1, -2), initial=0, keepdims=True)
-    if (np.abs(value - np.swapaxes(value, -1, -2)) > tolerance).any():
-        cure = "For a factor use scale_tril; against rounding use (C + C.T) / 2."
-        raise invalid("covariance_matrix", expected="symmetric matrices", got="another", cure=cure)
-    # NaN in, NaN out: only a NaN of Cholesky's own is an error.
-    if (np.isnan(np.asarray(tril)).any((-1, -2)) & ~np.isnan(value).any((-1, -2))).any():
-        cure = "Add a small multiple of the identity, or drop a coordinate that the others determine."
-        raise invalid("covariance_matrix", expected="positive definite matrices", got="another", cure=cure)
-    return tril
+def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:
+    """Standard normal coordinates of s, and log |dz/ds|."""
+    y = stacked(solve_lower(at.base_tril, columns_of(s - at.loc)))
+    half = jnp.exp(-0.5 * at.log_scale)[..., None]  # twice: the product may fit where exp(-log_scale) does not
+    return y * half * half, -_log_det(at)
+
+
+def _coloured(at: Gaussian, z: Array) -> tuple[Array, Array]:
+    """The inverse: s, and log |ds/dz|."""
+    half = jnp.exp(0.5 * at.log_scale)[..., None]
+    return at.loc + stacked(lower_times(at.base_tril, columns_of(z))) * half * half, _log_det(at)
+
+
+def _log_det(at: Gaussian) -> Array:
+    log_diagonal = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1)
+    return jnp.broadcast_to(log_diagonal + at.loc.shape[-1] * at.log_scale, at.batch_shape)
 
 
 def _checked_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
@@ -591,8 +452,8 @@ def _checked_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
     return fold
 
 
-def _checked_envelope(envelope: AbstractEnvelope) -> AbstractEnvelope:
-    if not isinstance(envelope, AbstractEnvelope):
-        cure = "Constant(), TimeLikelihood(power=...), or a subclass."
-        raise invalid("envelope", expected="an AbstractEnvelope", got=repr(envelope), cure=cure)
-    return envelope
+def _checked_envelope(envelope) -> AbstractEnvelope:
+    if not (isinstance(envelope, AbstractEnvelope) or callable(envelope)):
+        cure = "Constant(), TimeLikelihood(power=...), a callable that gives log a, or plain_envelope(a)."
+        raise invalid("envelope", expected="an envelope or a callable", got=repr(envelope), cure=cure)
+    return as_envelope(envelope)

@@ -5,16 +5,18 @@ is not.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from foldgauss._checks import invalid
+from foldgauss._pointwise import call_each, split
 
-__all__ = ["AbstractEnvelope", "Constant", "TimeLikelihood"]
+__all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
 
 
 class AbstractEnvelope(eqx.Module):
@@ -95,6 +97,70 @@ class TimeLikelihood(AbstractEnvelope):
         t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)
         tau = _bounded_tau(t - time_loc, time_scale)
         return _log_floored(0.5 * power * tau * tau, floor)
+
+
+class CallableEnvelope(AbstractEnvelope):
+    """Any function that gives log a, with or without parameters, as an envelope.
+
+        log a(t) = log_a(t, time_loc, time_scale)
+
+    **Shapes:** `log_a` takes three scalars to a scalar <= 0; this class vmaps it over batches. Arrays inside it (a
+    pytree) are leaves of the envelope and are trained with it.
+
+    **Example:** `CallableEnvelope(lambda t, m, scale: -jnp.abs((t - m) / scale))  # a = exp(-|tau|)`
+
+    **Source:** the "suitably chosen" a of eq:cond_dens. **Raises:** ValueError if `log_a` is not callable.
+    """
+
+    parameters: PyTree
+    static: PyTree = eqx.field(static=True)
+    parameter_ranks: tuple[int, ...] = eqx.field(static=True)  # taken where there is one envelope, as in CallableFold
+
+    def __init__(self, log_a: Callable[[Array, Array, Array], Array]):
+        if not callable(log_a):
+            raise invalid("log_a", expected="a callable (t, time_loc, time_scale) -> log a", got=repr(log_a))
+        self.parameters, self.static, self.parameter_ranks = split(log_a)
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return self.parameter_ranks
+
+    def log_a(self, t, *, time_loc, time_scale):
+        dtype = jnp.result_type(t, time_loc, time_scale)
+        scalars = (jnp.asarray(x, dtype) for x in (t, time_loc, time_scale))
+        return call_each(self.parameters, self.static, self.parameter_ranks, *scalars)
+
+
+def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelope:
+    """An envelope from a function that gives `a` itself, at a loss of range.
+
+    Where `a` underflows, its logarithm is lost: log a is held at that of the smallest normal number (-87.3 in
+    float32, -708.4 in float64), with slope 0. `exp(-tau^2/2)` gets there at |tau| = 13.2 and 37.6; beyond, densities
+    are those of a wider Gaussian. Give log a to `CallableEnvelope` where that matters.
+
+    **Shapes:** `a` takes three scalars (t, time_loc, time_scale) to a scalar in (0, 1].
+
+    **Example:** `plain_envelope(lambda t, m, scale: 1 / (1 + ((t - m) / scale) ** 2))`
+
+    **Source:** a of eq:cond_dens. **Raises:** ValueError if `a` is not callable.
+    """
+    if not callable(a):
+        raise invalid("a", expected="a callable (t, time_loc, time_scale) -> a in (0, 1]", got=repr(a))
+    return CallableEnvelope(_Logarithm(a))
+
+
+def as_envelope(envelope: AbstractEnvelope | Callable) -> AbstractEnvelope:
+    """`envelope` itself if it is one, else the callable, which must give log a, in a `CallableEnvelope`."""
+    return envelope if isinstance(envelope, AbstractEnvelope) else CallableEnvelope(envelope)
+
+
+class _Logarithm(eqx.Module):
+    function: Callable
+
+    def __call__(self, *scalars):
+        a = jnp.asarray(self.function(*scalars))
+        smallest = float(jnp.finfo(a.dtype).tiny)
+        return jnp.log(jnp.where(a < smallest, smallest, a))  # a NaN is not smaller, and propagates
 
 
 def _bounded_tau(offset: Float[Array, "*batch"], time_scale: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -5,16 +5,27 @@ A fold is a function of `u = time_loc - t` (note the sign), from a scalar to R^(
 
 from abc import abstractmethod
 from collections.abc import Callable
+from itertools import pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from foldgauss._checks import invalid
+from foldgauss._pointwise import call_each, split
 
-__all__ = ["AbstractFold", "CallableFold", "PolynomialFold", "ZeroFold", "as_fold"]
+__all__ = [
+    "AbstractFold",
+    "CallableFold",
+    "FourierFold",
+    "PolynomialFold",
+    "SplineFold",
+    "ZeroFold",
+    "as_fold",
+]
 
 
 class AbstractFold(eqx.Module):
@@ -78,16 +89,7 @@ class PolynomialFold(AbstractFold):
     coefficients: Float[Array, "*batch degree d-1"]
 
     def __init__(self, coefficients: ArrayLike):
-        coefficients = jnp.asarray(coefficients)
-        if coefficients.ndim < 2 or coefficients.shape[-1] < 1:
-            raise invalid(
-                "coefficients",
-                expected="shape (*batch, degree, d-1)",
-                got=f"shape {coefficients.shape}",
-                cure="Row k-1 holds c_k; a single space coordinate still needs its own axis.",
-            )
-        floating = jnp.issubdtype(coefficients.dtype, jnp.floating)
-        self.coefficients = coefficients if floating else coefficients.astype(float)
+        self.coefficients = _rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
@@ -100,13 +102,117 @@ class PolynomialFold(AbstractFold):
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         u = jnp.asarray(u)
-        rank = max(u.ndim, self.coefficients.ndim - 2)
-        coefficients, u = _with_rank(self.coefficients, rank + 2), _with_rank(u, rank)[..., None]
+        u, coefficients = _aligned(u, self.coefficients)
         batch = jnp.broadcast_shapes(u.shape[:-1], coefficients.shape[:-2])
         shift = jnp.zeros((*batch, coefficients.shape[-1]), jnp.result_type(u, coefficients))
         for k in reversed(range(self.degree)):  # Horner: no power of u is ever formed
             shift = u * (shift + coefficients[..., k, :])
         return shift
+
+
+class SplineFold(AbstractFold):
+    """A B-spline with given knots: a fold that bends locally, and stays bounded far from its time.
+
+        f(u) = sum_i c_i B_i(v),   v = u held within [knots[degree], knots[n]]
+
+    Outside its domain the fold is held at the end value (a polynomial continued out there would overflow where the
+    time likelihood is still alive). **f(0) is not forced to 0:** the B_i sum to 1, so a shift of all c_i is a shift
+    of `loc`, and when both are fitted only their sum is determined. `centred()` takes the constant out, and leaves
+    `loc` the centre at `time_loc`, as with the other folds.
+
+    **Shapes:** `knots` (n + degree + 1,), fixed, not trained; `coefficients` (*batch, n, d-1); u (*batch,) ->
+    (*batch, d-1), leading dimensions broadcast.
+
+    **Units:** knots are times, measured as u = time_loc - t; coefficients are space.
+
+    **Example:** `SplineFold([-1, -1, 0, 1, 1], [[2.0], [0.0], [1.0]], degree=1)(0.5)  # halfway: [0.5]`
+
+    **Source:** the "suitably chosen" f of eq:transform_s; the recursion is that of Cox and de Boor. **Raises:**
+    ValueError if `degree` is no whole number >= 0, knots decrease, are not finite, or leave no domain, or their
+    number does not fit.
+    """
+
+    coefficients: Float[Array, "*batch n d-1"]
+    knots: tuple[float, ...] = eqx.field(static=True)  # given, not trained: an optimiser of all leaves leaves them be
+    degree: int = eqx.field(static=True)
+
+    def __init__(self, knots: ArrayLike, coefficients: ArrayLike, *, degree: int = 3):
+        self.coefficients = _rows("coefficients", coefficients, "n", "Row i holds c_i")
+        if not isinstance(degree, int) or degree < 0:
+            raise invalid("degree", expected="a whole number >= 0", got=repr(degree), cure="3 is a cubic spline.")
+        self.knots, self.degree = _checked_knots(knots, self.coefficients.shape[-2], degree), degree
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (2,)
+
+    def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+        u, coefficients = _aligned(jnp.asarray(u), self.coefficients)
+        n, k = coefficients.shape[-2], self.degree
+        v = jnp.clip(u, self.knots[k], self.knots[n])
+        terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
+        return sum(terms, 0 * v)  # and a NaN propagates through degree 0 too
+
+    def centred(self) -> "SplineFold":
+        """The same fold less its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution."""
+        here = self(jnp.zeros((), self.coefficients.dtype))
+        return eqx.tree_at(lambda fold: fold.coefficients, self, self.coefficients - here[..., None, :])
+
+
+class FourierFold(AbstractFold):
+    """A periodic fold: sines and cosines without a constant, so that f(0) = 0.
+
+        f(u) = sum_{k=1..order} s_k sin(2 pi k u / period) + c_k (cos(2 pi k u / period) - 1)
+
+    More periods away than the float type can tell apart (1 / eps of them) the phase has no meaning and f is 0.
+
+    **Shapes:** `sine`, `cosine` (*batch, order, d-1), row `k - 1` is s_k, c_k; `period` (*batch,); u (*batch,) ->
+    (*batch, d-1), leading dimensions broadcast.
+
+    **Units:** coefficients are space, `period` and u are time.
+
+    **Example:** `FourierFold([[1.0]], [[0.5]], period=4.0)(1.0)  # [1 - 0.5] = [0.5]`
+
+    **Source:** the "suitably chosen" f of eq:transform_s. **Raises:** ValueError if sine and cosine differ in shape, or
+    `period` is not positive.
+    """
+
+    sine: Float[Array, "*batch order d-1"]
+    cosine: Float[Array, "*batch order d-1"]
+    period: Float[Array, "*batch"]
+
+    def __init__(self, sine: ArrayLike, cosine: ArrayLike, *, period: ArrayLike):
+        self.sine = _rows("sine", sine, "order", "Row k-1 holds s_k")
+        self.cosine = _rows("cosine", cosine, "order", "Row k-1 holds c_k").astype(self.sine.dtype)
+        self.period = jnp.asarray(period, self.sine.dtype)
+        if self.sine.shape != self.cosine.shape:
+            got = f"shapes {self.sine.shape} and {self.cosine.shape}"
+            raise invalid("cosine", expected="the shape of sine", got=got, cure="Zeros are free.")
+        if not isinstance(self.period, jax.core.Tracer) and (np.asarray(self.period) <= 0).any():
+            raise invalid("period", expected="positive numbers", got=period, cure="It is a time.")
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (2, 2, 0)
+
+    @property
+    def order(self) -> int:
+        """Number of harmonics."""
+        return self.sine.shape[-2]
+
+    def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+        u = jnp.asarray(u)
+        rank = max(u.ndim, self.period.ndim, self.sine.ndim - 2)
+        sine, cosine = (_with_rank(x, rank + 2) for x in (self.sine, self.cosine))
+        u, period = (_with_rank(x, rank)[..., None] for x in (u, self.period))
+        far = jnp.abs(u) > period / float(jnp.finfo(u.dtype).eps)
+        half_phase = jnp.pi * jnp.where(far, 0, u) / jnp.where(far, 1, period)
+        shift = jnp.zeros((), u.dtype)
+        for k in range(self.order):
+            s, c = jnp.sin((k + 1) * half_phase), jnp.cos((k + 1) * half_phase)
+            shift = shift + 2 * s * (c * sine[..., k, :] - s * cosine[..., k, :])  # cos - 1 without cancellation
+        batch = jnp.broadcast_shapes(u.shape[:-1], period.shape[:-1], sine.shape[:-2])
+        return jnp.broadcast_to(shift, (*batch, sine.shape[-1]))
 
 
 class CallableFold(AbstractFold):
@@ -130,26 +236,14 @@ class CallableFold(AbstractFold):
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, "d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
-        self.parameters, self.static = eqx.partition(function, eqx.is_array)
-        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
+        self.parameters, self.static, self.parameter_ranks = split(function)
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return self.parameter_ranks
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        leaves, treedef = jax.tree.flatten(self.parameters)
-        events = [x.shape[x.ndim - r :] for x, r in zip(leaves, self.parameter_ranks, strict=True)]
-        own = [x.shape[: x.ndim - r] for x, r in zip(leaves, self.parameter_ranks, strict=True)]
-        batch = jnp.broadcast_shapes(jnp.shape(u), *own)
-        flat_u, axis = jnp.broadcast_to(u, batch).reshape(-1), None
-        if any(size != 1 for shape in own for size in shape):  # else one set serves all: no copies of it
-            leaves, axis = [jnp.broadcast_to(x, batch + e) for x, e in zip(leaves, events, strict=True)], 0
-        to = () if axis is None else (flat_u.size,)
-        parameters = [x.reshape(to + e) for x, e in zip(leaves, events, strict=True)]
-        one = lambda leaves, u: eqx.combine(jax.tree.unflatten(treedef, leaves), self.static)(u)  # noqa: E731
-        shift = jax.vmap(one, in_axes=(axis, 0))(parameters, flat_u)
-        return shift.reshape(batch + shift.shape[1:])
+        return call_each(self.parameters, self.static, self.parameter_ranks, u)
 
 
 def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
@@ -160,3 +254,45 @@ def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
 def _with_rank(x: Array, rank: int) -> Array:
     """`x` with ones in front up to `rank` dimensions: broadcasting said aloud, and free under jit."""
     return lax.expand_dims(x, range(rank - x.ndim))
+
+
+def _aligned(u: Array, rows: Array) -> tuple[Array, Array]:
+    """u (*batch, 1) and rows (*batch, n, d-1), of equal batch rank."""
+    rank = max(u.ndim, rows.ndim - 2)
+    return _with_rank(u, rank)[..., None], _with_rank(rows, rank + 2)
+
+
+def _rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[Array, "*batch n d-1"]:
+    x = jnp.asarray(x)
+    if x.ndim < 2 or x.shape[-1] < 1:
+        cure = f"{rows}; a single space coordinate still needs its own axis."
+        raise invalid(name, expected=f"shape (*batch, {count}, d-1)", got=f"shape {x.shape}", cure=cure)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+
+
+def _checked_knots(knots: ArrayLike, n: int, degree: int) -> tuple[float, ...]:
+    knots = np.asarray(knots, np.float64)
+    if knots.shape != (n + degree + 1,) or n <= degree:
+        cure = "There are n coefficients, n > degree; end knots repeat degree + 1 times to clamp the ends."
+        raise invalid(
+            "knots", expected=f"shape (n + degree + 1,) = ({n + degree + 1},)", got=f"{knots.shape}", cure=cure
+        )
+    if not (np.isfinite(knots).all() and (np.diff(knots) >= 0).all() and knots[degree] < knots[n]):
+        cure = "Sort them, and leave knots[degree] < knots[n]."
+        raise invalid("knots", expected="finite numbers that do not decrease", got=knots.tolist(), cure=cure)
+    return tuple(knots.tolist())
+
+
+def _spline_basis(v: Array, knots: tuple[float, ...], degree: int) -> list[Array]:
+    """B_i(v) for all i, by the recursion of Cox and de Boor; empty intervals drop out while tracing."""
+    last = max(i for i in range(len(knots) - 1) if knots[i] < knots[i + 1] and knots[i + 1] <= knots[-degree - 1])
+    inside = [(v >= a) & ((v <= b) if i == last else (v < b)) for i, (a, b) in enumerate(pairwise(knots))]
+    basis = [jnp.where(here & (i <= last), 1, 0).astype(v.dtype) for i, here in enumerate(inside)]
+    for k in range(1, degree + 1):
+        ramps = [_ramp(v, knots[i], knots[i + k]) for i in range(len(basis))]
+        basis = [ramps[i] * basis[i] + (1 - ramps[i + 1]) * basis[i + 1] for i in range(len(basis) - 1)]
+    return basis
+
+
+def _ramp(v: Array, start: float, end: float) -> Array:
+    return (v - start) / (end - start) if start < end else jnp.zeros_like(v)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
-from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, plain_envelope
 from foldgauss.fold import CallableFold, PolynomialFold, ZeroFold
 
 TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
@@ -460,6 +460,14 @@ def test_callables_are_folds():
     _close(LOG_PROB(stack, jnp.zeros(3)), jnp.full(3, alone), 1e-5)
 
 
+def test_callables_are_envelopes():
+    x = jnp.array([0.1, 0.2, 0.6])
+    expected = LOG_PROB(_dist(), x)
+    log_a = lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2  # noqa: E731
+    _close(LOG_PROB(_dist(envelope=log_a), x), expected, 1e-6)
+    _close(LOG_PROB(_dist(envelope=plain_envelope(lambda *args: jnp.exp(log_a(*args)))), x), expected, 1e-5)
+
+
 def test_degree_zero_and_none_are_the_zero_fold():
     x = jax.random.normal(jax.random.key(0), (4, 3))
     plain = LOG_PROB(_dist(fold=ZeroFold(2)), x)
@@ -493,11 +501,15 @@ def test_dtype_follows_the_arrays():
         ({"scale_tril": jnp.ones((2, 2))}, "scale_tril"),
         ({"scale_tril": jnp.diag(jnp.array([1.0, -1.0]))}, "scale_tril"),
         ({"scale_tril": jnp.eye(3)}, "scale_tril"),
-        ({"scale_tril": None}, "scale_tril and covariance_matrix"),
-        ({"covariance_matrix": jnp.eye(2)}, "scale_tril and covariance_matrix"),
+        ({"scale_tril": None}, "scale_tril, covariance_matrix, precision_matrix, scale"),
+        ({"covariance_matrix": jnp.eye(2)}, "scale_tril, covariance_matrix, precision_matrix, scale"),
         ({"scale_tril": None, "covariance_matrix": jnp.eye(3)}, "covariance_matrix"),
         ({"scale_tril": None, "covariance_matrix": jnp.array([[1.0, 0.5], [0.0, 1.0]])}, "covariance_matrix"),
         ({"scale_tril": None, "covariance_matrix": jnp.array([[1.0, 2.0], [2.0, 1.0]])}, "covariance_matrix"),
+        ({"scale_tril": None, "precision_matrix": jnp.eye(3)}, "precision_matrix"),
+        ({"scale_tril": None, "precision_matrix": jnp.array([[1.0, 2.0], [2.0, 1.0]])}, "precision_matrix"),
+        ({"scale_tril": None, "scale": jnp.ones(3)}, "scale"),
+        ({"scale_tril": None, "scale": jnp.array([1.0, 0.0])}, "scale"),
         ({"loc": 0.0}, "loc"),
         ({"loc": jnp.zeros((3, 2)), "time_loc": jnp.zeros(4)}, "batch"),
         ({"fold": PolynomialFold(jnp.ones((3, 1)))}, "fold"),

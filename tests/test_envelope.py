@@ -3,12 +3,20 @@
 import math
 import pickle
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.envelope import (
+    AbstractEnvelope,
+    CallableEnvelope,
+    Constant,
+    TimeLikelihood,
+    as_envelope,
+    plain_envelope,
+)
 
 TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
 
@@ -17,7 +25,24 @@ def _at(envelope, tau):
     return envelope.log_a(jnp.asarray(tau), time_loc=0.0, time_scale=1.0)
 
 
-@pytest.mark.parametrize("envelope", [Constant(), TimeLikelihood(), TimeLikelihood(2.0, floor=0.1)])
+def _laplace(t, time_loc, time_scale):
+    return -jnp.abs(t - time_loc) / time_scale
+
+
+def _plain(t, time_loc, time_scale):
+    return jnp.exp(-0.5 * ((t - time_loc) / time_scale) ** 2)
+
+
+ENVELOPES = [
+    Constant(),
+    TimeLikelihood(),
+    TimeLikelihood(2.0, floor=0.1),
+    CallableEnvelope(_laplace),
+    plain_envelope(_plain),
+]
+
+
+@pytest.mark.parametrize("envelope", ENVELOPES)
 def test_every_envelope_keeps_the_protocol(envelope):
     assert isinstance(envelope, AbstractEnvelope)
     t, time_loc, time_scale = jnp.linspace(-2, 2, 6).reshape(3, 2), jnp.zeros(2), jnp.ones((3, 1))
@@ -115,3 +140,41 @@ def test_bad_input_names_the_parameter(arguments, name):
 def test_nan_propagates():
     assert jnp.isnan(_at(TimeLikelihood(jnp.nan), 1.0))
     assert jnp.isnan(_at(TimeLikelihood(1.0, 0.1), jnp.nan))
+
+
+class _Slope(eqx.Module):
+    rate: jax.Array
+
+    def __call__(self, t, time_loc, time_scale):
+        return -self.rate * jnp.abs(t - time_loc) / time_scale
+
+
+def test_callable_envelope_is_its_function_and_batches_and_trains():
+    t, scale = jnp.linspace(-2.0, 2.0, 6).reshape(3, 2), jnp.array([[0.5], [1.0], [2.0]])
+    got = CallableEnvelope(_laplace).log_a(t, time_loc=jnp.array([0.1, 0.2]), time_scale=scale)
+    np.testing.assert_allclose(got, -np.abs(np.asarray(t) - np.array([0.1, 0.2])) / np.asarray(scale), rtol=1e-6)
+    mapped = jax.vmap(lambda rate: CallableEnvelope(_Slope(rate)))(jnp.arange(3.0))
+    np.testing.assert_allclose(_at(mapped, jnp.full(3, 2.0)), [0, -2, -4])
+    slope = jax.grad(lambda e: _at(e, 2.0))(CallableEnvelope(_Slope(jnp.array(1.5))))
+    assert slope.parameters.rate == -2
+    assert as_envelope(mapped) is mapped
+    assert isinstance(as_envelope(_laplace), CallableEnvelope)
+
+
+@pytest.mark.parametrize(("dtype", "edge"), [(jnp.float32, 13.2), (jnp.float64, 37.6)])
+def test_plain_envelope_agrees_until_a_underflows_and_is_held_beyond(dtype, edge):
+    with jax.enable_x64(dtype == jnp.float64):
+        over = jax.vmap(jax.value_and_grad(lambda tau: _at(plain_envelope(_plain), tau)))
+        values, slopes = over(jnp.asarray([0.0, 1.0, edge - 0.1, edge + 0.2, 1e3, 1e25], dtype))
+        tau = np.array([0.0, 1.0, edge - 0.1])
+        np.testing.assert_allclose(values[:3], -(tau**2) / 2, rtol=1e-5)
+        np.testing.assert_allclose(slopes[:3], -tau, rtol=1e-5)
+        np.testing.assert_allclose(values[3:], math.log(jnp.finfo(dtype).tiny), rtol=1e-6)
+        assert jnp.isfinite(slopes).all()
+        assert jnp.isnan(_at(plain_envelope(_plain), jnp.nan))
+
+
+@pytest.mark.parametrize(("make", "name"), [(CallableEnvelope, "log_a"), (plain_envelope, "a"), (as_envelope, "log_a")])
+def test_what_is_not_callable_is_refused(make, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected .*, got "):
+        make(3.0)

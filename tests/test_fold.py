@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import BSpline
 
-from foldgauss.fold import AbstractFold, CallableFold, PolynomialFold, ZeroFold, as_fold
+from foldgauss.fold import AbstractFold, CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold, as_fold
 
 
 def _wave(u):
@@ -24,10 +25,14 @@ class _Line(eqx.Module):
         return self.slope * u
 
 
+KNOTS = [-1.0, -1.0, -1.0, -1.0, 0.2, 1.0, 1.0, 1.0, 1.0]
 FOLDS = {
     "zero": lambda: ZeroFold(2),
     "degree 0": lambda: PolynomialFold(jnp.zeros((0, 2))),
     "cubic": lambda: PolynomialFold([[1.0, -2.0], [0.5, 0.25], [0.1, 3.0]]),
+    "spline": lambda: SplineFold(KNOTS, np.arange(10.0).reshape(5, 2) ** 1.5, degree=3),
+    "steps": lambda: SplineFold([-1.0, 0.0, 0.5], [[1.0, 2.0], [3.0, -1.0]], degree=0),
+    "fourier": lambda: FourierFold([[1.0, -2.0], [0.5, 0.25]], [[0.3, 1.0], [0.0, -1.0]], period=1.7),
     "function": lambda: CallableFold(_wave),
     "pytree": lambda: CallableFold(_Line(jnp.array([1.0, 2.0]))),
 }
@@ -68,6 +73,71 @@ def test_every_fold_round_trips(fold):
     jax.tree.unflatten(treedef, [object()] * len(flat))  # as vmap and friends do
 
 
+@pytest.mark.parametrize(
+    ("knots", "degree"),
+    [(KNOTS, 3), (np.arange(8.0) - 3.5, 2), ([0.0, 0.0, 0.5, 0.5, 1.0, 1.0], 1), ([-1.0, 0.0, 0.3, 1.0], 0)],
+)
+def test_spline_equals_scipy_and_is_held_outside(knots, degree):
+    rows = np.random.default_rng(degree).normal(size=(len(knots) - degree - 1, 2))
+    domain = knots[degree], knots[len(rows)]
+    u = np.r_[np.linspace(*domain, 41), np.sort(knots)[degree : len(rows) + 1], -1e30, 1e30]
+    with jax.enable_x64(True):
+        fold = SplineFold(knots, rows, degree=degree)
+        both = jax.jit(lambda fold, u: (fold(u), jax.jacfwd(lambda v: fold(v))(u[7]), fold(jnp.nan)))
+        got, slope, nan = both(fold, jnp.asarray(u))
+        spline = BSpline(np.asarray(knots, float), rows, degree)
+        np.testing.assert_allclose(got, spline(np.clip(u, *domain)), rtol=1e-12, atol=1e-12)
+        if degree:
+            np.testing.assert_allclose(slope, spline(u[7], nu=1), rtol=1e-10)
+        assert jnp.isnan(nan).all()
+
+
+def test_centred_spline_differs_by_a_constant():
+    fold = FOLDS["spline"]()
+    u = jnp.linspace(-1.5, 1.5, 9)
+    np.testing.assert_allclose(fold.centred()(u), fold(u) - fold(0.0)[None], atol=1e-4)
+    np.testing.assert_allclose(fold.centred()(0.0), jnp.zeros(2), atol=1e-5)
+    assert jnp.abs(fold(0.0)).max() > 1
+
+
+def test_fourier_is_its_series_and_stays_finite_far_away():
+    rng = np.random.default_rng(0)
+    sine, cosine = rng.normal(size=(2, 3, 2))
+    u, k = rng.uniform(-3, 3, 20), np.arange(1, 4)
+    phase = 2 * np.pi * k * u[:, None] / 1.7
+    with jax.enable_x64(True):
+        fold = FourierFold(sine, cosine, period=1.7)
+        np.testing.assert_allclose(fold(u), np.sin(phase) @ sine + (np.cos(phase) - 1) @ cosine, rtol=1e-12, atol=1e-12)
+        np.testing.assert_array_equal(fold(0.0), [0, 0])
+        # cos - 1 to full accuracy where the plain form gives 0
+        tiny = FourierFold(np.zeros((1, 1)), np.ones((1, 1)), period=2 * np.pi)(1e-12)
+        np.testing.assert_allclose(tiny, [-0.5e-24], rtol=1e-12)
+    far = FourierFold([[1.0]], [[1.0]], period=1e-15)  # its square is still representable
+    both = jax.vmap(jax.value_and_grad(lambda f, u: f(u).sum(), argnums=(0, 1)), in_axes=(None, 0))
+    values, grads = both(far, jnp.array([1e30, -3e38, 1e10, 0.0]))
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((values, grads)))
+    assert jnp.isnan(far(jnp.nan)).all()
+
+
+@pytest.mark.parametrize(
+    "fold",
+    [
+        SplineFold([0.0, 0.0, 1.0, 1.0], jnp.ones((5, 2, 2)), degree=1),
+        FourierFold(jnp.ones((5, 1, 2)), jnp.ones((5, 1, 2)), period=2.0),
+        FourierFold(jnp.ones((1, 2)), jnp.ones((1, 2)), period=jnp.arange(1.0, 6.0)),
+    ],
+)
+def test_batches_of_spline_and_fourier_broadcast(fold):
+    assert fold(0.3).shape == (5, 2)
+    assert fold(jnp.zeros((7, 1))).shape == (7, 5, 2)
+    one = fold(jnp.linspace(0.1, 0.9, 5))
+    ranks = zip(jax.tree.leaves(fold), fold.leaf_ranks, strict=True)
+    axes = [0 if x.ndim > r else None for x, r in ranks]
+    axes = jax.tree.unflatten(jax.tree.structure(fold), axes)
+    mapped = jax.vmap(lambda f, u: f(u), in_axes=(axes, 0))(fold, jnp.linspace(0.1, 0.9, 5))
+    np.testing.assert_allclose(mapped, one, atol=1e-6)
+
+
 @pytest.mark.parametrize(("leading", "shape"), [((), (4,)), ((5,), ()), ((5,), (5,)), ((5, 1), (3,)), ((3,), (5, 1))])
 def test_polynomial_batches_broadcast(leading, shape):
     coefficients = jax.random.normal(jax.random.key(0), (*leading, 3, 2))
@@ -106,6 +176,14 @@ def test_as_fold_wraps_only_what_is_no_fold():
         (lambda: PolynomialFold([1.0, 2.0]), "coefficients"),
         (lambda: PolynomialFold(jnp.zeros((3, 0))), "coefficients"),
         (lambda: ZeroFold(0), "dim"),
+        (lambda: SplineFold([0, 1, 2], [[1.0], [2.0]], degree=1), "knots"),
+        (lambda: SplineFold([0, 2, 1, 3], [[1.0], [2.0]], degree=1), "knots"),
+        (lambda: SplineFold([0, 1, 1, 3], [[1.0], [2.0]], degree=1), "knots"),
+        (lambda: SplineFold([0, 1, 2, 3], [[1.0], [2.0]], degree=-1), "degree"),
+        (lambda: SplineFold([0, 1], [1.0], degree=0), "coefficients"),
+        (lambda: FourierFold([1.0], [[1.0]], period=1.0), "sine"),
+        (lambda: FourierFold([[1.0]], [[1.0], [2.0]], period=1.0), "cosine"),
+        (lambda: FourierFold([[1.0]], [[1.0]], period=0.0), "period"),
         (lambda: ZeroFold(1.5), "dim"),
         (lambda: as_fold(3.0), "function"),
     ],

@@ -1,0 +1,70 @@
+"""Triangular algebra for many systems: small vectors as lists of columns, so that XLA makes one loop of it."""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+Vector = Float[Array, "*#batch dim"]
+Matrix = Float[Array, "*#batch dim dim"]
+#: A small vector is one array (*batch, 1) per coordinate: stacking them is a pass over memory of its own, across which
+#: no loop is fused (a million log-densities on stacked vectors: 24 ms instead of 1 ms). A large one is one array
+#: (*batch, dim): there the coordinates written out would take minutes to compile.
+Columns = list[Array]
+
+#: Up to this size triangular systems are written out: XLA's CPU solver is called once per matrix and is 10x slower.
+UNROLLED_SIZE = 8
+
+
+def columns_of(x: Vector) -> Columns:
+    dim = x.shape[-1]
+    return [x] if dim > UNROLLED_SIZE else [x[..., i : i + 1] for i in range(dim)]
+
+
+def stacked(columns: Columns) -> Vector:
+    return columns[0] if len(columns) == 1 else jnp.concatenate(jnp.broadcast_arrays(*columns), axis=-1)
+
+
+def solve_lower(tril: Matrix, b: Columns) -> Columns:
+    """L^-1 b by forward substitution."""
+    if tril.shape[-1] > UNROLLED_SIZE:
+        return [_solve_large(tril, b[0], transpose=False)]
+    x: Columns = []
+    for i, rest in enumerate(b):
+        for j in range(i):
+            rest = rest - tril[..., i, j, None] * x[j]
+        x.append(rest / tril[..., i, i, None])
+    return x
+
+
+def solve_upper(tril: Matrix, b: Columns) -> Columns:
+    """L^-T b by back substitution."""
+    if tril.shape[-1] > UNROLLED_SIZE:
+        return [_solve_large(tril, b[0], transpose=True)]
+    x: Columns = []
+    for i in reversed(range(len(b))):
+        rest = b[i]
+        for j, known in zip(reversed(range(i + 1, len(b))), x, strict=True):
+            rest = rest - tril[..., j, i, None] * known
+        x.append(rest / tril[..., i, i, None])
+    return x[::-1]
+
+
+def lower_times(tril: Matrix, x: Columns) -> Columns:
+    """L x, reading the lower triangle only."""
+    if tril.shape[-1] > UNROLLED_SIZE:
+        return [jnp.matmul(jnp.tril(tril), x[0][..., None])[..., 0]]
+    return [
+        sum((tril[..., i, j, None] * x[j] for j in range(1, i + 1)), tril[..., i, 0, None] * x[0])
+        for i in range(len(x))
+    ]
+
+
+def _solve_large(tril: Matrix, b: Vector, *, transpose: bool) -> Vector:
+    """One solve with all of b as right-hand sides if there is one matrix, else a solve per matrix."""
+    dim = b.shape[-1]
+    solve = lambda a, b: lax.linalg.triangular_solve(a, b, left_side=True, lower=True, transpose_a=transpose)  # noqa: E731
+    if all(size == 1 for size in tril.shape[:-2]):
+        return solve(tril.reshape(dim, dim), b.reshape(-1, dim).T).T.reshape(b.shape)
+    batch = jnp.broadcast_shapes(tril.shape[:-2], b.shape[:-1])
+    tril, b = jnp.broadcast_to(tril, (*batch, dim, dim)), jnp.broadcast_to(b, (*batch, dim))
+    return solve(tril, b[..., None])[..., 0]

@@ -1,0 +1,243 @@
+"""The Gaussians that a Folded-Gaussian is made of: of time alone, and of space at one time (eq:cond_dens).
+
+Numerics: `a` is never formed, only `log a`. A log-density is finite or -inf for every finite input. Its
+gradient is 0 where it is -inf, and never NaN; the gradient with respect to the value saturates at the largest
+finite number.
+"""
+
+import functools
+import operator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Key
+
+from foldgauss._batch import (
+    align,
+    as_value,
+    batch_of,
+    check_event,
+    check_positive,
+    checked_batch,
+    common_dtype,
+    parts_of,
+)
+from foldgauss._factor import check_space, check_tril
+from foldgauss._triangular import UNROLLED_SIZE, Columns, columns_of, lower_times, solve_lower, solve_upper, stacked
+
+__all__ = ["Gaussian", "Normal"]
+
+_LOG_2PI = float(np.log(2 * np.pi))
+# Saturated gradients with respect to *parameters* stop this far below the largest finite number: chain rule
+# factors (powers of u, 1/scale) and sums over a batch then still have room, where inf - inf would be NaN.
+_CHAIN_HEADROOM = 2.0**-24
+
+
+class Normal(eqx.Module):
+    """A normal distribution on the line: what a Folded-Gaussian says about time alone.
+
+        N(loc, scale^2)(t) = exp(-((t - loc) / scale)^2 / 2) / (sqrt(2 pi) scale)
+
+    **Shapes:** `loc`, `scale` (*batch,), broadcast; `event_shape == ()`, so values have shape (*sample,
+    *batch).
+
+    **Example:** `Normal(0.0, 1.0).log_prob(0.0)  # -0.9189`
+
+    **Source:** eq:normal_pdf. **Raises:** ValueError if `scale` is not positive.
+    """
+
+    loc: Float[Array, "*#batch"]
+    scale: Float[Array, "*#batch"]
+
+    def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
+        dtype = common_dtype(loc, scale)
+        self.loc, self.scale = align([(jnp.asarray(loc, dtype), 0), (jnp.asarray(scale, dtype), 0)])
+        if validate_args:
+            check_positive("scale", self.scale)
+
+    @property
+    def event_shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (0, 0)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return batch_of(parts_of(self))
+
+    def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """log N(loc, scale^2)(value)."""
+        return _as_gaussian(self).log_prob(as_value(value, self.loc.dtype)[..., None])
+
+    def pdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """N(loc, scale^2)(value)."""
+        return jnp.exp(self.log_prob(value))
+
+    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Draws of shape (*sample_shape, *batch), differentiable in the parameters."""
+        return _as_gaussian(self).sample(key, sample_shape)[..., 0]
+
+
+class Gaussian(eqx.Module):
+    """A Gaussian in any dimension, by its factor and a scale kept in log space.
+
+        N(loc, exp(2 log_scale) L L^T),   L = base_tril
+
+    `log_scale` is there for Folded-Gaussians seen far from their time, where the product `exp(log_scale) L`
+    (given by `scale_tril`) is 0 in floating point and the density is not.
+
+    **Shapes:** `loc` (*batch, dim), `scale_tril` (*batch, dim, dim) lower-triangular with a positive
+    diagonal, `log_scale` (*batch,), all broadcast; `event_shape == (dim,)`.
+
+    **Example:** `Gaussian(jnp.zeros(2), jnp.eye(2)).log_prob(jnp.zeros(2))  # -1.8379`
+
+    **Source:** eq:cond_dens. **Raises:** ValueError on a wrong shape or a factor that is none.
+    """
+
+    loc: Float[Array, "*#batch dim"]
+    base_tril: Float[Array, "*#batch dim dim"]
+    log_scale: Float[Array, "*#batch"]
+
+    def __init__(
+        self,
+        loc: ArrayLike,
+        scale_tril: ArrayLike,
+        *,
+        log_scale: ArrayLike = 0.0,
+        validate_args: bool = True,
+    ):
+        dtype = common_dtype(loc, scale_tril, log_scale)
+        loc, tril, log_scale = (jnp.asarray(x, dtype) for x in (loc, scale_tril, log_scale))
+        check_space(loc, "scale_tril", tril)
+        if validate_args:
+            check_tril(tril)
+        parts = [(loc, 1), (tril, 2), (log_scale, 0)]
+        checked_batch(parts)
+        # Ones in front instead of copies: one factor may serve a million times.
+        self.loc, self.base_tril, self.log_scale = align(parts)
+
+    @property
+    def event_shape(self) -> tuple[int, ...]:
+        return self.loc.shape[-1:]
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (1, 2, 0)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return batch_of(parts_of(self))
+
+    @property
+    def scale_tril(self) -> Float[Array, "*#batch dim dim"]:
+        """Factor of the covariance, exp(log_scale) L: it may underflow to 0."""
+        return jnp.exp(self.log_scale)[..., None, None] * self.base_tril
+
+    @property
+    def covariance_matrix(self) -> Float[Array, "*#batch dim dim"]:
+        """exp(2 log_scale) L L^T: it may underflow to 0."""
+        factor = self.scale_tril
+        if factor.shape[-1] > UNROLLED_SIZE:
+            return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
+        return (factor[..., :, None, :] * factor[..., None, :, :]).sum(-1)
+
+    def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
+        """log N(loc, Sigma)(value)."""
+        value = as_value(value, self.loc.dtype)
+        check_event("value", value, self.event_shape)
+        value, loc, tril, log_scale = align([(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
+        half_square = _half_mahalanobis(value, loc, tril, log_scale)
+        dim = loc.shape[-1]
+        half_log_det = jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1) + dim * log_scale
+        unreachable = jnp.isposinf(half_square)
+        # Double where: 0 for the gradient of everything where the log-density is -inf.
+        log_density = -jnp.where(unreachable, 0, half_square) - half_log_det - 0.5 * dim * _LOG_2PI
+        return jnp.where(unreachable, -jnp.inf, log_density)
+
+    def pdf(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
+        """N(loc, Sigma)(value)."""
+        return jnp.exp(self.log_prob(value))
+
+    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Draws of shape (*sample_shape, *batch, dim), differentiable in the parameters."""
+        shape = (*sample_shape, *self.batch_shape, *self.event_shape)
+        noise = jax.random.normal(key, shape, self.loc.dtype)
+        noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
+        scale = jnp.exp(log_scale)[..., None]
+        return loc + stacked([scale * y for y in lower_times(tril, columns_of(noise))])
+
+
+# --- densities ----------------------------------------------------------------------------------------------
+
+
+def _as_gaussian(normal: Normal) -> Gaussian:
+    return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
+
+
+@jax.custom_jvp
+def _half_mahalanobis(value, loc, tril, log_scale):
+    """|L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; all arguments of one batch rank."""
+    residual = columns_of(value - loc)
+    z = [_times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
+    # A residual that is infinite in one coordinate meets zeros of L as 0 * inf; it is simply far away.
+    beyond = _any([jnp.isinf(r) for r in residual])
+    return jnp.where(beyond, jnp.inf, _sum([0.5 * y * y for y in z]))
+
+
+@_half_mahalanobis.defjvp
+def _half_mahalanobis_jvp(primals, tangents):
+    # d(|y|^2/2 e^2c) = g.(dr - dL y) + |y|^2 e^2c dc with y = L^-1 r, c = -log_scale, g = L^-T y e^2c. By
+    # hand, since e^2c alone overflows long before g does, and because g must be 0, not inf * 0, where the
+    # result is inf. Where g overflows, g dL y need not: it is taken as (L^-T z) dL z with z = y e^c.
+    value, loc, tril, log_scale = primals
+    value_dot, loc_dot, tril_dot, log_scale_dot = tangents
+    half = _half_mahalanobis(value, loc, tril, log_scale)
+    unreachable, c = jnp.isposinf(half)[..., None], -log_scale[..., None]
+    residual = [jnp.where(unreachable, 0, r) for r in columns_of(value - loc)]
+    z = [_times_exp(jnp.where(unreachable, 0, y), c) for y in solve_lower(tril, residual)]
+    w = [_saturated(y) for y in solve_upper(tril, z)]
+    by_value = [_times_exp(y, c) for y in w]
+    by_log_scale = -_saturated(_sum([y * y for y in z]), _CHAIN_HEADROOM)
+    return half, (
+        _sum([g * dx for g, dx in zip(by_value, columns_of(value_dot), strict=True)])
+        - _sum([_saturated(g, _CHAIN_HEADROOM) * dx for g, dx in zip(by_value, columns_of(loc_dot), strict=True)])
+        - _sum([g * dx for g, dx in zip(w, lower_times(tril_dot, z), strict=True)])
+        + by_log_scale * log_scale_dot
+    )
+
+
+def _sum(terms: Columns) -> Float[Array, "*#batch"]:
+    return functools.reduce(operator.add, terms).sum(-1)
+
+
+def _any(flags: Columns) -> Bool[Array, "*#batch"]:
+    return functools.reduce(operator.or_, flags).any(-1)
+
+
+@jax.custom_jvp
+def _times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+    """y exp(c) where the product fits but exp(c) need not; saturates where the product does not fit."""
+    largest = _log_largest(y.dtype)
+    half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))
+    return _saturated(y * half * half)
+
+
+@_times_exp.defjvp
+def _times_exp_jvp(primals, tangents):
+    (y, c), (y_dot, c_dot) = primals, tangents
+    product = _times_exp(y, c)
+    slope = jnp.exp(jnp.minimum(c, _log_largest(y.dtype)))
+    return product, slope * y_dot + _saturated(product, _CHAIN_HEADROOM) * c_dot
+
+
+def _log_largest(dtype) -> float:
+    return float(np.log(jnp.finfo(dtype).max)) * 0.999  # a little less: exp of it must not round to inf
+
+
+def _saturated(x: Array, fraction: float = 1.0) -> Array:
+    largest = float(jnp.finfo(x.dtype).max) * fraction
+    return jnp.clip(x, -largest, largest)

@@ -1,0 +1,125 @@
+"""Pictures of a Folded-Gaussian; matplotlib is imported when one is drawn."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from foldgauss._checks import invalid
+from foldgauss.distribution import FoldedGaussian
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_density"]
+
+_RED = "#d1242f"
+_DENSITY = "Blues"
+_MASS = (0.3, 0.6, 0.9)  # probability inside the contour lines
+_GRID = 240
+_REACH = 3.2  # time shown, in time_scales on either side
+_LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
+
+
+def plot_density(
+    dist: FoldedGaussian,
+    ax: "Axes | None" = None,
+    *,
+    slices: int | Sequence[float] = 3,
+    t_limits: tuple[float, float] | None = None,
+    s_limits: tuple[float, float] | None = None,
+) -> "Axes":
+    """The density of a Folded-Gaussian of d = 2, with conditional distributions s | t in red: the paper's figure.
+
+    Time runs to the right, space upwards; contour lines hold 30, 60 and 90% of the probability shown. A red bell
+    stands on each chosen time: `N(s | t)` drawn sideways, all to the same height (a narrow one would be tall), its
+    foot at that time, a dot at its centre `loc + f(time_loc - t)`.
+
+    **Shapes:** `dist` has `event_shape == (2,)` and no batch; `slices` is their number, or the times themselves.
+
+    **Units:** time and space of `dist`, for the limits as well.
+
+    **Example:** `plot_density(dist, ax).set_title("f(u) = u^2")`
+
+    **Source:** fig:2D_dist. **Raises:** ImportError that names the extra if matplotlib is missing; ValueError if
+    `dist` is not a single distribution in the plane.
+    """
+    _check_plane(dist)
+    pyplot = _pyplot()
+    ax = pyplot.subplots()[1] if ax is None else ax
+    loc, scale = float(dist.time_loc), float(dist.time_scale)
+    t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
+    s_limits = _space_limits(dist, t_limits) if s_limits is None else s_limits
+    times = loc + scale * np.linspace(-1.5, 1.5, slices) if isinstance(slices, int) else np.asarray(slices, float)
+    _draw_density(dist, ax, t_limits, s_limits)
+    _draw_slices(dist, ax, times, s_limits, width=_bell_width(times, t_limits))
+    ax.set(xlim=t_limits, ylim=s_limits, xlabel="time t", ylabel="space s")
+    return ax
+
+
+def _draw_density(dist, ax, t_limits, s_limits) -> None:
+    t, s = (np.linspace(*limits, _GRID) for limits in (t_limits, s_limits))
+    points = np.stack(np.broadcast_arrays(s[:, None], t[None, :]), axis=-1)
+    density = np.exp(np.asarray(_LOG_PROB(dist, jnp.asarray(points, dist.loc.dtype)), float))
+    # The square root keeps the tails visible beside the peak.
+    shade = np.sqrt(density / density.max())
+    ax.pcolormesh(t, s, shade, cmap=_DENSITY, vmin=0, vmax=1.6, shading="gouraud", rasterized=True)
+    levels = _mass_levels(density)
+    if len(levels):
+        ax.contour(t, s, density, levels=levels, colors="#1f4e79", linewidths=0.8, alpha=0.8)
+
+
+def _mass_levels(density: np.ndarray) -> np.ndarray:
+    """Densities above which the given shares of the probability lie, rising and distinct, as contours need them."""
+    ordered = np.sort(density.ravel())[::-1]
+    mass = np.cumsum(ordered) / ordered.sum()
+    return np.unique(ordered[np.searchsorted(mass, _MASS)])
+
+
+def _draw_slices(dist, ax, times, s_limits, width: float) -> None:
+    for t in times:
+        centre, scale = _conditional(dist, np.array([t]))
+        s = np.linspace(centre[0] - 3.5 * scale[0], centre[0] + 3.5 * scale[0], 201)
+        bell = t + width * np.exp(-0.5 * ((s - centre[0]) / scale[0]) ** 2)
+        ax.fill_betweenx(s, t, bell, color=_RED, alpha=0.25, linewidth=0, zorder=3)
+        ax.plot(bell, s, color=_RED, linewidth=1.4, zorder=4)
+        ax.plot([t, t], s_limits, color=_RED, linewidth=0.7, alpha=0.55, zorder=2)
+        ax.plot([t], centre, "o", color=_RED, markersize=3, zorder=5)
+
+
+def _bell_width(times, t_limits) -> float:
+    """Bells must not reach the next time."""
+    gap = np.diff(np.sort(times)).min() if len(times) > 1 else np.inf
+    return min(0.75 * gap, 0.16 * (t_limits[1] - t_limits[0]))
+
+
+def _conditional(dist, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and standard deviation of s | t."""
+    gaussian = dist.condition_time(jnp.asarray(t, dist.loc.dtype))
+    return np.asarray(gaussian.loc, float)[..., 0], np.asarray(gaussian.scale_tril, float)[..., 0, 0]
+
+
+def _space_limits(dist, t_limits) -> tuple[float, float]:
+    """Where s is with a probability of about 99%: the curve's far ends carry no mass and need no room."""
+    loc, scale = float(dist.time_loc), float(dist.time_scale)
+    t = np.linspace(max(t_limits[0], loc - 2.2 * scale), min(t_limits[1], loc + 2.2 * scale), 101)
+    centre, spread = _conditional(dist, t)
+    low, high = (centre - 3.2 * spread).min(), (centre + 3.2 * spread).max()
+    return float(low), float(high)
+
+
+def _check_plane(dist) -> None:
+    if dist.batch_shape != () or dist.event_shape != (2,):
+        got = f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}"
+        cure = "Take one element of a batch, or a marginal of one space coordinate and time."
+        raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
+
+
+def _pyplot():
+    try:
+        from matplotlib import pyplot
+    except ImportError as error:
+        raise ImportError("plot_density needs matplotlib: pip install 'foldgauss[plot]'.") from error
+    return pyplot

@@ -1,0 +1,165 @@
+"""The numpyro and scipy bridges: the same numbers in other clothes, and a short NUTS through one of them."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from foldgauss.bridges import to_numpyro, to_scipy
+from foldgauss.distribution import FoldedGaussian
+from foldgauss.envelope import Constant
+from foldgauss.fold import PolynomialFold
+from foldgauss.gaussian import Gaussian, Normal
+
+COVARIANCE = np.array([[0.5, 0.2], [0.2, 0.4]])
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def numpyro():
+    module = pytest.importorskip("numpyro", reason="numpyro is an optional extra")
+    # numpyro's own code broadcasts and promotes freely; the house rules are for ours.
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield module
+
+
+def _dist(**changes):
+    parameters = {"time_loc": 0.4, "time_scale": 0.3, "fold": PolynomialFold(jnp.array([[0.8, -0.5], [0.6, 0.9]]))}
+    return FoldedGaussian([0.1, -0.4], [[0.3, 0.0], [0.1, 0.2]], **(parameters | changes))
+
+
+def _plain():
+    """f = 0, a = 1: scipy's multivariate normal."""
+    dist = FoldedGaussian([0.1, -0.4], covariance_matrix=COVARIANCE, time_loc=0.4, time_scale=0.3, envelope=Constant())
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2], covariance[2, 2] = COVARIANCE, 0.09
+    return dist, stats.multivariate_normal([0.1, -0.4, 0.4], covariance)
+
+
+# --- scipy --------------------------------------------------------------------------------------------------
+
+
+def test_scipy_object_agrees_with_scipys_own(x64):
+    dist, twin = _plain()
+    frozen, x = to_scipy(dist), twin.rvs(50, random_state=0)
+    np.testing.assert_allclose(frozen.logpdf(x), twin.logpdf(x), rtol=1e-12)
+    np.testing.assert_allclose(frozen.pdf(x[0]), twin.pdf(x[0]), rtol=1e-12)
+    np.testing.assert_allclose(frozen.entropy(), twin.entropy(), rtol=1e-12)
+    np.testing.assert_allclose(frozen.mean, twin.mean, rtol=1e-12)
+    np.testing.assert_allclose(frozen.cov, twin.cov, rtol=1e-12, atol=1e-14)
+    assert frozen.dim == twin.dim == 3
+    assert isinstance(frozen.logpdf(x), np.ndarray)
+    assert np.shape(frozen.entropy()) == ()
+
+
+def test_scipy_marginals_agree_with_scipys_own(x64):
+    dist, twin = _plain()
+    for indices in ([0], [0, 1], [2], [1, 2], [-1]):
+        frozen, x = to_scipy(dist).marginal(indices), twin.rvs(20, random_state=1)[:, indices]
+        own = stats.multivariate_normal(twin.mean[indices], twin.cov[np.ix_(indices, indices)])
+        points = x[:, 0] if len(indices) == 1 else x
+        np.testing.assert_allclose(frozen.logpdf(points), own.logpdf(points), rtol=1e-7)
+
+
+def test_scipy_draws_follow_scipys_conventions():
+    frozen = to_scipy(_dist())
+    assert frozen.rvs(random_state=0).shape == (3,)
+    assert frozen.rvs(5, random_state=np.random.default_rng(0)).shape == (5, 3)
+    assert frozen.rvs((2, 4), random_state=np.random.RandomState(0)).shape == (2, 4, 3)
+    np.testing.assert_array_equal(frozen.rvs(5, random_state=7), frozen.rvs(5, random_state=7))
+    assert (frozen.rvs(5, random_state=7) != frozen.rvs(5, random_state=8)).any()
+    assert (frozen.rvs(5) != frozen.rvs(5)).any()
+
+
+def test_scipy_samples_belong_to_the_density():
+    frozen = _dist().to_scipy()
+    x = frozen.rvs(20_000, random_state=0)
+    score = -frozen.logpdf(x)
+    # The mean of -log p is the entropy; 5 standard errors, false alarm 6e-7.
+    assert abs(score.mean() - frozen.entropy()) < 5 * score.std() / np.sqrt(len(x))
+    # Power: draws of a fold of the other sign must be caught.
+    other = to_scipy(_dist(fold=PolynomialFold(jnp.array([[-0.8, 0.5], [0.6, 0.9]])))).rvs(20_000, random_state=0)
+    assert abs(-frozen.logpdf(other).mean() - frozen.entropy()) > 50 * score.std() / np.sqrt(len(x))
+
+
+def test_gaussians_are_frozen_too(x64):
+    normal, gaussian = to_scipy(Normal(0.5, 2.0)), to_scipy(Gaussian([0.0, 1.0], jnp.linalg.cholesky(COVARIANCE)))
+    np.testing.assert_allclose(normal.entropy(), stats.norm(0.5, 2.0).entropy(), rtol=1e-12)
+    np.testing.assert_allclose(normal.pdf(0.3), stats.norm(0.5, 2.0).pdf(0.3), rtol=1e-12)
+    np.testing.assert_allclose(gaussian.entropy(), stats.multivariate_normal(cov=COVARIANCE).entropy(), rtol=1e-12)
+    assert normal.rvs(4, random_state=0).shape == (4,)
+
+
+def test_scipy_object_refuses_a_batch():
+    with pytest.raises(ValueError, match=r"dist: expected batch_shape \(\), got \(3,\)"):
+        to_scipy(_dist(time_loc=jnp.zeros(3)))
+
+
+# --- numpyro ------------------------------------------------------------------------------------------------
+
+
+def test_numpyro_distribution_is_the_same_distribution(numpyro):
+    dist = _dist(time_loc=jnp.array([0.2, 0.4]))
+    bridge, key = to_numpyro(dist), jax.random.key(0)
+    assert (bridge.batch_shape, bridge.event_shape) == ((2,), (3,))
+    x = bridge.sample(key, (5,))
+    np.testing.assert_array_equal(x, dist.sample(key, (5,)))
+    np.testing.assert_array_equal(bridge.log_prob(x), dist.log_prob(x))
+    np.testing.assert_allclose(bridge.mean, dist.mean)
+    np.testing.assert_allclose(bridge.variance, dist.variance)
+    flat, treedef = jax.tree.flatten(bridge)
+    again = jax.tree.unflatten(treedef, flat)
+    np.testing.assert_array_equal(jax.jit(lambda d, x: d.log_prob(x))(again, x).shape, (5, 2))
+    assert again.support(x).all()
+
+
+def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
+    from numpyro import distributions
+    from numpyro.infer import MCMC, NUTS
+
+    x = _dist().sample(jax.random.key(0), (400,))
+
+    def model(x):
+        bend = numpyro.sample("bend", distributions.Normal(0, 1).expand([2, 2]).to_event(2))
+        numpyro.sample("x", _dist(fold=PolynomialFold(bend)).to_numpyro(), obs=x)
+        # The same family as a latent variable, not only as a likelihood (a = 1: else it is a funnel).
+        numpyro.sample("latent", to_numpyro(_dist(envelope=Constant())))
+
+    mcmc = MCMC(NUTS(model), num_warmup=150, num_samples=200, progress_bar=False)
+    mcmc.run(jax.random.key(1), x)
+    draws = mcmc.get_samples()
+    mean, error = draws["bend"].mean(0), draws["bend"].std(0)
+    truth = np.array([[0.8, -0.5], [0.6, 0.9]])
+    assert (np.abs(mean - truth) < 5 * error).all()
+    assert (error < 0.1).all()
+    # Power: a fold of the wrong sign lies far outside the posterior.
+    assert (np.abs(mean + truth) > 5 * error).all()
+    assert draws["latent"].shape == (200, 3)
+    np.testing.assert_allclose(draws["latent"][:, 2].mean(), 0.4, atol=0.15)  # sd 0.02 to 0.03
+
+
+def test_missing_numpyro_names_the_extra(monkeypatch):
+    from foldgauss import bridges
+
+    monkeypatch.setitem(sys.modules, "numpyro", None)
+    bridges._numpyro_class.cache_clear()
+    with pytest.raises(ImportError, match=r"pip install 'foldgauss\[numpyro\]'"):
+        to_numpyro(_dist())
+    bridges._numpyro_class.cache_clear()
+
+
+def test_import_leaves_optional_libraries_alone():
+    code = (
+        "import sys, foldgauss, foldgauss.bridges, foldgauss.plot; print({'numpyro', 'matplotlib'} & set(sys.modules))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "set()"

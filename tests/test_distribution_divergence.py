@@ -1,0 +1,168 @@
+"""The Kullback-Leibler divergence: against samples, scipy-like closed forms, and its infinite cases."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.distribution import FoldedGaussian
+from foldgauss.divergence import kl_divergence
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.fold import PolynomialFold, ZeroFold
+from foldgauss.gaussian import Gaussian, Normal
+
+BEND = np.array([[0.8, -0.5], [0.6, 0.9]])
+TRIL = np.array([[0.3, 0.0], [0.1, 0.2]])
+KL = eqx.filter_jit(kl_divergence)
+
+
+class OwnLikelihood(AbstractEnvelope):
+    """The time likelihood with power 1 as an envelope of unknown form: only quadrature can know it."""
+
+    @property
+    def leaf_ranks(self):
+        return ()
+
+    def log_a(self, t, *, time_loc, time_scale):
+        return -0.5 * ((t - time_loc) / time_scale) ** 2
+
+
+@pytest.fixture(autouse=True)
+def _x64():
+    with jax.enable_x64(True):
+        yield
+
+
+def _dist(power=1.0, floor=0.0, *, time_loc=0.4, time_scale=0.3, bend=BEND, envelope=None, loc=(0.1, -0.4), tril=TRIL):
+    return FoldedGaussian(
+        np.array(loc),
+        tril,
+        time_loc=time_loc,
+        time_scale=time_scale,
+        fold=PolynomialFold(bend),
+        envelope=TimeLikelihood(power, floor) if envelope is None else envelope,
+    )
+
+
+def test_divergence_from_itself_is_zero():
+    powers, floors = np.array([0.0, 1.0, 2.0, 2.0]), np.array([0.0, 0.0, 0.0, 0.1])
+    np.testing.assert_allclose(KL(_dist(powers, floors), _dist(powers, floors)), 0, atol=1e-12)
+    own = _dist(envelope=OwnLikelihood())
+    np.testing.assert_allclose(KL(own, own), 0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [
+        ({}, {"power": 0.5, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
+        ({"power": 2.0}, {"power": 0.5, "floor": 0.05, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
+        ({"floor": 0.2}, {"power": 0.5, "time_scale": 0.5, "loc": (0.0, 0.0)}),
+        ({"envelope": Constant()}, {"power": 0.2, "time_scale": 0.4, "tril": np.diag([0.4, 0.3])}),
+        ({"envelope": OwnLikelihood()}, {"power": 0.3, "time_scale": 0.4}),
+    ],
+)
+def test_divergence_is_the_mean_of_the_log_ratio(pair):
+    p, q = (_dist(**changes) for changes in pair)
+    n = 200_000
+    x = eqx.filter_jit(FoldedGaussian.sample)(p, jax.random.key(5), (n,))
+    log_prob = eqx.filter_jit(FoldedGaussian.log_prob)
+    ratio = np.asarray(log_prob(p, x) - log_prob(q, x))
+    divergence = KL(p, q)
+    error = ratio.std() / np.sqrt(n)
+    assert abs(ratio.mean() - divergence) < 5 * error
+    assert divergence > 5 * error  # so the test would see a wrong sign, or nothing
+
+
+def test_exact_and_quadrature_agree():
+    q = {"time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}
+    exact = KL(_dist(), _dist(1.0, **q))
+    np.testing.assert_allclose(KL(_dist(), _dist(envelope=OwnLikelihood(), **q)), exact, rtol=1e-9)
+    np.testing.assert_allclose(KL(_dist(envelope=OwnLikelihood()), _dist(1.0, **q)), exact, rtol=1e-9)
+    np.testing.assert_allclose(KL(_dist(), _dist(1.0, 1e-200, **q)), exact, rtol=1e-9)
+    nearly = KL(_dist(), _dist(np.array([1.0, 1.0]), np.array([0.0, 1e-200]), **q))  # both ways in one batch
+    np.testing.assert_allclose(nearly, exact, rtol=1e-9)
+
+
+def test_divergence_is_never_negative():
+    rng = np.random.default_rng(0)
+    n = 200
+    one = {"time_loc": rng.normal(size=n) * 0.1, "time_scale": rng.uniform(0.2, 0.6, n)}
+    other = {"time_loc": rng.normal(size=n) * 0.1, "time_scale": rng.uniform(0.2, 0.6, n)}
+    p, q = _dist(rng.uniform(0, 2, n), **one), _dist(rng.uniform(0, 2, n), **other)
+    divergence = KL(p, q)
+    assert (divergence > 0).all()
+    assert not np.isnan(divergence).any()
+
+
+@pytest.mark.parametrize(
+    ("p", "q", "finite"),
+    [
+        # The covariance term, finite iff (1 + power_p) scale_q^2 > power_q scale_p^2 (same curves).
+        ({"power": 1.0}, {"power": 1.0, "time_scale": 0.22}, True),
+        ({"power": 1.0}, {"power": 1.0, "time_scale": 0.21}, False),
+        ({"power": 0.0}, {"power": 1.0}, False),
+        ({"envelope": Constant()}, {"power": 0.9}, True),
+        # Curves that differ need scale_q^2 > power_q scale_p^2.
+        ({"power": 1.0}, {"power": 1.0, "bend": 2 * BEND}, False),
+        ({"power": 1.0}, {"power": 0.99, "bend": 2 * BEND}, True),
+        ({"power": 1.0}, {"power": 1.0, "loc": (0.2, -0.4), "time_scale": 0.31}, True),
+        # A floor in p is a tail of its own; a floor in q makes all finite.
+        ({"power": 1.0, "floor": 0.1}, {"power": 1.0}, False),
+        ({"power": 0.0}, {"power": 2.0, "floor": 1e-3, "bend": 2 * BEND}, True),
+        # The same by quadrature, to which nobody tells the formula.
+        ({"power": 0.5}, {"envelope": OwnLikelihood(), "bend": 2 * BEND, "time_scale": 0.2}, False),
+        ({"envelope": OwnLikelihood()}, {"power": 1.0, "time_scale": 0.2}, False),
+    ],
+)
+def test_where_it_is_infinite(p, q, finite):
+    divergence = KL(_dist(**p), _dist(**q))
+    assert np.isfinite(divergence) == finite
+    assert finite or np.isposinf(divergence)
+
+
+def test_same_curve_written_about_another_time_is_the_same_curve():
+    # loc + c (m_t - t) with m_t moved by 0.2: the centres agree up to rounding, so only the covariance counts.
+    p = _dist(1.0, bend=BEND[:1])
+    q = _dist(1.0, time_loc=0.6, bend=BEND[:1], loc=np.array([0.1, -0.4]) - 0.2 * BEND[0])
+    assert np.isfinite(KL(p, q))
+
+
+def test_gaussians():
+    rng = np.random.default_rng(1)
+    tril_p, tril_q = (np.tril(rng.uniform(0.5, 1, (3, 3))) for _ in range(2))
+    loc_p, loc_q = rng.normal(size=(2, 3))
+    sigma_p, inverse = tril_p @ tril_p.T * 4, np.linalg.inv(tril_q @ tril_q.T)
+    log_det = np.linalg.slogdet(sigma_p @ inverse)[1]
+    square = (loc_p - loc_q) @ inverse @ (loc_p - loc_q)
+    expected = 0.5 * (np.trace(inverse @ sigma_p) - 3 + square - log_det)
+    p, q = Gaussian(loc_p, tril_p, log_scale=np.log(2.0)), Gaussian(loc_q, tril_q)
+    np.testing.assert_allclose(KL(p, q), expected, rtol=1e-12)
+    normal = KL(Normal(0.3, 0.5), Normal(0.1, 0.7))
+    np.testing.assert_allclose(normal, np.log(1.4) + (0.25 + 0.04) / 0.98 - 0.5, rtol=1e-12)
+
+
+def test_without_fold_and_envelope_it_is_that_of_gaussians():
+    flat = {"fold": ZeroFold(2), "envelope": Constant()}
+    p = FoldedGaussian([0.1, 0.2], TRIL, time_loc=0.1, time_scale=0.5, **flat)
+    q = FoldedGaussian([0.3, 0.1], 2 * TRIL, time_loc=0.2, time_scale=0.7, **flat)
+    parts = KL(p.condition_time(0.0), q.condition_time(0.0)) + KL(p.time_marginal, q.time_marginal)
+    np.testing.assert_allclose(KL(p, q), parts, rtol=1e-12)
+
+
+def test_batches_jit_and_gradients():
+    p, q = _dist(np.array([[0.5], [1.0]])), _dist(0.3, time_scale=np.array([0.3, 0.4, 0.5]))
+    together = KL(p, q)
+    assert together.shape == (2, 3)
+    np.testing.assert_allclose(together[1, 2], KL(_dist(1.0), _dist(0.3, time_scale=0.5)), rtol=1e-12)
+    np.testing.assert_allclose(kl_divergence(_dist(1.0), _dist(0.3)), KL(_dist(1.0), _dist(0.3)), rtol=1e-12)
+    by_scale = lambda scale: kl_divergence(_dist(1.0), _dist(0.3, time_scale=scale))  # noqa: E731
+    difference = (by_scale(0.4 + 1e-5) - by_scale(0.4 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(by_scale)(0.4), difference, rtol=1e-6)
+
+
+def test_bad_pairs_are_refused():
+    with pytest.raises(ValueError, match=r"^p, q: expected two distributions of one class and dimension, got "):
+        kl_divergence(_dist(), Normal(0.0, 1.0))
+    with pytest.raises(ValueError, match=r"^p, q: expected "):
+        kl_divergence(Gaussian(jnp.zeros(2), jnp.eye(2)), Gaussian(jnp.zeros(3), jnp.eye(3)))

@@ -1,0 +1,74 @@
+"""The paper's figure: what is drawn, and where."""
+
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.distribution import FoldedGaussian
+from foldgauss.fold import PolynomialFold
+from foldgauss.plot import _mass_levels, plot_density
+
+pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
+
+
+@pytest.fixture
+def ax():
+    pyplot.switch_backend("Agg")
+    figure, ax = pyplot.subplots()
+    yield ax
+    pyplot.close(figure)
+
+
+def _dist(bend=((-1.0,),), **changes):
+    parameters = {"time_loc": 0.5, "time_scale": 0.3, "fold": PolynomialFold(jnp.array(bend))} | changes
+    return FoldedGaussian([0.2], [[0.4]], **parameters)
+
+
+def _red(ax):
+    return [line for line in ax.lines if line.get_color() == "#d1242f"]
+
+
+@pytest.mark.parametrize("bend", [((0.0,),), ((-1.0,),), ((0.0,), (1.0,)), ((0.0,), (0.0,), (1.0,))])
+def test_slices_stand_on_the_conditional_gaussians(ax, bend):
+    dist, times = _dist(bend), [0.2, 0.5, 0.9]
+    assert plot_density(dist, ax, slices=times) is ax
+    ax.figure.canvas.draw()
+    dots = [line for line in _red(ax) if line.get_marker() == "o"]
+    bells = [line for line in _red(ax) if len(line.get_xdata()) > 2]
+    assert len(dots) == len(bells) == 3
+    for t, dot, bell in zip(times, dots, bells, strict=True):
+        centre = 0.2 + sum(c * (0.5 - t) ** (k + 1) for k, (c,) in enumerate(bend))  # u = time_loc - t
+        scale = 0.4 * np.exp(-0.25 * ((t - 0.5) / 0.3) ** 2)
+        np.testing.assert_allclose([dot.get_xdata()[0], dot.get_ydata()[0]], [t, centre], atol=1e-6)
+        foot, s = bell.get_xdata() - t, bell.get_ydata()
+        np.testing.assert_allclose(foot / foot.max(), np.exp(-0.5 * ((s - centre) / scale) ** 2), atol=1e-3)
+
+
+def test_limits_labels_and_axes(ax):
+    plot_density(_dist(), ax, t_limits=(0.0, 1.0), s_limits=(-1.0, 2.0))
+    assert (ax.get_xlim(), ax.get_ylim()) == ((0.0, 1.0), (-1.0, 2.0))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time t", "space s")
+    own = plot_density(_dist(), slices=0)
+    assert own is not ax
+    assert not _red(own)
+    pyplot.close(own.figure)
+
+
+def test_contours_hold_the_mass_they_say():
+    z = np.linspace(-6, 6, 400)
+    density = np.exp(-0.5 * (z[:, None] ** 2 + z[None] ** 2))
+    # P(density of a plane Gaussian above c times its peak) = 1 - c.
+    np.testing.assert_allclose(_mass_levels(density), [0.1, 0.4, 0.7], atol=2e-3)
+
+
+def test_only_one_distribution_in_the_plane_is_drawn(ax):
+    with pytest.raises(ValueError, match=r"dist: expected batch_shape \(\) and event_shape \(2,\)"):
+        plot_density(_dist(time_loc=jnp.zeros(2)), ax)
+
+
+def test_missing_matplotlib_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"pip install 'foldgauss\[plot\]'"):
+        plot_density(_dist())
