@@ -1,0 +1,312 @@
+"""Gaussians in space, the cameras that look at them, and the splats they leave in a picture.
+
+Model space continues the frame's plane: x right, y down, z away from who looks at the frame; the frame is centred in
+the plane z = 0 and its longer side is 1. The published code's (x, y, z) is (x, z, -y) here, and its unit is the
+distance from the front camera to the plane.
+"""
+
+import math
+from numbers import Real
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float
+
+from foldgauss._batch import known
+from foldgauss._checks import invalid, one_of
+from foldgauss.render.splats import Splats2D, pixels_per_unit
+
+#: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.
+FIELD_OF_VIEW = 0.6911112
+#: eps of eq:mirage, the standard deviation across the plane: a ten-thousandth of a pixel where a frame has 1000.
+THICKNESS = 1e-7
+#: Nearest depth that is drawn, in model units, as in gsplat: the linearised projection has no meaning at depth 0.
+NEAR = 0.01
+#: The projection is linearised no farther out than this times the half field of view, as in the published 3DGS.
+TANGENT_LIMIT = 1.3
+ORDERS = ("depth", "array")
+
+
+class Gaussians3D(eqx.Module):
+    r"""Gaussians in space with opacity and colour.
+
+    .. math:: \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i))
+
+    Shapes: `mean` (num, 3) and `factor` (num, 3, 3) in model space, any F with covariance F F^T (columns R S of a
+    rotation and scales, or a Cholesky factor); `opacity` (num,) in [0, 1]; `color` (num, channels).
+    Source: VeGaS eq:3dgs, eq:mirage.
+    """
+
+    mean: Float[Array, "num 3"]
+    factor: Float[Array, "num 3 3"]
+    opacity: Float[Array, "num"]
+    color: Float[Array, "num channels"]
+
+    def __check_init__(self) -> None:
+        shapes = [getattr(leaf, "shape", None) for leaf in (self.mean, self.factor, self.opacity, self.color)]
+        if any(shape is None for shape in shapes):
+            return  # a skeleton, as inside tree transformations
+        num = shapes[0][:-1]
+        fits = shapes == [(*num, 3), (*num, 3, 3), num, (*num, *shapes[3][-1:])] and len(shapes[3]) > len(num)
+        if not fits:
+            raise invalid(
+                "mean, factor, opacity, color",
+                expected="shapes (num, 3), (num, 3, 3), (num,), (num, channels)",
+                got=", ".join(map(str, shapes)),
+            )
+
+    @classmethod
+    def from_flat(cls, splats: Splats2D, *, thickness: float = THICKNESS) -> "Gaussians3D":
+        """Splats in model space as flat Gaussians on the plane z = 0: m = (m1, m2, 0), F = diag(F_2D, thickness).
+
+        Source: VeGaS eq:mirage.
+        """
+        mean = jnp.concatenate([splats.mean, jnp.zeros_like(splats.mean[..., :1])], -1)
+        across = jnp.broadcast_to(jnp.asarray([0, 0, thickness], mean.dtype), mean.shape)[..., None, :]
+        plane = jnp.concatenate([splats.factor, jnp.zeros_like(splats.factor[..., :1])], -1)
+        return cls(mean, jnp.concatenate([plane, across], -2), splats.opacity, splats.color)
+
+    @classmethod
+    def from_scale_angle(
+        cls,
+        mean: Float[Array, "num 2"],
+        scale: Float[Array, "num 2"],
+        angle: Float[Array, "num"],
+        opacity: Float[Array, "num"],
+        color: Float[Array, "num channels"],
+        *,
+        thickness: float = THICKNESS,
+    ) -> "Gaussians3D":
+        """Flat Gaussians in MiraGe's own parameters: F = R(angle) diag(s1, s2, thickness).
+
+        The angle, in radians, turns x (right) towards y (down), so clockwise as one sees it. Source: VeGaS eq:mirage.
+        """
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        turn = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
+        return cls.from_flat(Splats2D(mean, turn * scale[..., None, :], opacity, color), thickness=thickness)
+
+    def to_flat(self) -> Splats2D:
+        """The shadow on the plane z = 0 along z, in model space: the marginal of (x, y), inverse of `from_flat`.
+
+        The covariance comes back to rounding, not the factor itself.
+        """
+        return Splats2D(self.mean[..., :2], square_factor(self.factor[..., :2, :]), self.opacity, self.color)
+
+
+class Camera(eqx.Module):
+    """A pinhole camera: axes right, down and forward, which are x, y and z of the front camera.
+
+    Shapes: `rotation` (3, 3) takes world directions to the camera's axes, its rows; `position` (3,) in model space;
+    `fov` () is the frame's horizontal field of view in radians. `aspect` is that frame's height / width (None: the
+    picture's own); where a picture has another, the frame covers it as in `Splats2D.to_pixels`.
+    """
+
+    rotation: Float[Array, "3 3"]
+    position: Float[Array, "3"]
+    fov: Float[Array, ""]
+    aspect: float | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        shapes = [getattr(leaf, "shape", None) for leaf in (self.rotation, self.position, self.fov)]
+        if any(shape is None for shape in shapes):
+            return  # a skeleton, as inside tree transformations
+        batch = shapes[2]
+        if shapes != [(*batch, 3, 3), (*batch, 3), batch]:
+            expected, got = "shapes (3, 3), (3,), ()", ", ".join(map(str, shapes))
+            raise invalid("rotation, position, fov", expected=expected, got=got)
+        if self.aspect is not None:
+            _check_aspect(self.aspect)
+        fov = known(self.fov)
+        if fov is not None and not ((fov > 0) & (fov < math.pi)).all():
+            raise invalid("fov", expected="radians in (0, pi)", got=fov, cure="For degrees use math.radians.")
+
+    @classmethod
+    def front(cls, aspect: float, *, fov: ArrayLike = FIELD_OF_VIEW) -> "Camera":
+        """The camera for which the plane z = 0 is the picture: a frame of height / width `aspect` fills its view.
+
+        It stands at (0, 0, -d) and looks along z, where d = min(1, 1 / aspect) / (2 tan(fov / 2)).
+        Source: VeGaS, "Video Gaussian Splatting" (two opposing cameras); field of view of the published code.
+        """
+        _check_aspect(aspect)
+        fov = _as_float(fov)
+        distance = min(1.0, 1 / aspect) / (2 * jnp.tan(fov / 2))
+        return cls(jnp.eye(3, dtype=fov.dtype), -distance * jnp.asarray([0, 0, 1], fov.dtype), fov, aspect)
+
+    @classmethod
+    def opposing(cls, aspect: float, *, fov: ArrayLike = FIELD_OF_VIEW) -> "Camera":
+        """The front camera's opposite, behind the plane: what lies in the plane appears mirrored, left for right.
+
+        Source: VeGaS, "Video Gaussian Splatting", last paragraph; MiraGe.
+        """
+        return cls.front(aspect, fov=fov).orbit(math.pi)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        up: ArrayLike = (0.0, -1.0, 0.0),
+        fov: ArrayLike = FIELD_OF_VIEW,
+        aspect: float | None = None,
+    ) -> "Camera":
+        """A camera at `eye` with `target` in the middle of its picture and `up` upright in it; all (3,), model space.
+
+        Raises ValueError if eye and target are one point, or up is along the line of sight; NaN under tracing.
+        """
+        eye, target, up = _as_float(eye), _as_float(target), _as_float(up)
+        if not eye.shape == target.shape == up.shape == (3,):
+            got = f"shapes {eye.shape}, {target.shape}, {up.shape}"
+            raise invalid("eye, target, up", expected="(x, y, z) each", got=got, cure="Use jax.vmap for a batch.")
+        forward = _unit(target - eye)
+        across = jnp.cross(forward, _unit(up))
+        # A sine of rounding size says nothing about a direction.
+        blind = ~(_length(across) > 8 * jnp.finfo(across.dtype).eps)
+        if known(blind) is not None and blind.any() and not jnp.isnan(eye + target + up).any():
+            got = f"eye {eye}, target {target}, up {up}"
+            cure = "Looking straight up or down, choose another up, such as (0, 0, 1)."
+            raise invalid("eye, target, up", expected="two points, and up not along their line", got=got, cure=cure)
+        right = jnp.where(blind, jnp.nan, _unit(across))
+        return cls(jnp.stack([right, jnp.cross(forward, right), forward]), eye, _as_float(fov), aspect)
+
+    def orbit(self, azimuth: ArrayLike, elevation: ArrayLike = 0.0, *, target: ArrayLike = (0.0, 0.0, 0.0)) -> "Camera":
+        """This camera carried about `target`: first up by `elevation` about x, then by `azimuth` about the vertical.
+
+        Angles in radians. From the front, a positive azimuth goes to the right, a positive elevation up. Quarter turns
+        are exact, so Gaussians at one depth stay at one depth.
+        """
+        dtype = self.position.dtype
+        (cos_a, sin_a), (cos_e, sin_e) = (_cos_sin(jnp.asarray(angle, dtype)) for angle in (azimuth, elevation))
+        zero, one, target = jnp.zeros((), dtype), jnp.ones((), dtype), jnp.asarray(target, dtype)
+        about_y = jnp.stack([cos_a, zero, -sin_a, zero, one, zero, sin_a, zero, cos_a]).reshape(3, 3)
+        about_x = jnp.stack([one, zero, zero, zero, cos_e, sin_e, zero, -sin_e, cos_e]).reshape(3, 3)
+        turn = jnp.matmul(about_y, about_x, precision="highest")
+        position = target + jnp.matmul(turn, self.position - target, precision="highest")
+        rotation = jnp.matmul(self.rotation, turn.T, precision="highest")
+        return Camera(rotation, position, self.fov, self.aspect)
+
+    def focal(self, size: tuple[int, int]) -> Float[Array, ""]:
+        """Focal length in pixels of a picture of `size` = (height, width)."""
+        height, width = size
+        aspect = height / width if self.aspect is None else self.aspect
+        frame_width = pixels_per_unit(size, aspect=aspect) * min(1.0, 1 / aspect)
+        return frame_width / (2 * jnp.tan(self.fov / 2))
+
+
+def project(
+    gaussians: Gaussians3D, camera: Camera, size: tuple[int, int], *, order: str = "depth", near: float = NEAR
+) -> Splats2D:
+    r"""What a camera sees: splats in pixels of a picture of `size` = (height, width), ready for `render`.
+
+    .. math:: F_{2D} F_{2D}^T = J W F F^T W^T J^T,
+              \quad J = \tfrac{f}{z} \begin{bmatrix} 1 & 0 & -x/z \\ 0 & 1 & -y/z \end{bmatrix}
+
+    with (x, y, z) the mean in the camera's axes W and f the focal length in pixels; x/z and y/z are held within 1.3
+    times the half field of view in J alone, where the linearisation would blow up.
+
+    - `order`: "depth", front to back by z, array order where depths are equal; or "array", as they come. In a fitted
+      picture array order says what covers what: seen at a slant, its flat Gaussians need "array", for "depth" compares
+      the centres of splats of one plane. From the front and from the opposing camera the two are the same.
+    - `near`: where z <= near (model units) the opacity is 0 and the other leaves mean nothing.
+
+    Flat Gaussians seen by the front camera are `Splats2D.to_pixels`, the covariance plus (thickness f / z)^2 u u^T with
+    u = (x/z, y/z) so held.
+
+    Differentiable in every leaf of both, rank-deficient covariances included; the order is piecewise constant. Raises
+    ValueError for an unknown order and for a batch (`jax.vmap` takes one).
+
+    Example: `render(project(gaussians, Camera.front(0.5).orbit(0.4), (160, 320)), (160, 320))`.
+
+    Source: Zwicker et al. 2001, EWA volume splatting (the local affine map); Kerbl et al. 2023, 3D Gaussian Splatting,
+    eq. 5, and its published rasteriser for the 1.3.
+    """
+    one_of("order", order, ORDERS)
+    if not (isinstance(near, Real) and near >= 0):
+        raise invalid("near", expected="a depth >= 0 in model units", got=near)
+    if gaussians.mean.ndim != 2 or camera.position.ndim != 1:
+        got = f"{gaussians.mean.shape} and {camera.position.shape}"
+        expected, cure = "mean of shape (num, 3) and position of shape (3,)", "Use jax.vmap for a batch."
+        raise invalid("gaussians, camera", expected=expected, got=got, cure=cure)
+    dtype = gaussians.mean.dtype
+    rotation, position = camera.rotation.astype(dtype), camera.position.astype(dtype)
+    focal, middle = camera.focal(size).astype(dtype), jnp.asarray([size[1] / 2, size[0] / 2], dtype)
+
+    view = jnp.sum(rotation[None] * (gaussians.mean - position[None])[:, None, :], -1)
+    depth = view[:, 2]
+    seen = depth > near
+    safe_depth = jnp.where(seen, depth, jnp.ones_like(depth))
+    tangent = view[:, :2] / safe_depth[:, None]
+    limit = (TANGENT_LIMIT * middle / focal)[None]
+    held = jnp.clip(tangent, -limit, limit)
+    jacobian = (focal / safe_depth)[:, None, None] * (rotation[None, :2] - held[..., None] * rotation[None, 2:])
+    splats = Splats2D(
+        focal * tangent + middle[None],
+        square_factor(jnp.matmul(jacobian, gaussians.factor, precision="highest")),
+        jnp.where(seen, gaussians.opacity, jnp.zeros_like(gaussians.opacity)),
+        gaussians.color,
+    )
+    if order == "array":
+        return splats
+    nearest_first = jnp.argsort(depth, stable=True)
+    return jax.tree.map(lambda leaf: leaf[nearest_first], splats)
+
+
+def square_factor(rows: Float[Array, "*num 2 3"]) -> Float[Array, "*num 2 2"]:
+    """A 2x2 factor of M M^T for M (2, 3), without forming it: M's QR decomposition, the longer row first.
+
+    Its entries are the rows' length, inner product and area, each to its own relative accuracy where M's columns are
+    graded, so a needle keeps its width. With the longer row first nothing is divided by less than the largest entry.
+    Where the rank is 1 the second diagonal entry is 0 and so is its gradient, which is exact for whatever depends on
+    M M^T alone.
+    """
+    # A constant unit: lengths are homogeneous, so their gradient does not depend on it. Squares then stay in range.
+    unit = lax.stop_gradient(jnp.max(jnp.abs(rows), axis=(-2, -1), keepdims=True))
+    unit = jnp.where(unit > 0, unit, jnp.ones_like(unit))
+    x, y = rows[..., 0, :] / unit[..., 0], rows[..., 1, :] / unit[..., 0]
+    wide = jnp.sum(x * x, -1, keepdims=True) >= jnp.sum(y * y, -1, keepdims=True)
+    first, second = jnp.where(wide, x, y), jnp.where(wide, y, x)
+    length, area = _length(first), _length(jnp.cross(first, second))
+    safe_length = jnp.where(length > 0, length, jnp.ones_like(length))
+    first = jnp.concatenate([length, jnp.zeros_like(length)], -1)
+    second = jnp.concatenate([jnp.sum(jnp.where(wide, x * y, y * x), -1, keepdims=True), area], -1) / safe_length
+    return unit * jnp.stack([jnp.where(wide, first, second), jnp.where(wide, second, first)], -2)
+
+
+def _length(vector: Float[Array, "*batch dim"]) -> Float[Array, "*batch 1"]:
+    """Euclidean length; at 0 the gradient is 0, not NaN."""
+    square = jnp.sum(vector * vector, -1, keepdims=True)
+    some = square > 0
+    length = jnp.sqrt(jnp.where(some, square, jnp.ones_like(square)))
+    # NaN in, NaN out.
+    return jnp.where(some, length, square)
+
+
+def _unit(vector: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+    """The direction of a vector; NaN for 0."""
+    return vector / _length(vector)
+
+
+def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Cosine and sine; an angle within its own rounding of a quarter turn is one: sin(pi) is 0, not 1e-7."""
+    quarters = jnp.round(angle / (math.pi / 2))
+    rest = angle - quarters * (math.pi / 2)
+    rounding = jnp.abs(rest) <= jnp.finfo(angle.dtype).eps * jnp.abs(angle)
+    rest = rest - lax.stop_gradient(jnp.where(rounding, rest, jnp.zeros_like(rest)))
+    cos, sin = jnp.cos(rest), jnp.sin(rest)
+    # By the number of quarters, modulo 4: as it is, (-sin, cos), (-cos, -sin), (sin, -cos).
+    which = jnp.mod(quarters, 4)
+    odd = jnp.mod(quarters, 2) == 1
+    sign_cos = jnp.where((which == 1) | (which == 2), -1.0, 1.0).astype(angle.dtype)
+    sign_sin = jnp.where(which >= 2, -1.0, 1.0).astype(angle.dtype)
+    return sign_cos * jnp.where(odd, sin, cos), sign_sin * jnp.where(odd, cos, sin)
+
+
+def _as_float(x: ArrayLike) -> Array:
+    return jnp.asarray(x, jnp.result_type(float))
+
+
+def _check_aspect(aspect: float) -> None:
+    if not (isinstance(aspect, Real) and 0 < aspect < math.inf):
+        raise invalid("aspect", expected="a frame's height / width, one positive number", got=aspect)

@@ -1,0 +1,491 @@
+"""Cameras: where points and shapes land, which covers which, the mirror image, and gradients."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.render import RenderOptions, Splats2D, render
+from foldgauss.render.camera import TANGENT_LIMIT, Camera, Gaussians3D, project, square_factor
+
+SIZE = (48, 96)
+#: No cutoff that rounding could cross: a splat more or less is 1/255, whatever the camera.
+SMOOTH = RenderOptions(alpha_cutoff=1e-8, transmittance_stop=0.0)
+
+
+def flat_scene(num=120, *, seed=0, aspect=0.5, dtype=np.float32, thickness=1e-7, thinnest=0.01):
+    """Overlapping flat Gaussians that fill the frame and stick out of it."""
+    rng = np.random.default_rng(seed)
+    mean = rng.uniform(-0.55, 0.55, (num, 2)) * [min(1, 1 / aspect), min(1, aspect)]
+    scale = np.exp(rng.uniform(np.log(thinnest), np.log(0.08), (num, 2)))
+    leaves = mean, scale, rng.uniform(0, 2 * np.pi, num), rng.uniform(0.2, 1, num), rng.uniform(0, 1, (num, 3))
+    return Gaussians3D.from_scale_angle(*(jnp.asarray(leaf, dtype) for leaf in leaves), thickness=thickness)
+
+
+def deep_scene(num=40, *, seed=0, dtype=np.float64):
+    """Gaussians of any shape about the origin."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(num, 3, 3)))[0]
+    factor = turn * np.exp(rng.uniform(np.log(0.005), np.log(0.2), (num, 1, 3)))
+    leaves = rng.uniform(-0.4, 0.4, (num, 3)), factor, rng.uniform(0.1, 0.9, num), rng.uniform(0, 1, (num, 3))
+    return Gaussians3D(*(jnp.asarray(leaf, dtype) for leaf in leaves))
+
+
+def cast(tree, dtype):
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
+
+
+def covariance(splats):
+    return splats.factor @ jnp.swapaxes(splats.factor, -1, -2)
+
+
+# --- the front camera is the picture ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("aspect", "size"), [(0.5, (160, 320)), (2.0, (320, 160)), (1.0, (64, 64)), (0.5, (200, 100)), (2.0, (100, 300))]
+)
+def test_front_camera_is_to_pixels(aspect, size):
+    """Means exactly; covariances up to thickness^2 (f/d)^2 u u^T, with u the tangent of the ray."""
+    with jax.enable_x64(True):
+        gaussians = flat_scene(aspect=aspect, dtype=np.float64, thickness=1e-3)
+        flat, camera = gaussians.to_flat().to_pixels(size, aspect=aspect), Camera.front(aspect)
+        seen = project(gaussians, camera, size)
+        np.testing.assert_allclose(seen.mean, flat.mean, atol=1e-10)
+        focal = camera.focal(size)
+        limit = TANGENT_LIMIT * np.asarray([size[1], size[0]]) / 2 / focal
+        tangent = np.clip((flat.mean - jnp.asarray([[size[1] / 2, size[0] / 2]])) / focal, -limit, limit)
+        across = 1e-3 * focal / -camera.position[2] * tangent
+        truth = covariance(flat) + across[:, :, None] * across[:, None, :]
+        np.testing.assert_allclose(covariance(seen), truth, rtol=1e-9, atol=1e-9)
+        for name in ("opacity", "color"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(gaussians, name))
+
+
+@pytest.mark.parametrize("engine", ["reference", "cpu"])
+def test_front_picture_is_the_flat_one(engine):
+    gaussians = flat_scene()
+    flat = render(gaussians.to_flat().to_pixels(SIZE), SIZE, engine=engine, options=SMOOTH)
+    seen = render(project(gaussians, Camera.front(0.5), SIZE), SIZE, engine=engine, options=SMOOTH)
+    np.testing.assert_allclose(seen, flat, atol=5e-6)
+
+
+def test_published_geometry():
+    """Camera at distance 1, half-width 0.36, in the published unit; ours is the frame's width."""
+    camera = Camera.front(0.5)
+    np.testing.assert_allclose(camera.position, [0, 0, -0.5 / math.tan(0.6911112 / 2)], rtol=1e-6)
+    np.testing.assert_allclose(camera.focal((640, 1280)), 1280 / (2 * math.tan(0.6911112 / 2)), rtol=1e-6)
+    assert float(-0.5 / camera.position[2]) == pytest.approx(0.36, abs=1e-6)
+
+
+@pytest.mark.parametrize("thickness", [0.0, 1e-7, 1e-3])
+def test_flat_there_and_back(thickness):
+    rng = np.random.default_rng(0)
+    leaves = rng.normal(size=(30, 2)), rng.normal(size=(30, 2, 2)), rng.uniform(size=30), rng.uniform(size=(30, 3))
+    splats = Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
+    gaussians = Gaussians3D.from_flat(splats, thickness=thickness)
+    np.testing.assert_array_equal(gaussians.mean[:, 2], 0)
+    np.testing.assert_allclose(jnp.linalg.norm(gaussians.factor[:, 2], axis=-1), thickness, rtol=1e-6)
+    back = gaussians.to_flat()
+    np.testing.assert_allclose(covariance(back), covariance(splats), rtol=2e-6, atol=2e-6)
+    for name in ("mean", "opacity", "color"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(splats, name))
+
+
+def test_mirage_parameters():
+    """eq:mirage, by hand: a quarter turn lays the first axis along y."""
+    one = (jnp.asarray([[0.1, 0.2]]), jnp.asarray([[3.0, 1.0]]), jnp.asarray([math.pi / 2]), jnp.ones(1))
+    gaussians = Gaussians3D.from_scale_angle(*one, jnp.ones((1, 3)), thickness=0.25)
+    np.testing.assert_allclose(gaussians.factor[0], [[0, -1, 0], [3, 0, 0], [0, 0, 0.25]], atol=1e-6)
+
+
+# --- the mirror ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["reference", "cpu"])
+@pytest.mark.parametrize("seed", range(3))
+def test_opposing_camera_shows_the_mirror_image(engine, seed):
+    """To 1e-6 where splats are wider than 3 px: a position of 96 px is known to 4e-6 px in float32."""
+    gaussians = flat_scene(seed=seed, thinnest=0.03)
+    front, mirror = (
+        render(project(gaussians, camera, SIZE), SIZE, engine=engine, options=SMOOTH)
+        for camera in (Camera.front(0.5), Camera.opposing(0.5))
+    )
+    assert jnp.abs(front - mirror[:, ::-1]).max() <= 1e-6
+    assert jnp.abs(front - mirror).max() > 0.1  # the comparison has power
+
+
+@pytest.mark.parametrize(("aspect", "size"), [(0.5, (48, 96)), (2.0, (96, 48)), (0.6, (50, 50))])
+def test_mirror_in_double_precision(aspect, size):
+    with jax.enable_x64(True):
+        gaussians = flat_scene(aspect=aspect, dtype=np.float64)
+        splats = [project(gaussians, camera(aspect), size) for camera in (Camera.front, Camera.opposing)]
+        front, mirror = (render(one, size, engine="reference") for one in splats)
+        np.testing.assert_allclose(front, mirror[:, ::-1], atol=1e-12)
+        np.testing.assert_array_equal(splats[0].color, splats[1].color)  # ties: array order in both
+
+
+def test_layers_change_places_behind():
+    gaussians = flat_scene(2)
+    layers = Gaussians3D(gaussians.mean.at[:, 2].set(jnp.asarray([0.1, -0.1])), *jax.tree.leaves(gaussians)[1:])
+    front, behind = (project(layers, camera(0.5), SIZE).color for camera in (Camera.front, Camera.opposing))
+    np.testing.assert_array_equal(front, layers.color[::-1])
+    np.testing.assert_array_equal(behind, layers.color)
+
+
+# --- where cameras stand ---------------------------------------------------------------------------------------
+
+
+def seen_at(point, camera):
+    one = Gaussians3D(jnp.asarray([point]), jnp.eye(3)[None] * 0.01, jnp.ones(1), jnp.ones((1, 3)))
+    return np.asarray(project(one, camera, SIZE).mean[0]) - [SIZE[1] / 2, SIZE[0] / 2]
+
+
+def test_right_and_down():
+    front, behind = Camera.front(0.5), Camera.opposing(0.5)
+    x, y = seen_at((0.1, 0.05, 0.0), front)
+    assert (x, y) == pytest.approx((9.6, 4.8), abs=1e-4)
+    assert seen_at((0.1, 0.05, 0.0), behind) == pytest.approx((-9.6, 4.8), abs=1e-4)
+    assert abs(seen_at((0.1, 0.0, 0.3), front)[0]) < 9.6 < abs(seen_at((0.1, 0.0, 0.3), behind)[0])  # z goes away
+
+
+@pytest.mark.parametrize(
+    ("angles", "position"), [((0.3, 0.0), (1, 0, 0)), ((0.0, 0.3), (0, -1, 0)), ((-0.3, -0.2), (-1, 1, 0))]
+)
+def test_orbit_goes_right_and_up(angles, position):
+    camera, front = Camera.front(0.5).orbit(*angles), Camera.front(0.5)
+    moved = np.asarray(camera.position)
+    np.testing.assert_array_equal(np.sign(np.round(moved[:2], 6)), position[:2])
+    assert np.linalg.norm(moved) == pytest.approx(float(-front.position[2]), rel=1e-6)
+    np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
+    assert seen_at((0.0, 0.0, 0.0), camera) == pytest.approx((0, 0), abs=1e-4)
+    looking = Camera.look_at(camera.position, aspect=0.5)
+    np.testing.assert_allclose(looking.rotation, camera.rotation, atol=1e-6)
+
+
+@pytest.mark.parametrize("wrap", [lambda function: function, jax.jit])
+@pytest.mark.parametrize("quarters", range(-6, 7))
+def test_quarter_turns_are_exact(quarters, wrap):
+    camera = wrap(lambda angle: Camera.front(0.5).orbit(angle))(quarters * math.pi / 2)
+    cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters % 4]
+    np.testing.assert_array_equal(camera.rotation, [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    np.testing.assert_array_equal(np.asarray(camera.position) == 0, [sin == 0, True, cos == 0])
+
+
+def test_orbit_gradient_at_a_quarter_turn():
+    gradient = jax.jacfwd(lambda angle: Camera.front(0.5).orbit(angle).position)(jnp.asarray(math.pi))
+    distance = float(-Camera.front(0.5).position[2])
+    np.testing.assert_allclose(gradient, [-distance, 0, 0], atol=1e-6)
+
+
+def test_orbit_about_a_target():
+    target = jnp.asarray([0.2, -0.1, 0.3])
+    camera = Camera.look_at((0.2, -0.1, -1.0), target).orbit(0.8, 0.3, target=target)
+    assert float(jnp.linalg.norm(camera.position - target)) == pytest.approx(1.3, rel=1e-6)
+    assert seen_at(target, camera) == pytest.approx((0, 0), abs=1e-4)
+
+
+def test_look_at_front_and_behind():
+    for camera in (Camera.front(0.5), Camera.opposing(0.5)):
+        np.testing.assert_array_equal(Camera.look_at(camera.position).rotation, camera.rotation)
+
+
+# --- the projection --------------------------------------------------------------------------------------------
+
+
+def random_cameras(count, seed=3):
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        eye = rng.normal(size=3)
+        eye *= rng.uniform(1.5, 3) / np.linalg.norm(eye)
+        yield Camera.look_at(eye, rng.uniform(-0.2, 0.2, 3), up=rng.normal(size=3), fov=rng.uniform(0.3, 1.2))
+
+
+def test_projection_is_the_pinhole_and_its_jacobian():
+    """The oracle is a pinhole written from eye and axes, differentiated by JAX, with the dense covariance."""
+    with jax.enable_x64(True):
+        scene = deep_scene()
+        scene = Gaussians3D(0.3 * scene.mean, scene.factor, scene.opacity, scene.color)  # inside the clamp
+        for camera in random_cameras(5):
+
+            def pinhole(point, camera=camera):
+                right, down, forward = ((point - camera.position) @ axis for axis in camera.rotation)
+                scale = SIZE[1] / 2 / jnp.tan(camera.fov / 2) / forward
+                return jnp.stack([SIZE[1] / 2 + scale * right, SIZE[0] / 2 + scale * down])
+
+            seen = project(scene, camera, SIZE, order="array")
+            np.testing.assert_allclose(seen.mean, jax.vmap(pinhole)(scene.mean), rtol=1e-12)
+            half_field = jnp.asarray([[SIZE[1] / 2, SIZE[0] / 2]])
+            assert (jnp.abs(seen.mean - half_field) < TANGENT_LIMIT * half_field).all()
+            root = jax.vmap(jax.jacfwd(pinhole))(scene.mean) @ scene.factor
+            np.testing.assert_allclose(covariance(seen), root @ jnp.swapaxes(root, 1, 2), rtol=1e-10, atol=1e-10)
+
+
+def test_linearised_no_farther_than_the_clamp():
+    """Outside 1.3 fields of view the shape is that of the clamp's edge at the same depth; the mean is not held."""
+    camera, focal = Camera.front(0.5), float(Camera.front(0.5).focal(SIZE))
+    depth = float(-camera.position[2])
+    edge = TANGENT_LIMIT * SIZE[1] / 2 / focal * depth
+    mean = jnp.asarray([[edge, 0.0, 0.0], [5 * edge, 0.0, 0.0], [0.9 * edge, 0.0, 0.0]])
+    ball = Gaussians3D(mean, jnp.tile(0.05 * jnp.eye(3), (3, 1, 1)), jnp.ones(3), jnp.ones((3, 3)))
+    at_edge, beyond, inside = covariance(project(ball, camera, SIZE))
+    np.testing.assert_allclose(beyond, at_edge, rtol=1e-5)
+    assert inside[0, 0] < 0.97 * at_edge[0, 0]
+    np.testing.assert_allclose(project(ball, camera, SIZE).mean[1, 0], SIZE[1] / 2 + 5 * TANGENT_LIMIT * 48, rtol=1e-5)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e-4, 1e-7, 0.0])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_square_factor(ratio, size):
+    """Against the double-precision covariance, its determinant too: a needle keeps its width."""
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
+    columns = np.asarray(turn[:, :2] * (size * np.asarray([1, ratio, ratio**2])), np.float32)
+    wide = columns.astype(np.float64)
+    truth = wide @ np.swapaxes(wide, 1, 2)
+    factor = np.asarray(square_factor(jnp.asarray(columns)), np.float64)
+    np.testing.assert_allclose(factor @ np.swapaxes(factor, 1, 2) / size**2, truth / size**2, atol=5e-7)
+    area = np.linalg.norm(np.cross(wide[:, 0], wide[:, 1]), axis=-1) / size**2
+    most = (np.linalg.norm(wide[:, :, 0], axis=1) * np.linalg.norm(wide[:, :, 1], axis=1)).max() / size**2
+    np.testing.assert_allclose(np.abs(np.linalg.det(factor)) / size**2, area, atol=1e-6 * most)
+
+
+@pytest.mark.parametrize("world", [1e-6, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("thickness", [0.0, 1e-7, 1e-2])
+def test_single_precision_at_any_size(world, thickness):
+    """A whole scene scaled, needles of 1e4:1 in it, from a slant: float32 against float64, width and length."""
+    rng = np.random.default_rng(1)
+    scale = np.exp(rng.uniform(np.log(0.02), np.log(0.1), (60, 2))) * [1, 1e-4]
+    leaves = rng.uniform(-0.4, 0.4, (60, 2)), scale, rng.uniform(0, 6.28, 60), np.ones(60), np.ones((60, 3))
+    gaussians = Gaussians3D.from_scale_angle(
+        *(jnp.asarray(leaf, jnp.float32) for leaf in leaves), thickness=thickness * 0.01
+    )
+    gaussians = Gaussians3D(world * gaussians.mean, world * gaussians.factor, gaussians.opacity, gaussians.color)
+    camera = Camera.front(0.5).orbit(0.9, 0.4)
+    camera = Camera(camera.rotation, world * camera.position, camera.fov, 0.5)
+    seen = project(gaussians, camera, SIZE, near=0.01 * world, order="array")
+    with jax.enable_x64(True):
+        truth = project(cast(gaussians, np.float64), cast(camera, np.float64), SIZE, near=0.01 * world, order="array")
+    np.testing.assert_allclose(seen.mean, truth.mean, atol=1e-4)
+    one, other = (np.linalg.svd(np.asarray(s.factor, np.float64), compute_uv=False) for s in (seen, truth))
+    np.testing.assert_allclose(one, other, rtol=2e-5)
+
+
+# --- order -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wrap", [lambda function: function, jax.jit])
+def test_equal_depths_keep_array_order(wrap):
+    """1003 Gaussians in one place, from a slant: an odd number, so that the vectorised loop has a remainder."""
+    num = 1003
+    leaves = jnp.tile(jnp.asarray([[0.13, 0.27, 0.31]]), (num, 1)), jnp.tile(0.01 * jnp.eye(3), (num, 1, 1))
+    same = Gaussians3D(*leaves, jnp.linspace(0, 1, num), jnp.ones((num, 3)))
+    seen = wrap(lambda scene: project(scene, Camera.front(0.5).orbit(0.7, 0.3), SIZE))(same)
+    np.testing.assert_array_equal(seen.opacity, same.opacity)
+
+
+def test_depth_order_and_array_order():
+    with jax.enable_x64(True):
+        scene = deep_scene()
+        camera = next(random_cameras(1))
+        depth = (scene.mean - camera.position[None]) @ camera.rotation[2]
+        nearest_first = np.argsort(depth)
+        assert (nearest_first != np.arange(depth.size)).any()
+        by_depth, as_they_come = (project(scene, camera, SIZE, order=order) for order in ("depth", "array"))
+        np.testing.assert_array_equal(as_they_come.color, scene.color)
+        for one, other in zip(jax.tree.leaves(by_depth), jax.tree.leaves(as_they_come), strict=True):
+            np.testing.assert_array_equal(one, other[nearest_first])
+
+
+def test_a_flat_picture_at_a_slant_needs_array_order():
+    """One splat covers another of its plane from everywhere in front; by depth of centres it does not."""
+    disc = (jnp.asarray([[0.0, 0.0], [0.05, 0.0]]), jnp.full((2, 2), 0.1), jnp.zeros(2), jnp.ones(2))
+    gaussians = Gaussians3D.from_scale_angle(*disc, jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
+    camera = Camera.front(0.5).orbit(0.01)  # the second is nearer by 5e-4
+    array, depth = (render(project(gaussians, camera, SIZE, order=order), SIZE) for order in ("array", "depth"))
+    assert array[24, 48, 0] > 0.95
+    assert depth[24, 48, 0] < 0.5
+
+
+def test_behind_the_camera_nothing_is_drawn():
+    z = jnp.asarray([-5.0, -1.388888, -1.38, 0.0, jnp.nan, jnp.inf])
+    mean = jnp.stack([jnp.zeros(6), jnp.zeros(6), z], -1)
+    scene = Gaussians3D(mean, jnp.tile(0.1 * jnp.eye(3), (6, 1, 1)), jnp.full(6, 0.5), jnp.ones((6, 3)))
+    seen = project(scene, Camera.front(0.5), SIZE, order="array")
+    np.testing.assert_array_equal(seen.opacity, [0, 0, 0, 0.5, 0, 0.5])
+    closer = project(scene, Camera.front(0.5), SIZE, order="array", near=0.001)
+    np.testing.assert_array_equal(closer.opacity, [0, 0, 0.5, 0.5, 0, 0.5])
+    picture = render(project(scene, Camera.front(0.5), SIZE), SIZE)
+    only = render(jax.tree.map(lambda leaf: leaf[3:4], seen), SIZE)
+    np.testing.assert_allclose(picture, only, atol=1e-6)
+
+    def brightness(mean):
+        scene_ = Gaussians3D(mean, scene.factor, scene.opacity, scene.color)
+        return jnp.sum(render(project(scene_, Camera.front(0.5), SIZE), SIZE))
+
+    gradient = jax.jit(jax.grad(brightness))(mean.at[4:].set(-9.0))
+    assert bool(jnp.isfinite(gradient).all())
+    np.testing.assert_array_equal(gradient[:3], 0)
+
+
+# --- gradients -------------------------------------------------------------------------------------------------
+
+
+def smooth_loss(scene, camera):
+    """Of the mean and the covariance: any loss of a picture depends on the factor only so."""
+    seen = project(scene, camera, SIZE, order="array")
+    weights = jnp.asarray([[1.0, 0.7], [-0.4, 1.3]])
+    means, shapes = jnp.sin(seen.mean / 30) * weights[:1], jnp.arctan(covariance(seen) / 20) * weights[None]
+    return jnp.sum(means) + jnp.sum(shapes) + jnp.sum(seen.opacity[:, None] * seen.color)
+
+
+def check_gradient(loss, tree, *, rtol=1e-6, step=1e-6):
+    loss = jax.jit(loss)
+    leaves, structure = jax.tree.flatten(tree)
+    gradient = jax.tree.leaves(jax.grad(loss)(tree))
+    rng = np.random.default_rng(0)
+    for k, leaf in enumerate(leaves):
+        direction = jnp.asarray(rng.normal(size=leaf.shape))
+
+        def along(step, k=k, leaf=leaf, direction=direction):
+            return loss(jax.tree.unflatten(structure, [*leaves[:k], leaf + step * direction, *leaves[k + 1 :]]))
+
+        numeric = (along(step) - along(-step)) / (2 * step)
+        exact = jnp.sum(gradient[k] * direction)
+        assert bool(jnp.isfinite(gradient[k]).all())
+        np.testing.assert_allclose(exact, numeric, rtol=rtol, atol=1e-6, err_msg=str(k))
+
+
+#: name: (thickness, scales, camera)
+VIEWS = {
+    "slanted": (1e-3, (0.05, 0.02), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
+    "flat, slanted": (0.0, (0.05, 0.02), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
+    "flat, edge-on": (0.0, (0.05, 0.02), lambda: Camera.front(0.5).orbit(math.pi / 2)),
+    "flat, edge-on from above": (0.0, (0.05, 0.02), lambda: Camera.front(0.5).orbit(0.0, math.pi / 2)),
+    "a line": (0.0, (0.05, 0.0), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
+    "points": (0.0, (0.0, 0.0), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
+    "thin, edge-on": (1e-7, (0.05, 0.02), lambda: Camera.front(0.5).orbit(math.pi / 2)),
+}
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_gradients_by_finite_differences(view):
+    """Of every leaf of the scene and of the camera, where the covariance in the picture is singular too."""
+    thickness, scales, camera = VIEWS[view]
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(5)
+        leaves = rng.uniform(-0.2, 0.2, (6, 2)), np.tile(scales, (6, 1)), rng.uniform(0, 6, 6), rng.uniform(size=6)
+        scene = Gaussians3D.from_scale_angle(*map(jnp.asarray, leaves), jnp.ones((6, 3)), thickness=thickness)
+        camera = camera()
+        check_gradient(lambda tree: smooth_loss(*tree), (scene, camera))
+
+
+def test_gradient_of_a_picture():
+    with jax.enable_x64(True):
+        scene, camera = flat_scene(10, dtype=np.float64, thickness=1e-5), Camera.front(0.5).orbit(0.6, 0.2)
+        weights = jnp.asarray(np.random.default_rng(2).normal(size=(*SIZE, 3)))
+        options = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1 - 1e-12, transmittance_stop=0.0)
+
+        def loss(tree):
+            return jnp.sum(render(project(*tree, SIZE), SIZE, engine="reference", options=options) * weights)
+
+        check_gradient(loss, (scene, camera), rtol=1e-5)
+
+
+@pytest.mark.parametrize("engine", ["cpu", "reference"])
+@pytest.mark.parametrize("thickness", [0.0, 1e-7])
+def test_single_precision_gradients_are_finite_edge_on(engine, thickness):
+    scene = flat_scene(20, thickness=thickness)
+    camera = Camera.front(0.5).orbit(math.pi / 2)
+
+    def loss(tree):
+        return jnp.sum(render(project(*tree, SIZE), SIZE, engine=engine) ** 2)
+
+    value, gradients = jax.jit(jax.value_and_grad(loss))((scene, camera))
+    assert value > 1
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
+
+
+# --- transformations and errors --------------------------------------------------------------------------------
+
+
+def test_no_gaussians():
+    scene = jax.tree.map(lambda leaf: leaf[:0], flat_scene())
+    seen = project(scene, Camera.front(0.5).orbit(0.3), SIZE)
+    assert seen.factor.shape == (0, 2, 2)
+    assert float(jnp.abs(render(seen, SIZE)).max()) == 0
+    assert scene.to_flat().factor.shape == (0, 2, 2)
+
+
+def test_vmap_over_cameras_and_scenes():
+    scene = flat_scene(20)
+    angles = jnp.asarray([0.0, 0.4, math.pi])
+    cameras = jax.vmap(lambda angle: Camera.front(0.5).orbit(angle))(angles)
+    many = jax.jit(jax.vmap(lambda camera: project(scene, camera, SIZE)))(cameras)
+    scenes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf[::-1]]), scene)
+    both = jax.jit(jax.vmap(lambda one: project(one, Camera.front(0.5), SIZE)))(scenes)
+    for k, angle in enumerate(angles):
+        alone = project(scene, Camera.front(0.5).orbit(angle), SIZE)
+        np.testing.assert_allclose(many.mean[k], alone.mean, atol=2e-5)
+        np.testing.assert_array_equal(many.color[k], alone.color)
+    np.testing.assert_array_equal(both.color[1], scene.color[::-1])
+    eyes = jnp.asarray([[0.0, 0, -1], [1, 0, -1]])
+    assert jax.vmap(Camera.look_at)(eyes).rotation.shape == (2, 3, 3)
+
+
+def test_compiles_once():
+    traces = []
+
+    @jax.jit
+    def view(scene, camera):
+        traces.append(1)
+        return project(scene, camera, SIZE)
+
+    for angle in (0.0, 0.1, math.pi):
+        view(flat_scene(seed=int(angle)), Camera.front(0.5).orbit(angle))
+    view(flat_scene(), Camera.look_at((0.0, 0.0, -2.0), aspect=0.5))
+    assert len(traces) == 1
+
+
+def test_dtypes():
+    scene = flat_scene(5)
+    assert project(scene, Camera.front(0.5), SIZE).mean.dtype == jnp.float32
+    with jax.enable_x64(True):  # the scene decides
+        camera = Camera.front(0.5)
+        assert camera.position.dtype == jnp.float64
+        assert {leaf.dtype for leaf in jax.tree.leaves(project(scene, camera, SIZE))} == {jnp.dtype("float32")}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Camera.front(0.0), "aspect"),
+        (lambda: Camera.front(None), "aspect"),
+        (lambda: Camera.opposing((160, 320)), "aspect"),
+        (lambda: Camera.look_at((0, 0, -1), aspect=math.nan), "aspect"),
+        (lambda: Camera.front(0.5, fov=40.0), "fov.*math.radians"),
+        (lambda: Camera.look_at((0, 0, 0)), "eye, target, up"),
+        (lambda: Camera.look_at((0, -1, 0)), "eye, target, up.*another up"),
+        (lambda: Camera.look_at((0, -1)), "eye, target, up"),
+        (lambda: Camera(jnp.eye(2), jnp.zeros(3), jnp.ones(())), "rotation, position, fov"),
+        (lambda: project(flat_scene(3), Camera.front(0.5), SIZE, order="back"), "order"),
+        (lambda: project(flat_scene(3), Camera.front(0.5), SIZE, near=-1.0), "near"),
+        (
+            lambda: project(jax.tree.map(lambda x: x[None], flat_scene(3)), Camera.front(0.5), SIZE),
+            "jax.vmap",
+        ),
+        (
+            lambda: Gaussians3D(jnp.zeros((2, 3)), jnp.zeros((2, 2, 2)), jnp.zeros(2), jnp.zeros((2, 3))),
+            "mean, factor, opacity, color",
+        ),
+    ],
+)
+def test_errors(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_blind_camera_is_nan_under_tracing():
+    assert bool(jnp.isnan(jax.jit(Camera.look_at)(jnp.asarray([0.0, -1.0, 0.0])).rotation[0]).all())

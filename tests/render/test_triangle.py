@@ -1,0 +1,249 @@
+"""Triangles: there and back, the faces of eq:traingle_face, and the faces that are none."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.render import Splats2D
+from foldgauss.render.camera import Gaussians3D
+from foldgauss.render.triangle import Triangles
+
+
+def rest(num):
+    return jnp.full(num, 0.5), jnp.full((num, 3), 0.25)
+
+
+def parameters(num, *, seed=0, longest=0.1, ratio=1.0):
+    """mean, scale, angle as MiraGe has them; either axis may be the longer."""
+    rng = np.random.default_rng(seed)
+    scale = longest * np.exp(rng.uniform(np.log(0.3), 0, (num, 2)))
+    scale[np.arange(num), rng.integers(0, 2, num)] *= ratio
+    leaves = rng.uniform(-0.5, 0.5, (num, 2)), scale, rng.uniform(0, 2 * np.pi, num)
+    return tuple(jnp.asarray(leaf, jnp.float32) for leaf in leaves)
+
+
+def covariance(factor):
+    factor = np.asarray(factor, np.float64)
+    return factor @ np.swapaxes(factor, -1, -2)
+
+
+def assert_same_covariance(one, other, rtol=1e-6):
+    one, other = covariance(one), covariance(other)
+    np.testing.assert_array_less(np.abs(one - other).max((-1, -2)), rtol * np.abs(other).max((-1, -2)))
+
+
+def test_vertices_are_the_paper_s():
+    """v1 = m + s1 r1, v2 = m + s2 r2, in this order even where s1 < s2 (eq:traingle_face)."""
+    mean, scale, angle = parameters(50)
+    assert (scale[:, 0] < scale[:, 1]).any()
+    triangles = Triangles.from_gaussians(Gaussians3D.from_scale_angle(mean, scale, angle, *rest(50)))
+    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros(50)
+    m = np.stack([mean[:, 0], mean[:, 1], zero], -1)
+    first, second = np.stack([cos, sin, zero], -1) * scale[:, :1], np.stack([-sin, cos, zero], -1) * scale[:, 1:]
+    np.testing.assert_allclose(triangles.vertices, np.stack([m, m + first, m + second], 1), atol=2e-7)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e-2, 1e-4])
+@pytest.mark.parametrize("longest", [1e-6, 0.1, 1e6])
+def test_round_trip_from_scales(ratio, longest):
+    gaussians = Gaussians3D.from_scale_angle(*parameters(200, longest=longest, ratio=ratio), *rest(200))
+    back = Triangles.from_gaussians(gaussians).to_gaussians()
+    assert_same_covariance(back.factor, gaussians.factor)
+    for name in ("mean", "opacity", "color"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(gaussians, name))
+    widths = [np.linalg.svd(np.asarray(g.factor, np.float64), compute_uv=False)[:, :2] for g in (gaussians, back)]
+    np.testing.assert_allclose(*widths, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["lower", "upper", "full", "round"])
+@pytest.mark.parametrize("ratio", [1.0, 1e-2, 1e-4])
+def test_round_trip_from_any_factor(kind, ratio):
+    """Factors whose columns are no axes: Cholesky's, their mirror, and any other square root."""
+    _, scale, angle = parameters(200, ratio=ratio)
+    cos, sin = np.cos(angle, dtype=np.float64), np.sin(angle, dtype=np.float64)
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    axes = turn * np.asarray(scale, np.float64)[:, None, :]
+    factor = {
+        "lower": np.linalg.cholesky(axes @ np.swapaxes(axes, 1, 2)),
+        "upper": np.linalg.cholesky(axes @ np.swapaxes(axes, 1, 2))[..., ::-1],
+        "full": axes @ turn[::-1],
+        "round": turn * np.asarray(scale)[:, :1, None],
+    }[kind]
+    splats = Splats2D(jnp.zeros((200, 2)), jnp.asarray(factor, jnp.float32), *rest(200))
+    gaussians = Gaussians3D.from_flat(splats)
+    back = Triangles.from_gaussians(gaussians).to_gaussians()
+    assert_same_covariance(back.factor, gaussians.factor)
+    determinants = [np.linalg.det(np.asarray(g.factor, np.float64)[:, :2, :2]) for g in (gaussians, back)]
+    np.testing.assert_allclose(*np.abs(determinants), rtol=3e-6, atol=1e-7 * 0.01 if kind == "full" else 0)
+
+
+def test_round_trip_anywhere_in_space():
+    """Turned out of the plane and moved: still R S, still exact."""
+    gaussians = Gaussians3D.from_scale_angle(*parameters(100, ratio=1e-3), *rest(100))
+    turn = jnp.asarray(np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], jnp.float32)
+    moved = Gaussians3D(gaussians.mean + 3.0, turn[None] @ gaussians.factor, gaussians.opacity, gaussians.color)
+    back = Triangles.from_gaussians(moved).to_gaussians()
+    assert_same_covariance(back.factor, moved.factor)
+    third = np.abs(np.asarray(back.factor[:, :, 2] @ turn[:, 2])) / 1e-7
+    np.testing.assert_allclose(third, 1, rtol=1e-4)
+
+
+def test_triangles_there_and_back():
+    """A face with a right angle is the same face; any other becomes the right-angled one of its Gaussian."""
+    rng = np.random.default_rng(1)
+    vertices = jnp.asarray(rng.normal(size=(100, 3, 3)), jnp.float32)
+    triangles = Triangles.from_vertices(vertices, *rest(100))
+    np.testing.assert_allclose(triangles.vertices, vertices, atol=1e-6)
+    right = Triangles.from_gaussians(triangles.to_gaussians())
+    np.testing.assert_allclose(right.edges[:, 0], triangles.edges[:, 0], atol=1e-5)
+    again = Triangles.from_gaussians(right.to_gaussians())
+    np.testing.assert_allclose(again.edges, right.edges, atol=1e-5)
+    np.testing.assert_allclose(jnp.sum(right.edges[:, 0] * right.edges[:, 1], -1), 0, atol=1e-5)
+    # Same first edge, same height over it: the same plane area.
+    areas = [np.linalg.norm(np.cross(t.edges[:, 0], t.edges[:, 1]), axis=-1) for t in (triangles, right)]
+    np.testing.assert_allclose(*areas, rtol=1e-4)
+
+
+def test_reconstruction_is_gram_schmidt():
+    """eq:gaussrecons1, eq:gaussrecons2 as printed, with e3 for the plane's normal."""
+    rng = np.random.default_rng(2)
+    plane = np.concatenate([rng.normal(size=(40, 3, 2)), np.zeros((40, 3, 1))], -1)
+    triangles = Triangles.from_vertices(jnp.asarray(plane, jnp.float32), *rest(40))
+    for vertices, factor in zip(plane, np.asarray(triangles.to_gaussians(thickness=0.5).factor), strict=True):
+        m, v1, v2 = vertices
+        s1 = np.linalg.norm(v1 - m)
+        r1, e3 = (v1 - m) / s1, np.asarray([0, 0, 1])
+        r2 = (v2 - m) - ((v2 - m) @ r1) * r1 - ((v2 - m) @ e3) * e3
+        r2 /= np.linalg.norm(r2)
+        truth = np.stack([s1 * r1, ((v2 - m) @ r2) * r2, 0.5 * e3], -1)
+        np.testing.assert_allclose(factor[:, :2], truth[:, :2], atol=1e-5)
+        np.testing.assert_allclose(np.abs(factor[:, 2]), truth[:, 2], atol=1e-5)
+
+
+def test_mirrored_faces_are_the_same_gaussian():
+    """A triangle determines the covariance, not the angle."""
+    triangles = Triangles.from_gaussians(Gaussians3D.from_scale_angle(*parameters(20), *rest(20)))
+    mirrored = Triangles(triangles.origin, triangles.edges[:, ::-1], triangles.opacity, triangles.color)
+    assert_same_covariance(mirrored.to_gaussians().factor, triangles.to_gaussians().factor)
+
+
+def test_wrong_normal_would_fail():
+    """The erratum: with e2 for the normal, the second scale comes out wrong, by far more than the tolerance."""
+    mean, scale, angle = parameters(20)
+    edges = np.asarray(Triangles.from_gaussians(Gaussians3D.from_scale_angle(mean, scale, angle, *rest(20))).edges)
+    along = edges[:, 0] / np.linalg.norm(edges[:, 0], axis=-1, keepdims=True)
+    second = edges[:, 1] - along * np.sum(along * edges[:, 1], -1, keepdims=True)
+    second[:, 1] = 0  # the part along e2 taken out
+    assert np.median(np.abs(np.linalg.norm(second, axis=-1) / scale[:, 1] - 1)) > 0.1
+
+
+def test_moving_the_origin_of_space_does_not_hurt():
+    """Edges are kept: a splat of 1e-5 at a distance of 1000 comes back to 1e-6; through vertices it could not."""
+    gaussians = Gaussians3D.from_scale_angle(*parameters(20, longest=1e-5), *rest(20))
+    far = Gaussians3D(gaussians.mean + 1e3, gaussians.factor, gaussians.opacity, gaussians.color)
+    triangles = Triangles.from_gaussians(far)
+    assert_same_covariance(triangles.to_gaussians().factor, far.factor)
+    np.testing.assert_array_equal(triangles.vertices[:, 0], triangles.vertices[:, 1])
+
+
+def test_moving_a_vertex_moves_the_gaussian():
+    triangles = Triangles.from_gaussians(Gaussians3D.from_scale_angle(*parameters(5), *rest(5)))
+    doubled = triangles.vertices.at[:, 1].add(triangles.edges[:, 0])
+    moved = Triangles.from_vertices(doubled, triangles.opacity, triangles.color).to_gaussians()
+    np.testing.assert_allclose(moved.factor[:, :, 0], 2 * triangles.edges[:, 0], rtol=1e-4, atol=1e-7)
+
+
+BAD_FACES = {
+    "collinear": [[1.0, 2.0, 0.0], [2.0, 4.0, 0.0]],
+    "collinear up to rounding": [[0.1, 0.7, 0.3], [0.3, 2.1, 0.9]],
+    "two vertices in one place": [[1.0, 2.0, 0.0], [0.0, 0.0, 0.0]],
+    "a point": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FACES)
+def test_faces_without_area(kind):
+    good = [[1.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]
+    triangles = Triangles(jnp.zeros((2, 3)), jnp.asarray([good, BAD_FACES[kind]]), *rest(2))
+    with pytest.raises(ValueError, match=r"edges: .*1 without area, the first at index 1\..*Move a vertex"):
+        triangles.to_gaussians()
+    factor = jax.jit(lambda t: t.to_gaussians().factor)(triangles)
+    assert bool(jnp.isfinite(factor[0]).all())
+    assert bool(jnp.isnan(factor[1]).all())
+
+
+def test_nan_in_nan_out():
+    triangles = Triangles(jnp.zeros((1, 3)), jnp.full((1, 2, 3), jnp.nan), *rest(1))
+    assert bool(jnp.isnan(triangles.to_gaussians().factor).all())
+
+
+def test_thin_slanted_faces_are_faces():
+    edges = jnp.asarray([[[1.0, 0.0, 0.0], [1e4, 1.0, 0.0]]])
+    factor = Triangles(jnp.zeros((1, 3)), edges, *rest(1)).to_gaussians().factor
+    np.testing.assert_allclose(factor[0, :, :2], [[1, 0], [0, 1], [0, 0]], atol=1e-6)
+
+
+def test_a_factor_that_is_not_flat():
+    tril = jnp.asarray([[[1.0, 0, 0], [0.5, 1, 0], [0.3, 0.2, 0.1]]])
+    with pytest.raises(ValueError, match=r"gaussians\.factor.*from_flat"):
+        Triangles.from_gaussians(Gaussians3D(jnp.zeros((1, 3)), tril, *rest(1)))
+
+
+def test_shapes():
+    with pytest.raises(ValueError, match="origin, edges, opacity, color"):
+        Triangles(jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), *rest(2))
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e-3])
+def test_gradients_by_finite_differences(ratio):
+    with jax.enable_x64(True):
+        leaves = [jnp.asarray(leaf, jnp.float64) for leaf in parameters(10, ratio=ratio)]
+        factor = Gaussians3D.from_scale_angle(*leaves, *rest(10)).factor[:, :2, :2]
+        factor = factor @ jnp.asarray([[[1.0, 0.0], [0.4, 1.0]]])
+        weights = jnp.asarray(np.random.default_rng(0).normal(size=(10, 3, 3)))
+
+        def loss(factor, through=True):
+            gaussians = Gaussians3D.from_flat(Splats2D(leaves[0], factor, *rest(10)))
+            if through:
+                gaussians = Triangles.from_gaussians(gaussians).to_gaussians()
+            return jnp.sum(gaussians.factor @ jnp.swapaxes(gaussians.factor, 1, 2) * (weights + weights.mT))
+
+        direction = jnp.asarray(np.random.default_rng(1).normal(size=factor.shape)) * 1e-2
+        exact = jnp.sum(jax.grad(loss)(factor) * direction)
+        numeric = (loss(factor + 1e-5 * direction) - loss(factor - 1e-5 * direction)) / 2e-5
+        np.testing.assert_allclose(exact, numeric, rtol=1e-6)
+        # There and back is the identity of the covariance, so its gradient is too.
+        np.testing.assert_allclose(jax.grad(loss)(factor), jax.grad(loss)(factor, through=False), rtol=1e-6, atol=1e-9)
+
+
+def test_gradients_of_round_gaussians_are_those_of_a_fixed_angle():
+    factor = 0.1 * jnp.eye(2)
+
+    def edges(factor):
+        splats = Splats2D(jnp.zeros((1, 2)), factor[None], *rest(1))
+        return Triangles.from_gaussians(Gaussians3D.from_flat(splats)).edges[0]
+
+    first, second = jax.jacrev(edges)(factor)[:, :2]
+    truth = jnp.zeros((2, 2, 2)).at[0, 0, 0].set(1).at[1, 1, 0].set(1)
+    np.testing.assert_allclose(first, truth, atol=1e-6)  # its own column, whatever the other does
+    np.testing.assert_allclose(second[1, 1, 1], 1, atol=1e-6)
+    assert bool(jnp.isfinite(second).all())
+
+
+def test_none_many_and_compiled_once():
+    none = Gaussians3D.from_scale_angle(*(leaf[:0] for leaf in parameters(3)), *rest(0))
+    assert Triangles.from_gaussians(none).to_gaussians().factor.shape == (0, 3, 3)
+    gaussians = Gaussians3D.from_scale_angle(*parameters(6), *rest(6))
+    traces = []
+
+    @jax.jit
+    def there_and_back(gaussians):
+        traces.append(1)
+        return Triangles.from_gaussians(gaussians).to_gaussians()
+
+    back = there_and_back(there_and_back(gaussians))
+    assert len(traces) == 1
+    pairs = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), gaussians)
+    many = jax.vmap(there_and_back)(pairs)
+    np.testing.assert_allclose(many.factor.reshape(6, 3, 3), back.factor, atol=1e-7)
