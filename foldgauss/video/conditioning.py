@@ -178,12 +178,16 @@ class Conditioned:
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the frame's size."""
+    """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the picture's size.
+
+    `aspect` is the model frame's height / width (default: the picture's own), see `Splats2D.to_pixels`.
+    """
 
     degree: int
     power: float
     floor: float
     size: tuple[int, int]
+    aspect: float | None = None
 
 
 def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
@@ -199,7 +203,8 @@ def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> C
     t = np.float32(t)
     alive = np.flatnonzero((window[:, 0] < t) & (t < window[:, 1]))
     num, (height, width) = len(alive), shape.size
-    unit = np.float32(pixels_per_unit(shape.size, aspect=height / width))
+    aspect = height / width if shape.aspect is None else shape.aspect
+    unit = np.float32(pixels_per_unit(shape.size, aspect=aspect))
     mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
     opacity, color = np.empty(num, np.float32), np.empty((num, 3), np.float32)
     constants = np.float32([width / 2, height / 2, shape.power, shape.floor])

@@ -134,15 +134,11 @@ class VideoModel(eqx.Module):
 
     def frames(self, times: np.ndarray | None = None, size: tuple[int, int] | None = None) -> Iterator[np.ndarray]:
         """Pictures at `times` (default: the frame times) one by one, uint8 (height, width, 3)."""
-        for t in np.asarray(self.frame_times.times() if times is None else times):
-            yield to_bytes(np.asarray(self.render(t, size)))
+        from foldgauss.video.playback import Playback  # which knows this class
+
+        yield from Playback(self, size).frames(times)
 
 
 @eqx.filter_jit
 def _splats_in_pixels(model: VideoModel, t: Float[Array, ""], size: tuple[int, int]) -> Splats2D:
     return model.at(t, size)
-
-
-def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Values about [0, 1] to uint8, rounded and clipped."""
-    return np.clip(image * 255 + 0.5, 0, 255).astype(np.uint8)
