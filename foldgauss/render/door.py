@@ -1,6 +1,7 @@
 """`render`: the one door to every engine, differentiable, usable inside jit and vmap."""
 
 import functools
+import math
 from numbers import Integral
 
 import jax
@@ -12,8 +13,9 @@ from foldgauss._checks import invalid, one_of
 from foldgauss.render import cpu
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D
+from foldgauss.render.xla import render_xla
 
-ENGINES = ("auto", "cpu", "reference")
+ENGINES = ("auto", "cpu", "xla", "reference")
 COMPOSITINGS = ("over", "sum")
 
 
@@ -35,12 +37,14 @@ def render(
     - `background`: one colour, (channels,); None is black.
     - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all
       T_i are 1 and the background is added whole.
-    - `engine`: "cpu" (Numba, float32 inside, three channels), "reference" (dense, slow, any dtype and number of
-      channels), or "auto": "cpu" for three channels, else "reference".
+    - `engine`: "cpu" (Numba, float32 inside); "xla" (tiles in plain JAX, on CPU, GPU and TPU, float32 or float64);
+      "reference" (dense, slow); or "auto": "cpu" where JAX's default device is a CPU and the options are those that
+      "cpu" takes, else "xla".
     - `options`: what may be left out, `RenderOptions`.
 
     Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
-    `background`. Raises ValueError for an unknown option, a size below 1 or shapes that do not fit.
+    `background`. A splat with a number that is not finite among its parameters is not drawn and gets no gradient.
+    Raises ValueError for an unknown option, a size below 1 or shapes that do not fit.
 
     Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
 
@@ -53,22 +57,51 @@ def render(
         raise invalid(
             "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
         )
+    if not jnp.issubdtype(splats.mean.dtype, jnp.floating):
+        raise invalid("splats.mean", expected="a floating dtype", got=splats.mean.dtype)
     options = RenderOptions() if options is None else options
     channels, dtype = splats.color.shape[-1], splats.mean.dtype
     background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
     if background.shape != (channels,):
         raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
     if engine == "auto":
-        engine = "cpu" if channels == 3 else "reference"
+        engine = "cpu" if jax.default_backend() == "cpu" and _cpu_takes(options) else "xla"
+    if engine == "cpu":
+        cpu.check_options(options)
     height, width = map(int, size)
+    leaves = (*_finite_splats(splats), background)
     if engine == "reference":
-        return render_reference(splats, (height, width), background, compositing=compositing, options=options)
-    if channels != 3:
-        raise invalid("color", expected="3 channels for engine 'cpu'", got=channels, cure="Use 'reference'.")
-    cpu.check_options(options)
-    leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
-    image = _render_cpu((height, width), compositing, options, *(leaf.astype(jnp.float32) for leaf in leaves))
+        return render_reference(
+            Splats2D(*leaves[:4]), (height, width), background, compositing=compositing, options=options
+        )
+    # Below single precision a sum of hundreds of splats has no digits left; float64 stays what it is, but in "cpu".
+    inner = jnp.float32 if engine == "cpu" or dtype.itemsize < 4 else dtype
+    leaves = tuple(leaf.astype(inner) for leaf in leaves)
+    if engine == "xla":
+        image = render_xla(leaves, (height, width), compositing=compositing, options=options)
+    else:
+        image = _render_cpu((height, width), compositing, options, *leaves)
     return image.astype(dtype)
+
+
+def _cpu_takes(options: RenderOptions) -> bool:
+    try:
+        cpu.check_options(options)
+    except ValueError:
+        return False
+    return True
+
+
+@jax.jit
+def _finite_splats(splats: Splats2D) -> tuple[jax.Array, ...]:
+    """The leaves, with zeros in place of splats that hold NaN or an infinity: without opacity they are not drawn."""
+    leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
+    flat = [leaf.reshape(len(leaf), math.prod(leaf.shape[1:])) for leaf in leaves]
+    kept = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf), axis=1) for leaf in flat]), axis=0)
+    return tuple(
+        jnp.where(kept[:, None], leaf, jnp.zeros_like(leaf)).reshape(own.shape)
+        for leaf, own in zip(flat, leaves, strict=True)
+    )
 
 
 def _check_size(size: tuple[int, int]) -> None:
@@ -85,7 +118,7 @@ def _render_cpu(size, compositing, options, *leaves):
         trace = cpu.forward(*_as_numpy(leaves), size, compositing=compositing, options=options)
         return np.moveaxis(trace.image, 0, -1)
 
-    shape = jax.ShapeDtypeStruct((*size, 3), jnp.float32)
+    shape = jax.ShapeDtypeStruct((*size, len(leaves[-1])), jnp.float32)
     return jax.pure_callback(draw, shape, *leaves, vmap_method="sequential")
 
 

@@ -1,31 +1,78 @@
-"""The shape one splat leaves on the pixels: closed forms in plain JAX."""
+"""The shape one splat leaves on the pixels: closed forms in plain JAX, and the rules of what is left out.
+
+All engines follow these rules, whatever they are written in.
+"""
+
+import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from foldgauss.render.splats import RenderOptions
+
+#: A splat is drawn if its standard deviations, along x at fixed y and along y, are between about 1e-6 and 1e12 px:
+#: what is thinner no pixel's centre meets but by design, what is wider float32 cannot follow. Bounds of 1 / (that
+#: deviation), in the unit in which the exponent is a power of two.
+WIDEST, THINNEST = 1e-12, 1e6
+_PER_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 
 
-def whitening(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    r"""(p, q, r) with (p dx + q dy)^2 + (r dy)^2 the squared Mahalanobis distance, and the covariance's determinant.
+def whitening(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    r"""(p, q, r) with (p dx + q dy)^2 + (r dy)^2 the squared Mahalanobis distance, and whether the splat is drawn.
 
     The covariance is F F^T + low_pass I. Its determinant is written as a sum of squares, which cannot cancel, and the
     distance is centred before it is squared: the three terms of the usual conic cancel for thin, slanted splats.
+    A splat that is not drawn (too thin, too wide, NaN) gets those of F = I, so that no NaN reaches a gradient.
     """
-    xx = jnp.sum(factor[0] ** 2) + low_pass
-    xy = jnp.sum(factor[0] * factor[1])
-    yy = jnp.sum(factor[1] ** 2) + low_pass
-    area = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
-    det = area**2 + low_pass * (xx + yy - low_pass)
-    kept = (det > 0) & (yy > 0)
-    det_safe, yy_safe = jnp.where(kept, det, jnp.ones_like(det)), jnp.where(kept, yy, jnp.ones_like(yy))
-    across = jnp.sqrt(det_safe * yy_safe)
-    return jnp.stack([yy / across, -xy / across, 1 / jnp.sqrt(yy_safe)]), det
+    white = _whitening(factor, low_pass)
+    drawn = jnp.all(_within(white[::2]))
+    return _whitening(jnp.where(drawn, factor, jnp.eye(2, dtype=factor.dtype)), low_pass), drawn
 
 
-def exponent(offset: Float[Array, "*pixels 2"], whitener: Float[Array, "3"]) -> Float[Array, "*pixels"]:
-    """Minus half the squared Mahalanobis distance of offsets x - m."""
-    dx, dy = offset[..., 0], offset[..., 1]
+def _whitening(factor: Float[Array, "2 2"], low_pass: float) -> Float[Array, "3"]:
+    _, xy, yy, det = covariance(factor, low_pass)
+    # Two roots, not the root of the quotient: its derivative holds det^2, which underflows.
+    p = jnp.sqrt(yy) / jnp.sqrt(det)
+    return jnp.stack([p, -xy / yy * p, 1 / jnp.sqrt(yy)])
+
+
+def _within(inverse: Float[Array, "..."]) -> Bool[Array, "..."]:
+    """Also False for NaN, and for an infinite determinant."""
+    return (inverse * _PER_POWER_OF_TWO > WIDEST) & (inverse * _PER_POWER_OF_TWO < THINNEST)
+
+
+def covariance(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array, ""], ...]:
+    """Entries xx, xy, yy of F F^T + low_pass I, and the determinant."""
+    (a, b), (c, d) = factor
+    xx, xy, yy = a * a + b * b + low_pass, a * c + b * d, c * c + d * d + low_pass
+    return xx, xy, yy, (a * d - b * c) ** 2 + low_pass * (xx + yy - low_pass)
+
+
+def squared_distance(dx, dy, whitener):
+    """Squared Mahalanobis distance of offsets x - m; `whitener` is (p, q, r), each of a shape that broadcasts."""
     p, q, r = whitener
-    return -((p * dx + q * dy) ** 2 + (r * dy) ** 2) / 2
+    return (p * dx + q * dy) ** 2 + (r * dy) ** 2
+
+
+def raw_alpha(opacity, distance, options: RenderOptions):
+    """Opacity times the Gaussian; 0 below the cutoff and beyond the support radius. Not capped yet."""
+    alpha = opacity * jnp.exp(-distance / 2)
+    kept = alpha >= options.alpha_cutoff
+    if options.support_radius is not None:
+        kept &= distance <= options.support_radius**2
+    return jnp.where(kept, alpha, jnp.zeros_like(alpha))
+
+
+def capped(alpha, options: RenderOptions):
+    """Alpha under the ceiling. Not `minimum`, whose gradient is a half where the two are equal, as at alpha 1."""
+    return jnp.where(alpha > options.alpha_ceiling, jnp.full_like(alpha, options.alpha_ceiling), alpha)
+
+
+def squared_reach(opacity, options: RenderOptions):
+    """Squared Mahalanobis distance up to which a splat may be seen; negative where it is not seen at all."""
+    cutoff = options.alpha_cutoff
+    reach = 2 * (jnp.log(jnp.maximum(opacity, cutoff / 2)) - math.log(cutoff))
+    return reach if options.support_radius is None else jnp.minimum(reach, options.support_radius**2)
 
 
 def pixel_centres(size: tuple[int, int], dtype: jnp.dtype) -> Float[Array, "height width 2"]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss.render.footprint import exponent, pixel_centres, whitening
+from foldgauss.render.footprint import capped, pixel_centres, raw_alpha, squared_distance, whitening
 from foldgauss.render.splats import RenderOptions, Splats2D
 
 
@@ -36,11 +36,12 @@ def render_reference(
 def splat_alpha(
     splat: Splats2D, centres: Float[Array, "height width 2"], options: RenderOptions
 ) -> Float[Array, "height width"]:
-    """Alpha of one splat at every pixel centre: capped, and zero below the cutoff."""
-    whitener, det = whitening(splat.factor, options.low_pass)
-    alpha = splat.opacity * jnp.exp(exponent(centres - splat.mean[None, None, :], whitener))
-    kept = (alpha >= options.alpha_cutoff) & (det > 0)
-    return jnp.where(kept, jnp.minimum(alpha, options.alpha_ceiling), jnp.zeros_like(alpha))
+    """Alpha of one splat at every pixel centre: capped, and zero where it is left out."""
+    whitener, drawn = whitening(splat.factor, options.low_pass)
+    offset = centres - splat.mean[None, None, :]
+    distance = squared_distance(offset[..., 0], offset[..., 1], whitener)
+    alpha = capped(raw_alpha(splat.opacity, distance, options), options)
+    return jnp.where(drawn, alpha, jnp.zeros_like(alpha))
 
 
 def _over(carry, alpha, color, options):

@@ -1,10 +1,10 @@
-"""Model space to pixels."""
+"""Model space to pixels, and options."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss.render import Splats2D, pixels_per_unit
+from foldgauss.render import RenderOptions, Splats2D, pixels_per_unit
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,23 @@ def test_to_pixels_keeps_the_centre_and_scales_all_lengths():
     pixels = splats.to_pixels((160, 320))
     np.testing.assert_allclose(pixels.mean, [[160 + 80, 80 - 40]])
     np.testing.assert_allclose(pixels.factor, factor * 320)
+
+
+@pytest.mark.parametrize("field", ["alpha_cutoff", "alpha_ceiling", "low_pass", "transmittance_stop", "support_radius"])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), "much", float("inf")])
+def test_bad_options(field, value):
+    with pytest.raises(ValueError, match=field):
+        RenderOptions(**{field: value})
+
+
+@pytest.mark.parametrize("change", [{"tile_size": 3}, {"tile_size": 8.0}, {"list_capacity": 0}, {"alpha_ceiling": 1.1}])
+def test_bad_sizes_and_bounds(change):
+    with pytest.raises(ValueError, match=f"RenderOptions.{next(iter(change))}"):
+        RenderOptions(**change)
+
+
+def test_presets():
+    assert RenderOptions.standard() == RenderOptions()
+    assert RenderOptions.exact().alpha_ceiling == 1.0
+    assert RenderOptions.exact().transmittance_stop == 0.0
+    assert RenderOptions.fast().alpha_cutoff > RenderOptions().alpha_cutoff

@@ -1,0 +1,128 @@
+"""Colours by least squares: against the dense solution, and against descended colours on a real frame."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from scenes import scene
+
+from foldgauss.datasets import sample_clip
+from foldgauss.render import RenderOptions, Splats2D, render, solve_colors
+
+BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
+
+
+def recolored(splats, colors):
+    return Splats2D(splats.mean, splats.factor, splats.opacity, colors)
+
+
+def weights(splats, size, **how):
+    """The map from one channel of the colours to the pixels, as a matrix (pixels, num)."""
+    one_hot = recolored(splats, jnp.eye(len(splats.mean), dtype=splats.mean.dtype))
+    return np.asarray(render(one_hot, size, engine="reference", **how), np.float64).reshape(-1, len(splats.mean))
+
+
+@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_equals_the_dense_solution(compositing, engine):
+    """Two frames, of two sizes, that share their colours; the matrix is made from pictures of single splats."""
+    splats, size = scene("plain")
+    splats = jax.tree.map(lambda leaf: leaf[:40], splats)
+    frames = [splats, Splats2D(splats.mean[::-1] + 2, splats.factor, splats.opacity, splats.color)]
+    sizes = [size, (33, 40)]
+    rng = np.random.default_rng(0)
+    images = [rng.uniform(0, 1, (*size, 3)).astype(np.float32) for size in sizes]
+    matrices = [weights(one, size, compositing=compositing) for one, size in zip(frames, sizes, strict=True)]
+    blank = jnp.zeros_like(splats.color)
+    rest = [
+        image - np.asarray(render(recolored(one, blank), size, background=BACKGROUND, compositing=compositing))
+        for one, size, image in zip(frames, sizes, images, strict=True)
+    ]
+    matrix, right = np.concatenate(matrices), np.concatenate([one.reshape(-1, 3) for one in rest])
+    start, ridge = np.asarray(splats.color, np.float64), 1e-3
+    damping = ridge * (matrix.T @ matrix.sum(1)).max()
+    normal = matrix.T @ matrix + damping * np.eye(len(start))
+    dense = np.linalg.solve(normal, matrix.T @ right + damping * start)
+    colors = solve_colors(
+        frames, images, background=BACKGROUND, compositing=compositing, engine=engine, ridge=ridge, tolerance=1e-6
+    )
+    np.testing.assert_allclose(colors, dense, atol=2e-4)
+
+
+def test_finds_the_colours_that_made_the_picture():
+    splats, size = scene("plain")
+    splats = jax.tree.map(lambda leaf: leaf[:30], splats)
+    image = render(splats, size, background=BACKGROUND)
+    blank = recolored(splats, jnp.zeros_like(splats.color))
+    solved = solve_colors(blank, image, background=BACKGROUND, ridge=0.0, tolerance=1e-7)
+    np.testing.assert_allclose(render(recolored(splats, solved), size, background=BACKGROUND), image, atol=1e-4)
+
+
+def test_unseen_splats_keep_their_colours():
+    splats, size = scene("plain")
+    away = Splats2D(splats.mean + 1e4, splats.factor, splats.opacity, splats.color)
+    np.testing.assert_array_equal(solve_colors(away, jnp.ones((*size, 3)), ridge=0.0), splats.color)
+    none, size = scene("none")
+    assert solve_colors(none, jnp.ones((*size, 3))).shape == (0, 3)
+
+
+def bunny(size):
+    """The first frame of the clip, made smaller."""
+    cv2 = pytest.importorskip("cv2")
+    done, frame = cv2.VideoCapture(str(sample_clip("bunny"))).read()
+    assert done
+    frame = cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
+    return (frame[..., ::-1] / 255).astype(np.float32)
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_beats_descended_colours_on_a_real_frame(compositing):
+    """The best of three rates of Adam, 200 steps each, from the same start; the solve has at most 60 iterations."""
+    size = (90, 160)
+    image = jnp.asarray(bunny(size))
+    rng = np.random.default_rng(0)
+    num = 1500
+    mean = rng.uniform(0, 1, (num, 2)) * [size[1], size[0]]
+    opacity = rng.uniform(0.3, 0.9, num) if compositing == "over" else rng.uniform(0.1, 0.3, num)
+    factor = np.tile(np.eye(2), (num, 1, 1)) * rng.uniform(1.5, 3.0, (num, 1, 1))
+    leaves = mean, factor, opacity, np.full((num, 3), 0.5)
+    splats = Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
+
+    @jax.jit
+    def error(colors):
+        return jnp.mean((render(recolored(splats, colors), size, compositing=compositing) - image) ** 2)
+
+    def descended(rate):
+        optimiser, colors = optax.adam(rate), splats.color
+
+        @jax.jit
+        def step(colors, state):
+            updates, state = optimiser.update(jax.grad(error)(colors), state)
+            return optax.apply_updates(colors, updates), state
+
+        with jax.numpy_dtype_promotion("standard"):  # optax counts on it
+            state = optimiser.init(colors)
+            for _ in range(200):
+                colors, state = step(colors, state)
+        return float(error(colors))
+
+    best = min(map(descended, (0.003, 0.01, 0.03)))
+    solved = solve_colors(splats, image, compositing=compositing, max_iterations=60)
+    assert float(error(solved)) < best < float(error(splats.color)) / 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": []}, "images: expected one for each"),
+        ({"images": [np.zeros((5, 5))]}, "shape"),
+        ({"ridge": -1.0}, "ridge"),
+        ({"options": RenderOptions(tile_size=8), "engine": "cpu"}, "tile_size"),
+    ],
+)
+def test_refusals(change, message):
+    splats, size = scene("plain")
+    arguments = {"splats": [splats], "images": [np.zeros((*size, 3), np.float32)]} | change
+    with pytest.raises(ValueError, match=message):
+        solve_colors(**arguments)

@@ -1,0 +1,270 @@
+"""The CPU engine by itself: channels, ceilings, support radius, statistics, several frames."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import scene
+
+from foldgauss import _threads
+from foldgauss.render import RenderOptions, Splats2D, cpu
+from foldgauss.render.footprint import pixel_centres
+from foldgauss.render.reference import render_reference, splat_alpha
+
+NAMES = ("mean", "factor", "opacity", "color", "background")
+
+
+def leaves_of(kind, channels=3, *, dtype=np.float32, change=None):
+    """(mean, factor, opacity, color, background) in NumPy, and the picture's size."""
+    splats, size = scene(kind)
+    rng = np.random.default_rng(4)
+    leaves = [np.asarray(leaf) for leaf in (splats.mean, splats.factor, splats.opacity)]
+    leaves += [rng.uniform(size=(len(splats.opacity), channels)), rng.uniform(size=channels)]
+    leaves = [np.array(leaf, np.float32) for leaf in leaves]
+    if change is not None:
+        change(leaves)
+    return [leaf.astype(dtype) for leaf in leaves], size
+
+
+def judge(leaves, size, weights, compositing, options):
+    """Picture, planar, and gradients of <picture, weights> from the reference in double precision."""
+    with jax.enable_x64(True):
+        wide, weights = [jnp.asarray(leaf, jnp.float64) for leaf in leaves], jnp.asarray(weights, jnp.float64)
+
+        def loss(*leaves):
+            splats = Splats2D(*leaves[:4])
+            picture = render_reference(splats, size, leaves[4], compositing=compositing, options=options)
+            return jnp.sum(jnp.moveaxis(picture, -1, 0) * weights), picture
+
+        grads, picture = jax.jit(jax.grad(loss, tuple(range(5)), has_aux=True))(*wide)
+    return np.moveaxis(np.asarray(picture), -1, 0), [np.asarray(one) for one in grads]
+
+
+def near_a_threshold(leaves, size, options):
+    """Pixels where an alpha is so near to where it is dropped, capped or stopped that float32 may fall either way."""
+    loose = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1.0, low_pass=options.low_pass)
+    with jax.enable_x64(True):
+        splats = Splats2D(*(jnp.asarray(leaf, jnp.float64) for leaf in leaves[:4]))
+        raw = jax.lax.map(lambda one: splat_alpha(one, pixel_centres(size, jnp.float64), loose), splats)
+        kept = jax.lax.map(lambda one: splat_alpha(one, pixel_centres(size, jnp.float64), options), splats)
+        near = np.abs(np.asarray(raw) / options.alpha_cutoff - 1) < 1e-4
+        if options.support_radius is not None:
+            edge = np.asarray(splats.opacity)[:, None, None] * np.exp(-(options.support_radius**2) / 2)
+            near |= np.abs(np.asarray(raw) / edge - 1) < 1e-4
+        if options.alpha_ceiling < 1:
+            near |= np.abs(np.asarray(raw) / options.alpha_ceiling - 1) < 1e-5
+        light = np.cumprod(1 - np.asarray(kept), axis=0)
+    # With stop 0 the light never falls to it but where an alpha is 1 exactly, which both sides see.
+    stop = options.transmittance_stop
+    return (near | (np.abs(light - stop) < 1e-3 * stop)).any(axis=0)
+
+
+def assert_agrees(leaves, size, compositing="over", options=None):
+    """Picture and gradients against the judge, the pixels near a threshold aside."""
+    options = RenderOptions() if options is None else options
+    weights = np.random.default_rng(1).normal(size=(leaves[4].size, *size)).astype(np.float32)
+    avoid = near_a_threshold(leaves, size, options)
+    assert avoid.mean() < 0.5
+    weights[:, avoid] = 0
+    truth, true_grads = judge(leaves, size, weights, compositing, options)
+    trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
+    difference = np.abs(trace.image - truth)[:, ~avoid]
+    assert difference.max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
+    for name, one, other in zip(NAMES, cpu.backward(trace, weights), true_grads, strict=True):
+        scale = max(1.0, np.abs(other).max(initial=0))
+        np.testing.assert_allclose(one / scale, other / scale, atol=2e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("channels", [1, 4, 5, 11])
+def test_any_number_of_channels(channels, compositing):
+    assert_agrees(*leaves_of("plain", channels), compositing)
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("ceiling", [0.5, 0.9999, 1.0])
+@pytest.mark.parametrize("kind", ["opaque", "curtain"])
+def test_any_ceiling(kind, ceiling, compositing):
+    assert_agrees(*leaves_of(kind), compositing, RenderOptions(alpha_ceiling=ceiling, transmittance_stop=1e-6))
+
+
+def opaque(leaves):
+    """Splats of opacity 1, some with their centre on a pixel's: there alpha is 1 to the bit."""
+    leaves[2][:] = 1
+    leaves[0][::2] = np.floor(leaves[0][::2]) + 0.5
+
+
+@pytest.mark.parametrize("stop", [0.0, 1e-4])
+def test_alpha_of_one(stop):
+    """No light passes a splat of alpha 1: what lies behind gets no gradient, what lies before gets a finite one."""
+    leaves, size = leaves_of("plain", change=opaque)
+    options = RenderOptions(alpha_ceiling=1.0, transmittance_stop=stop)
+    assert (cpu.forward(*leaves, size, options=options).light == 0).any()
+    assert_agrees(leaves, size, "over", options)
+
+
+@pytest.mark.parametrize("kind", ["plain", "opaque", "needles", "huge", "none"])
+def test_exact_options(kind):
+    assert_agrees(*leaves_of(kind), "over", dataclasses.replace(RenderOptions.exact(), low_pass=0.05))
+
+
+@pytest.mark.parametrize("radius", [0.5, 2.0, 3.0])
+@pytest.mark.parametrize("kind", ["plain", "needles"])
+def test_support_radius(kind, radius):
+    options = RenderOptions(support_radius=radius)
+    leaves, size = leaves_of(kind)
+    assert_agrees(leaves, size, "over", options)
+    if radius < 3:
+        assert cpu.forward(*leaves, size, options=options).num_pairs < cpu.forward(*leaves, size).num_pairs
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("kind", ["plain", "curtain", "tiny", "one pixel", "none"])
+def test_statistics(kind, compositing):
+    """Against the weights of a dense picture, in double precision."""
+    leaves, size = leaves_of(kind)
+    options = RenderOptions()
+    trace = cpu.forward(*leaves, size, compositing=compositing, options=options, statistics=True)
+    plain = cpu.forward(*leaves, size, compositing=compositing, options=options)
+    assert plain.statistics is None
+    np.testing.assert_array_equal(trace.image, plain.image)
+    splats = Splats2D(*map(jnp.asarray, leaves[:4]))
+    if len(leaves[2]):
+        alpha = jax.lax.map(lambda one: splat_alpha(one, pixel_centres(size, jnp.float32), options), splats)
+    alpha = np.asarray(alpha if len(leaves[2]) else np.zeros((0, *size)), np.float64)
+    light, weights, drawn = np.ones(size), np.zeros_like(alpha), np.zeros_like(alpha)
+    for k, own in enumerate(alpha):
+        drawn[k] = own * (light > options.transmittance_stop)
+        weights[k] = drawn[k] * light
+        if compositing == "over":
+            light = light * (1 - drawn[k])
+    contribution, largest_alpha = trace.statistics
+    # A splat at the very cutoff may be drawn by one and not by the other; so may one at the stop.
+    np.testing.assert_allclose(contribution, weights.sum((1, 2)), rtol=1e-4, atol=2.5 / 255)
+    slack = np.where(largest_alpha > 0.02, 1e-4, 2 / 255)
+    close = np.abs(largest_alpha - drawn.max((1, 2), initial=0)) <= slack
+    assert close.mean() > 0.99 if len(close) else True
+    np.testing.assert_allclose(trace.light, light, atol=1e-4)
+
+
+def test_statistics_see_what_is_hidden():
+    """The comparison above has power: in a curtain most splats contribute nothing, and the first ones most."""
+    leaves, size = leaves_of("curtain")
+    contribution, largest_alpha = cpu.forward(*leaves, size, statistics=True).statistics
+    assert np.mean(contribution == 0) > 0.5
+    assert contribution[:10].sum() > 0.9 * contribution.sum()
+    np.testing.assert_array_equal(contribution == 0, largest_alpha == 0)
+
+
+def test_light_is_what_the_background_gets():
+    leaves, size = leaves_of("plain")
+    white = cpu.forward(*leaves[:3], np.zeros_like(leaves[3]), np.ones(3, np.float32), size)
+    np.testing.assert_array_equal(white.image[1], white.light)
+    assert white.light.min() < 0.5 < white.light.max()
+
+
+def test_screen_gradient():
+    d_mean = np.float32([[3, 4], [0, 0], [-5, 12]])
+    np.testing.assert_array_equal(cpu.screen_gradient(d_mean), np.float32([5, 0, 13]))
+
+
+def results(leaves, size, weights, **how):
+    trace = cpu.forward(*leaves, size, statistics=True, **how)
+    return [trace.image, trace.light, *trace.statistics, *cpu.backward(trace, weights)]
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+@pytest.mark.parametrize("kind", ["plain", "curtain"])
+def test_bits_do_not_depend_on_threads(kind, channels):
+    leaves, size = leaves_of(kind, channels)
+    weights = np.random.default_rng(0).normal(size=(channels, *size)).astype(np.float32)
+    several = []
+    try:
+        for count in (1, 2, 5):
+            _threads.set_num_threads(count)
+            several.append(results(leaves, size, weights))
+    finally:
+        _threads.set_num_threads(None)
+    for other in several[1:]:
+        for one, two in zip(several[0], other, strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_several_frames_are_as_one_by_one(compositing):
+    """To the bit; the frames may have different numbers of splats."""
+    leaves, size = leaves_of("plain")
+    frames = [[leaf[k:] for leaf in leaves[:4]] + leaves[4:] for k in (0, 20, len(leaves[0]))]
+    weights = np.random.default_rng(0).normal(size=(3, 3, *size)).astype(np.float32)
+    traces = cpu.forward_frames(frames, size, compositing=compositing, statistics=True)
+    grads = cpu.backward_frames(traces, weights)
+    for frame, weight, trace, grad in zip(frames, weights, traces, grads, strict=True):
+        alone = results(frame, size, weight, compositing=compositing)
+        for one, two in zip(alone, [trace.image, trace.light, *trace.statistics, *grad], strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+def test_no_frames():
+    assert cpu.forward_frames([], (8, 8)) == []
+    assert cpu.backward_frames([], []) == []
+
+
+def test_cut_lists_keep_the_gradient():
+    """Behind the last light nothing is kept, and nothing is lost: the gradient is that of the whole list."""
+    leaves, size = leaves_of("curtain")
+    weights = np.ones((3, *size), np.float32)
+    trace = cpu.forward(*leaves, size)
+    used = max(int(stop.max()) for _, _, stop in trace.lists)
+    assert used < len(leaves[0])
+    seen = cpu.backward(trace, weights)
+    assert not seen[3][-1].any()
+    first = sum(seen[3].any(axis=1))
+    short = cpu.backward(cpu.forward(*(leaf[: 2 * first] for leaf in leaves[:4]), leaves[4], size), weights)
+    for one, other in zip(seen[:4], short[:4], strict=True):
+        np.testing.assert_array_equal(one[:first], other[:first])
+
+
+def test_other_tiles_are_refused_with_a_cure():
+    leaves, size = leaves_of("one")
+    cpu.forward(*leaves, size, options=RenderOptions(tile_size=16))
+    with pytest.raises(ValueError, match=r"options.tile_size.*slower"):
+        cpu.forward(*leaves, size, options=RenderOptions(tile_size=8))
+
+
+@pytest.mark.parametrize("wrong", ["sign", "order"])
+def test_mutant_is_caught(wrong, monkeypatch):
+    """The gradient test has power: another sign, or another order of the splats, fails it."""
+    leaves, size = leaves_of("plain")
+    backward = cpu.backward
+
+    def mutant(trace, weights):
+        grads = list(backward(trace, weights))
+        grads[0] = -grads[0] if wrong == "sign" else grads[0][::-1]
+        return grads
+
+    monkeypatch.setattr(cpu, "backward", mutant)
+    with pytest.raises(AssertionError, match="mean"):
+        assert_agrees(leaves, size)
+
+
+def test_exponential():
+    """Within 2e-7 over the powers that are drawn, in a kernel of its own."""
+    from foldgauss._kernels import kernel
+    from foldgauss.render import _cpu_kernels
+    from foldgauss.render._vectors import LANES, load, store
+
+    exp2 = _cpu_kernels._exp2
+
+    @functools.partial(kernel)
+    def apply(x, y):
+        for k in range(np.uint64(0), np.uint64(len(x)), np.uint64(LANES)):
+            store(y, k, exp2(load(x, k)))
+
+    x = np.linspace(-30, 0, 1 << 16).astype(np.float32)
+    y = np.empty_like(x)
+    apply(x, y)
+    np.testing.assert_allclose(y, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
+    assert y[-1] == 1
