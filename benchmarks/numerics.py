@@ -1,11 +1,18 @@
-"""The extremes: float32 log-densities against float64, and float64 against extended precision, in excess wrong bits.
+"""The extremes: log-densities and their gradients, float32 and float64, against long double, in excess wrong bits.
 
     python -m benchmarks.numerics [--json FILE]
 
-Excess wrong bits = log2(error in units of the last place) - log2(condition number), at the same inputs. The condition
-number is that of the log-density with respect to every input (point and parameters), sum |x dlogp/dx| / |logp|: what no
-algorithm can win back. A row shows its worst over tau, residual and power. "off" counts the points where one of the two
-is -inf and the other is not although the condition number is finite; it must be 0, and so must "NaN".
+**Values.** Excess wrong bits = log2(error in units of the last place) - log2(condition number), at the same inputs. The
+condition number is that of the log-density with respect to every input (point and parameters),
+sum |x dlogp/dx| / |logp|: what no algorithm can win back.
+
+**Gradients**, by the point and by every parameter: log2(error / max(eps |g|, change)), where `change` is the largest
+that half a unit in the last place of every input, up or down at random, makes in the true gradient. Where the truth
+is beyond the largest number, that number is asked for, with its sign; where the log-density is -inf, 0.
+
+A row shows its worst over tau, residual and power. "off" counts log-densities that are -inf and should not be though
+the condition number is finite; "wrong ends" gradients that are not the largest number where they should be, or not 0.
+Both must be 0, and so must "NaN".
 """
 
 from typing import NamedTuple
@@ -28,7 +35,10 @@ BOUND = 8.0
 
 
 class Case(NamedTuple):
-    """One row of the table; `condition` is that of Sigma, `offset` is added to space and to time (times its scale)."""
+    """One row of the table; `condition` is that of Sigma, `offset` is added to space and to time (times its scale).
+
+    `centred` puts loc at 0: there residuals as small as 1e-30 are seen, which drown beside a loc of 1.
+    """
 
     name: str
     dim: int = 3
@@ -36,6 +46,7 @@ class Case(NamedTuple):
     time_scale: float = 0.3
     condition: float = 10.0
     offset: float = 0.0
+    centred: bool = False
 
 
 def cases(dtype) -> list[Case]:
@@ -53,6 +64,11 @@ def cases(dtype) -> list[Case]:
         Case("d 10", dim=10),
         Case("d 64", dim=64),
         Case("d 64, condition", dim=64, condition=condition),
+        Case("centred", degree=0, centred=True),
+        Case("centred, condition, time_scale 1e-12", degree=0, centred=True, condition=condition, time_scale=1e-12),
+        # Not degree 12: XLA on the CPU takes coefficients below the smallest normal number for 0.
+        Case("condition, time_scale 1e6, degree 5", condition=condition, time_scale=1e6, degree=5),
+        Case("condition, offset, time_scale 1e-12", condition=condition, offset=offset, time_scale=1e-12),
     ]
 
 
@@ -67,9 +83,9 @@ def build(case: Case, dtype) -> tuple[FoldedGaussian, np.ndarray]:
     tril = (tril * np.sign(np.diagonal(tril))).astype(dtype)  # columns: Sigma stays the same
     rows = rng.normal(size=(case.degree, dim)) / scale ** np.arange(1, case.degree + 1)[:, None] / 4
     dist = FoldedGaussian(
-        (rng.normal(size=dim) + case.offset).astype(dtype),
+        np.zeros(dim, dtype) if case.centred else (rng.normal(size=dim) + case.offset).astype(dtype),
         tril,
-        time_loc=np.asarray(0.4 + case.offset * scale, dtype),
+        time_loc=np.asarray((0.0 if case.centred else 0.4) + case.offset * scale, dtype),
         time_scale=np.asarray(scale, dtype),
         fold=PolynomialFold(rows.astype(dtype)),
         envelope=TimeLikelihood(power.astype(dtype)),
@@ -91,64 +107,104 @@ def excess_bits(case: Case, dtype) -> dict[str, float]:
     with jax.enable_x64(True):
         dist, x = build(case, dtype)
         value, grads = evaluate(dist, x)
-        wide = jax.tree.map(lambda leaf: leaf.astype(np.float64), dist)
-        reference, by_leaf = evaluate(wide, x.astype(np.float64))
-    inputs = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves((wide, x))]
+    inputs = _wide(dist, x)
     with np.errstate(all="ignore"):
-        moved = sum(map(_movement, inputs, jax.tree.leaves(by_leaf)))
-        truth = reference
-        if dtype == np.float64:  # the slope at the truth: where float64 sees a residual of exactly 0, its own is 0
-            truth, at_truth = extended(wide, x).T
-            moved = np.maximum(moved, at_truth)
-        condition = np.maximum(moved / np.abs(reference), 1.0)
-        ulps = np.abs(value.astype(np.longdouble) - truth) / np.spacing(np.abs(truth).astype(dtype))
+        truth, slopes = extended(*inputs)
+        moved = sum(map(_movement, inputs, slopes))
+        condition = np.maximum(moved / np.abs(truth), 1.0)
+        ulps = np.abs(value - truth) / np.spacing(np.abs(truth).astype(dtype))
         excess = (np.log2(np.maximum(ulps, 1.0)) - np.log2(condition)).astype(np.float64)
-    both = np.isfinite(value) & np.isfinite(truth) & (np.abs(truth) < np.finfo(dtype).max)
+        changes = _changes(inputs, slopes, dtype)
+    largest = np.longdouble(np.finfo(dtype).max)
+    both = np.isfinite(value) & np.isfinite(truth) & (np.abs(truth) < largest)
     tame = np.isfinite(condition) & (condition < 1 / np.finfo(dtype).eps)
-    off = np.isneginf(value) & (truth > -0.01 * float(np.finfo(dtype).max)) & tame
+    off = np.isneginf(value) & (truth > -0.01 * largest) & tame
+    own = [*jax.tree.leaves(grads[0]), grads[1]]
+    # Where float sees a residual of 0 and the truth is -inf, or the other way round, all slopes are another point's.
+    same = np.isneginf(value) == (np.isneginf(truth) | (truth < -largest))
+    each = zip(own, slopes, changes, strict=True)
+    kept = [_gradient_excess(g, true, change, value, same, dtype) for g, true, change in each]
     return {
         "excess": float(excess[both].max(initial=-np.inf)),
+        "gradient's excess": max(float(bits) for bits, _, _ in kept),
         "compared": int(both.sum()),
+        "slopes": int(sum(count for _, _, count in kept)),
         "-inf": int(np.isneginf(value).sum()),
         "off": int(off.sum()),
-        "NaN": int(np.isnan(value).sum() + sum(np.isnan(g).sum() for g in jax.tree.leaves(grads))),
-        "infinite slopes": int(sum(np.isinf(g).sum() for g in jax.tree.leaves(grads))),
+        "wrong ends": int(sum(wrong for _, wrong, _ in kept)),
+        "NaN": int(np.isnan(value).sum() + sum(np.isnan(g).sum() for g in own)),
     }
 
 
 def _movement(x: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """sum |x dlogp/dx| per point: an input that is 0 has no relative error to pass on, however steep the slope."""
-    terms = np.where(x == 0, 0, np.abs(x.astype(np.longdouble) * slope))
-    return terms.reshape(len(x), -1).sum(-1)
+    return np.where(x == 0, 0, np.abs(x * slope)).reshape(len(x), -1).sum(-1)
 
 
-def extended(dist: FoldedGaussian, x: np.ndarray) -> np.ndarray:
-    """eq:foldgauss in NumPy's long double, and |x dlogp/dx| by space: (points, 2), straight from the book."""
-    wide = lambda leaf: np.asarray(leaf).astype(np.longdouble)  # noqa: E731
-    leaves = [wide(leaf) for leaf in (dist.loc, dist.scale_tril, dist.time_loc, dist.time_scale)]
-    every = zip(*leaves, wide(dist.fold.coefficients), wide(dist.envelope.power), wide(x), strict=True)
-    return np.array([_extended_one(*arguments) for arguments in every])
+def _wide(dist: FoldedGaussian, x: np.ndarray) -> list[np.ndarray]:
+    """loc, tril, time_loc, time_scale, coefficients, power, floor, x in long double, each for every point."""
+    return [np.asarray(leaf).astype(np.longdouble) for leaf in (*jax.tree.leaves(dist), x)]
 
 
-def _extended_one(loc, tril, time_loc, time_scale, coefficients, power, x):
-    u = time_loc - x[-1]
+def _changes(inputs: list[np.ndarray], slopes: list[np.ndarray], dtype) -> list[np.ndarray]:
+    """What half a unit in the last place of all inputs does to the true gradients, at the most of some draws."""
+    rng, half_ulp = np.random.default_rng(1), 0.5 * np.finfo(dtype).eps
+    changes = [np.zeros_like(g) for g in slopes]
+    for _ in range(6):
+        moved = [y * (1 + half_ulp * rng.choice([-1, 1], size=y.shape)) for y in inputs]
+        again = extended(*moved)[1]
+        changes = [np.fmax(c, np.abs(g - h)) for c, g, h in zip(changes, slopes, again, strict=True)]
+    return changes
+
+
+def _gradient_excess(own, truth, change, value, same, dtype) -> tuple[float, int, int]:
+    """Worst excess bits of one leaf's gradients, how many are at wrong ends, and how many were compared."""
+    largest, tiny = np.longdouble(np.finfo(dtype).max), np.longdouble(np.finfo(dtype).tiny)
+    nowhere, same = (flag.reshape(-1, *[1] * (own.ndim - 1)) for flag in (np.isneginf(value), same))
+    size = np.abs(truth)
+    with np.errstate(all="ignore"):  # a NaN, of infinities, compares as neither
+        beyond = (size - 8 * change > largest) & same & ~nowhere
+        within = (size + 8 * change < largest) & same & ~nowhere
+        allowed = np.maximum(np.maximum(np.finfo(dtype).eps * size, change), tiny)
+        bits = np.log2(np.maximum(np.abs(own - truth), allowed) / allowed)
+    wrong = (beyond & (own != np.sign(truth) * largest)) | (nowhere & (own != 0)) | np.isinf(own)
+    return float(bits[within].max(initial=0.0)), int(wrong.sum()), int((within | beyond).sum())
+
+
+def extended(loc, tril, time_loc, time_scale, coefficients, power, floor, x) -> tuple[np.ndarray, list[np.ndarray]]:
+    """eq:foldgauss and its gradient by every argument in NumPy's long double, straight from the book.
+
+    Every argument has the points in front. The floor must be 0; the gradient by it is there all the same.
+    """
+    dim, t = loc.shape[-1], x[:, -1]
+    u = time_loc - t
     tau = u / time_scale
-    shift = np.zeros_like(loc)
-    for row in coefficients[::-1]:
-        shift = u * (shift + row)
-    residual, z = x[:-1] - loc - shift, np.zeros_like(loc)
-    for i in range(len(loc)):
-        z[i] = (residual[i] - (tril[i, :i] * z[:i]).sum()) / tril[i, i]
+    powers = u[:, None] ** np.arange(coefficients.shape[1] + 1)  # u^0 .. u^degree
+    shift = (coefficients * powers[:, 1:, None]).sum(1)
+    slope = (coefficients * (np.arange(1, powers.shape[1]) * powers[:, :-1])[:, :, None]).sum(1)
+    residual, y = x[:, :-1] - loc - shift, np.zeros_like(loc)
+    for i in range(dim):
+        y[:, i] = (residual[:, i] - (tril[:, i, :i] * y[:, :i]).sum(-1)) / tril[:, i, i]
     half_log_a = -power * tau * tau / 4
-    white = np.sign(z) * np.exp(np.log(np.abs(z)) - half_log_a)
-    log_det = np.log(np.diagonal(tril)).sum() + np.log(time_scale) + len(loc) * half_log_a
-    slope = np.linalg.solve(tril.T.astype(float), z.astype(float)).astype(np.longdouble)
-    slope = np.sign(slope) * np.exp(np.log(np.abs(slope)) - 2 * half_log_a)
-    moved = (np.abs(slope) * (np.abs(x[:-1]) + np.abs(loc) + np.abs(shift))).sum()
-    log_prob = (
-        -(white * white).sum() / 2 - tau * tau / 2 - log_det - (len(loc) + 1) * np.log(2 * np.longdouble(np.pi)) / 2
-    )
-    return log_prob, np.nan_to_num(moved)
+    z = y * np.exp(-half_log_a)[:, None]
+    w = np.zeros_like(loc)
+    for i in reversed(range(dim)):
+        w[:, i] = (z[:, i] - (tril[:, i + 1 :, i] * w[:, i + 1 :]).sum(-1)) / tril[:, i, i]
+    diagonal, square = np.diagonal(tril, axis1=1, axis2=2), (z * z).sum(-1)
+    log_det = np.log(diagonal).sum(-1) + np.log(time_scale) + dim * half_log_a
+    log_prob = -square / 2 - tau * tau / 2 - log_det - (dim + 1) * np.log(2 * np.longdouble(np.pi)) / 2
+    by_loc = w * np.exp(-half_log_a)[:, None]
+    by_half_log_a = square - dim
+    by_tau = -tau - by_half_log_a * power * tau / 2
+    by_u = (by_loc * slope).sum(-1)
+    by_tril = np.tril(w[:, :, None] * z[:, None, :]) - np.eye(dim) / diagonal[:, None, :]
+    by_time_loc = by_tau / time_scale + by_u
+    by_coefficients = by_loc[:, None, :] * powers[:, 1:, None]
+    by_power = -by_half_log_a * tau * tau / 4
+    by_floor = by_half_log_a * np.expm1(power * tau * tau / 2) / 2
+    by_x = np.concatenate([-by_loc, -by_time_loc[:, None]], axis=-1)
+    by_time_scale = -(by_tau * tau + 1) / time_scale
+    return log_prob, [by_loc, by_tril, by_time_loc, by_time_scale, by_coefficients, by_power, by_floor, by_x]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -156,16 +212,16 @@ def main(arguments: list[str] | None = None) -> None:
     figures: dict[str, float] = {}
     for dtype in (np.float32, np.float64):
         name = np.dtype(dtype).name
-        against = "float64" if dtype == np.float32 else "long double"
         shown, columns = None, None
         for case in cases(dtype):
             row = excess_bits(case, dtype)
             columns = columns or list(row)
-            shown = shown or common.table(f"{name} against {against}: excess wrong bits", "case", *columns)
+            shown = shown or common.table(f"{name}: excess wrong bits", "case", *columns)
             shown.add_row(
                 case.name, *(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values())
             )
             figures[f"{name}, {case.name}: excess wrong bits"] = row["excess"]
+            figures[f"{name}, {case.name}: gradient's excess wrong bits"] = row["gradient's excess"]
             figures[f"{name}, {case.name}: NaN"] = row["NaN"]
         common.console.print(shown)
     figures["worst excess wrong bits"] = max(v for k, v in figures.items() if k.endswith("bits"))

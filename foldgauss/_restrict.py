@@ -19,6 +19,10 @@ class RestrictedFold(AbstractFold):
     def leaf_ranks(self) -> tuple[int, ...]:
         return self.fold.leaf_ranks
 
+    @property
+    def is_closed(self) -> bool:
+        return self.fold.is_closed
+
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch kept"]:
         return self.fold(u)[..., np.array(self.indices)]
 

@@ -15,8 +15,10 @@ from jaxtyping import Array, Float, Key
 from foldgauss._batch import as_value, batch_of, check_event, over_batch, parts_of
 from foldgauss._checks import invalid
 from foldgauss._restrict import checked_indices
+from foldgauss._spikes import ROUNDING, centre_at, modes_of, spikes_of
+from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.gaussian import Gaussian
-from foldgauss.quadrature import REACH, SEARCH_GRID, Panels, adaptive_panels, diverges, peaks
+from foldgauss.quadrature import REACH, SEARCH_GRID, Panels, adaptive_panels, diverges, peaks, within_any
 
 __all__ = ["TimeDensity", "TimeMixture", "conditional_gaussian", "time_density", "time_mixture"]
 
@@ -32,8 +34,14 @@ class TimeDensity(eqx.Module):
 
     Made by `FoldedGaussian.time_given_space`.
 
+    Where time is known more narrowly than floating-point times lie apart (one space coordinate and a small `scale_tril`
+    or a large |tau|), probabilities, quantiles and moments have its mass, as an atom of sorts; `pdf(t)` has what it is
+    at the very number t, which may be next to nothing on both sides of the peak.
+
     **Shapes:** `event_shape == ()`: values have shape (*sample, *batch). `log_normalizer` (*batch,) is log p(s).
-    It is +inf where p(s) diverges (`power (d-1) >= 2` and s on a ridge that stands still).
+    It is +inf where p(s) diverges (`power (d-1) >= 2` and s on a ridge that stands still). `error_estimate` (*batch,)
+    is the estimated relative error of p(s), and so of every density and probability: large where p(s) hangs on the
+    rounding of s, `inf` where it diverges or log p(s) is -inf, of which nothing follows: quantiles and moments are NaN.
 
     **Example:** `dist.time_given_space([0.3, 0.1]).mean`
 
@@ -44,6 +52,7 @@ class TimeDensity(eqx.Module):
     values: Float[Array, "*#batch d-1"]
     panels: Panels
     log_normalizer: Float[Array, "*batch"]
+    error_estimate: Float[Array, "*batch"]
 
     @property
     def event_shape(self) -> tuple[int, ...]:
@@ -53,18 +62,13 @@ class TimeDensity(eqx.Module):
     def batch_shape(self) -> tuple[int, ...]:
         return self.log_normalizer.shape
 
-    @property
-    def error_estimate(self) -> Float[Array, "*batch"]:
-        """Estimated relative error of every density and probability of this distribution."""
-        return jnp.where(jnp.isposinf(self.log_normalizer), jnp.inf, self.panels.error_estimate)
-
     def log_prob(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log p(t | s)."""
         t = as_value(t, self.values.dtype)
         shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
         t = jnp.broadcast_to(t, shape)[..., None]
         joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), t], axis=-1))
-        return joint - jnp.broadcast_to(self.log_normalizer, shape)
+        return jnp.where(jnp.isneginf(joint), -jnp.inf, joint - jnp.broadcast_to(self.log_normalizer, shape))
 
     def pdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """p(t | s)."""
@@ -75,13 +79,14 @@ class TimeDensity(eqx.Module):
         return self._elementwise(Panels.cdf, self._tau(as_value(t, self.values.dtype)))
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """The quantile: the inverse of `cdf`."""
+        """The quantile: the inverse of `cdf`, -inf at 0 and +inf at 1."""
         return self._time(self._elementwise(Panels.icdf, as_value(q, self.values.dtype)))
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch), by the quantile function."""
         shape = (*sample_shape, *self.batch_shape)
-        return self.icdf(jax.random.uniform(key, shape, self.values.dtype))
+        smallest = float(jnp.finfo(self.values.dtype).tiny)  # not 0, whose quantile is -inf
+        return self.icdf(jax.random.uniform(key, shape, self.values.dtype, minval=smallest))
 
     @property
     def mean(self) -> Float[Array, "*batch"]:
@@ -153,7 +158,8 @@ class TimeMixture(eqx.Module):
             log_joint = self.parent.log_prob(self._with_values(x))
         else:
             log_joint = self._space_integral(x)[0]
-        return log_joint - jnp.broadcast_to(self._log_normalizer, log_joint.shape)
+        log_given = jnp.broadcast_to(self._log_normalizer, log_joint.shape)
+        return jnp.where(jnp.isneginf(log_joint), -jnp.inf, log_joint - log_given)
 
     def pdf(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """p(x | given)."""
@@ -162,8 +168,10 @@ class TimeMixture(eqx.Module):
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """Estimated relative error of `pdf(x)`: that of its integrals over time.
 
-        In one space dimension it counts mass far out (|tau| > 8 in float32 and 12 in float64 at power 1) where the
-        curve is narrower than floating-point times lie apart, and so is missed: then it is 1 and more.
+        It is large where p hangs on the rounding of x. In two and more space coordinates, far out or with a small
+        `scale_tril`, that is so for points on the curve to rounding, where the curve is narrower still: the density
+        *of this very number* is computed; that of the point meant may be greater by any factor. In one, only at a
+        turning point of the curve: anywhere else the curve passes every number on its way, at any width.
         """
         x = self._checked(x)
         shape = jnp.broadcast_shapes(x.shape[:-1], self.batch_shape)
@@ -177,8 +185,11 @@ class TimeMixture(eqx.Module):
         x = self._checked(x)
         if self.keeps_time:
             return self.time.cdf(x[..., 0])
-        log_mass = over_batch(_log_space_cdf, self.parent, (self._with_values(x), 1))
-        return jnp.clip(jnp.exp(log_mass - jnp.broadcast_to(self._log_normalizer, log_mass.shape)), 0, 1)
+        infinite = jnp.isinf(x)
+        log_mass = over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, x)), 1))
+        mass = jnp.clip(jnp.exp(log_mass - jnp.broadcast_to(self._log_normalizer, log_mass.shape)), 0, 1)
+        infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, x))
+        return jnp.where(infinite, (last > 0).astype(mass.dtype), mass)
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
@@ -275,9 +286,9 @@ class TimeMixture(eqx.Module):
 
 def time_density(parent, values: Float[Array, "*#batch d-1"]) -> TimeDensity:
     """p(t | s = values) of a Folded-Gaussian."""
-    panels, log_normalizer = over_batch(_space_panels, parent, (values, 1))
+    panels, log_normalizer, error = over_batch(_space_panels, parent, (values, 1))
     values = _over(values, log_normalizer.shape)
-    return TimeDensity(parent, values, panels, log_normalizer)
+    return TimeDensity(parent, values, panels, log_normalizer, error)
 
 
 def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixture:
@@ -318,6 +329,15 @@ def _over(x: Array, batch: tuple[int, ...]) -> Array:
 # --- one at a time: parents and values without batch --------------------------------------------------------
 
 
+def _centred(parent, s):
+    """The parent about 0 and the space coordinates s about there: integrals over tau without the offsets' rounding."""
+    offset = parent.loc[: s.size]
+    parent = eqx.tree_at(lambda dist: dist.loc, parent, jnp.zeros_like(parent.loc))
+    if isinstance(parent.envelope, Constant | TimeLikelihood):  # others may know more of t than its distance
+        parent = eqx.tree_at(lambda dist: dist.time_loc, parent, jnp.zeros_like(parent.time_loc))
+    return parent, s - offset
+
+
 def _log_joint(parent, s):
     """tau -> log of the density of (s, tau), elementwise."""
 
@@ -329,36 +349,115 @@ def _log_joint(parent, s):
     return log_f
 
 
-def _guides(parent, s):
-    """tau where mass may be: where the ridge passes s (peaks too narrow for a grid), and where the density peaks."""
-    log_f, grid = _log_joint(parent, s), jnp.asarray(SEARCH_GRID, s.dtype)
+def _log_joint_frozen(parent, s):
+    """The same without derivatives, and less to compile."""
+    parent, s = lax.stop_gradient((parent, s))
+    return lambda tau: centre_at(parent, tau).log_prob(_over(s, tau.shape)) - 0.5 * tau**2 - _HALF_LOG_2PI
 
-    def at(tau):
-        return parent.condition_time(parent.time_loc + parent.time_scale * tau)
+
+def _guides(parent, s, log_f):
+    """tau where mass may be: where the ridge comes near (peaks too narrow for a grid), and where the density peaks.
+
+    And all of the former, NaN where there are fewer, by their distance from 0.
+    """
+    grid = jnp.asarray(SEARCH_GRID, s.dtype)
 
     def nearness(tau):
-        here = at(tau)
+        here = centre_at(parent, tau)
         return Gaussian(here.loc, here.base_tril, validate_args=False).log_prob(_over(s, tau.shape))
 
     near = peaks(nearness, grid, _CROSSINGS, score=lambda tau: -(tau**2))
+    # A square tells its minimum to half the digits; the residual itself, which is linear there, to all of them.
+    near = lax.fori_loop(0, 3, lambda _, tau: _nearer(parent, s, tau), near)
     there = jnp.where(jnp.isnan(near), 0, near)
     # A ridge far out is high because it is narrow: its mass goes without the factor a^(-(d-1)/2).
-    mass = jnp.where(jnp.isnan(near), -jnp.inf, log_f(there) + s.size * at(there).log_scale)
-    return jnp.concatenate([near[lax.top_k(mass, _BEST)[1]], peaks(log_f, grid, _MAXIMA)])
+    mass = jnp.where(jnp.isnan(near), -jnp.inf, log_f(there) + s.size * centre_at(parent, there).log_scale)
+    return jnp.concatenate([near[lax.top_k(mass, _BEST)[1]], peaks(log_f, grid, _MAXIMA)]), near
 
 
-def _space_panels(parent, s) -> tuple[Panels, Array]:
-    log_f, search = _log_joint(parent, s), _log_joint(*lax.stop_gradient((parent, s)))
-    panels = adaptive_panels(log_f, _guides(*lax.stop_gradient((parent, s))), search=search)
-    return panels, jnp.where(diverges(search, panels), jnp.inf, panels.log_total)
+def _nearer(parent, s, tau):
+    """A Gauss-Newton step from tau to where the ridge is nearest to s; no step that would be a long one."""
+    place, speed = jax.jvp(lambda tau: centre_at(parent, tau).loc[..., : s.size], (tau,), (jnp.ones_like(tau),))
+    tril = parent.scale_tril[: s.size, : s.size]
+    solve = lambda rows: lax.linalg.triangular_solve(tril, rows.T, left_side=True, lower=True)  # noqa: E731
+    residual, rate = solve(_over(s, tau.shape) - place), solve(speed)
+    step = (residual * rate).sum(0) / (rate * rate).sum(0)
+    return jnp.where(jnp.abs(step) < 1e-3 * (1 + jnp.abs(tau)), tau + step, tau)
 
 
-def _modes(parent, s, panels: Panels):
-    log_f = _log_joint(parent, s)
+def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
+    """Panels of p(s, tau) over tau, log p(s), and its estimated relative error."""
+    parent, s = _centred(parent, s)
+    frozen, log_f = lax.stop_gradient((parent, s)), _log_joint_frozen(parent, s)
+    guides, near = _guides(*frozen, log_f)
+    spikes, log_unseen = spikes_of(parent, s) if s.size == 1 else (None, jnp.asarray(-jnp.inf, s.dtype))
+    panels = adaptive_panels(_log_joint(parent, s), guides, search=log_f, spikes=spikes)
+    log_total = panels.log_total
+    log_error = jnp.logaddexp(log_unseen, _log_rounding(*frozen, near, spikes))
+    error = panels.error_estimate + jnp.exp(log_error - jnp.where(jnp.isneginf(log_total), 0, log_total))
+    infinite = diverges(log_f, panels)
+    error = jnp.where(infinite | jnp.isneginf(log_total), jnp.inf, error)
+    return panels, jnp.where(infinite, jnp.inf, log_total), lax.stop_gradient(error)
+
+
+def _log_rounding(parent, s, near, spikes: Panels | None):
+    """log of the error of p(s) from the rounding of s - c(tau), where the ridge comes as close as that.
+
+    Whitened, the residual is z and its rounding q: a factor exp(-(z - q)^2 / 2) of the density at best, an error of
+    q (z + q) at most. A spike does not know of it: its mass is where the curve passes, whatever its width.
+    """
+    tau = jnp.where(jnp.isnan(near), 0, near)
+    eps, tril = jnp.finfo(s.dtype).eps, parent.scale_tril[: s.size, : s.size]
+
+    def curve(tau):
+        at = centre_at(parent, tau)
+        return at.loc[..., : s.size], at.log_scale
+
+    (place, log_scale), (speed, _) = jax.jvp(curve, (tau,), (jnp.ones_like(tau),))
+    inverse = lax.linalg.triangular_solve(tril, jnp.eye(s.size, dtype=s.dtype), left_side=True, lower=True)
+    length = lambda rows, matrix: jnp.sqrt(((rows @ matrix.T) ** 2).sum(-1))  # noqa: E731
+    sharp = jnp.exp(jnp.minimum(-log_scale, 0.4 * float(np.log(jnp.finfo(s.dtype).max))))
+    residual = _over(s, tau.shape) - place
+    size = jnp.abs(_over(s, tau.shape)) + jnp.abs(place) + jnp.abs(speed * tau[:, None])
+    z, q = length(residual, inverse) * sharp, eps * length(size, jnp.abs(inverse)) * sharp
+    rate = length(speed, inverse)
+    log_width = jnp.minimum(0, log_scale - jnp.log(jnp.where(rate > 0, rate, 1)))
+    log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + _HALF_LOG_2PI)
+    log_best = -0.5 * (tau**2 + jnp.maximum(z - q, 0) ** 2) - _HALF_LOG_2PI - log_det + log_width
+    log_error = log_best + jnp.log(q * (z + q))
+    counts = ~jnp.isnan(near) & jnp.isfinite(place).all(-1)
+    if spikes is not None:
+        counts = counts & ~within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)
+    return logsumexp(jnp.where(counts, log_error, -jnp.inf))
+
+
+def _modes(parent, values, panels: Panels):
+    own, s = _centred(parent, values)
+    log_f = _log_joint_frozen(own, s)
     grid = jnp.unique(panels.nodes.ravel(), size=panels.nodes.size, fill_value=REACH)
     found = peaks(log_f, grid, 2 * _MODES)
     height = jnp.where(jnp.isnan(found), -jnp.inf, log_f(jnp.where(jnp.isnan(found), 0, found)))
-    return parent.time_loc + parent.time_scale * found[lax.top_k(height, _MODES)[1]]
+    if s.size == 1:
+        spikes, _ = spikes_of(own, s)
+        holes = spikes.left[:, 0], spikes.right[:, -1]
+        peak, peak_height = modes_of(own, s, spikes)
+        height = jnp.concatenate([jnp.where(within_any(holes, found), -jnp.inf, height), peak_height])
+        found = jnp.concatenate([found, peak])
+    height, order = lax.top_k(height, height.size)
+    found = jnp.where(jnp.isneginf(height), jnp.nan, found[order])
+    shown = jnp.isfinite(found) & ~_same_top(log_f, found, height)
+    best = lax.top_k(jnp.where(shown, height, -jnp.inf), _MODES)[1]
+    return parent.time_loc + parent.time_scale * jnp.where(shown, found, jnp.nan)[best]
+
+
+def _same_top(log_f, found, height):
+    """Which maxima (highest first) are a higher one's, seen twice: a top flat to rounding has many of its own."""
+    a, b = jnp.where(jnp.isnan(found), REACH, found)[:, None], found[None]
+    eps = jnp.finfo(found.dtype).eps
+    valley = log_f(0.5 * (a + b)) < height[None] - ROUNDING * eps * jnp.maximum(1, jnp.abs(height[None]))
+    close = jnp.abs(a - b) < eps**0.25 * (1 + jnp.abs(b))
+    earlier = jnp.arange(found.size)[:, None] < jnp.arange(found.size)[None]
+    return (close & ~valley & earlier).any(0)
 
 
 def _tau_moments(panels: Panels):
@@ -367,67 +466,53 @@ def _tau_moments(panels: Panels):
 
 
 def _log_space_density(parent, s):
-    panels, log_total = _space_panels(parent, s)
-    error = panels.error_estimate + jnp.exp(_unresolved(*lax.stop_gradient((parent, s))) - log_total)
-    return log_total, jnp.where(jnp.isposinf(log_total), jnp.inf, error)
-
-
-def _unresolved(parent, s):
-    """log of the mass where one space coordinate's curve passes s and is narrower than numbers lie apart.
-
-    As a goes to 0 space is a curve, and the mass is that of tau over its speed: N(tau) / |ds / dtau|.
-    """
-    if s.size > 1:  # a curve in more dimensions passes a point by, at a distance; then no mass is there
-        return jnp.asarray(-jnp.inf, s.dtype)
-
-    def centre(tau):
-        at = parent.condition_time(parent.time_loc + parent.time_scale * tau)
-        return at.loc[..., 0], at.log_scale
-
-    near = peaks(lambda tau: -jnp.abs(s[0] - centre(tau)[0]), jnp.asarray(SEARCH_GRID, s.dtype), _CROSSINGS)
-    tau = jnp.where(jnp.isnan(near), 0, near)
-    (place, log_scale), (speed, _) = jax.jvp(centre, (tau,), (jnp.ones_like(tau),))
-    eps = jnp.finfo(s.dtype).eps
-    width = jnp.exp(log_scale) * parent.scale_tril[0, 0] / jnp.abs(speed)
-    passes = ~jnp.isnan(near) & (jnp.abs(s[0] - place) <= 1e3 * eps * (jnp.abs(s[0]) + jnp.abs(speed * tau)))
-    log_mass = -0.5 * tau**2 - _HALF_LOG_2PI - jnp.log(jnp.abs(speed))
-    return logsumexp(jnp.where(passes & (width < 1e3 * eps * jnp.abs(tau)), log_mass, -jnp.inf))
+    _, log_total, error = _space_panels(parent, s)
+    return log_total, error
 
 
 def _log_space_cdf(parent, s):
     """log of p(first coordinates) P(last coordinate <= its value | the first)."""
+    parent, s = _centred(parent, s)
+    given, frozen = s.size - 1, lax.stop_gradient((parent, s))
+    keep = (*range(given), s.size)
 
-    def make(parent, s):
-        given, tril = s.size - 1, parent.scale_tril
-        first = parent.marginal((*range(given), s.size)) if given else None
+    def log_share(parent, s, tau):
+        t = parent.time_loc + parent.time_scale * tau
+        one = conditional_gaussian(parent, _over(s[:-1], t.shape), t)
+        residual = (s[-1] - one.loc[..., 0]) / parent.scale_tril[-1, -1]
+        return log_ndtr(residual * jnp.exp(jnp.minimum(-one.log_scale, 0.9 * float(np.log(jnp.finfo(s.dtype).max)))))
 
-        def log_f(tau):
-            t = parent.time_loc + parent.time_scale * tau
-            log_w = -0.5 * tau**2 - _HALF_LOG_2PI if first is None else _log_joint(first, s[:-1])(tau)
-            one = conditional_gaussian(parent, _over(s[:-1], t.shape), t)
-            residual = (s[-1] - one.loc[..., 0]) / tril[-1, -1]
-            z = residual * jnp.exp(jnp.minimum(-one.log_scale, 0.9 * float(np.log(jnp.finfo(s.dtype).max))))
-            return log_w + log_ndtr(z)
+    def make(log_joint, parent, s):
+        if not given:
+            return lambda tau: log_share(parent, s, tau) - 0.5 * tau**2 - _HALF_LOG_2PI
+        first = log_joint(parent.marginal(keep), s[:-1])
+        return lambda tau: log_share(parent, s, tau) + first(tau)
 
-        return log_f
-
-    frozen = lax.stop_gradient((parent, s))
-    guides = _guides(*frozen)
-    return adaptive_panels(make(parent, s), guides, search=make(*frozen)).log_total
+    log_f, search = make(_log_joint, parent, s), make(_log_joint_frozen, *frozen)
+    spikes = None
+    if given == 1:
+        spikes, _ = spikes_of(parent.marginal(keep), s[:-1])
+        shares = log_share(parent, s, spikes.nodes)
+        spikes = eqx.tree_at(lambda panels: panels.log_values, spikes, spikes.log_values + shares)
+    guides, _ = _guides(*frozen, _log_joint_frozen(*frozen))
+    return adaptive_panels(log_f, guides, search=search, spikes=spikes).log_total
 
 
 def _mixture_moments(parent, values, panels: Panels):
     """Mean and covariance of (kept, time) given the values, by the laws of total mean and covariance."""
-    t = parent.time_loc + parent.time_scale * panels.nodes
+    offset = jnp.append(parent.loc[values.size :], parent.time_loc)
+    own, s = _centred(parent, values)
+    t = own.time_loc + own.time_scale * panels.nodes
+    offset = offset.at[-1].add(-own.time_loc)
     dim = parent.event_shape[0] - 1 - values.size
     if not dim:
         y, within = t[..., None], jnp.zeros((1, 1), t.dtype)
     else:
-        at = conditional_gaussian(parent, _over(values, t.shape), t)
+        at = conditional_gaussian(own, _over(s, t.shape), t)
         y = jnp.concatenate([at.loc, t[..., None]], axis=-1)
         tril = parent.scale_tril[values.size :, values.size :]
         mean_a = panels.expectation(jnp.exp(2 * at.log_scale))
         within = jnp.pad(mean_a * tril @ tril.T, ((0, 1), (0, 1)))
     mean = panels.expectation(y)
     centred = y - mean[None, None]
-    return mean, within + panels.expectation(centred[..., :, None] * centred[..., None, :])
+    return offset + mean, within + panels.expectation(centred[..., :, None] * centred[..., None, :])

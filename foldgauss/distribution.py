@@ -26,11 +26,12 @@ from foldgauss._batch import (
 )
 from foldgauss._checks import invalid
 from foldgauss._factor import check_loc, given_factor
+from foldgauss._far import far_reaching
 from foldgauss._restrict import checked_indices, restricted_fold, restricted_tril
 from foldgauss._triangular import columns_of, lower_times, solve_lower, stacked
 from foldgauss.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
-from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold
+from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, shift_at
 from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
@@ -150,7 +151,7 @@ class FoldedGaussian(eqx.Module):
         t = as_value(t, self.loc.dtype)
         dist = expand(self, t.ndim)
         (t,) = align([(t, 0)], dist.time_loc.ndim)
-        shift = dist.fold(dist.time_loc - t)
+        shift = shift_at(dist.fold, dist.time_loc - t)
         log_a = dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
         largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would make inf - inf of the density
         log_a = jnp.clip(log_a, -largest, largest)
@@ -168,12 +169,22 @@ class FoldedGaussian(eqx.Module):
         """
         x = as_value(x, self.loc.dtype)
         check_event("x", x, self.event_shape)
-        s, t = x[..., :-1], x[..., -1]
-        log_time = self.time_marginal.log_prob(t)
+        leaves, structure = jax.tree.flatten(self)
+
+        def scaled_log_prob(root, s, t, *leaves):
+            return jax.tree.unflatten(structure, leaves)._scaled_log_prob(root, s, t)
+
+        return far_reaching(
+            scaled_log_prob, x[..., :-1], x[..., -1], *leaves, closed=self.fold.is_closed and self.envelope.is_closed
+        )
+
+    def _scaled_log_prob(self, root: Array | None, s: Array, t: Array) -> Float[Array, "*#batch"]:
+        """root^2 log FN((s, t)), as `Gaussian.scaled_log_prob`."""
+        log_time = self.time_marginal.scaled_log_prob(root, t)
         overflown = jnp.isinf(self.condition_time(t).loc).any(-1)
         # Double where: at a time so far away that the fold overflows, gradients are taken at f(0) instead.
         near, time_loc = align([(t, 0), (self.time_loc, 0)], overflown.ndim)
-        log_space = self.condition_time(jnp.where(overflown, time_loc, near)).log_prob(s)
+        log_space = self.condition_time(jnp.where(overflown, time_loc, near)).scaled_log_prob(root, s)
         unreachable = overflown | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
 

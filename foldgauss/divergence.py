@@ -1,5 +1,6 @@
 """The Kullback-Leibler divergence between Folded-Gaussians, and between Gaussians."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -45,6 +46,7 @@ def kl_divergence(p, q, *, order: int = 64) -> Float[Array, "*batch"]:
         return _kl_normal(p.loc, p.scale, q.loc, q.scale)
     if isinstance(p, Gaussian):
         return _kl_gaussian(p, q)
+    p, q = _from_time_zero(p, q)
     dim = p.loc.shape[-1]
     ratio, mahalanobis, log_ratio = _expectations(p, q, order)
     trace, log_det = _trace_and_log_det(p.scale_tril, q.scale_tril)
@@ -59,6 +61,14 @@ def _check_pair(p, q) -> None:
     got = " and ".join(f"{type(x).__name__} of {getattr(x, 'event_shape', 'no')} coordinates" for x in (p, q))
     cure = "Across classes, estimate it: the mean of p.log_prob - q.log_prob over samples of p."
     raise invalid("p, q", expected="two distributions of one class and dimension", got=got, cure=cure)
+
+
+def _from_time_zero(p, q):
+    """Both with time counted from that of p, so that no offset rounds it; unless an envelope knows more of t."""
+    if not all(isinstance(x.envelope, Constant | TimeLikelihood) for x in (p, q)):
+        return p, q
+    moved = lambda x: eqx.tree_at(lambda dist: dist.time_loc, x, x.time_loc - p.time_loc)  # noqa: E731
+    return moved(p), moved(q)
 
 
 def _kl_normal(loc_p, scale_p, loc_q, scale_q):
@@ -114,8 +124,8 @@ def _exact(p, q, own, power_q, order: int):
     mass, mean, scale = plain
     z, weights = (jnp.asarray(x, mean.dtype).reshape(-1, *(1,) * mean.ndim) for x in gauss_hermite(order))
     finite = jnp.isfinite(mass)
-    square, same = _centre_distance(p, q, mean[None] + scale[None] * z)
-    mahalanobis = jnp.where(finite, mass, 1) * (weights * square).sum(0)
+    log_square, same = _centre_distance(p, q, mean[None] + scale[None] * z)
+    mahalanobis = jnp.where(finite, mass, 1) * (weights * jnp.exp(log_square)).sum(0)
     mahalanobis = jnp.where(same.all(0), 0, jnp.where(finite, mahalanobis, jnp.inf))
     offset = (p.time_loc - q.time_loc) / q.time_scale
     mean_log_q = -0.5 * power_q * ((p.time_scale / q.time_scale) ** 2 + offset**2)
@@ -124,23 +134,28 @@ def _exact(p, q, own, power_q, order: int):
 
 def _tilted(p, q, sharpness, power_q):
     """Mass, mean and scale of N(t; p) exp(-(sharpness - 1) tau_p^2 / 2 + power_q tau_q^2 / 2); +inf mass if none."""
-    a, b = sharpness / p.time_scale**2, power_q / q.time_scale**2
-    finite = sharpness * q.time_scale**2 > power_q * p.time_scale**2
-    rest = jnp.where(finite, a - b, 1 / p.time_scale**2)
-    offset = p.time_loc - q.time_loc
-    mass = jnp.exp(0.5 * a * b * offset**2 / rest) / (p.time_scale * jnp.sqrt(rest))
-    mean = p.time_loc + jnp.where(finite, b * offset / rest, 0)
-    return jnp.where(finite, mass, jnp.inf), mean, 1 / jnp.sqrt(rest)
+    # In units of p's time_scale, whose square may not fit the dtype.
+    a, b = sharpness, power_q * (p.time_scale / q.time_scale) ** 2
+    finite = a > b
+    rest = jnp.where(finite, a - b, 1)
+    offset = (p.time_loc - q.time_loc) / p.time_scale
+    mass = jnp.exp(0.5 * a * b * offset**2 / rest) / jnp.sqrt(rest)
+    mean = p.time_loc + p.time_scale * jnp.where(finite, b * offset / rest, 0)
+    return jnp.where(finite, mass, jnp.inf), mean, p.time_scale / jnp.sqrt(rest)
 
 
 def _centre_distance(p, q, t):
-    """|L_q^-1 (centre_p - centre_q)|^2 at t (one axis in front of the batch), and whether it is only rounding."""
+    """log |L_q^-1 (centre_p - centre_q)|^2 at t (one axis in front of the batch), and whether it is only rounding."""
     here, there = (expand(x, t.ndim).condition_time(t).loc for x in (p, q))
     difference = here - there
     size = jnp.abs(here) + jnp.abs(there) + jnp.abs(p.loc)[None] + jnp.abs(q.loc)[None]
     same = (jnp.abs(difference) <= _SAME_CURVE * jnp.finfo(size.dtype).eps * size).all(-1)
     tril = jnp.broadcast_to(q.scale_tril, (*difference.shape, difference.shape[-1]))
-    return (_solve(tril, difference[..., None]) ** 2).sum((-2, -1)), same
+    difference = jnp.where(same[..., None], 1, difference)
+    unit = jnp.abs(difference).max(-1)
+    unit = jnp.where(unit > 0, unit, 1)
+    length = (_solve(tril, (difference / unit[..., None])[..., None]) ** 2).sum((-2, -1))
+    return jnp.where(same, -jnp.inf, jnp.log(length) + 2 * jnp.log(unit)), same
 
 
 def _integrals(p, q):
@@ -156,8 +171,7 @@ def _integrals(p, q):
 
         def log_mahalanobis(tau):
             t = time(tau)
-            square, same = _centre_distance(p, q, t.ravel())
-            log_square = jnp.log(jnp.where(same, 1, square)) + jnp.where(same, -jnp.inf, 0)
+            log_square, _ = _centre_distance(p, q, t.ravel())
             return log_square.reshape(t.shape) - 0.5 * tau**2 - 0.5 * float(np.log(2 * np.pi)) - log_a(q, t)
 
         return log_ratio, log_mahalanobis

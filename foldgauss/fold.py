@@ -5,6 +5,7 @@ A fold is a function of `u = time_loc - t` (note the sign), from a scalar to R^(
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 
 import equinox as eqx
@@ -12,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from foldgauss._checks import invalid
 from foldgauss._pointwise import call_each, split
+from foldgauss._triangular import columns_of, stacked
 
 __all__ = [
     "AbstractFold",
@@ -39,6 +42,11 @@ class AbstractFold(eqx.Module):
     @abstractmethod
     def leaf_ranks(self) -> tuple[int, ...]:
         """Rank of each leaf (in the order of `jax.tree.leaves`) for one fold; what is in front is batch."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it depends on its leaves only; a user's function may close over tracers too."""
+        return False
 
     @abstractmethod
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
@@ -65,6 +73,10 @@ class ZeroFold(AbstractFold):
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return ()
+
+    @property
+    def is_closed(self) -> bool:
+        return True
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
         return jnp.zeros((*jnp.shape(u), self.dim), jnp.result_type(u))
@@ -94,6 +106,10 @@ class PolynomialFold(AbstractFold):
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return (2,)
+
+    @property
+    def is_closed(self) -> bool:
+        return True
 
     @property
     def degree(self) -> int:
@@ -146,6 +162,10 @@ class SplineFold(AbstractFold):
     def leaf_ranks(self) -> tuple[int, ...]:
         return (2,)
 
+    @property
+    def is_closed(self) -> bool:
+        return True
+
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         u, coefficients = _aligned(jnp.asarray(u), self.coefficients)
         n, k = coefficients.shape[-2], self.degree
@@ -196,6 +216,10 @@ class FourierFold(AbstractFold):
         return (2, 2, 0)
 
     @property
+    def is_closed(self) -> bool:
+        return True
+
+    @property
     def order(self) -> int:
         """Number of harmonics."""
         return self.sine.shape[-2]
@@ -208,9 +232,10 @@ class FourierFold(AbstractFold):
         far = jnp.abs(u) > period / float(jnp.finfo(u.dtype).eps)
         half_phase = jnp.pi * jnp.where(far, 0, u) / jnp.where(far, 1, period)
         shift = jnp.zeros((), u.dtype)
+        first = s, c = jnp.sin(half_phase), jnp.cos(half_phase)
         for k in range(self.order):
-            s, c = jnp.sin((k + 1) * half_phase), jnp.cos((k + 1) * half_phase)
             shift = shift + 2 * s * (c * sine[..., k, :] - s * cosine[..., k, :])  # cos - 1 without cancellation
+            s, c = s * first[1] + c * first[0], c * first[1] - s * first[0]  # the next harmonic, by one more turn
         batch = jnp.broadcast_shapes(u.shape[:-1], period.shape[:-1], sine.shape[:-2])
         return jnp.broadcast_to(shift, (*batch, sine.shape[-1]))
 
@@ -249,6 +274,40 @@ class CallableFold(AbstractFold):
 def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
     """`fold` itself if it is one, else the callable wrapped (and so vmapped) by `CallableFold`."""
     return fold if isinstance(fold, AbstractFold) else CallableFold(fold)
+
+
+def shift_at(fold: AbstractFold, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+    """`fold(u)`, with a derivative by u that is made for large batches.
+
+    A fold is pointwise in u, so that its slope is one forward derivative. Backwards, autodiff would sum over the d-1
+    coordinates at each step of the recursion instead of once, in loops of so few that nothing is vectorised.
+    """
+    if not fold.is_closed:  # then it may close over tracers, which a custom derivative would lose
+        return fold(u)
+    leaves, structure = jax.tree.flatten(fold)
+    return _shift(structure, u, *leaves)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _shift(structure, u, *leaves):
+    return jax.tree.unflatten(structure, leaves)(u)
+
+
+@partial(_shift.defjvp, symbolic_zeros=True)
+def _shift_jvp(structure, primals, tangents):
+    u, *leaves = primals
+    moving = [i for i, tangent in enumerate(tangents[1:]) if not isinstance(tangent, SymbolicZero)]
+
+    def of_leaves(*moved):
+        every = {**dict(enumerate(leaves)), **dict(zip(moving, moved, strict=True))}
+        return jax.tree.unflatten(structure, [every[i] for i in range(len(leaves))])(u)
+
+    shift, moved = jax.jvp(of_leaves, [leaves[i] for i in moving], [tangents[1 + i] for i in moving])
+    if isinstance(tangents[0], SymbolicZero):
+        return shift, moved
+    slope = jax.jvp(lambda u: jax.tree.unflatten(structure, leaves)(u), (u,), (jnp.ones_like(u),))[1]
+    by_u = [column * tangents[0][..., None] for column in columns_of(slope)]
+    return shift, moved + stacked(by_u)
 
 
 def _with_rank(x: Array, rank: int) -> Array:

@@ -1,8 +1,7 @@
 """The Gaussians that a Folded-Gaussian is made of: of time alone, and of space at one time (eq:cond_dens).
 
 Numerics: `a` is never formed, only `log a`. A log-density is finite or -inf for every finite input. Its
-gradient is 0 where it is -inf, and never NaN; the gradient with respect to the value saturates at the largest
-finite number.
+gradient is 0 where it is -inf, and else true, or held at the largest finite number (`_far`).
 """
 
 import functools
@@ -12,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from foldgauss._batch import (
@@ -25,14 +25,12 @@ from foldgauss._batch import (
     parts_of,
 )
 from foldgauss._factor import check_space, check_tril
+from foldgauss._far import far_reaching
 from foldgauss._triangular import UNROLLED_SIZE, Columns, columns_of, lower_times, solve_lower, solve_upper, stacked
 
 __all__ = ["Gaussian", "Normal"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
-# Saturated gradients with respect to *parameters* stop this far below the largest finite number: chain rule
-# factors (powers of u, 1/scale) and sums over a batch then still have room, where inf - inf would be NaN.
-_CHAIN_HEADROOM = 2.0**-24
 
 
 class Normal(eqx.Module):
@@ -72,6 +70,10 @@ class Normal(eqx.Module):
     def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log N(loc, scale^2)(value)."""
         return _as_gaussian(self).log_prob(as_value(value, self.loc.dtype)[..., None])
+
+    def scaled_log_prob(self, root: Array | None, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """root^2 log N(loc, scale^2)(value), as `Gaussian.scaled_log_prob`."""
+        return _as_gaussian(self).scaled_log_prob(root, value[..., None])
 
     def pdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """N(loc, scale^2)(value)."""
@@ -149,14 +151,12 @@ class Gaussian(eqx.Module):
         """log N(loc, Sigma)(value)."""
         value = as_value(value, self.loc.dtype)
         check_event("value", value, self.event_shape)
-        value, loc, tril, log_scale = align([(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
-        half_square = _half_mahalanobis(value, loc, tril, log_scale)
-        dim = loc.shape[-1]
-        half_log_det = jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1) + dim * log_scale
-        unreachable = jnp.isposinf(half_square)
-        # Double where: 0 for the gradient of everything where the log-density is -inf.
-        log_density = -jnp.where(unreachable, 0, half_square) - half_log_det - 0.5 * dim * _LOG_2PI
-        return jnp.where(unreachable, -jnp.inf, log_density)
+        parts = [(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
+        return far_reaching(_scaled_log_prob, *align(parts))
+
+    def scaled_log_prob(self, root: Array | None, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
+        """root^2 log N(loc, Sigma)(value), the factor put in where it keeps derivatives in range (see `_far`)."""
+        return _scaled_log_prob(root, *align([(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]))
 
     def pdf(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
         """N(loc, Sigma)(value)."""
@@ -178,14 +178,27 @@ def _as_gaussian(normal: Normal) -> Gaussian:
     return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
 
 
+def _scaled_log_prob(root: Array | None, value: Array, loc: Array, tril: Array, log_scale: Array) -> Array:
+    """root^2 log N(loc, exp(2 log_scale) L L^T)(value); all arrays of one batch rank, root None is 1."""
+    half_square = _half_mahalanobis(value, loc, tril, log_scale, root)
+    dim = loc.shape[-1]
+    half_log_det = jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1) + dim * log_scale
+    unreachable = jnp.isposinf(half_square)
+    # Double where: 0 for the gradient of everything where the log-density is -inf.
+    log_density = -jnp.where(unreachable, 0, half_square) - _times_square(half_log_det + 0.5 * dim * _LOG_2PI, root)
+    return jnp.where(unreachable, -jnp.inf, log_density)
+
+
 @jax.custom_jvp
-def _half_mahalanobis(value, loc, tril, log_scale):
-    """|L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; all arguments of one batch rank."""
+def _half_mahalanobis(value, loc, tril, log_scale, root):
+    """root^2 |L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; it is inf where it would be for root = 1."""
     residual = columns_of(value - loc)
     z = [_times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
     # A residual that is infinite in one coordinate meets zeros of L as 0 * inf; it is simply far away.
     beyond = _any([jnp.isinf(r) for r in residual])
-    return jnp.where(beyond, jnp.inf, _sum([0.5 * y * y for y in z]))
+    half = _sum([0.5 * y * y for y in z])
+    scaled = half if root is None else jnp.where(jnp.isinf(half), half, _times_square(half, root))
+    return jnp.where(beyond, jnp.inf, scaled)
 
 
 @_half_mahalanobis.defjvp
@@ -193,20 +206,21 @@ def _half_mahalanobis_jvp(primals, tangents):
     # d(|y|^2/2 e^2c) = g.(dr - dL y) + |y|^2 e^2c dc with y = L^-1 r, c = -log_scale, g = L^-T y e^2c. By
     # hand, since e^2c alone overflows long before g does, and because g must be 0, not inf * 0, where the
     # result is inf. Where g overflows, g dL y need not: it is taken as (L^-T z) dL z with z = y e^c.
-    value, loc, tril, log_scale = primals
-    value_dot, loc_dot, tril_dot, log_scale_dot = tangents
-    half = _half_mahalanobis(value, loc, tril, log_scale)
+    value, loc, tril, log_scale, root = primals
+    value_dot, loc_dot, tril_dot, log_scale_dot, _ = tangents
+    half = _half_mahalanobis(value, loc, tril, log_scale, root)
     unreachable, c = jnp.isposinf(half)[..., None], -log_scale[..., None]
     residual = [jnp.where(unreachable, 0, r) for r in columns_of(value - loc)]
-    z = [_times_exp(jnp.where(unreachable, 0, y), c) for y in solve_lower(tril, residual)]
-    w = [_saturated(y) for y in solve_upper(tril, z)]
-    by_value = [_times_exp(y, c) for y in w]
-    by_log_scale = -_saturated(_sum([y * y for y in z]), _CHAIN_HEADROOM)
+    z = [_times_exp(jnp.where(unreachable, 0, y), c, root) for y in solve_lower(tril, residual)]
+    w = solve_upper(tril, z)
+    by_residual = [_times_exp(y, c, root) for y in w]
+    # The barrier: gradients are made one coordinate at a time, before they are put side by side. XLA on the CPU would
+    # fuse the two, and then ask for every number of every coordinate which of them it is: many times slower.
+    residual_dot = lax.optimization_barrier(columns_of(value_dot - loc_dot))
     return half, (
-        _sum([g * dx for g, dx in zip(by_value, columns_of(value_dot), strict=True)])
-        - _sum([_saturated(g, _CHAIN_HEADROOM) * dx for g, dx in zip(by_value, columns_of(loc_dot), strict=True)])
+        _sum([g * dr for g, dr in zip(by_residual, residual_dot, strict=True)])
         - _sum([g * dx for g, dx in zip(w, lower_times(tril_dot, z), strict=True)])
-        + by_log_scale * log_scale_dot
+        - _sum([y * y for y in z]) * log_scale_dot
     )
 
 
@@ -219,25 +233,23 @@ def _any(flags: Columns) -> Bool[Array, "*#batch"]:
 
 
 @jax.custom_jvp
-def _times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-    """y exp(c) where the product fits but exp(c) need not; saturates where the product does not fit."""
+def _times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"], root: Array | None = None):
+    """root y exp(c): infinite only where that product is, not where exp(c) alone is."""
     largest = _log_largest(y.dtype)
     half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))
-    return _saturated(y * half * half)
+    return y * (half if root is None else half * root) * half
 
 
 @_times_exp.defjvp
 def _times_exp_jvp(primals, tangents):
-    (y, c), (y_dot, c_dot) = primals, tangents
-    product = _times_exp(y, c)
-    slope = jnp.exp(jnp.minimum(c, _log_largest(y.dtype)))
-    return product, slope * y_dot + _saturated(product, _CHAIN_HEADROOM) * c_dot
+    (y, c, root), (y_dot, c_dot, _) = primals, tangents
+    product = _times_exp(y, c, root)
+    return product, _times_exp(y_dot, c, root) + product * c_dot
+
+
+def _times_square(x: Array, root: Array | None) -> Array:
+    return x if root is None else x * root * root
 
 
 def _log_largest(dtype) -> float:
     return float(np.log(jnp.finfo(dtype).max)) * 0.999  # a little less: exp of it must not round to inf
-
-
-def _saturated(x: Array, fraction: float = 1.0) -> Array:
-    largest = float(jnp.finfo(x.dtype).max) * fraction
-    return jnp.clip(x, -largest, largest)

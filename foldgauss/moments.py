@@ -130,6 +130,9 @@ def _log_envelope(dist, tau: Float[Array, "tau"]) -> Float[Array, "tau *batch"]:
     dist = fill(dist, dist.batch_shape)
     rank = dist.time_loc.ndim + 1
     tau = tau.reshape(-1, *(1,) * (rank - 1))
+    if isinstance(dist.envelope, TimeLikelihood):  # knows tau only, which t = time_loc + .. may lose in rounding
+        zero, one = jnp.zeros_like(dist.time_loc)[None], jnp.ones_like(dist.time_scale)[None]
+        return expand(dist.envelope, rank).log_a(tau, time_loc=zero, time_scale=one)
     t = dist.time_loc[None] + dist.time_scale[None] * tau
     envelope = expand(dist.envelope, rank)
     return envelope.log_a(t, time_loc=dist.time_loc[None], time_scale=dist.time_scale[None])

@@ -6,16 +6,26 @@ Where the panels lie is not differentiated, what they sum up to is.
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
-__all__ = ["Panels", "adaptive_panels", "diverges", "gauss_hermite", "normal_rule", "peaks"]
+__all__ = [
+    "KRONROD_NODES",
+    "Panels",
+    "adaptive_panels",
+    "diverges",
+    "gauss_hermite",
+    "normal_rule",
+    "peaks",
+    "within_any",
+]
 
 _Log = Callable[[Float[Array, "..."]], Float[Array, "..."]]
 
@@ -59,7 +69,7 @@ _TAIL = np.geomspace(10, REACH, 150)
 SEARCH_GRID = np.r_[-_TAIL[::-1], np.linspace(-10, 10, 401)[1:-1], _TAIL]
 _LADDER = 20.0 * 4.0 ** -np.arange(13)  # distances of panel edges around each peak
 _ROUNDS, _SPLITS = 24, 16  # halvings, and panels halved in each
-_GOLDEN = (np.sqrt(5) - 1) / 2
+_GOLDEN = float((np.sqrt(5) - 1) / 2)
 
 
 @cache
@@ -82,7 +92,11 @@ def normal_rule() -> tuple[np.ndarray, np.ndarray]:
 class Panels(eqx.Module):
     """Panels of an adaptive integral of exp(log_f), sorted, with log_f at the 15 nodes of each.
 
-    **Shapes:** `left`, `right` (*batch, panels), `log_values` (*batch, panels, 15).
+    A panel may lie in another variable than x, one in which a spike of exp(log_f) is broad: `log_half` and
+    `log_values` are of that variable, `left`, `right` and `nodes` of x, where they may be one number.
+
+    **Shapes:** `left`, `right` (*batch, panels), `nodes` (*batch, panels, 15), `log_half`, the log of half a panel's
+    width, (*batch, panels), `log_values` (*batch, panels, 15).
 
     **Example:** `adaptive_panels(lambda x: -(x**2) / 2, jnp.zeros(1)).log_total  # log sqrt(2 pi)`
 
@@ -91,20 +105,18 @@ class Panels(eqx.Module):
 
     left: Float[Array, "*batch panels"]
     right: Float[Array, "*batch panels"]
+    nodes: Float[Array, "*batch panels 15"]
+    log_half: Float[Array, "*batch panels"]
     log_values: Float[Array, "*batch panels 15"]
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
-        return (1, 1, 2)
-
-    @property
-    def nodes(self) -> Float[Array, "*batch panels 15"]:
-        return _nodes(self.left, self.right)
+        return (1, 1, 2, 1, 2)
 
     @property
     def log_weights(self) -> Float[Array, "*batch panels 15"]:
         """log of (weight times value): they sum to `log_total`."""
-        half = _log_width(self.left, self.right)[..., None]
+        half = self.log_half[..., None]
         weights = jnp.asarray(np.log(_KRONROD), half.dtype)
         return self.log_values + lax.expand_dims(weights, range(half.ndim - 1)) + half
 
@@ -115,75 +127,110 @@ class Panels(eqx.Module):
 
     @property
     def error_estimate(self) -> Float[Array, "*batch"]:
-        """Relative error of the integral, as QUADPACK estimates it, at least the rounding of its sum."""
-        log_error = _log_error(self.left, self.right, self.log_values) - self.log_total[..., None]
-        error = jnp.exp(log_error).sum(-1)
-        return jnp.maximum(error * jnp.minimum(1, (200 * error) ** 0.5), 10 * jnp.finfo(error.dtype).eps)
+        """Relative error of the integral, as QUADPACK estimates it, at least the rounding of its sum and logarithm."""
+        log_total = self.log_total
+        log_error = _log_error(self.log_half, self.log_values)
+        finite = jnp.where(jnp.isfinite(log_total), log_total, 0)
+        error, size = jnp.exp(log_error - finite[..., None]).sum(-1), jnp.abs(finite)
+        return jnp.maximum(
+            error * jnp.minimum(1, (200 * error) ** 0.5), 10 * jnp.finfo(error.dtype).eps * jnp.maximum(1, size)
+        )
+
+    @property
+    def weights(self) -> Float[Array, "*batch panels 15"]:
+        """Shares of the integral: they sum to 1, as exp(log_weights - log_total) would not where log_total is large."""
+        return jax.nn.softmax(self.log_weights, axis=(-2, -1))
 
     @property
     def probabilities(self) -> Float[Array, "*batch panels"]:
-        """Each panel's share of the integral."""
-        return jnp.exp(logsumexp(self.log_weights, axis=-1) - self.log_total[..., None])
+        """Each panel's share of the integral; NaN if that is 0."""
+        return self.weights.sum(-1)
 
     def expectation(self, function: Float[Array, "panels 15 *event"]) -> Float[Array, "*event"]:
         """Mean of values given at `nodes` under the normalised density; one integral, not a batch."""
-        weights = jnp.exp(self.log_weights - self.log_total)
+        weights = self.weights
         # Far out, where no mass is, a function may overflow: 0 * inf is 0 here.
         weighs = lax.expand_dims(weights > 0, range(2, function.ndim))
         return jnp.tensordot(weights, jnp.where(weighs, function, 0), axes=2)
 
     def cdf(self, x: Float[Array, ""]) -> Float[Array, ""]:
         """Share of the integral left of x; one integral, not a batch."""
-        index = jnp.clip(jnp.searchsorted(self.right, x), 0, self.right.size - 1)
-        below = (jnp.cumsum(self.probabilities) - self.probabilities)[index]
-        width = self.right[index] - self.left[index]
-        y = 2 * (x - self.left[index]) / jnp.where(width > 0, width, 1) - 1
-        inside = self.probabilities[index] * _share(self._shape(index), jnp.clip(y, -1, 1))
-        return jnp.clip(below + inside, 0, 1)
+        # Panels without width in x are atoms: right-continuous, P(X <= x).
+        index = jnp.clip(jnp.searchsorted(self.right, x, side="right"), 0, self.right.size - 1)
+        probabilities = self.probabilities
+        below = (jnp.cumsum(probabilities) - probabilities)[index]
+        inside = probabilities[index] * _series(self._share(index), self._within(index, x))
+        total = jnp.clip(below + inside, 0, 1)
+        return jnp.where(jnp.isnan(x), jnp.nan, jnp.where(jnp.isinf(x), (x > 0).astype(total.dtype), total))
 
     def icdf(self, q: Float[Array, ""]) -> Float[Array, ""]:
-        """The inverse of `cdf`, by bisection in the right panel."""
-        total = jnp.cumsum(self.probabilities)
-        q = q * total[-1]
-        index = jnp.clip(jnp.searchsorted(total, q), 0, total.size - 1)
-        share = (q - (total - self.probabilities)[index]) / self.probabilities[index]
-        shape = self._shape(index)
+        """The inverse of `cdf`, by bisection in the right panel: -inf at 0, +inf at 1, NaN outside."""
+        probabilities = self.probabilities
+        total = jnp.cumsum(probabilities)
+        target = q * total[-1]
+        index = jnp.clip(jnp.searchsorted(total, target), 0, total.size - 1)
+        share = (target - (total - probabilities)[index]) / probabilities[index]
+        y = _solved(self._share(index), share)
+        width = self.right[index] - self.left[index]
+        x = self.left[index] + width * jnp.clip(_series(self._place(index), y), 0, 1)
+        ends = jnp.where(q == 0, -jnp.inf, jnp.where(q == 1, jnp.inf, x))
+        return jnp.where((q >= 0) & (q <= 1), ends, jnp.nan)
 
-        def halve(_, bounds):
-            low, high = bounds
-            middle = 0.5 * (low + high)
-            above = _share(shape, middle) > share
-            return jnp.where(above, low, middle), jnp.where(above, middle, high)
-
-        one = jnp.ones((), q.dtype)
-        low, high = lax.fori_loop(0, 50, halve, (-one, one))
-        return self.left[index] + (self.right[index] - self.left[index]) * 0.5 * (1 + 0.5 * (low + high))
-
-    def _shape(self, index) -> Float[Array, "16"]:
+    def _share(self, index) -> Float[Array, "16"]:
         """Legendre coefficients of one panel's cumulative share, from 0 at -1 to 1 at 1."""
         values = self.log_values[index]
         largest = values.max()
-        values = jnp.exp(values - jnp.where(jnp.isfinite(largest), largest, 0))
+        empty = jnp.isneginf(largest)
+        values = jnp.where(empty, 1, jnp.exp(values - jnp.where(empty, 0, largest)))
         coefficients = jnp.asarray(_CUMULATIVE, values.dtype) @ values
         return coefficients / coefficients.sum()  # P_k(1) = 1
 
+    def _place(self, index) -> Float[Array, "16"]:
+        """Legendre coefficients of x in one panel, from 0 (left) to 1 (right)."""
+        left, width = self.left[index], self.right[index] - self.left[index]
+        places = (self.nodes[index] - left) / jnp.where(width > 0, width, 1)
+        return jnp.append(jnp.asarray(_INTERPOLATING, places.dtype) @ places, 0)
 
-def adaptive_panels(log_f: _Log, guides: Float[Array, "guides"], *, search: _Log | None = None) -> Panels:
+    def _within(self, index, x) -> Float[Array, ""]:
+        """Where x lies in one panel, -1 (left) to 1 (right)."""
+        left, width = self.left[index], self.right[index] - self.left[index]
+        place = (x - left) / jnp.where(width > 0, width, 1)
+        return jnp.where(place <= 0, -1, jnp.where(place >= 1, 1, _solved(self._place(index), place)))
+
+
+def adaptive_panels(
+    log_f: _Log, guides: Float[Array, "guides"], *, search: _Log | None = None, spikes: Panels | None = None
+) -> Panels:
     """Panels for the integral of exp(log_f) over [-REACH, REACH], fine around `guides` (see `peaks`).
 
-    `search` is `log_f` without derivatives, where `log_f` has parameters to be differentiated.
+    `search` is `log_f` without derivatives, where `log_f` has parameters to be differentiated. `spikes` (panels of
+    shape (spikes, panels)) are taken over as they are, each in place of log_f from its first edge to its last.
 
     **Shapes:** `log_f` is elementwise. **Raises:** nothing; see `diverges` for a mass that does not fall off.
     """
-    left, right = _found_panels(log_f if search is None else search, lax.stop_gradient(guides))
-    return Panels(left, right, log_f(_nodes(left, right)))
+    search, guides = log_f if search is None else search, lax.stop_gradient(guides)
+    if spikes is None:
+        left, right = _found_panels(search, guides, None)
+        return Panels(left, right, _nodes(left, right), _log_width(left, right), log_f(_nodes(left, right)))
+    holes = lax.stop_gradient((spikes.left[:, 0], spikes.right[:, -1]))
+    left, right = _found_panels(search, guides, holes)
+    # Panels inside a hole give way, to its low edge, so that right edges stay sorted.
+    middle = 0.5 * (left + right)[None]
+    low = jnp.where((middle > holes[0][:, None]) & (middle < holes[1][:, None]), holes[0][:, None], -jnp.inf).max(0)
+    left, right = (jnp.where(jnp.isneginf(low), edge, low) for edge in (left, right))
+    nodes = _nodes(left, right)
+    around = Panels(left, right, nodes, _log_width(left, right), log_f(nodes))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spikes)
+    both = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), around, flat)
+    order = jnp.argsort(lax.stop_gradient(both.left + both.right))
+    return jax.tree.map(lambda x: x[order], both)
 
 
 def diverges(log_f: _Log, panels: Panels) -> Array:
     """Whether the integral's mass reaches the ends of the line."""
     ends = log_f(jnp.asarray([-REACH, REACH], panels.left.dtype)).max()
     # e^-20 of the total at the ends, were they as wide as they are far, is no tail of a finite integral here.
-    return ends + np.log(REACH) > panels.log_total - 20.0
+    return ends + float(np.log(REACH)) > panels.log_total - 20.0
 
 
 def peaks(log_f: _Log, grid: Float[Array, "grid"], count: int, *, score: _Log | None = None) -> Float[Array, "count"]:
@@ -206,54 +253,63 @@ def _golden(log_f: _Log, low: Array, high: Array) -> Array:
 
     def shrink(_, bounds):
         low, high = bounds
-        a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        left_wins = log_f(a) >= log_f(b)
+        inner = _GOLDEN * (high - low)
+        a, b = high - inner, low + inner
+        at_a, at_b = jnp.split(log_f(jnp.concatenate([a, b])), 2)  # one call: half of it to compile
+        left_wins = at_a >= at_b
         return jnp.where(left_wins, low, a), jnp.where(left_wins, b, high)
 
     low, high = lax.fori_loop(0, steps, shrink, (low, high))
     return 0.5 * (low + high)
 
 
-def _found_panels(log_f: _Log, guides: Array) -> tuple[Array, Array]:
-    """Left and right edges after all halvings, sorted."""
+def within_any(holes: tuple[Array, Array], x: Array) -> Array:
+    """Whether x lies strictly inside one of the intervals."""
+    low, high = (lax.expand_dims(edge, range(1, x.ndim + 1)) for edge in holes)
+    return ((x[None] > low) & (x[None] < high)).any(0)
+
+
+def _found_panels(log_f: _Log, guides: Array, holes: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    """Left and right edges after all halvings, sorted; none lies across an edge of a hole, where nothing is."""
     dtype = guides.dtype
     ladder = jnp.asarray(np.r_[0, _LADDER, -_LADDER], dtype)
     extra = (jnp.where(jnp.isnan(guides), 0, guides)[:, None] + ladder[None, :]).ravel()
-    edges = jnp.sort(jnp.clip(jnp.concatenate([jnp.asarray(_BASE, dtype), extra]), -REACH, REACH))
+    borders = [] if holes is None else [*holes]
+    edges = jnp.concatenate([jnp.asarray(_BASE, dtype), extra, *borders])
+    edges = jnp.sort(jnp.clip(edges, -REACH, REACH))
     spare = jnp.full(_ROUNDS * _SPLITS, REACH, dtype)
     left, right = jnp.concatenate([edges[:-1], spare]), jnp.concatenate([edges[1:], spare])
-    log_mass, log_error = _estimates(log_f, left, right)
+    estimates = partial(_estimates, log_f, holes)
+    log_error = estimates(left, right)
     first_spare = edges.size - 1
 
     def halve(round_, state):
-        left, right, log_mass, log_error = state
+        left, right, log_error = state
         worst = lax.top_k(log_error, _SPLITS)[1]
         new = (first_spare + round_ * _SPLITS + np.arange(_SPLITS)).astype(worst.dtype)
         middle = 0.5 * (left[worst] + right[worst])
         both = jnp.concatenate([worst, new])
         new_left = jnp.concatenate([left[worst], middle])
         new_right = jnp.concatenate([middle, right[worst]])
-        mass, error = _estimates(log_f, new_left, new_right)
         put = lambda x, y: x.at[both].set(y)  # noqa: E731
-        return put(left, new_left), put(right, new_right), put(log_mass, mass), put(log_error, error)
+        return put(left, new_left), put(right, new_right), put(log_error, estimates(new_left, new_right))
 
-    left, right, *_ = lax.fori_loop(0, _ROUNDS, halve, (left, right, log_mass, log_error))
+    left, right, _ = lax.fori_loop(0, _ROUNDS, halve, (left, right, log_error))
     order = jnp.argsort(left + right)
     return left[order], right[order]
 
 
-def _estimates(log_f: _Log, left: Array, right: Array) -> tuple[Array, Array]:
-    values = log_f(_nodes(left, right))
-    weights = jnp.asarray(np.log(_KRONROD), values.dtype)[None]
-    return logsumexp(values + weights, axis=-1) + _log_width(left, right), _log_error(left, right, values)
+def _estimates(log_f: _Log, holes, left: Array, right: Array) -> Array:
+    log_error = _log_error(_log_width(left, right), log_f(_nodes(left, right)))
+    return log_error if holes is None else jnp.where(within_any(holes, 0.5 * (left + right)), -jnp.inf, log_error)
 
 
-def _log_error(left: Array, right: Array, log_values: Array) -> Array:
+def _log_error(log_half: Array, log_values: Array) -> Array:
     """log |Kronrod - Gauss| of each panel."""
     largest = log_values.max(-1)
     largest = jnp.where(jnp.isfinite(largest), largest, 0)
     difference = jnp.exp(log_values - largest[..., None]) @ jnp.asarray(_KRONROD - _GAUSS, log_values.dtype)
-    return jnp.log(jnp.abs(difference)) + largest + _log_width(left, right)
+    return jnp.log(jnp.abs(difference)) + largest + log_half
 
 
 def _nodes(left: Array, right: Array) -> Array:
@@ -265,7 +321,7 @@ def _log_width(left: Array, right: Array) -> Array:
     return jnp.log(0.5 * (right - left))
 
 
-def _share(coefficients: Float[Array, "16"], y: Array) -> Array:
+def _series(coefficients: Float[Array, "16"], y: Array) -> Array:
     """The Legendre series at y, by the recurrence of the polynomials."""
     before, now = jnp.ones_like(y), y
     total = coefficients[0] * before + coefficients[1] * now
@@ -275,11 +331,28 @@ def _share(coefficients: Float[Array, "16"], y: Array) -> Array:
     return total
 
 
-def _cumulative_matrix() -> np.ndarray:
-    """Values at the nodes -> Legendre coefficients of their interpolant's integral from -1."""
+def _solved(coefficients: Float[Array, "16"], value: Array) -> Array:
+    """y in [-1, 1] where an increasing Legendre series has the value: bisection, and a Newton step for derivatives."""
+
+    def halve(_, bounds):
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        above = _series(coefficients, middle) > value
+        return jnp.where(above, low, middle), jnp.where(above, middle, high)
+
+    one = jnp.ones_like(value)
+    low, high = lax.fori_loop(0, 50, halve, (-one, one))
+    y = lax.stop_gradient(0.5 * (low + high))
+    slope = lax.stop_gradient(jax.jvp(partial(_series, coefficients), (y,), (one,))[1])
+    step = (value - _series(coefficients, y)) / jnp.where(slope > 0, slope, 1)
+    return jnp.where(slope > 0, jnp.clip(y + step, -1, 1), y)
+
+
+def _legendre_matrices() -> tuple[np.ndarray, np.ndarray]:
+    """Values at the nodes -> Legendre coefficients of their interpolant, and of its integral from -1."""
     legendre = np.polynomial.legendre
     coefficients = np.linalg.inv(legendre.legvander(KRONROD_NODES, 14))
-    return np.stack([legendre.legint(column, lbnd=-1) for column in coefficients.T], axis=1)
+    return coefficients, np.stack([legendre.legint(column, lbnd=-1) for column in coefficients.T], axis=1)
 
 
-_CUMULATIVE = _cumulative_matrix()
+_INTERPOLATING, _CUMULATIVE = _legendre_matrices()

@@ -395,6 +395,10 @@ def test_any_parameter_may_carry_the_batch(changes):
     assert shape(lambda: dist.condition_time(0.1).sample(key)) == (*batch, 2)
 
 
+def test_two_large_sample_dimensions_keep_their_shape():
+    assert jax.jit(lambda d, x: d.log_prob(x))(_dist(), jnp.zeros((240, 240, 3))).shape == (240, 240)
+
+
 def test_batch_shape_is_true_under_vmap():
     make = lambda loc, time_loc: _dist(loc=loc, time_loc=time_loc)  # noqa: E731
     mapped = jax.vmap(make)(jnp.zeros((6, 4, 2)), jnp.linspace(0.0, 1.0, 6))  # inner batch 4 in loc alone

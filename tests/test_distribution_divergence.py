@@ -161,6 +161,34 @@ def test_batches_jit_and_gradients():
     np.testing.assert_allclose(jax.grad(by_scale)(0.4), difference, rtol=1e-6)
 
 
+@pytest.mark.parametrize("floor", [0.0, 0.05])
+def test_float32_agrees_with_float64(floor):
+    # Offsets 0 and 1e4, time scales 1e-12, 0.3 and 1e6, time_loc of q a half, 1e3 or 1e10 scales away.
+    offset, scale = (x.ravel() for x in np.meshgrid([0.0, 1e4], [1e-12, 0.3, 1e6]))
+    apart = np.array([0.5, 1e3, 1e10])[:, None]
+
+    def pair(dtype):
+        bend = BEND * 0.3 ** np.array([[1], [2]]) / scale[:, None, None] ** np.array([[1], [2]])
+        parts = {"bend": bend.astype(dtype), "loc": np.array([0.1, -0.4], dtype), "tril": TRIL.astype(dtype)}
+        floors, powers = np.asarray(floor, dtype), np.asarray(0.5, dtype)
+        p = _dist(powers, floors, time_loc=offset.astype(dtype), time_scale=scale.astype(dtype), **parts)
+        there = (offset + np.array([0.5, 1e3, 1e10])[:, None] * scale).astype(np.float32).astype(dtype)
+        return p, _dist(powers, floors, time_loc=there, time_scale=(1.5 * scale).astype(dtype), **parts)
+
+    divergence = KL(*pair(np.float32))
+    assert divergence.dtype == np.float32
+    # float64 is given float32's numbers: what is compared is the computation.
+    exact = jax.tree.map(lambda x: x.astype(jnp.float64), pair(np.float32))
+    expected = np.asarray(KL(*exact))
+    divergence = np.asarray(divergence, float)
+    assert divergence.shape == (apart.size, scale.size)
+    assert not np.isnan(divergence).any()
+    finite = np.isfinite(divergence)
+    assert finite[0].all()
+    assert (expected[~finite] > 1e38).all()
+    np.testing.assert_allclose(divergence[finite], expected[finite], rtol=1e-4, atol=1e-5)
+
+
 def test_bad_pairs_are_refused():
     with pytest.raises(ValueError, match=r"^p, q: expected two distributions of one class and dimension, got "):
         kl_divergence(_dist(), Normal(0.0, 1.0))
