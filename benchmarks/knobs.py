@@ -5,7 +5,7 @@
 
 Without options: Bunny at 320x640, fitted for two minutes first. One knob is turned at a time, from the constants that
 the model was fitted with; the presets (with the fitted low pass) are shown beside. All settings draw the same frames in
-turn (engine "cpu", conditioning not counted). PSNR is against the clip; `apart` is the PSNR, at the worst frame, between
+turn (engine "cpu", conditioning not counted). PSNR is against the clip; `apart` is that at the worst frame between
 a setting's picture and that of the fitted constants, and `largest` the largest difference of a number of theirs.
 """
 
