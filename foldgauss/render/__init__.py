@@ -1,7 +1,20 @@
-"""Pixels from two-dimensional splats: one door, `render`, and the engines behind it."""
+"""Pixels from Gaussians: one door, `render`, the engines behind it, and cameras in front of it."""
 
+from foldgauss.render.camera import Camera, Gaussians3D, project
 from foldgauss.render.colors import solve_colors
 from foldgauss.render.door import ENGINES, render
 from foldgauss.render.splats import RenderOptions, Splats2D, pixels_per_unit
+from foldgauss.render.triangle import Triangles
 
-__all__ = ["ENGINES", "RenderOptions", "Splats2D", "pixels_per_unit", "render", "solve_colors"]
+__all__ = [
+    "ENGINES",
+    "Camera",
+    "Gaussians3D",
+    "RenderOptions",
+    "Splats2D",
+    "Triangles",
+    "pixels_per_unit",
+    "project",
+    "render",
+    "solve_colors",
+]
