@@ -252,7 +252,7 @@ def test_samples_have_pathwise_gradients():
 # --- gradients and extremes -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dim", [2, 10])
+@pytest.mark.parametrize("dim", [2, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("x64")
 def test_gradients_equal_finite_differences(dim):
     rng = np.random.default_rng(0)
