@@ -37,7 +37,8 @@ BOUND = 8.0
 class Case(NamedTuple):
     """One row of the table; `condition` is that of Sigma, `offset` is added to space and to time (times its scale).
 
-    `centred` puts loc at 0: there residuals as small as 1e-30 are seen, which drown beside a loc of 1.
+    `centred` puts loc and time_loc at 0: there residuals as small as 1e-30 are seen, which drown beside a loc of 1.
+    `resting` makes all coefficients 0, so that this is so for a fold too: slopes by coefficients remain.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Case(NamedTuple):
     condition: float = 10.0
     offset: float = 0.0
     centred: bool = False
+    resting: bool = False
 
 
 def cases(dtype) -> list[Case]:
@@ -65,6 +67,9 @@ def cases(dtype) -> list[Case]:
         Case("d 64", dim=64),
         Case("d 64, condition", dim=64, condition=condition),
         Case("centred", degree=0, centred=True),
+        Case("centred, resting fold", centred=True, resting=True),
+        Case("centred, resting fold, time_scale 1e-3", centred=True, resting=True, time_scale=1e-3),
+        Case("centred, resting fold, time_scale 1e6", centred=True, resting=True, time_scale=1e6),
         Case("centred, condition, time_scale 1e-12", degree=0, centred=True, condition=condition, time_scale=1e-12),
         # Not degree 12: XLA on the CPU takes coefficients below the smallest normal number for 0.
         Case("condition, time_scale 1e6, degree 5", condition=condition, time_scale=1e6, degree=5),
@@ -81,7 +86,9 @@ def build(case: Case, dtype) -> tuple[FoldedGaussian, np.ndarray]:
     root = turn * np.logspace(0, -0.5 * np.log10(case.condition), dim)  # Sigma = root root^T
     tril = np.linalg.qr(root.T)[1].T
     tril = (tril * np.sign(np.diagonal(tril))).astype(dtype)  # columns: Sigma stays the same
-    rows = rng.normal(size=(case.degree, dim)) / scale ** np.arange(1, case.degree + 1)[:, None] / 4
+    rows = (
+        (not case.resting) * rng.normal(size=(case.degree, dim)) / scale ** np.arange(1, case.degree + 1)[:, None] / 4
+    )
     dist = FoldedGaussian(
         np.zeros(dim, dtype) if case.centred else (rng.normal(size=dim) + case.offset).astype(dtype),
         tril,

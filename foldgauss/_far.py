@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Primitive
+from jax.extend.core import Primitive, unmapped_aval
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
@@ -39,13 +39,19 @@ def far_reaching(function: _Scaled, *arrays: Array, closed: bool = True) -> Arra
 
     `function(root, *arrays)` is root^2 times the same, and its derivatives overflow no sooner than root^2 times the
     true ones do. It depends on nothing else, unless `closed` is false: then it is looked through for tracers.
+
+    A derivative that is a *sum* over points is true unless one of the points needs a root so small that the others'
+    shares underflow beside it.
     """
+    arrays = _alike(arrays)
     if closed:
         return _far_reaching(function, *arrays)
     traced = jax.make_jaxpr(partial(function, None))(*arrays)
-    captured = [x for x in traced.consts if isinstance(x, jax.core.Tracer)]
+    captured = [jnp.asarray(x) for x in traced.consts if isinstance(x, jax.core.Tracer)]
     # A tracer inside a user's function becomes an argument: a custom derivative loses those it closes over.
-    return _far_reaching(_hoisted(function, arrays) if captured else function, *arrays, *captured)
+    if not captured:
+        return _far_reaching(function, *arrays)
+    return _far_reaching(_hoisted(function, arrays), *_alike([*arrays, *captured]))
 
 
 def _hoisted(function: _Scaled, arrays: tuple[Array, ...]) -> _Scaled:
@@ -54,13 +60,37 @@ def _hoisted(function: _Scaled, arrays: tuple[Array, ...]) -> _Scaled:
     traced = jax.make_jaxpr(function)(one, *arrays)
     is_captured = [isinstance(x, jax.core.Tracer) for x in traced.consts]
     fixed = [None if hoist else x for hoist, x in zip(is_captured, traced.consts, strict=True)]
+    count, jaxpr = len(arrays), traced.jaxpr  # and no tracer is kept alive by the function below
 
     def hoisted(root, *arguments):
-        given, captured = arguments[: len(arrays)], iter(arguments[len(arrays) :])
+        given, captured = arguments[:count], iter(arguments[count:])
         consts = [next(captured) if hoist else x for hoist, x in zip(is_captured, fixed, strict=True)]
-        return jax.core.eval_jaxpr(traced.jaxpr, consts, one if root is None else root, *given)[0]
+        scale = one if root is None else jnp.asarray(root, one.dtype)
+        return jax.core.eval_jaxpr(jaxpr, consts, scale, *given)[0]
 
     return hoisted
+
+
+def _alike(arrays) -> list[Array]:
+    """The arrays as varying, all of them, over the mesh axes that any of them varies over (inside `shard_map`).
+
+    Else JAX would cast within, and its transpose, a sum over devices, would stand in a branch that not all take.
+    """
+    arrays = [jnp.asarray(x) for x in arrays]
+    axes = frozenset().union(*map(_varying_axes, arrays))
+    if not axes:
+        return arrays
+    lacking = [tuple(axes - _varying_axes(x)) for x in arrays]
+    return [_cast_varying(x, axes) if axes else x for x, axes in zip(arrays, lacking, strict=True)]
+
+
+def _varying_axes(x: Array) -> frozenset:
+    aval = jax.typeof(x)
+    return frozenset(aval.vma if hasattr(aval, "vma") else aval.manual_axis_type.varying)
+
+
+def _cast_varying(x: Array, axes: tuple) -> Array:
+    return lax.pcast(x, axes, to="varying") if hasattr(lax, "pcast") else lax.pvary(x, axes)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -72,15 +102,15 @@ def _far_reaching(function: _Scaled, *arrays: Array) -> Array:
 def _far_reaching_jvp(function, primals, tangents):
     moving = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero))
     value, moved = function(None, *primals), [tangents[i] for i in moving]
-    return value, _push.bind(*primals, *moved, function=function, moving=moving, shape=value.shape)
+    return value, _push.bind(*primals, *moved, function=function, moving=moving, aval=_strong(jax.typeof(value)))
 
 
 # --- the two primitives --------------------------------------------------------------------------------------
 
 
-def _pushed(*arguments: Array, function: _Scaled, moving: tuple[int, ...], shape: tuple[int, ...]) -> Array:
+def _pushed(*arguments: Array, function: _Scaled, moving: tuple[int, ...], aval) -> Array:
     """The derivative along tangents of the arrays `moving`: arguments are all arrays, then these tangents."""
-    del shape
+    del aval
     count = len(arguments) - len(moving)
     arrays, tangents = arguments[:count], arguments[count:]
 
@@ -131,7 +161,12 @@ def _climbed(at: Callable[[Array | None], list[Array]], plain: list[Array]) -> l
     def step(found, root):
         return lax.cond(_missing(found) > 0, climb, lambda root, found: found, root, found), None
 
-    found = lax.scan(step, plain, jnp.asarray(roots))[0]
+    if any(isinstance(x, jax.core.Tracer) for x in plain):
+        found = lax.scan(step, plain, jnp.asarray(roots))[0]
+    else:  # not compiled: a scan would be, anew each time
+        found = plain
+        for root in roots:
+            found = climb(jnp.asarray(root), found) if _missing(found) else found
     # An infinity that is left is one further out than all roots reach, and has its sign.
     return [_held(x, jnp.finfo(x.dtype).max) for x in found]
 
@@ -156,12 +191,16 @@ def _primitive(name: str, implementation: Callable, shape_of: Callable, *, sever
     return primitive
 
 
-def _push_shape(*avals, function, moving, shape):
-    return jax.core.ShapedArray(shape, jnp.result_type(*(x.dtype for x in avals)))
+def _push_shape(*avals, function, moving, aval):
+    return aval
 
 
 def _pull_shapes(*avals, function, moving):
-    return [jax.core.ShapedArray(avals[i].shape, avals[i].dtype) for i in moving]
+    return [_strong(avals[i]) for i in moving]
+
+
+def _strong(aval):
+    return aval.update(weak_type=False)
 
 
 def _differentiated(implementation, primals, tangents, **how):
@@ -174,8 +213,8 @@ _push = _primitive("far_push", _pushed, _push_shape, several=False)
 _pull = _primitive("far_pull", _pulled, _pull_shapes, several=True)
 
 
-def _transposed(cotangent, *arguments, function, moving, shape):
-    del shape
+def _transposed(cotangent, *arguments, function, moving, aval):
+    del aval
     count = len(arguments) - len(moving)
     nothing = [None] * count
     if isinstance(cotangent, ad.Zero):
@@ -187,7 +226,7 @@ def _transposed(cotangent, *arguments, function, moving, shape):
     return [*nothing, *(next(found) if want else None for want in wanted)]
 
 
-def _push_batched(arguments, dims, *, function, moving, shape):
+def _push_batched(arguments, dims, *, function, moving, aval):
     count = len(arguments) - len(moving)
     size = next(x.shape[d] for x, d in zip(arguments, dims, strict=True) if d is not None)
     is_batched = [d is not None for d in dims]
@@ -196,7 +235,7 @@ def _push_batched(arguments, dims, *, function, moving, shape):
     arguments = [_to_front(x, d, size, b) for x, d, b in zip(arguments, dims, is_batched, strict=True)]
     axes = tuple(0 if b else None for b in is_batched[:count])
     over = _over_batch(function, axes)
-    return _push.bind(*arguments, function=over, moving=moving, shape=(size, *shape)), 0
+    return _push.bind(*arguments, function=over, moving=moving, aval=unmapped_aval(size, 0, aval)), 0
 
 
 def _pull_batched(arguments, dims, *, function, moving):
@@ -215,6 +254,7 @@ def _over_batch(function: _Scaled, axes, size: int | None = None) -> _Scaled:
 
 
 def _to_front(x: Array, dim: int | None, size: int, wanted: bool) -> Array:
+    x = jnp.asarray(x)
     if dim is not None:
         return jnp.moveaxis(x, dim, 0)
     return jnp.broadcast_to(x, (size, *x.shape)) if wanted else x

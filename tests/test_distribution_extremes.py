@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.numerics import BOUND, Case, cases, excess_bits
 
-QUICK = {"degree 12", "time_scale 1e6", "centred", "d 64, condition"}
+QUICK = {"degree 12", "time_scale 1e6", "centred, resting fold", "d 64, condition"}
 
 
 def _parameters():

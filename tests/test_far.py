@@ -99,3 +99,42 @@ def test_far_points_do_not_spoil_a_networks_gradient():
     x = jnp.stack([s, jnp.array([0.3, 14.0])], -1)
     for leaf in jax.tree.leaves(jax.jit(jax.grad(lambda d: d.log_prob(x).sum()))(dist)):
         assert np.isfinite(leaf).all()
+
+
+def test_eager_gradients_do_not_compile_anew():
+    dist = FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0)
+    gradient = jax.grad(lambda x: dist.log_prob(x))
+    x = jnp.array([1e-8, 15.0])
+    gradient(x)
+    with jax.log_compiles(), pytest.MonkeyPatch.context() as patch:
+        compiled = []
+        patch.setattr(
+            "jax._src.compiler.compile_or_get_cached", lambda *a, **k: compiled.append(1) or pytest.fail("compiled")
+        )
+        assert np.isfinite(gradient(x)).all()
+    assert not compiled
+
+
+def test_python_scalars_and_two_dtypes_through_a_users_function():
+    def log_prob(w, x):
+        fold = lambda u: w * u * jnp.ones(2)  # noqa: E731
+        return FoldedGaussian(jnp.zeros(2), jnp.eye(2), time_loc=0.4, time_scale=0.3, fold=fold).log_prob(x)
+
+    x = jnp.array([0.1, -0.2, 0.9])
+    np.testing.assert_allclose(jax.jacfwd(log_prob)(0.5, x), jax.grad(log_prob)(0.5, x), rtol=1e-5)
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        found = jax.jit(jax.grad(log_prob))(np.float32(0.5), np.asarray(x, np.float64))
+    np.testing.assert_allclose(found, jax.grad(log_prob)(0.5, x), rtol=1e-4)
+
+
+def test_gradients_inside_shard_map():
+    mesh = jax.make_mesh((1,), ("i",), axis_types=(jax.sharding.AxisType.Auto,))
+    dist = FoldedGaussian([0.0], [[1.0]], time_loc=0.4, time_scale=0.3, fold=PolynomialFold([[0.7]]))
+    x = jnp.array([[0.1, 0.2], [0.3, 0.9]])
+    spec = jax.sharding.PartitionSpec
+    for argument in (0, 1):
+        one = jax.grad(lambda dist, x: jax.vmap(dist.log_prob)(x).sum(), argnums=argument)
+        sharded = jax.shard_map(
+            one, mesh=mesh, in_specs=(spec(), spec("i")), out_specs=spec() if argument == 0 else spec("i")
+        )
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), jax.jit(sharded)(dist, x), one(dist, x))
