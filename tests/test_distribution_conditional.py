@@ -435,7 +435,8 @@ def _far_quantities(dist, s, tau):
     }
 
 
-@pytest.mark.parametrize("dim", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [1, 2])
 def test_float32_far_out_agrees_with_float64(dim):
     # name: offset of space and time, time_scale, scale of space, power, floor
     cases = {

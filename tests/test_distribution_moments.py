@@ -115,7 +115,7 @@ FOLDS = {
 }
 
 
-@pytest.mark.parametrize("name", FOLDS)
+@pytest.mark.parametrize("name", [pytest.param("spline", marks=pytest.mark.slow), "fourier"])
 def test_moments_of_splines_and_sines(name):
     # Gauss-Hermite of order 64: to rounding for a sine as slow as this; to 4e-4 for a cubic spline with knots 1.7
     # standard deviations apart, which is not analytic.

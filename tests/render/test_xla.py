@@ -46,7 +46,14 @@ def check_against_reference(splats, size, tolerance=2e-5, **how):
         check_same(ones, others, tolerance)
 
 
-@pytest.mark.parametrize(("kind", "compositing"), [("plain", "over"), ("needles", "sum"), ("curtain", "over")])
+@pytest.mark.parametrize(
+    ("kind", "compositing"),
+    [
+        pytest.param("plain", "over", marks=pytest.mark.slow),
+        pytest.param("needles", "sum", marks=pytest.mark.slow),
+        ("curtain", "over"),
+    ],
+)
 def test_rounds_change_nothing(kind, compositing):
     """With room for a few splats at a time, drawn in many rounds, the picture and the gradients are the same."""
     splats, size = scene(kind)
@@ -66,7 +73,9 @@ def test_more_pairs_than_room_is_no_loss(monkeypatch):
     np.testing.assert_allclose(draw(splats, size), truth, atol=1e-6)
 
 
-@pytest.mark.parametrize("tile_size", [4, 7, 32])
+@pytest.mark.parametrize(
+    "tile_size", [pytest.param(4, marks=pytest.mark.slow), 7, pytest.param(32, marks=pytest.mark.slow)]
+)
 def test_tile_size_changes_nothing(tile_size):
     splats, size = scene("plain")
     weights = weights_for(size)
