@@ -21,7 +21,6 @@ from foldgauss.datasets import sample_clip
 from foldgauss.io.video_file import read_video
 from foldgauss.io.video_model import load_video_model
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.video.conditioning import condition
 from foldgauss.video.fit import FitConfig, fit
 from foldgauss.video.playback import Playback
 
@@ -63,8 +62,8 @@ def main(arguments: list[str] | None = None) -> None:
     shown = np.linspace(0, len(times) - 1, options.frames).astype(int)
     leaves = []
     for k in shown:
-        splats = condition(playback._rows, playback._window, times[k], playback._shape)
-        leaves.append((splats.mean, splats.factor, splats.opacity, splats.color, playback._black))
+        splats = playback.splats(times[k])
+        leaves.append((splats.mean, splats.factor, splats.opacity, splats.color, np.zeros(3, np.float32)))
     made = {}
     for name, how in settings(model.options).items():
         try:

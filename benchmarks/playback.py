@@ -20,7 +20,6 @@ from foldgauss.datasets import sample_clip
 from foldgauss.io.video_file import read_video
 from foldgauss.io.video_model import load_video_model, save_video_model
 from foldgauss.render import cpu
-from foldgauss.video.conditioning import condition
 from foldgauss.video.fit import FitConfig, fit
 from foldgauss.video.model import VideoModel
 from foldgauss.video.playback import Playback, to_bytes
@@ -46,16 +45,16 @@ def stages(playback: Playback, times: np.ndarray) -> dict[str, float]:
     alive, pairs = [], []
     for t in times:
         begun = time.perf_counter()
-        splats = condition(playback._rows, playback._window, t, playback._shape)
+        splats = playback.splats(t)
         conditioned = time.perf_counter()
-        leaves = splats.mean, splats.factor, splats.opacity, splats.color, playback._black
+        leaves = splats.mean, splats.factor, splats.opacity, splats.color, np.zeros(3, np.float32)
         trace = cpu.forward(*leaves, playback.size, options=playback.model.options)
         blended = time.perf_counter()
         to_bytes(trace.image)
         done = time.perf_counter()
         for name, span in zip(seconds, (conditioned - begun, blended - conditioned, done - blended), strict=True):
             seconds[name].append(span)
-        alive.append(len(splats.alive))
+        alive.append(len(splats.opacity))
         pairs.append(trace.num_pairs)
     return {f"{name} (ms)": 1e3 * float(np.median(spans)) for name, spans in seconds.items()} | {
         "alive": float(np.median(alive)),

@@ -9,10 +9,11 @@ smaller and smaller roots, the factor put in *before* anything can overflow; wha
 the largest number. Far away this costs some more evaluations, elsewhere a look at whether all is finite.
 
 JAX has no rule that decides on a derivative *after* its transposition and still allows forward mode (`custom_vjp` does
-not) and batches (`linear_call` does not), so there are two primitives here, each other's transpose.
+not) and batches (`linear_call` does not), so there are two primitives here: `push`, forward, and `pull`, its transpose.
+Derivatives of either are a `push` of the first derivative, so all orders decide, and all of a batch together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
@@ -26,16 +27,16 @@ from jaxtyping import Array
 
 __all__ = ["far_reaching"]
 
-#: `function(root, *arrays)` is root^2 times an array; root None is 1.
-_Scaled = Callable[..., Array]
+#: `function(root, *arrays)` is root^2 times a list of arrays; root None is 1.
+_Scaled = Callable[..., list[Array]]
 
 #: log2 of the roots, in units of the dtype's largest exponent: in float32 the factors are 2^-24, 2^-48, .. 2^-240.
 #: Neighbours are close, so that of a derivative that needs the one nothing is lost to underflow there.
 _LADDER = -0.0945 * np.arange(1, 11)
 
 
-def far_reaching(function: _Scaled, *arrays: Array, closed: bool = True) -> Array:
-    """`function(None, *arrays)`, whose first derivatives by `arrays` are true where they fit and saturate where not.
+def far_reaching(function: Callable[..., Array], *arrays: Array, closed: bool = True) -> Array:
+    """`function(None, *arrays)`, whose derivatives by `arrays` are true where they fit and saturate where not.
 
     `function(root, *arrays)` is root^2 times the same, and its derivatives overflow no sooner than root^2 times the
     true ones do. It depends on nothing else, unless `closed` is false: then it is looked through for tracers.
@@ -43,35 +44,34 @@ def far_reaching(function: _Scaled, *arrays: Array, closed: bool = True) -> Arra
     A derivative that is a *sum* over points is true unless one of the points needs a root so small that the others'
     shares underflow beside it.
     """
-    arrays = _alike(arrays)
-    if closed:
-        return _far_reaching(function, *arrays)
-    traced = jax.make_jaxpr(partial(function, None))(*arrays)
-    captured = [jnp.asarray(x) for x in traced.consts if isinstance(x, jax.core.Tracer)]
-    # A tracer inside a user's function becomes an argument: a custom derivative loses those it closes over.
-    if not captured:
-        return _far_reaching(function, *arrays)
-    return _far_reaching(_hoisted(function, arrays), *_alike([*arrays, *captured]))
+    scaled = lambda root, *arrays: [function(root, *arrays)]  # noqa: E731
+    captured = []
+    if not closed:
+        scaled, captured = _hoisted(scaled, arrays)
+    return _far_reaching(scaled, *_alike([*arrays, *captured]))[0]
 
 
-def _hoisted(function: _Scaled, arrays: tuple[Array, ...]) -> _Scaled:
-    """`function` with the tracers it closes over as further arguments."""
+def _hoisted(function: _Scaled, arrays: tuple[Array, ...]) -> tuple[_Scaled, list[Array]]:
+    """`function` with the tracers it closes over as further arguments, and those: custom derivatives lose them."""
     one = np.ones((), jnp.result_type(*arrays))  # of NumPy: no tracer
     traced = jax.make_jaxpr(function)(one, *arrays)
     is_captured = [isinstance(x, jax.core.Tracer) for x in traced.consts]
+    if not any(is_captured):
+        return function, []
     fixed = [None if hoist else x for hoist, x in zip(is_captured, traced.consts, strict=True)]
+    captured = [jnp.asarray(x) for hoist, x in zip(is_captured, traced.consts, strict=True) if hoist]
     count, jaxpr = len(arrays), traced.jaxpr  # and no tracer is kept alive by the function below
 
     def hoisted(root, *arguments):
-        given, captured = arguments[:count], iter(arguments[count:])
-        consts = [next(captured) if hoist else x for hoist, x in zip(is_captured, fixed, strict=True)]
+        given, own = arguments[:count], iter(arguments[count:])
+        consts = [next(own) if hoist else x for hoist, x in zip(is_captured, fixed, strict=True)]
         scale = one if root is None else jnp.asarray(root, one.dtype)
-        return jax.core.eval_jaxpr(jaxpr, consts, scale, *given)[0]
+        return jax.core.eval_jaxpr(jaxpr, consts, scale, *given)
 
-    return hoisted
+    return hoisted, captured
 
 
-def _alike(arrays) -> list[Array]:
+def _alike(arrays: Sequence[Array]) -> list[Array]:
     """The arrays as varying, all of them, over the mesh axes that any of them varies over (inside `shard_map`).
 
     Else JAX would cast within, and its transpose, a sum over devices, would stand in a branch that not all take.
@@ -94,42 +94,51 @@ def _cast_varying(x: Array, axes: tuple) -> Array:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _far_reaching(function: _Scaled, *arrays: Array) -> Array:
+def _far_reaching(function: _Scaled, *arrays: Array) -> list[Array]:
     return function(None, *arrays)
 
 
 @partial(_far_reaching.defjvp, symbolic_zeros=True)
 def _far_reaching_jvp(function, primals, tangents):
     moving = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero))
-    value, moved = function(None, *primals), [tangents[i] for i in moving]
-    return value, _push.bind(*primals, *moved, function=function, moving=moving, aval=_strong(jax.typeof(value)))
+    values = _far_reaching(function, *primals)
+    return values, _push_along(function, primals, tangents, moving, values)
 
 
-# --- the two primitives --------------------------------------------------------------------------------------
+def _push_along(function: _Scaled, primals, tangents, moving: tuple[int, ...], values) -> list[Array]:
+    avals = tuple(_strong(jax.typeof(x)) for x in values)
+    return _push.bind(*primals, *(tangents[i] for i in moving), function=function, moving=moving, avals=avals)
 
 
-def _pushed(*arguments: Array, function: _Scaled, moving: tuple[int, ...], aval) -> Array:
-    """The derivative along tangents of the arrays `moving`: arguments are all arrays, then these tangents."""
-    del aval
-    count = len(arguments) - len(moving)
-    arrays, tangents = arguments[:count], arguments[count:]
-
-    def at(root):
-        free = _freed(partial(function, root), arrays, moving)
-        return [jax.jvp(free, tuple(arrays[i] for i in moving), tuple(tangents))[1]]
-
-    return _first_finite(at)[0]
+def _strong(aval):
+    return aval.update(weak_type=False)
 
 
-def _pulled(*arguments: Array, function: _Scaled, moving: tuple[int, ...]) -> list[Array]:
-    """The gradients by the arrays `moving`: arguments are all arrays, then the cotangent."""
-    arrays, cotangent = arguments[:-1], arguments[-1]
+# --- the derivatives -----------------------------------------------------------------------------------------
 
-    def at(root):
-        free = _freed(partial(function, root), arrays, moving)
-        return list(jax.vjp(free, *(arrays[i] for i in moving))[1](cotangent))
 
-    return _first_finite(at)
+def _pushed(*arguments: Array, function: _Scaled, moving: tuple[int, ...], avals) -> list[Array]:
+    """The derivatives along tangents of the arrays `moving`: arguments are all arrays, then these tangents."""
+    del avals
+    return _first_finite(lambda root: _pushed_at(root, *arguments, function=function, moving=moving))
+
+
+def _pushed_at(root, *arguments: Array, function: _Scaled, moving: tuple[int, ...]) -> list[Array]:
+    """root^2 times those, by plain autodiff."""
+    arrays, tangents = arguments[: len(arguments) - len(moving)], arguments[len(arguments) - len(moving) :]
+    return jax.jvp(_freed(partial(function, root), arrays, moving), [arrays[i] for i in moving], list(tangents))[1]
+
+
+def _pulled(*arguments: Array, function: _Scaled, moving: tuple[int, ...], count: int) -> list[Array]:
+    """The gradients by the arrays `moving`: arguments are `count` arrays, then the cotangents."""
+    return _first_finite(lambda root: _pulled_at(root, *arguments, function=function, moving=moving, count=count))
+
+
+def _pulled_at(root, *arguments: Array, function: _Scaled, moving: tuple[int, ...], count: int) -> list[Array]:
+    """root^2 times those, by plain autodiff."""
+    arrays, cotangents = arguments[:count], arguments[count:]
+    free = _freed(partial(function, root), arrays, moving)
+    return list(jax.vjp(free, *(arrays[i] for i in moving))[1](list(cotangents)))
 
 
 def _freed(function: Callable, arrays, moving: tuple[int, ...]) -> Callable:
@@ -181,83 +190,85 @@ def _held(x: Array, largest) -> Array:
     return jnp.clip(x, -largest, largest)  # a NaN stays one
 
 
-def _primitive(name: str, implementation: Callable, shape_of: Callable, *, several: bool) -> Primitive:
+# --- the two primitives --------------------------------------------------------------------------------------
+
+
+def _primitive(name: str, implementation: Callable, derivative: Callable, avals: Callable) -> Primitive:
+    """`implementation`, whose own derivative is a push of `derivative(root, *arguments, **how)`, root^2 times it."""
     primitive = Primitive(name)
-    primitive.multiple_results = several
+    primitive.multiple_results = True
     primitive.def_impl(implementation)
-    primitive.def_abstract_eval(shape_of)  # known without tracing the implementation, which is long
-    mlir.register_lowering(primitive, mlir.lower_fun(implementation, multiple_results=several))
-    ad.primitive_jvps[primitive] = partial(_differentiated, implementation)
+    primitive.def_abstract_eval(avals)  # known without tracing the implementation, which is long
+    mlir.register_lowering(primitive, mlir.lower_fun(implementation, multiple_results=True))
+
+    def differentiated(primals, tangents, **how):
+        how_much = {key: value for key, value in how.items() if key != "avals"}
+        found = primitive.bind(*primals, **how)
+        moving = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero))
+        return found, _push_along(partial(derivative, **how_much), primals, tangents, moving, found)
+
+    ad.primitive_jvps[primitive] = differentiated
     return primitive
 
 
-def _push_shape(*avals, function, moving, aval):
-    return aval
-
-
-def _pull_shapes(*avals, function, moving):
+def _pull_avals(*avals, function, moving, count):
+    del function, count
     return [_strong(avals[i]) for i in moving]
 
 
-def _strong(aval):
-    return aval.update(weak_type=False)
+_push = _primitive("far_push", _pushed, _pushed_at, lambda *_, avals, **how: list(avals))
+_pull = _primitive("far_pull", _pulled, _pulled_at, _pull_avals)
 
 
-def _differentiated(implementation, primals, tangents, **how):
-    """Second derivatives: plain autodiff of the first."""
-    tangents = [ad.instantiate_zeros(t) for t in tangents]
-    return jax.jvp(partial(implementation, **how), tuple(primals), tuple(tangents))
-
-
-_push = _primitive("far_push", _pushed, _push_shape, several=False)
-_pull = _primitive("far_pull", _pulled, _pull_shapes, several=True)
-
-
-def _transposed(cotangent, *arguments, function, moving, aval):
-    del aval
+def _transposed(cotangents, *arguments, function, moving, avals):
+    del avals
     count = len(arguments) - len(moving)
-    nothing = [None] * count
-    if isinstance(cotangent, ad.Zero):
-        return [*nothing, *[None] * len(moving)]
     # A tangent that is known, not to be differentiated by, is left out.
     wanted = [ad.is_undefined_primal(x) for x in arguments[count:]]
+    if all(isinstance(x, ad.Zero) for x in cotangents):
+        return [None] * len(arguments)
     asked = tuple(i for i, want in zip(moving, wanted, strict=True) if want)
-    found = iter(_pull.bind(*arguments[:count], cotangent, function=function, moving=asked))
-    return [*nothing, *(next(found) if want else None for want in wanted)]
+    given = [*arguments[:count], *map(ad.instantiate_zeros, cotangents)]
+    found = iter(_pull.bind(*given, function=function, moving=asked, count=count))
+    return [*[None] * count, *(next(found) if want else None for want in wanted)]
 
 
-def _push_batched(arguments, dims, *, function, moving, aval):
-    count = len(arguments) - len(moving)
-    size = next(x.shape[d] for x, d in zip(arguments, dims, strict=True) if d is not None)
+def _push_batched(arguments, dims, *, function, moving, avals):
+    count, size = len(arguments) - len(moving), _batch_size(arguments, dims)
     is_batched = [d is not None for d in dims]
     for i, j in zip(moving, range(count, len(arguments)), strict=True):  # an array and its tangent go together
         is_batched[i] = is_batched[j] = is_batched[i] or is_batched[j]
-    arguments = [_to_front(x, d, size, b) for x, d, b in zip(arguments, dims, is_batched, strict=True)]
-    axes = tuple(0 if b else None for b in is_batched[:count])
-    over = _over_batch(function, axes)
-    return _push.bind(*arguments, function=over, moving=moving, aval=unmapped_aval(size, 0, aval)), 0
+    arguments = _to_front(arguments, dims, size, is_batched)
+    over = _over_batch(function, is_batched[:count], size)
+    avals = tuple(unmapped_aval(size, 0, aval) for aval in avals)
+    return _push.bind(*arguments, function=over, moving=moving, avals=avals), [0] * len(avals)
 
 
-def _pull_batched(arguments, dims, *, function, moving):
-    size = next(x.shape[d] for x, d in zip(arguments, dims, strict=True) if d is not None)
+def _pull_batched(arguments, dims, *, function, moving, count):
+    size = _batch_size(arguments, dims)
     # Gradients per batch element are asked for, not their sum: the arrays they are taken by become a batch.
-    is_batched = [d is not None or i in moving for i, d in enumerate(dims)]
-    is_batched[-1] = True
-    arguments = [_to_front(x, d, size, b) for x, d, b in zip(arguments, dims, is_batched, strict=True)]
-    axes = tuple(0 if b else None for b in is_batched[:-1])
-    results = _pull.bind(*arguments, function=_over_batch(function, axes, size), moving=moving)
-    return results, [0] * len(results)
+    is_batched = [d is not None or i in moving or i >= count for i, d in enumerate(dims)]
+    arguments = _to_front(arguments, dims, size, is_batched)
+    over = _over_batch(function, is_batched[:count], size)
+    return _pull.bind(*arguments, function=over, moving=moving, count=count), [0] * len(moving)
 
 
-def _over_batch(function: _Scaled, axes, size: int | None = None) -> _Scaled:
+def _over_batch(function: _Scaled, is_batched: list[bool], size: int) -> _Scaled:
+    axes = tuple(0 if batched else None for batched in is_batched)
     return lambda root, *arrays: jax.vmap(partial(function, root), in_axes=axes, axis_size=size)(*arrays)
 
 
-def _to_front(x: Array, dim: int | None, size: int, wanted: bool) -> Array:
-    x = jnp.asarray(x)
-    if dim is not None:
-        return jnp.moveaxis(x, dim, 0)
-    return jnp.broadcast_to(x, (size, *x.shape)) if wanted else x
+def _batch_size(arguments, dims) -> int:
+    return next(x.shape[d] for x, d in zip(arguments, dims, strict=True) if d is not None)
+
+
+def _to_front(arguments, dims, size: int, is_batched: list[bool]) -> list[Array]:
+    """The batch in front of every argument that has one, or is to have one."""
+    arguments = map(jnp.asarray, arguments)
+    return [
+        jnp.moveaxis(x, d, 0) if d is not None else jnp.broadcast_to(x, (size, *x.shape)) if batched else x
+        for x, d, batched in zip(arguments, dims, is_batched, strict=True)
+    ]
 
 
 ad.primitive_transposes[_push] = _transposed

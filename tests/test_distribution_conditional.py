@@ -408,6 +408,23 @@ def test_points_on_a_curve_to_rounding_are_said_to_be():
     assert line.error_estimate(turn + 0.1) < 1e-9  # before it, that is: the parabola is open upwards
 
 
+def test_far_points():
+    dist = _dist(1, 1.0)
+    marginal, far, t = dist.marginal([0]), jnp.array([[50.0], [-1e4], [1e6]]), jnp.full((3, 1), 0.3)
+    log_prob, time = LOG_PROB(marginal, far), dist.time_given_space(far)
+    assert np.isfinite(log_prob).all()
+    np.testing.assert_allclose(time.log_normalizer, log_prob, rtol=1e-12)
+    # Not at the modes: there the curve is narrower than times lie apart, and the density hangs on their rounding.
+    log_time = LOG_PROB(time, t[:, 0])
+    assert np.isfinite(log_time).all()
+    np.testing.assert_allclose(LOG_PROB(dist.condition([0], far), t), log_time, rtol=1e-12)
+    np.testing.assert_allclose(log_prob + log_time, LOG_PROB(dist, jnp.concatenate([far, t], -1)), rtol=1e-12)
+    assert np.isfinite([time.mean, time.variance, time.icdf(jnp.array(0.5))]).all()
+    near = jnp.array([[0.3], [3.0]])
+    assert (marginal.error_estimate(near) < 1e-9).all()
+    assert (dist.time_given_space(near).error_estimate < 1e-9).all()
+
+
 def test_divergent_densities():
     # On a ridge that stands still p(s) diverges for power (d-1) >= 2; next to it, it does not.
     still = _dist(2, 1.0, fold=ZeroFold(2)).marginal([0, 1])

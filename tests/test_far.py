@@ -138,3 +138,35 @@ def test_gradients_inside_shard_map():
             one, mesh=mesh, in_specs=(spec(), spec("i")), out_specs=spec() if argument == 0 else spec("i")
         )
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), jax.jit(sharded)(dist, x), one(dist, x))
+
+
+def _forward_overflows(root, x, small):
+    """1e60 x small, multiplied in the order that overflows forward only: backward it meets `small` first."""
+    factor = 1.0 if root is None else root
+    return factor * 1e30 * (factor * 1e30 * x) * small
+
+
+def test_forward_mode_is_true_where_backward_needs_no_help():
+    x, small = jnp.float32(1e-25), jnp.float32(1e-30)
+    function = lambda x, s: far_reaching(_forward_overflows, x, s)  # noqa: E731
+    assert np.isinf(jax.jvp(lambda x: _forward_overflows(None, x, small), (x,), (jnp.float32(1.0),))[1])
+    for jit in (lambda f: f, jax.jit):
+        slope = jit(lambda x: jax.jvp(lambda x: function(x, small), (x,), (jnp.float32(1.0),))[1])(x)
+        np.testing.assert_allclose(slope, 1e30, rtol=1e-6)
+        np.testing.assert_allclose(jit(jax.jacfwd(function))(x, small), 1e30, rtol=1e-6)
+
+
+def _deep(root, x, y, small):
+    """1e90 x y small: backward passes through 1e90, which only the roots below 2^-174 bring below 2^128."""
+    factor = 1.0 if root is None else root
+    return factor * 1e30 * (factor * 1e30 * (1e30 * (x * y * small)))
+
+
+def test_deep_roots_are_reached():
+    x, y, small = jnp.float32(1e-35), jnp.float32(1e-20), jnp.float32(1e-35)
+    for jit in (lambda f: f, jax.jit):
+        slope = jit(jax.grad(lambda x: far_reaching(_deep, x, y, small)))(x)
+        np.testing.assert_allclose(slope, 1e35, rtol=1e-5)
+        np.testing.assert_allclose(
+            jit(jax.vmap(jax.grad(lambda x: far_reaching(_deep, x, y, small))))(x[None]), 1e35, rtol=1e-5
+        )

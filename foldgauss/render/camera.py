@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._batch import known
 from foldgauss._checks import invalid, one_of
-from foldgauss.render.splats import Splats2D, pixels_per_unit
+from foldgauss.render.splats import Splats2D, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.
 FIELD_OF_VIEW = 0.6911112
@@ -45,17 +45,7 @@ class Gaussians3D(eqx.Module):
     color: Float[Array, "num channels"]
 
     def __check_init__(self) -> None:
-        shapes = [getattr(leaf, "shape", None) for leaf in (self.mean, self.factor, self.opacity, self.color)]
-        if any(shape is None for shape in shapes):
-            return  # a skeleton, as inside tree transformations
-        num = shapes[0][:-1]
-        fits = shapes == [(*num, 3), (*num, 3, 3), num, (*num, *shapes[3][-1:])] and len(shapes[3]) > len(num)
-        if not fits:
-            raise invalid(
-                "mean, factor, opacity, color",
-                expected="shapes (num, 3), (num, 3, 3), (num,), (num, channels)",
-                got=", ".join(map(str, shapes)),
-            )
+        check_shapes(self, mean=(3,), factor=(3, 3))
 
     @classmethod
     def from_flat(cls, splats: Splats2D, *, thickness: float = THICKNESS) -> "Gaussians3D":
@@ -189,6 +179,7 @@ class Camera(eqx.Module):
 
     def focal(self, size: tuple[int, int]) -> Float[Array, ""]:
         """Focal length in pixels of a picture of `size` = (height, width)."""
+        check_size(size)
         height, width = size
         aspect = height / width if self.aspect is None else self.aspect
         frame_width = pixels_per_unit(size, aspect=aspect) * min(1.0, 1 / aspect)
@@ -215,7 +206,7 @@ def project(
     u = (x/z, y/z) so held.
 
     Differentiable in every leaf of both, rank-deficient covariances included; the order is piecewise constant. Raises
-    ValueError for an unknown order and for a batch (`jax.vmap` takes one).
+    ValueError for an unknown order, a size below 1 and a batch (`jax.vmap` takes one).
 
     Example: `render(project(gaussians, Camera.front(0.5).orbit(0.4), (160, 320)), (160, 320))`.
 

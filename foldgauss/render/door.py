@@ -2,7 +2,6 @@
 
 import functools
 import math
-from numbers import Integral
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float
 from foldgauss._checks import invalid, one_of
 from foldgauss.render import cpu
 from foldgauss.render.reference import render_reference
-from foldgauss.render.splats import RenderOptions, Splats2D
+from foldgauss.render.splats import RenderOptions, Splats2D, check_size
 from foldgauss.render.xla import render_xla
 
 ENGINES = ("auto", "cpu", "xla", "reference")
@@ -52,7 +51,7 @@ def render(
     """
     one_of("engine", engine, ENGINES)
     one_of("compositing", compositing, COMPOSITINGS)
-    _check_size(size)
+    check_size(size)
     if splats.mean.ndim != 2:
         raise invalid(
             "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
@@ -102,12 +101,6 @@ def _finite_splats(splats: Splats2D) -> tuple[jax.Array, ...]:
         jnp.where(kept[:, None], leaf, jnp.zeros_like(leaf)).reshape(own.shape)
         for leaf, own in zip(flat, leaves, strict=True)
     )
-
-
-def _check_size(size: tuple[int, int]) -> None:
-    whole = isinstance(size, tuple | list) and all(isinstance(n, Integral) and n >= 1 for n in size)
-    if not (whole and len(size) == 2):
-        raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))

@@ -8,12 +8,11 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from foldgauss.render._cpu_kernels import THINNEST, WIDEST
 from foldgauss.render.splats import RenderOptions
 
-#: A splat is drawn if its standard deviations, along x at fixed y and along y, are between about 1e-6 and 1e12 px:
-#: what is thinner no pixel's centre meets but by design, what is wider float32 cannot follow. Bounds of 1 / (that
-#: deviation), in the unit in which the exponent is a power of two.
-WIDEST, THINNEST = 1e-12, 1e6
+# WIDEST and THINNEST are bounds of 1 / (a standard deviation) in the unit in which the exponent is a power of two. They
+# stand with the kernels, whose compiled code would not notice a change in another file.
 _PER_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from numbers import Integral
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,17 +31,7 @@ class Splats2D(eqx.Module):
     color: Float[Array, "num channels"]
 
     def __check_init__(self) -> None:
-        shapes = [getattr(leaf, "shape", None) for leaf in (self.mean, self.factor, self.opacity, self.color)]
-        if any(shape is None for shape in shapes):
-            return  # a skeleton, as inside tree transformations
-        num = shapes[0][:-1]
-        fits = shapes == [(*num, 2), (*num, 2, 2), num, (*num, *shapes[3][-1:])] and len(shapes[3]) > len(num)
-        if not fits:
-            raise invalid(
-                "mean, factor, opacity, color",
-                expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels)",
-                got=", ".join(map(str, shapes)),
-            )
+        check_shapes(self, mean=(2,), factor=(2, 2))
 
     def to_pixels(self, size: tuple[int, int], *, aspect: float | None = None) -> "Splats2D":
         """Model space to pixels of a picture of `size` = (height, width).
@@ -48,15 +39,38 @@ class Splats2D(eqx.Module):
         `aspect` is the model frame's height / width (default: the picture's own). Where the two differ the
         frame covers the picture and what sticks out is cut off evenly, as a centre crop does.
         """
+        scale = pixels_per_unit(size, aspect=aspect)
         height, width = size
-        scale = pixels_per_unit(size, aspect=height / width if aspect is None else aspect)
         centre = jnp.asarray([[width / 2, height / 2]], self.mean.dtype)
         return Splats2D(self.mean * scale + centre, self.factor * scale, self.opacity, self.color)
 
 
-def pixels_per_unit(size: tuple[int, int], *, aspect: float) -> float:
-    """Pixels along one unit of model space when a frame of height/width `aspect` covers `size`."""
+def check_shapes(splats: eqx.Module, **geometry: tuple[int, ...]) -> None:
+    """Raise unless the leaves fit: for one splat those named have these shapes, opacity (), color (channels,)."""
+    names = [*geometry, "opacity", "color"]
+    shapes = [getattr(getattr(splats, name), "shape", None) for name in names]
+    if any(shape is None for shape in shapes):
+        return  # a skeleton, as inside tree transformations
+    *_, num, color = shapes
+    own = [(*num, *shape) for shape in geometry.values()]
+    if shapes != [*own, num, (*num, *color[-1:])] or len(color) == len(num):
+        texts = [f"(num, {', '.join(map(str, shape))})" for shape in geometry.values()]
+        expected = f"shapes {', '.join(texts)}, (num,), (num, channels)"
+        raise invalid(", ".join(names), expected=expected, got=", ".join(map(str, shapes)))
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raise unless `size` is that of a picture, (height, width)."""
+    whole = isinstance(size, tuple | list) and all(isinstance(n, Integral) and n >= 1 for n in size)
+    if not (whole and len(size) == 2):
+        raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
+
+
+def pixels_per_unit(size: tuple[int, int], *, aspect: float | None = None) -> float:
+    """Pixels along one unit of model space when a frame of height/width `aspect` covers `size` (None: its own)."""
+    check_size(size)
     height, width = size
+    aspect = height / width if aspect is None else aspect
     unit_height, unit_width = min(1.0, aspect), min(1.0, 1 / aspect)
     return max(height / unit_height, width / unit_width)
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from foldgauss._batch import known
 from foldgauss._checks import invalid
 from foldgauss.render.camera import THICKNESS, Gaussians3D
+from foldgauss.render.splats import check_shapes
 
 #: A sine of the angle between two edges that is rounding, in units of the dtype's epsilon.
 COLLINEAR = 8.0
@@ -32,17 +33,7 @@ class Triangles(eqx.Module):
     color: Float[Array, "num channels"]
 
     def __check_init__(self) -> None:
-        shapes = [getattr(leaf, "shape", None) for leaf in (self.origin, self.edges, self.opacity, self.color)]
-        if any(shape is None for shape in shapes):
-            return  # a skeleton, as inside tree transformations
-        num = shapes[0][:-1]
-        fits = shapes == [(*num, 3), (*num, 2, 3), num, (*num, *shapes[3][-1:])] and len(shapes[3]) > len(num)
-        if not fits:
-            raise invalid(
-                "origin, edges, opacity, color",
-                expected="shapes (num, 3), (num, 2, 3), (num,), (num, channels)",
-                got=", ".join(map(str, shapes)),
-            )
+        check_shapes(self, origin=(3,), edges=(2, 3))
 
     @classmethod
     def from_vertices(

@@ -203,8 +203,7 @@ def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> C
     t = np.float32(t)
     alive = np.flatnonzero((window[:, 0] < t) & (t < window[:, 1]))
     num, (height, width) = len(alive), shape.size
-    aspect = height / width if shape.aspect is None else shape.aspect
-    unit = np.float32(pixels_per_unit(shape.size, aspect=aspect))
+    unit = np.float32(pixels_per_unit(shape.size, aspect=shape.aspect))
     mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
     opacity, color = np.empty(num, np.float32), np.empty((num, 3), np.float32)
     constants = np.float32([width / 2, height / 2, shape.power, shape.floor])

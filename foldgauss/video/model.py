@@ -12,6 +12,7 @@ from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.fold import PolynomialFold
 from foldgauss.render import RenderOptions, Splats2D, render
+from foldgauss.render.splats import check_size
 from foldgauss.video.frame_times import FrameTimes
 
 #: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
@@ -129,6 +130,7 @@ class VideoModel(eqx.Module):
     ) -> Float[Array, "height width 3"]:
         """The picture at any time t in [0, 1], values about [0, 1]; see `foldgauss.render.render`."""
         size = self.size if size is None else size
+        check_size(size)
         splats = _splats_in_pixels(self, jnp.asarray(t, jnp.float32), tuple(size))
         return render(splats, size, engine=engine, options=self.options)
 

@@ -13,7 +13,9 @@ from jaxtyping import Float, UInt8
 from foldgauss._checks import invalid
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
-from foldgauss.render import cpu
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import Splats2D, cpu
+from foldgauss.render.splats import check_size
 from foldgauss.video.conditioning import Shape, condition, update_windows
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import pack
@@ -31,25 +33,30 @@ class Playback:
     **Example:** `for picture in Playback(model).frames(): ...`
 
     **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for a size that is none, and for a model
-    with NaN or infinities in it (its pictures would have holes).
+    with NaN or infinities in it (its pictures would have holes) or with several envelopes.
     """
 
     def __init__(self, model: VideoModel, size: tuple[int, int] | None = None):
         self.model = model
-        self.size = tuple(model.size if size is None else size)
-        if len(self.size) != 2 or min(self.size) < 1:
-            raise invalid("size", expected="(height, width), both >= 1", got=size)
+        size = model.size if size is None else size
+        check_size(size)
+        self.size = tuple(size)
         self._rows = pack(model.splats)
         broken = int((~np.isfinite(self._rows)).any(-1).sum())
         if broken:
             got, cure = f"{broken:,} Gaussians that have none", "The fit diverged, or the model was edited: fit again."
             raise invalid("model", expected="finite numbers", got=got, cure=cure)
-        power, floor = (float(np.ravel(x)[0]) for x in (model.splats.envelope.power, model.splats.envelope.floor))
+        power, floor = (_the_one(model.splats.envelope, name) for name in ("power", "floor"))
         height, width = model.size
         self._shape = Shape(model.splats.degree, power, floor, self.size, aspect=height / width)
         self._window = np.empty((len(self._rows), 2), np.float32)
         update_windows(self._rows, np.arange(len(self._rows)), self._window)
         self._black = np.zeros(3, np.float32)
+
+    def splats(self, t: float) -> Splats2D:
+        """The splats of the Gaussians alive at time t, in pixels of a picture of `size`; NumPy leaves."""
+        done = condition(self._rows, self._window, t, self._shape)
+        return Splats2D(done.mean, done.factor, done.opacity, done.color)
 
     def frame(self, t: float) -> UInt8[np.ndarray, "height width 3"]:
         """The picture at time t."""
@@ -61,9 +68,19 @@ class Playback:
             yield self.frame(t)
 
     def _image(self, t: float) -> Float[np.ndarray, "3 height width"]:
-        splats = condition(self._rows, self._window, t, self._shape)
+        splats = self.splats(t)
         leaves = splats.mean, splats.factor, splats.opacity, splats.color
         return cpu.forward(*leaves, self._black, self.size, options=self.model.options).image
+
+
+def _the_one(envelope: TimeLikelihood, name: str) -> float:
+    """The number that all Gaussians share."""
+    values = np.unique(np.asarray(getattr(envelope, name)))
+    if values.size != 1:
+        got = f"{values.size} different ones"
+        cure = "Use VideoModel.render, which knows an envelope of each Gaussian's own."
+        raise invalid(f"model.splats.envelope.{name}", expected="one number for all Gaussians", got=got, cure=cure)
+    return float(values[0])
 
 
 def to_bytes(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "height width 3"]:

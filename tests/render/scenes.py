@@ -1,5 +1,6 @@
-"""Random splats of every temper, for the engines to agree on."""
+"""Random splats of every temper, for the engines to agree on; and what their gradients must be."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -32,3 +33,17 @@ def scene(kind: str = "plain", *, seed: int = 0, dtype=np.float32) -> tuple[Spla
     turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
     leaves = mean, turn * scale, rng.uniform(*opacities, num), rng.uniform(0, 1, (num, 3))
     return Splats2D(*(jnp.asarray(leaf, dtype) for leaf in leaves)), (height, width)
+
+
+def check_slope(loss, splats: Splats2D, leaf: str, *, rtol: float) -> None:
+    """The gradient of a loss by one leaf, along a random direction, against finite differences."""
+    gradient = getattr(jax.grad(loss)(splats), leaf)
+    direction = jnp.asarray(np.random.default_rng(3).normal(size=gradient.shape))
+
+    def along(step):
+        leaves = {name: getattr(splats, name) for name in ("mean", "factor", "opacity", "color")}
+        leaves[leaf] = leaves[leaf] + step * direction
+        return loss(Splats2D(**leaves))
+
+    numeric = (along(1e-5) - along(-1e-5)) / 2e-5
+    np.testing.assert_allclose(jnp.sum(gradient * direction), numeric, rtol=rtol)

@@ -472,6 +472,8 @@ def test_dtypes():
         (lambda: Camera(jnp.eye(2), jnp.zeros(3), jnp.ones(())), "rotation, position, fov"),
         (lambda: project(flat_scene(3), Camera.front(0.5), SIZE, order="back"), "order"),
         (lambda: project(flat_scene(3), Camera.front(0.5), SIZE, near=-1.0), "near"),
+        (lambda: project(flat_scene(3), Camera.front(0.5), (0, 5)), "size"),
+        (lambda: Camera.front(0.5).focal((160.0, 320)), "size"),
         (
             lambda: project(jax.tree.map(lambda x: x[None], flat_scene(3)), Camera.front(0.5), SIZE),
             "jax.vmap",

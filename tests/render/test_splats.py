@@ -28,6 +28,36 @@ def test_to_pixels_keeps_the_centre_and_scales_all_lengths():
     np.testing.assert_allclose(pixels.factor, factor * 320)
 
 
+@pytest.mark.parametrize("size", [(0, 5), (5,), (5, 5, 3), (2.5, 5), 5, None, "55"])
+def test_bad_sizes_of_pictures(size):
+    splats = Splats2D(jnp.zeros((1, 2)), jnp.eye(2)[None], jnp.ones(1), jnp.ones((1, 3)))
+    for call in (splats.to_pixels, lambda size: pixels_per_unit(size, aspect=1.0)):
+        with pytest.raises(ValueError, match=r"^size: expected \(height, width\)"):
+            call(size)
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        ((4, 2), (4, 2, 2), (3,), (4, 3)),
+        ((4, 2), (4, 2), (4,), (4, 3)),
+        ((4, 3), (4, 2, 2), (4,), (4, 3)),
+        ((4, 2), (4, 2, 2), (4,), (4,)),
+        ((2,), (2, 2), (), ()),
+        ((), (2, 2), (), (3,)),
+    ],
+)
+def test_bad_shapes(shapes):
+    expected = r"shapes \(num, 2\), \(num, 2, 2\), \(num,\), \(num, channels\)"
+    with pytest.raises(ValueError, match=f"^mean, factor, opacity, color: expected {expected}, got "):
+        Splats2D(*map(jnp.zeros, shapes))
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 4), (0,)])
+def test_good_shapes(batch):
+    Splats2D(*(jnp.zeros((*batch, *shape)) for shape in ((2,), (2, 2), (), (3,))))
+
+
 @pytest.mark.parametrize("field", ["alpha_cutoff", "alpha_ceiling", "low_pass", "transmittance_stop", "support_radius"])
 @pytest.mark.parametrize("value", [-1.0, float("nan"), "much", float("inf")])
 def test_bad_options(field, value):

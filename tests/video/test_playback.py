@@ -42,6 +42,31 @@ def test_frames_are_those_of_the_frame_times():
     np.testing.assert_array_equal(np.stack(list(model.frames())), played)
 
 
+def test_splats_are_those_of_the_model_that_are_alive():
+    model, t = eqx.tree_at(lambda m: m.splats.log_time_scale, _model(), replace_fn=lambda x: x - 1.5), 0.31
+    fast, slow = Playback(model, (60, 41)).splats(t), model.at(jnp.float32(t), (60, 41))
+    alive = np.asarray(slow.opacity) > 0
+    assert 0 < len(fast.opacity) == alive.sum() < alive.size
+    covariance = lambda factor: np.asarray(factor) @ np.asarray(factor).mT  # noqa: E731
+    np.testing.assert_allclose(fast.mean, slow.mean[alive], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(covariance(fast.factor), covariance(slow.factor[alive]), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(fast.opacity, slow.opacity[alive], rtol=1e-6)
+    np.testing.assert_allclose(fast.color, slow.color[alive], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["power", "floor"])
+def test_one_envelope_for_all(name):
+    model = _model(floor=0.1)
+    values = np.full(300, getattr(model.splats.envelope, name), np.float32)
+    some = lambda values: eqx.tree_at(lambda m: getattr(m.splats.envelope, name), model, jnp.asarray(values))  # noqa: E731
+    np.testing.assert_array_equal(Playback(some(values)).frame(0.31), Playback(model).frame(0.31))
+    values[7] *= 2
+    message = rf"^model\.splats\.envelope\.{name}: expected one number for all Gaussians, got 2 .*VideoModel\.render"
+    with pytest.raises(ValueError, match=message):
+        Playback(some(values))
+    assert bool(jnp.isfinite(some(values).render(0.31)).all())  # the cure
+
+
 def test_bytes_are_rounded_and_held():
     image = np.broadcast_to(np.float32([-3, 0, 0.5 / 255 - 1e-6, 0.5 / 255 + 1e-6, 1, 7, np.inf]), (3, 2, 7))
     np.testing.assert_array_equal(to_bytes(np.ascontiguousarray(image))[1, :, 0], [0, 0, 0, 1, 255, 255, 255])
@@ -49,8 +74,10 @@ def test_bytes_are_rounded_and_held():
 
 def test_bad_models_and_sizes_are_refused():
     model = _model()
-    with pytest.raises(ValueError, match="size"):
-        Playback(model, (0, 5))
+    for size in ((0, 5), (5.5, 5), 5):
+        for call in (Playback, lambda model, size: model.render(0.0, size)):
+            with pytest.raises(ValueError, match=r"^size: expected \(height, width\)"):
+                call(model, size)
     broken = eqx.tree_at(lambda m: m.splats.loc, model, jnp.asarray(model.splats.loc).at[3].set(jnp.nan))
     with pytest.raises(ValueError, match="finite"):
         Playback(broken)
