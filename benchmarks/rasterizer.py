@@ -13,6 +13,11 @@ timed with one thread and with two. Backward is the gradient of <image, g> by me
 background, the forward pass included. The reference is dense, so it draws only as many splats as make about 1e7
 pairs of its own, pixels times splats.
 
+`cpu` is timed twice: its own functions, as playback and fitting call them, and through the jitted `render` with two
+threads ("cpu, render"), which is the door that engine "xla" has: checks, copies in and out of JAX and, in the backward
+pass, a second forward one are then counted. `xla_over_cpu_forward` and `xla_over_cpu_forward_backward` compare the
+engines through that door; all other figures of `cpu` are of its own functions.
+
 The C++ rivals (`rasterizer_kernel.cpp`, compiled on the spot) are serial and get their lists for nothing:
 
 * `cpu_over_cpp`: one thread of the engine's `forward_row` calls, which list by tile and blend, over C++ `exact`, the
@@ -218,32 +223,32 @@ def rival_tasks(case: Case, compiled: _rivals.Compiled | None) -> dict[str, Task
     return tasks
 
 
-def xla_tasks(scene: Scene) -> dict[str, Task]:
-    *parts, background, gradient = jax.device_put((*scene.leaves, np.moveaxis(scene.grad_image, 0, -1)))
-    forward, both = _jitted(scene.size, "xla", RenderOptions(list_capacity=_capacity(scene)))
-    splats = Splats2D(*parts)
-    return {
-        "xla forward": Task(lambda: forward(splats, background).block_until_ready()),
-        "xla both": Task(lambda: jax.block_until_ready(both(splats, background, gradient))),
-    }
+def render_tasks(case: Case) -> dict[str, Task]:
+    """Engines through the jitted `render`: XLA, the CPU engine with its most threads, the reference with few splats."""
+    scene, threads = case.scene, max(THREADS)
+    gradient, room = np.moveaxis(scene.grad_image, 0, -1), RenderOptions(list_capacity=_capacity(scene))
+    tasks = {}
+    for engine, name, options, num, *prepare in (
+        ("xla", "xla {}", room, scene.num_splats),
+        ("cpu", f"cpu, render {{}} {threads}", None, scene.num_splats, functools.partial(_use_threads, threads)),
+        ("reference", "reference {}", None, case.reference_splats),
+    ):
+        *parts, background = scene.leaves
+        own = jax.device_put((Splats2D(*(leaf[:num] for leaf in parts)), background, gradient))
+        draw, differentiate = _jitted(scene.size, engine, options)
+        tasks[name.format("forward")] = Task(functools.partial(_wait_for, draw, *own[:2]), *prepare)
+        tasks[name.format("both")] = Task(functools.partial(_wait_for, differentiate, *own), *prepare)
+    return tasks
+
+
+def _wait_for(function, *arguments):
+    return jax.block_until_ready(function(*arguments))
 
 
 def _capacity(scene: Scene) -> int:
     """Room for all slots of engine "xla" at once, as it would count them itself outside `jit`."""
     tiles = -(-scene.size[0] // XLA_TILE) * -(-scene.size[1] // XLA_TILE)
     return 1 << (max(num_boxes(scene, XLA_TILE), tiles) - 1).bit_length()
-
-
-def reference_tasks(case: Case) -> dict[str, Task]:
-    scene = case.scene
-    *parts, background = scene.leaves
-    splats = jax.device_put(Splats2D(*(leaf[: case.reference_splats] for leaf in parts)))
-    gradient = jax.device_put(np.moveaxis(scene.grad_image, 0, -1))
-    forward, both = _jitted(scene.size, "reference", RenderOptions())
-    return {
-        "reference forward": Task(lambda: forward(splats, background).block_until_ready()),
-        "reference both": Task(lambda: jax.block_until_ready(both(splats, background, gradient))),
-    }
 
 
 def _jitted(size, engine, options):
@@ -289,7 +294,7 @@ def check_agreement(case: Case, compiled: _rivals.Compiled | None) -> float:
 
 def measure(case: Case, rounds: int, compiled: _rivals.Compiled | None) -> dict[str, list[float]]:
     """Seconds of every round, by task."""
-    tasks = cpu_tasks(case.scene) | rival_tasks(case, compiled) | xla_tasks(case.scene) | reference_tasks(case)
+    tasks = cpu_tasks(case.scene) | rival_tasks(case, compiled) | render_tasks(case)
     try:
         return interleaved(tasks, rounds)
     finally:
@@ -329,6 +334,7 @@ def scene_figures(case: Case, seconds: dict[str, float]) -> dict[str, float]:
     pairs = case.pairs
     own = case.scene.size[0] * case.scene.size[1] * case.reference_splats
     forward, both, alone = seconds["cpu forward 2"], seconds["cpu both 2"], seconds["cpu forward 1"]
+    through = {what: seconds[f"cpu, render {what} {max(THREADS)}"] for what in ("forward", "both")}
     figures = {
         "cpu_forward_ns_per_pair": forward * 1e9 / pairs.listed,
         "cpu_forward_backward_ns_per_pair": both * 1e9 / pairs.listed,
@@ -342,8 +348,10 @@ def scene_figures(case: Case, seconds: dict[str, float]) -> dict[str, float]:
         "cpu_forward_backward_1_thread_ms": seconds["cpu both 1"] * 1e3,
         "xla_forward_ms": seconds["xla forward"] * 1e3,
         "xla_forward_backward_ms": seconds["xla both"] * 1e3,
-        "xla_over_cpu_forward": seconds["xla forward"] / forward,
-        "xla_over_cpu_forward_backward": seconds["xla both"] / both,
+        "cpu_render_forward_ms": through["forward"] * 1e3,
+        "cpu_render_forward_backward_ms": through["both"] * 1e3,
+        "xla_over_cpu_forward": seconds["xla forward"] / through["forward"],
+        "xla_over_cpu_forward_backward": seconds["xla both"] / through["both"],
         "exact_over_plain": seconds["plain image forward 1"] / alone,
         "exact_over_plain_loop": seconds["plain forward 1"] / alone,
         "reference_forward_ns_per_pair": seconds["reference forward"] * 1e9 / own,

@@ -2,7 +2,8 @@
 // on the spot and calls it through ctypes. Tiles are 16x16, a row of a tile is one AVX-512 vector; everything is float.
 //
 //   plain  every pixel of every listed pair, the textbook loop: no tile is left early, no pixel row is skipped
-//   exact  what the engine does with the same lists: only the pixel rows that a splat reaches, a tile left once dark
+//   exact  what the engine does with the same lists: only the pixel rows that a splat reaches and that have light left,
+//          a tile left once dark
 //
 // Columns of `geometry` and of the blocks are those of `foldgauss/render/_cpu_kernels.py`:
 // alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2), drawn where the exponent is at least LEAST.
@@ -32,6 +33,13 @@ inline Row power_of_two(Row x) {
     return reinterpret_cast<Row>(reinterpret_cast<Whole>(y) + (whole << 23));
 }
 
+inline bool all_dark(Row light, float finished) {
+    const Whole lit = light > finished;
+    int any = 0;
+    for (int x = 0; x < TILE; ++x) any |= lit[x];
+    return !any;
+}
+
 struct Tile {
     Row light[TILE], color[CHANNELS][TILE];
 
@@ -43,9 +51,7 @@ struct Tile {
     bool dark(float finished) const {
         Row most = light[0];
         for (int y = 1; y < TILE; ++y) most = most > light[y] ? most : light[y];
-        float highest = most[0];
-        for (int x = 1; x < TILE; ++x) highest = std::max(highest, most[x]);
-        return highest <= finished;
+        return all_dark(most, finished);
     }
 
     void write(const float *background, float *image, float *out, int top, int left, int height, int width) const {
@@ -97,7 +103,7 @@ void blend_block(int num, const float *block, const int *first, const int *last,
             shear[e] = block[Q * BLOCK + e] * dy - block[P * BLOCK + e] * block[X * BLOCK + e];
             drop[e] = block[LOG * BLOCK + e] - along * along;
         }
-        if (!left) continue;
+        if (!left || all_dark(tile.light[row], finished)) continue;
         Row light = tile.light[row], color[CHANNELS];
         for (int c = 0; c < CHANNELS; ++c) color[c] = tile.color[c][row];
         for (; left; left &= left - 1) {

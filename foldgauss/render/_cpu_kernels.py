@@ -27,9 +27,10 @@ from foldgauss.render._vectors import (
 TILE = LANES  # a row of a tile is one vector
 PIXELS = TILE * TILE
 _SHIFT = 4  # log2(TILE)
-#: A splat is drawn if its standard deviations, along x at fixed y and along y, are between about 1e-6 and 1e12 px:
-#: what is thinner no pixel's centre meets but by design, what is wider float32 cannot follow.
-WIDEST, THINNEST = 1e-12, 1e6
+#: A splat is drawn if it is thicker than about 1e-6 px (standard deviations along x at fixed y, and along y at fixed x)
+#: and, over all, not wider or higher than 1e9 px: what is thinner no pixel's centre meets but by design, and of what is
+#: wider float32 does not hold the determinant. Within these bounds nothing here overflows.
+WIDEST, THINNEST = 1e-9, 1e6
 #: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
 SLACK = np.float32(1e-3)
 
@@ -96,8 +97,9 @@ def project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff,
         det = area * area + low_pass * (xx + yy - low_pass)
         inverse = 1.0 / yy
         p, r = math.sqrt(half_log2e * (yy / det)), math.sqrt(half_log2e * inverse)
+        q = -xy * inverse * p
         # Also false for NaN, and for a determinant of 0.
-        drawable = p > WIDEST and p < THINNEST and r > WIDEST and r < THINNEST
+        drawable = p < THINNEST and q * q + r * r < THINNEST**2 and max(xx, yy) < half_log2e / WIDEST**2
         if not (drawable and opacity[i] >= cutoff):
             continue
         log = math.log2(opacity[i])
@@ -110,7 +112,7 @@ def project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff,
         geometry[i, _X] = x
         geometry[i, _Y] = y
         geometry[i, _P] = p
-        geometry[i, _Q] = -xy * inverse * p
+        geometry[i, _Q] = q
         geometry[i, _R] = r
         geometry[i, _LOG] = log
         geometry[i, _LEAST] = max(log_cutoff, log - radius)
@@ -176,8 +178,9 @@ def _tiles_of(num, block, upper, lower, width, first, end):
         right = x + _edge(p, q, r, level, min(max(turn, upper - y), lower - y))
         left = x - _edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
         # Held within the picture before the cast; truncated, as ceil and floor would be calls into libm here.
-        low = min(max(left - _f(0.5), _f(0.0)), width)
-        high = min(max(right - _f(0.5), _f(-1.0)), width - _f(1.0))
+        # The bound stands first in `max`, which so makes it of NaN, whose cast could be any number.
+        low = min(max(_f(0.0), left - _f(0.5)), width)
+        high = min(max(_f(-1.0), right - _f(0.5)), width - _f(1.0))
         column = _i(low)
         column += _i(_f(column) < low)
         stop = _i(high + _f(1.0))
@@ -232,8 +235,9 @@ def _pixel_rows(x, y, p, q, r, level):
     half_above = math.sqrt(max(square * level - (p * r * above) * (p * r * above), _f(0.0)))
     half_below = math.sqrt(max(square * level - (p * r * below) * (p * r * below), _f(0.0)))
     # Held within the tile before the cast; truncated, as ceil and floor would be calls into libm here.
-    low = min(max(y - (shear * below + half_below) * inverse, _f(0.0)), _f(TILE))
-    high = min(max(y - (shear * above - half_above) * inverse, _f(-1.0)), _f(TILE - 1))
+    # NaN, too: see `_tiles_of`.
+    low = min(max(_f(0.0), y - (shear * below + half_below) * inverse), _f(TILE))
+    high = min(max(_f(-1.0), y - (shear * above - half_above) * inverse), _f(TILE - 1))
     first = _i(low)
     first += _i(_f(first) < low)
     return first, _i(high + _f(1.0))
@@ -496,8 +500,8 @@ def _unblend(begin, end, items, shear, e, block, scratch, notes, background, ove
     """Add the gradient sums of splat e, items begin..end of a tile, to its slot; light from behind moves before it.
 
     With B the light, times incoming gradient, that one unit of light would bring back from behind the splat,
-    dL/dalpha = T (c . g - B): nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha from which on it
-    does not follow the exponent. `many`: room for the sums of the channels beyond FEW.
+    dL/dalpha = T (c . g - B): nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha that `_note` capped
+    at, from which on it does not follow the exponent. `many`: room for the sums of the channels beyond FEW.
     """
     num, limit, none, columns = _u(len(background)), every(flat), every(_f(0.0)), lanes()
     slant = every(block[_u(_P * BLOCK) + e])
@@ -581,7 +585,7 @@ def backward_row(
     """Gradient sums of every entry of one row, into its slots; arguments as `forward_row` took and gave them."""
     channels, (height, width) = len(background), grad_image.shape[1:]
     top = row * TILE
-    flat = ceiling if ceiling < _f(1.0) else _f(2.0)  # without a ceiling, alpha 1 still follows the exponent
+    flat = ceiling * _f(1.0 + 2.0**-23)  # the next float: an alpha at the ceiling itself follows the exponent
     entries, slots = entries[row_start[row] : row_start[row + 1]], slots[row_start[row] : row_start[row + 1]]
     slots[:] = 0.0
     scratch, block = _aligned((2 + channels) * PIXELS), _aligned((_COLOR + channels) * BLOCK)
@@ -612,7 +616,7 @@ def backward_row(
                     scratch[p] = lights[kept, p]
             else:
                 scratch[:PIXELS] = 1.0
-            _note(num_items, items, shear, drop, block, scratch, notes, over, ceiling, finished)
+            _note(num_items, items, shear, drop, block, scratch, notes, over, flat, finished)
             end = num_items
             for e in range(len(part) - 1, -1, -1):
                 begin = end - _u(last[e] - first[e])

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._batch import known
 from foldgauss._checks import invalid, one_of
-from foldgauss.render.splats import Splats2D, check_shapes, check_size, pixels_per_unit
+from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.
 FIELD_OF_VIEW = 0.6911112
@@ -107,7 +107,7 @@ class Camera(eqx.Module):
             expected, got = "shapes (3, 3), (3,), ()", ", ".join(map(str, shapes))
             raise invalid("rotation, position, fov", expected=expected, got=got)
         if self.aspect is not None:
-            _check_aspect(self.aspect)
+            check_aspect(self.aspect)
         fov = known(self.fov)
         if fov is not None and not ((fov > 0) & (fov < math.pi)).all():
             raise invalid("fov", expected="radians in (0, pi)", got=fov, cure="For degrees use math.radians.")
@@ -119,7 +119,7 @@ class Camera(eqx.Module):
         It stands at (0, 0, -d) and looks along z, where d = min(1, 1 / aspect) / (2 tan(fov / 2)).
         Source: VeGaS, "Video Gaussian Splatting" (two opposing cameras); field of view of the published code.
         """
-        _check_aspect(aspect)
+        check_aspect(aspect)
         fov = _as_float(fov)
         distance = min(1.0, 1 / aspect) / (2 * jnp.tan(fov / 2))
         return cls(jnp.eye(3, dtype=fov.dtype), -distance * jnp.asarray([0, 0, 1], fov.dtype), fov, aspect)
@@ -214,6 +214,9 @@ def project(
     eq. 5, and its published rasteriser for the 1.3.
     """
     one_of("order", order, ORDERS)
+    for name, value, kind in (("gaussians", gaussians, Gaussians3D), ("camera", camera, Camera)):
+        if not isinstance(value, kind):
+            raise invalid(name, expected=kind.__name__, got=type(value).__name__)
     if not (isinstance(near, Real) and near >= 0):
         raise invalid("near", expected="a depth >= 0 in model units", got=near)
     if gaussians.mean.ndim != 2 or camera.position.ndim != 1:
@@ -296,8 +299,3 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
 
 def _as_float(x: ArrayLike) -> Array:
     return jnp.asarray(x, jnp.result_type(float))
-
-
-def _check_aspect(aspect: float) -> None:
-    if not (isinstance(aspect, Real) and 0 < aspect < math.inf):
-        raise invalid("aspect", expected="a frame's height / width, one positive number", got=aspect)

@@ -44,8 +44,8 @@ def solve_colors(
     - `tolerance`, `max_iterations`: conjugate gradient stops once the residual of the normal equations has fallen by
       this factor in every channel, or after so many products with A and its transpose.
 
-    Returns (num, channels). Raises ValueError where frames and images do not fit together. Not for use inside `jit`:
-    when to stop is decided on the host.
+    Returns (num, channels). Raises ValueError where frames and images do not fit together or hold numbers that are not
+    finite. Not for use inside `jit`: when to stop is decided on the host.
 
     Example: `Splats2D(mean, factor, opacity, solve_colors(splats, image))`.
 
@@ -54,6 +54,10 @@ def solve_colors(
     frames, images = _frames(splats, images)
     if not ridge >= 0:
         raise invalid("ridge", expected="a number >= 0", got=ridge)
+    # Below single precision the descent loses its way.
+    dtype = frames[0].color.dtype
+    if dtype.itemsize < 4:
+        frames, images = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (frames, images))
     start = frames[0].color
     how = {"compositing": compositing, "engine": engine, "options": options}
 
@@ -79,7 +83,8 @@ def solve_colors(
         return transpose(forward(colors)) + damping * colors
 
     right = transpose(jax.tree.map(jnp.subtract, images, drawn))
-    return start + _conjugate_gradient(normal, right, row_sums + damping, tolerance, max_iterations)
+    found = start + _conjugate_gradient(normal, right, row_sums + damping, tolerance, max_iterations)
+    return found.astype(dtype)
 
 
 def _conjugate_gradient(normal, right, scale, tolerance: float, max_iterations: int) -> Float[Array, "num channels"]:
@@ -121,4 +126,9 @@ def _frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
     for image in images:
         if image.ndim != 3 or image.shape[-1] != shape[-1]:
             raise invalid("images", expected=f"shape (height, width, {shape[-1]})", got=image.shape)
+    # One NaN would end the descent of every channel at its first step.
+    for name, arrays in (("images", images), ("splats.color", [splats[0].color])):
+        wrong = sum(int(jnp.sum(~jnp.isfinite(one))) for one in arrays)
+        if wrong:
+            raise invalid(name, expected="finite numbers", got=f"{wrong} that are NaN or infinite")
     return splats, images

@@ -29,7 +29,7 @@ import numpy as np
 from foldgauss._checks import invalid
 from foldgauss._threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
-from foldgauss.render.splats import RenderOptions
+from foldgauss.render.splats import RenderOptions, check_size
 
 TILE, PIXELS = kernels.TILE, kernels.PIXELS
 CHUNK = 8192  # splats per task where splats, not rows, are shared out
@@ -84,7 +84,8 @@ def forward(
     """Render float32 splats: shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), in pixels.
 
     Returns the trace: its `image` is planar, (channels, height, width), its `statistics` are there if asked for.
-    Any number of channels from 1 on; kernels for 1 to 4 are compiled each, one for all others.
+    Any number of channels from 1 on; kernels for 1 to 4 are compiled each, one for all others. Raises ValueError for
+    a tile size that is not this engine's, and where colours and background have not the same channels, at least one.
     """
     leaves = (mean, factor, opacity, color, background)
     return forward_frames([leaves], size, compositing=compositing, options=options, statistics=statistics)[0]
@@ -98,9 +99,15 @@ def forward_frames(
     options: RenderOptions | None = None,
     statistics: bool = False,
 ) -> list[Trace]:
-    """`forward` of several frames at once, (mean, factor, opacity, color, background) each: fewer waits for threads."""
+    """`forward` of several frames at once, (mean, factor, opacity, color, background) each: fewer waits for threads.
+
+    Raises ValueError as `forward`.
+    """
     options = RenderOptions() if options is None else options
     check_options(options)
+    check_size(size)
+    for frame in frames:
+        _check_leaves(*frame)
     drafts = [_Draft(frame, size, compositing, options, statistics) for frame in frames]
     run_tasks(lambda task: task[0].project(task[1]), [(one, start) for one in drafts for start in one.chunks])
     run_tasks(_Draft.bucket, drafts)
@@ -108,6 +115,26 @@ def forward_frames(
     if statistics:
         run_tasks(lambda task: task[0].gather(task[1]), [(one, start) for one in drafts for start in one.chunks])
     return [one.trace() for one in drafts]
+
+
+def _check_leaves(mean, factor, opacity, color, background) -> None:
+    """Raise unless the arrays fit together: the kernels check no bounds."""
+    leaves = (mean, factor, opacity, color, background)
+    shapes, dtypes = [np.shape(leaf) for leaf in leaves], {getattr(leaf, "dtype", None) for leaf in leaves}
+    num, channels = shapes[2][:1], shapes[4][:1]
+    if (
+        shapes != [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
+        or channels == (0,)
+        or not (num and channels)
+    ):
+        raise invalid(
+            "mean, factor, opacity, color, background",
+            expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel",
+            got=", ".join(map(str, shapes)),
+        )
+    if dtypes != {np.dtype(np.float32)}:
+        got = ", ".join(sorted(str(dtype) for dtype in dtypes))
+        raise invalid("mean, factor, opacity, color, background", expected="float32 NumPy arrays", got=got)
 
 
 class _Draft:
@@ -161,12 +188,18 @@ class _Draft:
 
 
 def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Gradients of mean, factor, opacity, color and background, given dL/dimage, planar (channels, height, width)."""
+    """Gradients of mean, factor, opacity, color and background, given dL/dimage, planar (channels, height, width).
+
+    Raises ValueError where that is not the picture's shape.
+    """
     return backward_frames([trace], [grad_image])[0]
 
 
 def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) -> list[tuple[np.ndarray, ...]]:
-    """`backward` of several frames at once."""
+    """`backward` of several frames at once; raises ValueError as it does."""
+    for trace, grad_image in zip(traces, grad_images, strict=True):
+        if grad_image.shape != trace.image.shape:
+            raise invalid("grad_image", expected=f"the picture's shape {trace.image.shape}", got=grad_image.shape)
     rooms = ((_slots(trace), _room_for_grads(trace)) for trace in traces)
     jobs = [(trace, grad, *room) for trace, grad, room in zip(traces, grad_images, rooms, strict=True)]
 

@@ -43,7 +43,7 @@ def render(
 
     Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
     `background`. A splat with a number that is not finite among its parameters is not drawn and gets no gradient.
-    Raises ValueError for an unknown option, a size below 1 or shapes that do not fit.
+    Raises ValueError for an unknown option, a size below 1, shapes that do not fit or colours without a channel.
 
     Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
 
@@ -52,6 +52,12 @@ def render(
     one_of("engine", engine, ENGINES)
     one_of("compositing", compositing, COMPOSITINGS)
     check_size(size)
+    if not isinstance(splats, Splats2D):
+        cure = "For Gaussians3D use foldgauss.render.project first."
+        raise invalid("splats", expected="Splats2D", got=type(splats).__name__, cure=cure)
+    if not isinstance(options, RenderOptions | None):
+        cure = "A preset is RenderOptions.fast(), with parentheses."
+        raise invalid("options", expected="RenderOptions or None", got=repr(options), cure=cure)
     if splats.mean.ndim != 2:
         raise invalid(
             "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
@@ -61,6 +67,8 @@ def render(
     options = RenderOptions() if options is None else options
     channels, dtype = splats.color.shape[-1], splats.mean.dtype
     background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
+    if channels == 0:
+        raise invalid("splats.color", expected="at least one channel", got=f"shape {splats.color.shape}")
     if background.shape != (channels,):
         raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
     if engine == "auto":

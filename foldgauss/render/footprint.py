@@ -23,8 +23,10 @@ def whitening(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array
     distance is centred before it is squared: the three terms of the usual conic cancel for thin, slanted splats.
     A splat that is not drawn (too thin, too wide, NaN) gets those of F = I, so that no NaN reaches a gradient.
     """
-    white = _whitening(factor, low_pass)
-    drawn = jnp.all(_within(white[::2]))
+    p, q, r = _whitening(factor, low_pass) * _PER_POWER_OF_TWO
+    along_x = _PER_POWER_OF_TWO / jnp.sqrt(covariance(factor, low_pass)[0])
+    # Also False for NaN, and for a determinant of 0.
+    drawn = (p < THINNEST) & (jnp.hypot(q, r) < THINNEST) & (r > WIDEST) & (along_x > WIDEST)
     return _whitening(jnp.where(drawn, factor, jnp.eye(2, dtype=factor.dtype)), low_pass), drawn
 
 
@@ -33,11 +35,6 @@ def _whitening(factor: Float[Array, "2 2"], low_pass: float) -> Float[Array, "3"
     # Two roots, not the root of the quotient: its derivative holds det^2, which underflows.
     p = jnp.sqrt(yy) / jnp.sqrt(det)
     return jnp.stack([p, -xy / yy * p, 1 / jnp.sqrt(yy)])
-
-
-def _within(inverse: Float[Array, "..."]) -> Bool[Array, "..."]:
-    """Also False for NaN, and for an infinite determinant."""
-    return (inverse * _PER_POWER_OF_TWO > WIDEST) & (inverse * _PER_POWER_OF_TWO < THINNEST)
 
 
 def covariance(factor: Float[Array, "2 2"], low_pass: float) -> tuple[Float[Array, ""], ...]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from numbers import Integral
+from numbers import Integral, Real
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,8 +10,11 @@ from jaxtyping import Array, Float
 
 from foldgauss._checks import invalid
 
-#: Below this support radius, in standard deviations, a splat is no Gaussian any more.
-SMALLEST_RADIUS = 0.1
+#: Below the first support radius, in standard deviations, a splat is no Gaussian any more; the square of the second
+#: is still far from the end of float32.
+SMALLEST_RADIUS, LARGEST_RADIUS = 0.1, 1e6
+#: Engine "xla" counts (tile, splat) pairs up to one more, so that int32 holds the sum of two.
+LARGEST_CAPACITY = 2**30 - 2
 
 
 class Splats2D(eqx.Module):
@@ -37,7 +40,8 @@ class Splats2D(eqx.Module):
         """Model space to pixels of a picture of `size` = (height, width).
 
         `aspect` is the model frame's height / width (default: the picture's own). Where the two differ the
-        frame covers the picture and what sticks out is cut off evenly, as a centre crop does.
+        frame covers the picture and what sticks out is cut off evenly, as a centre crop does. Raises ValueError as
+        `pixels_per_unit`.
         """
         scale = pixels_per_unit(size, aspect=aspect)
         height, width = size
@@ -66,11 +70,21 @@ def check_size(size: tuple[int, int]) -> None:
         raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
 
 
+def check_aspect(aspect: float) -> None:
+    """Raise unless `aspect` is that of a frame."""
+    if not (isinstance(aspect, Real) and 0 < aspect < math.inf):
+        raise invalid("aspect", expected="a frame's height / width, one positive number", got=aspect)
+
+
 def pixels_per_unit(size: tuple[int, int], *, aspect: float | None = None) -> float:
-    """Pixels along one unit of model space when a frame of height/width `aspect` covers `size` (None: its own)."""
+    """Pixels along one unit of model space when a frame of height/width `aspect` covers `size` (None: its own).
+
+    Raises ValueError unless `size` is two whole numbers >= 1 and `aspect` one positive number.
+    """
     check_size(size)
     height, width = size
     aspect = height / width if aspect is None else aspect
+    check_aspect(aspect)
     unit_height, unit_width = min(1.0, aspect), min(1.0, 1 / aspect)
     return max(height / unit_height, width / unit_width)
 
@@ -79,8 +93,11 @@ def pixels_per_unit(size: tuple[int, int], *, aspect: float | None = None) -> fl
 class RenderOptions:
     """What is left out of a picture, and how little it matters; and how the work is cut, which changes no picture.
 
-    The defaults are the constants of the published 3DGS rasteriser and so of VeGaS; `low_pass` excepted, they
-    change a pixel by less than one step of 8 bits for a single splat. See `exact`, `standard` and `fast`.
+    The defaults are the constants of the published 3DGS rasteriser and so of VeGaS. For a single splat the cutoff and
+    the stop change a pixel by no more than one step of 8 bits, the ceiling by up to 2.55 of them (where the opacity is
+    above 0.99), the low pass by more. See `exact`, `standard` and `fast`.
+
+    Raises ValueError for a number outside its bounds. Numbers are kept as Python's own.
     """
 
     #: A splat is dropped where its alpha is below this: less than one step of an 8-bit picture.
@@ -99,7 +116,7 @@ class RenderOptions:
     tile_size: int | None = None
     #: Room for (tile, splat) pairs in engine "xla": memory and speed only, since splats that do not fit into the lists
     #: at once are drawn in several rounds. A whole number of at least the number of tiles; None: counted where the
-    #: splats are known, else (inside `jit`, `vmap`) derived from the number of splats.
+    #: splats are known, else (inside `jit`, `vmap`) derived from the numbers of splats and tiles.
     list_capacity: int | None = None
 
     def __post_init__(self) -> None:
@@ -107,19 +124,23 @@ class RenderOptions:
         for name, high in highest.items():
             self._check(name, 1e-8 if name == "alpha_cutoff" else 0.0, high, closed=name == "alpha_ceiling")
         if self.support_radius is not None:
-            self._check("support_radius", SMALLEST_RADIUS, math.inf)
-        for name, low, high in (("tile_size", 4, 32), ("list_capacity", 1, 2**30)):
+            self._check("support_radius", SMALLEST_RADIUS, LARGEST_RADIUS, closed=True)
+        for name, low, high in (("tile_size", 4, 32), ("list_capacity", 1, LARGEST_CAPACITY)):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, int) and low <= value <= high):
+            if value is None:
+                continue
+            if not (isinstance(value, Integral) and not isinstance(value, bool) and low <= value <= high):
                 expected = f"None or a whole number in [{low}, {high}]"
                 raise invalid(f"RenderOptions.{name}", expected=expected, got=value)
+            object.__setattr__(self, name, int(value))
 
     def _check(self, name: str, low: float, high: float, *, closed: bool = False) -> None:
         value = getattr(self, name)
-        within = isinstance(value, float | int) and low <= value and (value <= high if closed else value < high)
+        within = isinstance(value, Real) and low <= value and (value <= high if closed else value < high)
         if not within:
             expected = f"a number in [{low:g}, {high:g}{']' if closed else ')'}"
             raise invalid(f"RenderOptions.{name}", expected=expected, got=value)
+        object.__setattr__(self, name, float(value))
 
     @classmethod
     def exact(cls) -> "RenderOptions":
@@ -137,9 +158,8 @@ class RenderOptions:
 
     @classmethod
     def fast(cls) -> "RenderOptions":
-        """Cutoff 1/64 and stop 1e-2: provisional, chosen by one measurement with engine "cpu".
+        """Cutoff 1/64 and stop 1e-3, for previews: what these bring on a fitted model is in docs/performance.md.
 
-        On the random scenes of the benchmarks (20k and 100k splats) the time falls by 1.3 to 1.7 and the picture
-        differs from the standard one by 0.006 rms (44 dB), by 0.05 at most.
+        A later stop costs more picture than it saves time, and so does a smaller support radius.
         """
-        return cls(alpha_cutoff=1 / 64, transmittance_stop=1e-2)
+        return cls(alpha_cutoff=1 / 64, transmittance_stop=1e-3)

@@ -12,7 +12,7 @@ How a picture is made, and why so:
 * *Backward*, batch by batch again: forward once more, keeping light at the starts of chunks, then the chunks from
   back to front. With B the colour that lies behind, times incoming gradient and for unit light, dL/dalpha_i =
   T_i (c_i . g - B_i): no division by 1 - alpha, so alpha may be 1. What is kept grows with the square root of the
-  longest list only.
+  longest list only. Of several rounds, taken from back to front too, some starts are kept, and the others drawn anew.
 """
 
 import functools
@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._checks import invalid
 from foldgauss.render.footprint import capped, covariance, raw_alpha, squared_distance, squared_reach, whitening
-from foldgauss.render.splats import RenderOptions
+from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
 
 #: Measured on two AVX-512 cores, 20k splats on 160x320: 8 lists twice the entries of 16 for half the pairs of pixel and
 #: splat, 1.3 times faster forward, 1.8 with the backward pass.
@@ -37,10 +37,12 @@ CHUNK = 16
 BATCH_PIXELS = {"cpu": 1 << 14, "other": 1 << 18}
 #: Slots per splat where the splats' sizes are not known (inside `jit`), and the most slots of one round.
 SLOTS_PER_SPLAT, MOST_SLOTS = 16, 1 << 22
+#: Rounds whose start the backward pass keeps, a plane of light each; of more, every n-th.
+KEPT_ROUNDS = 8
 #: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
 SLACK = 1e-3
-#: Sums of slots stop here: int32 holds the sum of two.
-_MANY = 2**30 - 1
+#: Sums of slots stop here, above any capacity.
+_MANY = LARGEST_CAPACITY + 1
 # Rows of a splat's fields, colours after them.
 _X, _Y, _P, _Q, _R, _OPACITY, _COLOR = range(7)
 # Rows of a splat's gradient sums, colours after them: of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where
@@ -107,7 +109,11 @@ def _plan(leaves, size, compositing, options) -> Plan:
     if capacity is None:
         geometry = jax.lax.stop_gradient(leaves[:3])  # concrete even under an eager `grad`
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in geometry)
-        slots = SLOTS_PER_SPLAT * len(leaves[2]) if traced else int(_count_slots(plan, *geometry))
+        num = len(leaves[2])
+        # Of a few wide splats a chunk for every tile: fewer would make rounds of little work, more would be sorted in
+        # vain where splats are small (a million slots double the time of 20k splats on 160x320).
+        guess = min(num * num_tiles, max(SLOTS_PER_SPLAT * num, CHUNK * num_tiles))
+        slots = guess if traced else int(_count_slots(plan, *geometry))
         # A power of two, so that a scene that moves does not compile anew for each frame.
         capacity = max(_power_of_two(min(slots, MOST_SLOTS)), _power_of_two(num_tiles))
     return plan._replace(capacity=capacity)
@@ -263,8 +269,12 @@ class Canvas(NamedTuple):
 
 
 def _blank(plan: Plan, channels: int, dtype) -> Canvas:
-    shape = (plan.tile**2, plan.num_batches * plan.batch)
-    return Canvas(jnp.ones(shape, dtype), tuple(jnp.zeros(shape, dtype) for _ in range(channels)))
+    """Where a tile reaches beyond the picture there is no light from the start: nothing waits for it to be taken."""
+    pixel, tile = _numbers(plan.tile**2)[:, None], _numbers(plan.num_batches * plan.batch)[None, :]
+    y = tile // plan.grid[1] * plan.tile + pixel // plan.tile
+    x = tile % plan.grid[1] * plan.tile + pixel % plan.tile
+    light = ((y < plan.size[0]) & (x < plan.size[1])).astype(dtype)
+    return Canvas(light, tuple(jnp.zeros_like(light) for _ in range(channels)))
 
 
 def _picture(plan: Plan, planes: Float[Array, "channels pixels tiles"]) -> Float[Array, "height width channels"]:
@@ -374,19 +384,21 @@ def _draw_round(plan: Plan, projected: Projected, mean, fields, begin, canvas: C
     return end, canvas
 
 
-def _forward(plan: Plan, leaves) -> Canvas:
+def _forward(plan: Plan, leaves) -> tuple[Int[Array, ""], Canvas]:
+    """The number of rounds drawn, until no splat or no light was left, and the canvas."""
     mean, factor, opacity, color, _ = leaves
     projected = _project(plan, mean, factor, opacity)
     fields = _fields(projected, mean, opacity, color)
 
     def more(carry):
-        return (carry[0] < len(mean)) & jnp.any(carry[1].light > plan.finished)
+        return (carry[1] < len(mean)) & jnp.any(carry[2].light > plan.finished)
 
     def draw(carry):
-        return _draw_round(plan, projected, mean, fields, *carry)
+        return carry[0] + 1, *_draw_round(plan, projected, mean, fields, *carry[1:])
 
-    start = jnp.int32(0), _blank(plan, color.shape[1], mean.dtype)
-    return jax.lax.while_loop(more, draw, start)[1]
+    start = jnp.int32(0), jnp.int32(0), _blank(plan, color.shape[1], mean.dtype)
+    num, _, canvas = jax.lax.while_loop(more, draw, start)
+    return num, canvas
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -395,9 +407,9 @@ def _render(plan: Plan, leaves):
 
 
 def _render_fwd(plan: Plan, leaves):
-    canvas = _forward(plan, leaves)
+    num, canvas = _forward(plan, leaves)
     planes = [plane + canvas.light * own for plane, own in zip(canvas.color, leaves[4], strict=True)]
-    return _picture(plan, jnp.stack(planes)), (leaves, canvas.light)
+    return _picture(plan, jnp.stack(planes)), (leaves, canvas.light, num)
 
 
 _render_jit = jax.jit(_render, static_argnums=0)
@@ -527,25 +539,13 @@ def _unblend_batch(plan: Plan, fields, lists: Lists, light, grad_planes, carry, 
 
 
 def _render_bwd(plan: Plan, residuals, grad_image):
-    leaves, final_light = residuals
+    leaves, final_light, num = residuals
     mean, factor, opacity, color, background = leaves
     projected = _project(plan, mean, factor, opacity)
     fields = _fields(projected, mean, opacity, color)
     grad_planes = _planes(plan, grad_image)
     behind = jnp.sum(grad_planes * background[:, None, None], axis=0)
-    blank = _blank(plan, 0, mean.dtype)
-    bare = fields[:, :_COLOR]
-
-    def draw(carry):
-        number, begin, canvas = carry
-        return number + 1, *_draw_round(plan, projected, mean, bare, begin, canvas)
-
-    def before(number):
-        """The first splat of a round, and the light there: all rounds before it once more, as memory is bounded."""
-        _, begin, canvas = jax.lax.while_loop(
-            lambda carry: carry[0] < number, draw, (jnp.int32(0), jnp.int32(0), blank)
-        )
-        return begin, canvas.light
+    before = _keep_rounds(plan, projected, mean, fields[:, :_COLOR], num)
 
     def undraw(carry):
         number, *state = carry
@@ -557,21 +557,35 @@ def _render_bwd(plan: Plan, residuals, grad_image):
 
     sums = jnp.zeros((len(fields), _MOMENTS + color.shape[1]), mean.dtype)
     room = jnp.zeros((_room(plan, len(mean)), plan.tile**2, plan.batch), mean.dtype)
-    start = _num_rounds(plan, projected) - 1, sums, behind, Kept(room, room)
+    start = num - 1, sums, behind, Kept(room, room)
     _, sums, *_ = jax.lax.while_loop(lambda carry: carry[0] >= 0, undraw, start)
     lit = final_light[None, :, :] * grad_planes
     return ((*_gather(projected, sums[:-1], factor, opacity), jnp.sum(lit, axis=(1, 2))),)
 
 
-def _num_rounds(plan: Plan, projected: Projected) -> Int[Array, ""]:
-    num = len(projected.reach)
+def _keep_rounds(plan: Plan, projected: Projected, mean, bare, num):
+    """Draw `num` rounds once more but for colours, keeping starts; returns the function that gives, for the number of
+    a round, its first splat and the light there, by drawing on from the start kept before it.
+    """
+    stride = jnp.maximum(-(-num // KEPT_ROUNDS), 1)
+    last = (num - 1) // stride
 
-    def skip(carry):
-        number, begin = carry
-        total = _running_sum(jnp.where(_numbers(num) >= begin, projected.slots, 0))
-        return number + 1, jnp.sum(total <= plan.capacity, dtype=jnp.int32)
+    def advance(count, begin, light):
+        def draw(_, state):
+            begin, canvas = _draw_round(plan, projected, mean, bare, state[0], Canvas(state[1], ()))
+            return begin, canvas.light
 
-    return jax.lax.while_loop(lambda carry: carry[1] < num, skip, (jnp.int32(0), jnp.int32(0)))[0]
+        return jax.lax.fori_loop(0, count, draw, (begin, light))
+
+    def keep(k, carry):
+        begins, lights, begin, light = carry
+        begins, lights = begins.at[k].set(begin), lights.at[k].set(light)
+        return begins, lights, *advance(jnp.where(k < last, stride, 0), begin, light)
+
+    light = _blank(plan, 0, mean.dtype).light
+    room = jnp.zeros(KEPT_ROUNDS, jnp.int32), jnp.zeros((KEPT_ROUNDS, *light.shape), light.dtype)
+    begins, lights, *_ = jax.lax.fori_loop(0, last + 1, keep, (*room, jnp.int32(0), light))
+    return lambda number: advance(number % stride, begins[number // stride], lights[number // stride])
 
 
 def _gather(projected: Projected, sums, factor, opacity):

@@ -117,6 +117,7 @@ def test_beats_descended_colours_on_a_real_frame(compositing):
     [
         ({"images": []}, "images: expected one for each"),
         ({"images": [np.zeros((5, 5))]}, "shape"),
+        ({"images": [np.full((50, 70, 3), np.inf, np.float32)]}, "images: expected finite numbers, got 10500 that"),
         ({"ridge": -1.0}, "ridge"),
         ({"options": RenderOptions(tile_size=8), "engine": "cpu"}, "tile_size"),
     ],
@@ -126,3 +127,28 @@ def test_refusals(change, message):
     arguments = {"splats": [splats], "images": [np.zeros((*size, 3), np.float32)]} | change
     with pytest.raises(ValueError, match=message):
         solve_colors(**arguments)
+
+
+def test_one_number_that_is_not_finite_is_refused():
+    """It would stop the solve of every channel, in silence."""
+    splats, size = scene("plain")
+    image = np.zeros((*size, 3), np.float32)
+    image[3, 4, 0] = np.nan
+    with pytest.raises(ValueError, match=r"^images: expected finite numbers, got 1 that"):
+        solve_colors(splats, image)
+    with pytest.raises(ValueError, match=r"^splats.color: expected finite numbers, got 1 "):
+        solve_colors(recolored(splats, splats.color.at[2, 1].set(jnp.nan)), np.zeros_like(image))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_half_precision_is_solved_in_single(dtype):
+    splats, size = scene("plain")
+    image = render(splats, size).astype(dtype)
+    half = jax.tree.map(lambda leaf: leaf.astype(dtype), splats)
+    start = Splats2D(half.mean, half.factor, half.opacity, jnp.zeros_like(half.color))
+    found = solve_colors(start, image)
+    assert found.dtype == dtype
+    drawn = render(Splats2D(half.mean, half.factor, half.opacity, found), size)
+    assert jnp.mean(jnp.square(drawn - image).astype(jnp.float32)) < 0.02 * jnp.mean(
+        jnp.square(image).astype(jnp.float32)
+    )

@@ -11,6 +11,7 @@ from scenes import scene
 
 from foldgauss import _threads
 from foldgauss.render import RenderOptions, Splats2D, cpu
+from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.footprint import pixel_centres
 from foldgauss.render.reference import render_reference, splat_alpha
 
@@ -104,6 +105,20 @@ def test_alpha_of_one(stop):
     options = RenderOptions(alpha_ceiling=1.0, transmittance_stop=stop)
     assert (cpu.forward(*leaves, size, options=options).light == 0).any()
     assert_agrees(leaves, size, "over", options)
+
+
+def above_one(leaves):
+    """Opacities on both sides of 1."""
+    leaves[2] *= 3
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("ceiling", [0.99, 1.0])
+def test_opacity_above_one(ceiling, compositing):
+    """Where alpha would exceed the ceiling it has no gradient, with a ceiling of 1 as with any other."""
+    leaves, size = leaves_of("plain", change=above_one)
+    assert leaves[2].min() < 1 < leaves[2].max()
+    assert_agrees(leaves, size, compositing, RenderOptions(alpha_ceiling=ceiling))
 
 
 @pytest.mark.parametrize("kind", ["plain", "opaque", "needles", "huge", "none"])
@@ -234,6 +249,41 @@ def test_other_tiles_are_refused_with_a_cure():
         cpu.forward(*leaves, size, options=RenderOptions(tile_size=8))
 
 
+@pytest.mark.parametrize(("colors", "background"), [(0, 0), (2, 3), (3, 2), (3, 0)])
+def test_channels_that_do_not_fit_are_refused(colors, background):
+    leaves, size = leaves_of("one")
+    leaves[3:] = np.zeros((1, colors), np.float32), np.zeros(background, np.float32)
+    with pytest.raises(ValueError, match=r"color, background: expected .* at least one channel"):
+        cpu.forward(*leaves, size)
+
+
+@pytest.mark.parametrize("shape", [(2, 17, 16), (3, 16, 16), (17, 16, 3), (17, 16)])
+def test_gradients_that_do_not_fit_are_refused(shape):
+    leaves, size = leaves_of("one")
+    trace = cpu.forward(*leaves, size)
+    with pytest.raises(ValueError, match=r"^grad_image: expected the picture's shape \(3, 17, 16\)"):
+        cpu.backward(trace, np.zeros(shape, np.float32))
+
+
+def test_nan_reaches_no_tile_and_no_row():
+    """No such geometry is made, but an index made of it would write anywhere."""
+    nan, num = np.float32(np.nan), kernels.BLOCK
+    first, end = np.full(num, -7, np.int32), np.full(num, -7, np.int32)
+    one, width = np.float32(1), np.float32(64)
+    for column in range(8):
+        block = np.ones((8, num), np.float32)
+        block[column] = nan
+        kernels._tiles_of(num, block.ravel(), one, one, width, first, end)
+        assert 0 <= first.min() <= end.max() <= 4
+        assert (first <= end).all()
+        values = np.ones(6, np.float32)
+        values[column % 6] = nan
+        low, high = kernels._pixel_rows(*values)
+        assert 0 <= low <= cpu.TILE >= high
+    kernels._tiles_of(num, np.full(8 * num, nan), one, one, width, first, end)
+    np.testing.assert_array_equal(first, end)
+
+
 @pytest.mark.parametrize("wrong", ["sign", "order"])
 def test_mutant_is_caught(wrong, monkeypatch):
     """The gradient test has power: another sign, or another order of the splats, fails it."""
@@ -253,10 +303,9 @@ def test_mutant_is_caught(wrong, monkeypatch):
 def test_exponential():
     """Within 2e-7 over the powers that are drawn, in a kernel of its own."""
     from foldgauss._kernels import kernel
-    from foldgauss.render import _cpu_kernels
     from foldgauss.render._vectors import LANES, load, store
 
-    exp2 = _cpu_kernels._exp2
+    exp2 = kernels._exp2
 
     @functools.partial(kernel)
     def apply(x, y):
@@ -268,3 +317,15 @@ def test_exponential():
     apply(x, y)
     np.testing.assert_allclose(y, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
     assert y[-1] == 1
+
+
+@pytest.mark.parametrize("changed", range(5))
+def test_arrays_that_do_not_fit_are_refused(changed):
+    """The kernels check no bounds."""
+    num = 200
+    leaves = [np.zeros(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, 3), (3,))]
+    for wrong in (leaves[changed][:1], leaves[changed].astype(np.float64), np.float32(1)):
+        with pytest.raises(ValueError, match="mean, factor, opacity, color, background"):
+            cpu.forward(*leaves[:changed], wrong, *leaves[changed + 1 :], (16, 16))
+    with pytest.raises(ValueError, match="size"):
+        cpu.forward(*leaves, (0, 10))

@@ -14,7 +14,7 @@ import pytest
 from scenes import KINDS, check_slope, scene
 
 from foldgauss import _threads
-from foldgauss.render import ENGINES, RenderOptions, Splats2D, cpu, render
+from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project, render
 from foldgauss.render.footprint import pixel_centres
 from foldgauss.render.reference import splat_alpha
 
@@ -288,6 +288,35 @@ def test_gradients_of_extreme_splats_are_finite(engine, scale, other):
         assert float(draw(splats)[8, 8, 0]) == pytest.approx(0.5, abs=1e-4)
 
 
+#: Lower and upper triangular factors, and whether a splat of theirs is drawn: thickness along y at fixed x, and width.
+SLANTED = [
+    ([[1e12, 0], [1e-5, 1e-23]], False),  # q of 1e23: its square is no float32
+    ([[1e38, 0], [1e-3, 1]], False),
+    ([[1e10, 0], [0, 1]], False),
+    ([[1, 0], [1e10, 1]], False),
+    ([[1e10, 0], [0, 1e-5]], False),
+    ([[1e3, 0], [1, 1e-8]], False),
+    ([[1, 1e8], [0, 1]], False),
+    ([[1e3, 0], [1e3, 1e-4]], True),
+    ([[1e5, 0], [1, 1]], True),
+    ([[0, 1e6], [1, 0]], True),
+    ([[1, 1e4], [0, 1e3]], True),
+]
+
+
+@pytest.mark.parametrize(("factor", "drawn"), SLANTED)
+def test_engines_agree_on_which_slanted_splats_are_drawn(factor, drawn):
+    """On a pixel's centre, where alpha is the opacity however thin the splat is."""
+    splats = Splats2D(jnp.full((1, 2), 8.5), jnp.asarray([factor], jnp.float32), jnp.asarray([0.5]), jnp.ones((1, 3)))
+    for engine in ENGINES:
+        draw = functools.partial(render, size=(17, 40), engine=engine, options=RenderOptions.exact())
+        picture = draw(splats)
+        assert bool(jnp.all(jnp.isfinite(picture))), engine
+        assert float(picture[8, 8, 0]) == pytest.approx(0.5 if drawn else 0.0, abs=1e-4), engine
+        grads = jax.grad(lambda s, draw=draw: jnp.sum(draw(s) ** 2))(splats)
+        assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(grads)), engine
+
+
 def test_auto_takes_xla_where_the_cpu_engine_refuses():
     splats, size = scene("plain")
     options = RenderOptions(tile_size=8)
@@ -377,6 +406,14 @@ def test_bad_arguments(changes, message):
         render(splats, **({"size": size} | changes))
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_colours_without_a_channel_are_refused(engine):
+    splats, size = scene("plain")
+    bare = Splats2D(splats.mean, splats.factor, splats.opacity, splats.color[:, :0])
+    with pytest.raises(ValueError, match=r"^splats.color: expected at least one channel"):
+        render(bare, size, engine=engine)
+
+
 def test_a_batch_is_refused_with_a_cure():
     splats, size = scene("plain")
     with pytest.raises(ValueError, match="vmap"):
@@ -387,3 +424,16 @@ def test_bad_shapes():
     splats, _ = scene("plain")
     with pytest.raises(ValueError, match="mean, factor, opacity, color"):
         Splats2D(splats.mean, splats.factor, splats.opacity[:-1], splats.color)
+
+
+def test_things_that_are_no_splats_are_refused():
+    splats, size = scene("plain")
+    with pytest.raises(ValueError, match=r"splats: expected Splats2D, got Gaussians3D.*project"):
+        render(Gaussians3D.from_flat(splats), size)
+    for options in ("fast", RenderOptions.fast):
+        with pytest.raises(ValueError, match="parentheses"):
+            render(splats, size, options=options)
+    with pytest.raises(ValueError, match="gaussians: expected Gaussians3D"):
+        project(splats, Camera.front(0.5), size)
+    with pytest.raises(ValueError, match="camera: expected Camera"):
+        project(Gaussians3D.from_flat(splats), None, size)

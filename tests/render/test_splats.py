@@ -1,5 +1,7 @@
 """Model space to pixels, and options."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,10 +67,38 @@ def test_bad_options(field, value):
         RenderOptions(**{field: value})
 
 
-@pytest.mark.parametrize("change", [{"tile_size": 3}, {"tile_size": 8.0}, {"list_capacity": 0}, {"alpha_ceiling": 1.1}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tile_size": 3},
+        {"tile_size": 8.0},
+        {"list_capacity": 0},
+        {"list_capacity": 2**30 - 1},
+        {"list_capacity": True},
+        {"alpha_ceiling": 1.1},
+        {"support_radius": 1e200},
+        {"support_radius": 0.05},
+    ],
+)
 def test_bad_sizes_and_bounds(change):
     with pytest.raises(ValueError, match=f"RenderOptions.{next(iter(change))}"):
         RenderOptions(**change)
+
+
+def test_options_are_kept_as_numbers_of_python():
+    options = RenderOptions(
+        low_pass=np.float32(0.25), support_radius=3, tile_size=np.int32(8), list_capacity=np.int64(2**30 - 2)
+    )
+    assert options == RenderOptions(low_pass=0.25, support_radius=3.0, tile_size=8, list_capacity=2**30 - 2)
+    assert [type(value) for value in dataclasses.astuple(options)] == [float] * 5 + [int] * 2
+
+
+@pytest.mark.parametrize("aspect", [0, -0.5, np.inf, np.nan, "wide"])
+def test_bad_aspects(aspect):
+    splats = Splats2D(jnp.zeros((1, 2)), jnp.eye(2)[None], jnp.ones(1), jnp.ones((1, 3)))
+    for call in (splats.to_pixels, pixels_per_unit):
+        with pytest.raises(ValueError, match=r"^aspect: expected a frame's height / width"):
+            call((5, 5), aspect=aspect)
 
 
 def test_presets():

@@ -73,6 +73,64 @@ def test_more_pairs_than_room_is_no_loss(monkeypatch):
     np.testing.assert_allclose(draw(splats, size), truth, atol=1e-6)
 
 
+def counted(monkeypatch, name):
+    """A list that grows with every run, not trace, of a function of the engine."""
+    calls, function = [], getattr(xla, name)
+
+    def counting(*arguments):
+        jax.debug.callback(lambda: calls.append(None))
+        return function(*arguments)
+
+    monkeypatch.setattr(xla, name, counting)
+    return calls
+
+
+def leaves_of(splats):
+    return splats.mean, splats.factor, splats.opacity, splats.color, BACKGROUND
+
+
+def test_a_few_wide_splats_take_one_round_inside_jit():
+    """Where sizes are not known there is room for splats that fill the picture, while they are few."""
+    rng, size, plans = np.random.default_rng(0), (320, 640), []
+    num = 12
+    leaves = rng.uniform(0, 320, (num, 2)), np.tile(300 * np.eye(2), (num, 1, 1)), np.full(num, 0.1), np.ones((num, 3))
+    leaves = [jnp.asarray(leaf, jnp.float32) for leaf in (*leaves, BACKGROUND)]
+    jax.eval_shape(lambda leaves: plans.append(xla._plan(leaves, size, "over", RenderOptions())), leaves)
+    _, (*_, rounds) = xla._render_fwd(plans[0], leaves)
+    assert int(rounds) == 1
+    jax.eval_shape(lambda leaves: plans.append(xla._plan(leaves, (8, 8), "over", RenderOptions())), leaves)
+    assert plans[1].capacity < 2 * num  # but no more than that
+
+
+@pytest.mark.parametrize(("capacity", "most"), [(200, 2), (64, 4)])
+def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
+    """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
+    splats, size = scene("huge")
+    leaves, weights = leaves_of(splats), weights_for(size)
+    calls, grads = counted(monkeypatch, "_draw_round"), []
+    for options in (RenderOptions(), RenderOptions(list_capacity=capacity)):
+        plan = xla._plan(leaves, size, "over", options)
+        del calls[:]
+        _, residuals = xla._render_fwd(plan, leaves)
+        grads.append(jax.tree.leaves(xla._render_bwd(plan, residuals, weights)))
+        jax.effects_barrier()
+        rounds = int(residuals[-1])
+        assert rounds <= len(calls) <= most * rounds
+    assert rounds > 4
+    check_same(*grads, 1e-5)
+
+
+@pytest.mark.parametrize("size", [(40, 40), (44, 43)])
+def test_pixels_outside_the_picture_keep_no_tile_waiting(size, monkeypatch):
+    """Tiles that reach beyond the picture are left once dark like others."""
+    splats, _ = scene("curtain")
+    leaves, calls = leaves_of(splats), counted(monkeypatch, "_load")
+    picture, _ = xla._render_fwd(xla._plan(leaves, size, "over", RenderOptions()), leaves)
+    jax.effects_barrier()
+    assert picture.shape == (*size, 3)
+    assert 0 < len(calls) < len(splats.mean) / xla.CHUNK / 4
+
+
 @pytest.mark.parametrize(
     "tile_size", [pytest.param(4, marks=pytest.mark.slow), 7, pytest.param(32, marks=pytest.mark.slow)]
 )
@@ -137,8 +195,15 @@ def test_needles_a_metre_long(compositing):
     check_against_reference(splats, (37, 53), 1e-3, compositing=compositing, options=RenderOptions(alpha_cutoff=1e-6))
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
-def test_sizes(scale):
+@pytest.mark.parametrize(
+    ("engine", "scale", "bound"),
+    [
+        *(("xla", scale, 1e-5) for scale in (1e-6, 1e-3, 1e3, 1e6)),
+        *(("cpu", scale, 1e-5) for scale in (1e-3, 1e3, 1e6)),
+        ("cpu", 1e-6, 0.05),  # it takes P column - P X along a row, of which float32 then keeps one digit
+    ],
+)
+def test_sizes(engine, scale, bound):
     """On pixels' centres, so that the smallest are seen at all."""
     rng = np.random.default_rng(0)
     mean = rng.integers(0, 30, (50, 2)) + 0.5
@@ -150,7 +215,7 @@ def test_sizes(scale):
     with jax.enable_x64(True):
         wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), splats)
         truth = render(wide, size, engine="reference", options=options)
-    np.testing.assert_allclose(render(splats, size, engine="xla", options=options), truth, atol=1e-5)
+    np.testing.assert_allclose(render(splats, size, engine=engine, options=options), truth, atol=bound)
 
 
 def test_far_outside():

@@ -1,0 +1,45 @@
+"""The guides' examples run, in order, as one program each."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def _run(name: str) -> dict:
+    """The names that the guide's program leaves."""
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.S)
+    names = {}
+    exec(compile("\n".join(blocks), name, "exec"), names)
+    return names
+
+
+@pytest.mark.slow
+def test_distribution():
+    pytest.importorskip("numpyro", reason="numpyro is an optional extra")
+    pytest.importorskip("matplotlib", reason="matplotlib is an optional extra").use("Agg")
+    names = _run("distribution.md")
+    assert names["select_degree"](names["x"], 4, "bic").degree == 2
+    assert names["kl_divergence"](names["dist"], names["dist"]) == 0
+
+
+@pytest.mark.slow
+def test_rendering():
+    names = _run("rendering.md")
+    image, target = names["image"], names["target"]
+    assert image.shape == (90, 160, 3)
+    assert names["features"].shape == (90, 160, 7)
+    # Equal but for a splat at the very cutoff, and the perspective's own rounding.
+    np.testing.assert_allclose(names["exact"], image, atol=1 / 255)
+    np.testing.assert_allclose(names["pair"][0], image, atol=1e-6)
+    np.testing.assert_allclose(names["same"], image, atol=0.02)
+    np.testing.assert_allclose(names["mirrored"], names["same"][:, ::-1], atol=1e-3)
+    np.testing.assert_allclose(names["trace"].image, np.moveaxis(image, -1, 0), atol=1e-6)
+    np.testing.assert_allclose(1 - names["trace"].light, names["light_taken"], atol=1e-6)
+    assert np.mean((names["better"] - target) ** 2) < 0.5 * np.mean((image - target) ** 2)
+    for other in ("added", "sharp", "soft", "aside", "from_above"):
+        assert np.isfinite(names[other]).all()
+        assert np.abs(names[other] - image).max() > 0.05
