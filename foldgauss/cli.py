@@ -32,15 +32,8 @@ from foldgauss.io.model_file import read_header
 from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import MAX_FPS, VIDEO_SUFFIXES, Clip, memory_limit, read_video, write_image, write_video
 from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
-from foldgauss.video.fit import (
-    FitConfig,
-    FitInfo,
-    FitState,
-    default_num_gaussians,
-    fit_steps,
-    planned_steps,
-    to_model,
-)
+from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fit import FitInfo, FitState, fit_steps, to_model
 from foldgauss.video.frame_times import interpolated_times
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
@@ -128,10 +121,18 @@ def fit(
     ] = None,
     size: Size = None,
     frames: Frames = None,
-    gaussians: Annotated[int | None, typer.Option(help="Number of Gaussians [default: by the frame's size].")] = None,
+    gaussians: Annotated[
+        int | None,
+        typer.Option("--gaussians", "--max-gaussians", help="Number of Gaussians [default: by the frame's size]."),
+    ] = None,
+    max_size_mb: Annotated[
+        float | None,
+        typer.Option("--max-size-mb", help="Largest model file, in 10^6 bytes; limits the Gaussians."),
+    ] = None,
     degree: Annotated[int, typer.Option(help="Degree of the fold polynomial.")] = FitConfig.degree,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips].")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Time to fit for, instead of steps.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Time to fit for.")] = None,
+    target_psnr: Annotated[float | None, typer.Option("--target-psnr", help="Stop at this PSNR, in dB.")] = None,
     batch_size: Annotated[int, typer.Option(help="Frames per step.")] = FitConfig.batch_size,
     power: Annotated[
         float, typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code.")
@@ -140,13 +141,18 @@ def fit(
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
 ) -> None:
-    """Fit a model to a clip. A stopped fit is kept and goes on with --resume."""
+    """Fit a model to a clip, until the first of the given budgets binds.
+
+    A stopped fit is kept and goes on with --resume.
+    """
     try:
         config = FitConfig(
             num_gaussians=gaussians,
             degree=degree,
             steps=steps,
             minutes=minutes,
+            target_psnr=target_psnr,
+            max_size_mb=max_size_mb,
             batch_size=batch_size,
             power=power,
             seed=seed,
@@ -179,6 +185,7 @@ def fit(
     scores = _evaluate_with_progress(model, clip.frames)
     save_video_model(target, model, metadata=about | _scores(scores))
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+    figures["stopped_by"] = info.stopped_by
     _print_figures(str(target), figures | {"file_bytes": target.stat().st_size})
 
 
@@ -423,9 +430,10 @@ def _say_clip(clip: Clip, config: FitConfig) -> None:
             f"warning: only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; those are used.",
             soft_wrap=True,
         )
-    num = config.num_gaussians or default_num_gaussians(height, width)
+    num = chosen_num_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
-    plan = f"{config.minutes:g} minutes" if steps is None else f"{steps} steps"
+    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
+    plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
     out.print(
         f"{clip.source}: {clip.num_frames} frames of {height}x{width}, {num:,} Gaussians of degree {config.degree}, "
         f"{plan}, {num_threads()} threads",
@@ -471,6 +479,7 @@ _LABELS = {
     "degree": ("degree of the folds", "{}"),
     "fit_seconds": ("time spent fitting", "{:.1f} s"),
     "steps": ("steps", "{:,}"),
+    "stopped_by": ("stopped by", "{}"),
     "file_bytes": ("model file", "{:,} bytes"),
     "bits_per_pixel": ("bits per pixel", "{:.3f}"),
 }
@@ -522,7 +531,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _exit_code(error: BaseException) -> int:
     """Wrong use: an argument that cannot be right. Failure: a file that cannot be read or written."""
-    names_an_option = str(error).startswith(("frames:", "size:", "resume:"))
+    names_an_option = str(error).startswith(("frames:", "size:", "resume:", "max_size_mb:"))
     return WRONG_USE if isinstance(error, WrongUse | FileNotFoundError) or names_an_option else FAILURE
 
 

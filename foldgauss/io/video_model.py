@@ -13,7 +13,8 @@ from foldgauss._checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import RenderOptions
-from foldgauss.video.fit import TIME_ADAM, FitConfig, FitState
+from foldgauss.video.config import FitConfig
+from foldgauss.video.fit import TIME_ADAM, FitState
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import columns, unpack
@@ -103,6 +104,7 @@ def _describe_checkpoint(state: FitState) -> dict:
         "width": width,
         "num_intervals": len(state.time_logits),
         "step": state.step,
+        "plan": state.plan,
         "seconds": state.seconds,
         "error": state.error,
     }
@@ -122,6 +124,7 @@ def _checkpoint_skeleton(header: dict) -> FitState:
         time_logits=floats(intervals),
         time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
         step=int(header["step"]),
+        plan=int(header["plan"]),
         seconds=float(header["seconds"]),
         error=float(header["error"]),
     )

@@ -1,6 +1,7 @@
 """Videos as folded splats: the model, its fit and its quality. Frames are arrays here; files are `foldgauss.io`'s."""
 
-from foldgauss.video.fit import FitConfig, FitInfo, FitResult, FitState, LearningRates, fit, fit_steps
+from foldgauss.video.config import FitConfig, LearningRates
+from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
 from foldgauss.video.frame_times import FrameTimes, interpolated_times
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel

@@ -5,9 +5,9 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from numbers import Integral, Real
 from typing import NamedTuple
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,112 +15,17 @@ import optax
 
 from foldgauss._checks import invalid
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.render import RenderOptions, cpu
+from foldgauss.render import cpu
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
+from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.initialize import initialize
-from foldgauss.video.loss import ImageLoss, image_loss
+from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.model import VideoModel
+from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack, unpack
+from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
-
-
-@dataclasses.dataclass(frozen=True)
-class LearningRates:
-    """Adam rates at the first step, by leaf; model space (the frame's longer side is 1)."""
-
-    loc: float = 6.9e-4
-    coefficients: float = 4e-3
-    log_scale: float = 0.06
-    angle_logit: float = 0.06
-    opacity_logit: float = 0.15
-    color_dc: float = 0.06
-    time_loc_logit: float = 0.02
-    log_time_scale: float = 0.1
-    frame_times: float = 3e-3
-
-    def __post_init__(self) -> None:
-        for name, value in dataclasses.asdict(self).items():
-            if not (math.isfinite(value) and value >= 0):
-                raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
-
-
-#: Their state takes some 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
-MAX_GAUSSIANS = 10_000_000
-#: Beyond, powers of u and their gradients no longer tell the coefficients apart in float32.
-MAX_DEGREE = 16
-#: 0.1 px^2 of low pass fits finer detail than the usual 0.3.
-FINE = RenderOptions(low_pass=0.1)
-
-
-@dataclasses.dataclass(frozen=True)
-class FitConfig:
-    """Everything a fit depends on beside the frames.
-
-    At most one of `steps` and `minutes` is given; with neither, `DEFAULT_STEPS` or more for long clips.
-    """
-
-    num_gaussians: int | None = None  # None: by the size of the frames, `default_num_gaussians`
-    degree: int = 3
-    steps: int | None = None
-    minutes: float | None = None
-    batch_size: int = 1
-    power: float = 2.0  # of the envelope: 1 as in the paper's text, 2 as in its code
-    floor: float = 0.0  # of the envelope
-    ssim_share: float = 0.2
-    seed: int = 0
-    learn_frame_times: bool = True
-    rates: LearningRates = LearningRates()
-    final_rate: float = 0.07  # all rates fall exponentially to this share of themselves
-    options: RenderOptions = FINE
-
-    def __post_init__(self) -> None:
-        whole = {"num_gaussians": 1, "degree": 0, "steps": 1, "batch_size": 1, "seed": 0}
-        for name, least in whole.items():
-            value = getattr(self, name)
-            if value is None and name in ("num_gaussians", "steps"):
-                continue
-            if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
-                raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
-            object.__setattr__(self, name, int(value))  # NumPy's integers have no place in a checkpoint
-        for name, most in {"degree": MAX_DEGREE, "num_gaussians": MAX_GAUSSIANS}.items():
-            if (getattr(self, name) or 0) > most:
-                raise invalid(name, expected=f"at most {most:,}", got=f"{getattr(self, name):,}")
-        if self.steps is not None and self.minutes is not None:
-            raise invalid("steps, minutes", expected="at most one of them", got="both")
-        # "[" includes the bound, "(" does not.
-        ranges = {
-            "minutes": "(0, inf)",
-            "power": "[0, 16]",
-            "floor": "[0, 1)",
-            "ssim_share": "[0, 1]",
-            "final_rate": "[0, 1]",
-        }
-        for name, bounds in ranges.items():
-            value = getattr(self, name)
-            if value is None and name == "minutes":
-                continue
-            if not _within(value, bounds):
-                raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
-            object.__setattr__(self, name, float(value))
-        kinds = {"learn_frame_times": bool, "rates": LearningRates, "options": RenderOptions}
-        for name, kind in kinds.items():
-            if not isinstance(getattr(self, name), kind):
-                raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
-
-
-def _within(value: object, bounds: str) -> bool:
-    """Whether `value` is a finite number in an interval written as "[0, 1)"."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-        return False
-    low, high = (float(part) for part in bounds[1:-1].split(","))
-    return (low < value or (bounds[0] == "[" and low == value)) and (
-        value < high or (bounds[-1] == "]" and value == high)
-    )
-
-
-#: Steps where neither steps nor minutes are given: this many, and at least so many visits to every frame.
-DEFAULT_STEPS, DEFAULT_VISITS = 3000, 12
 
 
 class FitInfo(NamedTuple):
@@ -134,12 +39,13 @@ class FitInfo(NamedTuple):
     num_alive: int  # Gaussians that took part in this step
     seconds: float  # spent fitting so far
     seconds_left: float  # by the pace so far
+    stopped_by: str | None  # the budget that bound, at the last step: "steps", "minutes" or "target_psnr"
 
 
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=["rows", "first", "second", "counts", "time_logits", "time_moments"],
-    meta_fields=["step", "seconds", "error"],
+    meta_fields=["step", "plan", "seconds", "error"],
 )
 @dataclasses.dataclass
 class FitState:
@@ -152,6 +58,7 @@ class FitState:
     time_logits: np.ndarray  # float32 (num_frames - 1,)
     time_moments: optax.OptState
     step: int
+    plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
     seconds: float
     error: float  # running mean of the squared error
 
@@ -162,11 +69,6 @@ class FitResult:
 
     model: VideoModel
     history: list[FitInfo]
-
-
-def default_num_gaussians(height: int, width: int) -> int:
-    """40,000 for 160x320, growing as the square root of the pixels: larger frames are smoother per pixel."""
-    return round(177 * math.sqrt(height * width))
 
 
 def fit(
@@ -180,7 +82,7 @@ def fit(
     """Fit a video of folded Gaussians to `frames`, uint8 (num_frames, height, width, 3).
 
     `observers` are called with (state, info) after every step: progress bars, checkpoints. Raises ValueError for
-    frames or settings that cannot be fitted. A `config` with `steps` gives the same bits for any number of threads.
+    frames or settings that cannot be fitted. Without `minutes` the bits are the same for any number of threads.
 
     Example: `fit(frames, FitConfig(steps=1000)).model.render(0.5)`. Source: VeGaS, section 4.
     """
@@ -202,48 +104,100 @@ def fit_steps(
     """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one."""
     check_frames(frames)
     state = start(frames, config) if state is None else state
-    planes = np.ascontiguousarray(np.moveaxis(frames, -1, 1))  # planar, as the kernels want them
-    step = _Stepper(planes, config, state)
-    progress = _progress(state, config, len(frames))
-    if progress >= 1:  # a kept state that needs no more steps
-        yield state, _info(state, progress, loss=math.nan, num_alive=0)
-    while progress < 1:
+    step, pace = _Stepper(frames, config, state), _Pace(config, len(frames))
+    stopped_by = _stopped_by(state, config)
+    if stopped_by:  # a kept state that needs no more steps
+        yield state, _info(state, config, math.nan, 0, stopped_by)
+    while not stopped_by:
         begun = time.perf_counter()
-        loss, squared_error, num_alive = step(state, progress)
+        loss, squared_error, num_alive = step(state, _progress(state))
         memory = max(1 - config.batch_size / len(frames), 0.5) if state.step else 0.0
         state.error = memory * state.error + (1 - memory) * squared_error
         state.step += 1
         state.seconds += time.perf_counter() - begun
-        progress = _progress(state, config, len(frames))
-        yield state, _info(state, progress, loss, num_alive)
+        if not state.plan:
+            state.plan = pace.plan(state)
+        stopped_by = _stopped_by(state, config, seen=state.step * config.batch_size >= len(frames))
+        yield state, _info(state, config, loss, num_alive, stopped_by)
 
 
-def _info(state: FitState, progress: float, loss: float, num_alive: int) -> FitInfo:
-    left = state.seconds * (1 - progress) / progress if progress > 0 else math.inf
-    psnr = -10 * math.log10(max(state.error, 1e-12))
-    return FitInfo(state.step, progress, loss, psnr, len(state.rows), num_alive, state.seconds, left)
+class _Pace:
+    """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that one which
+    was stopped goes on as if it had not been."""
+
+    def __init__(self, config: FitConfig, num_frames: int):
+        self.config, self.since = config, None
+
+    def plan(self, state: FitState) -> int:
+        """Steps of the whole fit, or 0 while the pace is not known yet."""
+        if state.step == self.config.steps:
+            return state.step
+        budget = 60 * self.config.minutes
+        if state.seconds >= budget:
+            return state.step
+        if self.since is None and state.step >= WARM_UP:
+            self.since = state.step, state.seconds
+        if self.since is None:
+            return 0
+        steps, seconds = state.step - self.since[0], state.seconds - self.since[1]
+        if steps < LEAST_STEPS or seconds < budget * MEASURED:
+            return 0
+        planned = state.step + int((budget - state.seconds) * steps / (seconds * SLOWER))
+        return min(planned, self.config.steps or planned)
+
+
+def _progress(state: FitState) -> float:
+    """Share of the plan that is done; 0 while there is none."""
+    return min(state.step / state.plan, 1.0) if state.plan else 0.0
+
+
+def _stopped_by(state: FitState, config: FitConfig, *, seen: bool = True) -> str | None:
+    """The budget that binds now; `seen`: whether every frame was, which the running PSNR is told from."""
+    if config.target_psnr is not None and seen and state.step and _psnr(state) >= config.target_psnr:
+        return "target_psnr"
+    if not state.plan or state.step < state.plan:
+        return None
+    return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
+
+
+def _psnr(state: FitState) -> float:
+    return -10 * math.log10(max(state.error, 1e-12))
+
+
+def _info(state: FitState, config: FitConfig, loss: float, num_alive: int, stopped_by: str | None) -> FitInfo:
+    done = 1.0 if stopped_by else _progress(state)
+    if not state.plan and config.minutes is not None:
+        done, left = state.seconds / (60 * config.minutes), 60 * config.minutes - state.seconds
+    else:
+        left = state.seconds * (1 - done) / done if done else math.inf
+    return FitInfo(state.step, done, loss, _psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by)
 
 
 def start(frames: np.ndarray, config: FitConfig) -> FitState:
     """State before the first step."""
-    num_frames, height, width, _ = frames.shape
+    begun, num_frames = time.perf_counter(), len(frames)
+    motion = Motion.of(frames) if config.follow_motion else None
+    logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
     splats = initialize(
         frames,
-        config.num_gaussians or default_num_gaussians(height, width),
+        chosen_num_gaussians(config, *frames.shape[:3]),
         degree=config.degree,
         envelope=_envelope(config),
         seed=config.seed,
+        times=np.asarray(FrameTimes(logits).times()),
+        motion=motion,
     )
-    rows, time_logits = pack(splats), np.asarray(FrameTimes.uniform(num_frames).logits)
+    rows = pack(splats)
     return FitState(
         rows=rows,
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
-        time_logits=time_logits,
-        time_moments=TIME_ADAM.init(jnp.asarray(time_logits)),
+        time_logits=logits,
+        time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         step=0,
-        seconds=0.0,
+        plan=0 if config.minutes is not None else planned_steps(config, num_frames),
+        seconds=time.perf_counter() - begun,
         error=0.0,
     )
 
@@ -273,10 +227,9 @@ def check_frames(frames: np.ndarray) -> None:
 class _Stepper:
     """One step of the fit: buffers and constants that every step shares."""
 
-    def __init__(self, planes: np.ndarray, config: FitConfig, state: FitState):
-        self.planes, self.config = planes, config
-        num_frames, _, height, width = planes.shape
-        self.num_frames = num_frames
+    def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState):
+        self.frames, self.config = frames, config
+        self.num_frames, height, width, _ = frames.shape
         self.shape = Shape(config.degree, config.power, config.floor, (height, width))
         self.rates = np.empty(state.rows.shape[1], np.float32)
         for name, place in columns(config.degree).items():
@@ -291,15 +244,17 @@ class _Stepper:
         decay = self.config.final_rate**progress if self.config.final_rate > 0 else 1 - progress
         times = np.asarray(_frame_times(state.time_logits))
         by_time = np.zeros_like(times)
-        losses, alive = [], []
+        losses, alive, squared = [], [], progress >= 1 - self.config.square_share
         for k in self._batch(state.step):
-            loss, done, d_time = self._frame(state.rows, int(k), times[k])
+            loss, done, d_time = self._frame(state.rows, int(k), times[k], squared)
             by_time[k] += d_time  # a batch may hold a frame twice
             losses.append(loss)
             alive.append(done.alive)
         touched = alive[0] if len(alive) == 1 else np.unique(np.concatenate(alive))
         rates = self.rates * np.float32(decay)
-        sparse_adam(state.rows, self.grad, state.first, state.second, state.counts, touched, rates)
+        moments = state.first, state.second, state.counts
+        unit = UNIT_TIME if self.config.own_time else 0.0
+        sparse_adam(state.rows, self.grad, *moments, touched, rates, unit_time=unit)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
             rate = np.float32(self.config.rates.frame_times * decay)
@@ -316,9 +271,9 @@ class _Stepper:
     def _order(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.config.seed, 1, epoch]).permutation(self.num_frames)
 
-    def _frame(self, rows: np.ndarray, k: int, t: np.float32) -> tuple[ImageLoss, Conditioned, float]:
+    def _frame(self, rows: np.ndarray, k: int, t: np.float32, squared: bool) -> tuple[ImageLoss, Conditioned, float]:
         """Loss of frame k; its gradients are added to `self.grad`, dL/dt_k is returned."""
-        target = np.multiply(self.planes[k], np.float32(1 / 255), dtype=np.float32)
+        target = _planar(self.frames[k])
         done = condition(rows, self.window, t, self.shape)
         trace = cpu.forward(
             done.mean,
@@ -329,28 +284,31 @@ class _Stepper:
             self.shape.size,
             options=self.config.options,
         )
-        loss = image_loss(trace.image, target, ssim_share=self.config.ssim_share)
+        if squared:
+            loss = squared_loss(trace.image, target)
+        else:
+            loss = image_loss(trace.image, target, ssim_share=self.config.ssim_share)
         *gradients, _ = cpu.backward(trace, loss.gradient / np.float32(self.config.batch_size))
         return loss, done, pull_back(rows, done, tuple(gradients), self.shape, self.grad)
 
 
-def planned_steps(config: FitConfig, num_frames: int) -> int | None:
-    """Steps of the whole fit; None where time, not steps, ends it."""
-    if config.minutes is not None:
-        return None
-    return config.steps or max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
-
-
-def _progress(state: FitState, config: FitConfig, num_frames: int) -> float:
-    steps = planned_steps(config, num_frames)
-    share = state.seconds / (60 * config.minutes) if steps is None else state.step / steps
-    return min(share, 1.0)
+def _planar(frame: np.ndarray) -> np.ndarray:
+    """Bytes (height, width, 3) as floats (3, height, width), as the kernels want them."""
+    out = np.empty((3, *frame.shape[:2]), np.float32)
+    for plane, own in zip(out, cv2.split(frame), strict=True):
+        np.multiply(own, np.float32(1 / 255), out=plane)
+    return out
 
 
 def _envelope(config: FitConfig) -> TimeLikelihood:
     return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
 
 
+#: The pace is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
+#: share of the time.
+WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05
+#: Steps of the whole fit are slower than the first ones by this: Gaussians grow longer in time.
+SLOWER = 1.05
 TIME_ADAM = optax.scale_by_adam(eps=1e-15)
 
 

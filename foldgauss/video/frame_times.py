@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._checks import invalid
+from foldgauss.video.shots import is_cut
 
 
 class FrameTimes(eqx.Module):
@@ -44,10 +45,13 @@ class FrameTimes(eqx.Module):
 def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
     """`upsample` frames per original interval, evenly spaced between t_k and t_{k+1}, and the last frame.
 
+    At a cut nothing lies between: the first half of the frames there is the one before it, the rest the one after.
     Shape ((n - 1) * upsample + 1,). Source: VeGaS, the sentence after eq:frame_fitting.
     """
     if upsample < 1:
         raise invalid("upsample", expected="a whole number >= 1", got=upsample)
     times = np.asarray(times)
     position = np.arange((len(times) - 1) * upsample + 1) / upsample
+    interval = np.minimum(position.astype(int), len(times) - 2)
+    position = np.where(np.asarray(is_cut(times))[interval], np.floor(position + 0.5), position)
     return np.interp(position, np.arange(len(times)), times).astype(times.dtype)

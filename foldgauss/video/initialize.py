@@ -1,63 +1,142 @@
 """Where the Gaussians start: drawn from the clip's own detail, with its own colours."""
 
+import dataclasses
+from collections.abc import Callable
+
 import cv2
+import jax
 import numpy as np
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.model import SH_C0, TAU_MAX, FoldedSplats
+from foldgauss.video.motion import Motion, fitted_folds
 
 #: Share of the starts that is spread evenly, so that flat parts are covered too.
 EVEN_SHARE = 0.15
 #: Starting standard deviation in units of the distance to the neighbours alive at the same time.
 SCALE_FACTOR = 1.3
 START_OPACITY = 0.3
-#: sigma_t is drawn log-uniformly between these, in units of the clip's duration.
+#: sigma_t of a start that stands still is drawn log-uniformly between these, in units of the clip's duration.
 TIME_SCALES = (0.02, 0.4)
+#: sigma_t of a start that follows its track, in units of half the track; and in frames at the least.
+TRACK_SHARES, LEAST_FRAMES = (0.25, 1.2), 0.6
+#: Where the fold misses the track by more than this many pixels, sigma_t is shortened by this, some times.
+MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
+CHUNK = 50_000  # tracks held at once
+#: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side.
+PILOT, CORE, ROUNDS = 32, 1.5, 50
+#: Share of the starts that is spread so that all frames, however short the tracks there, are covered alike. With more,
+#: the worst frames get better and the mean worse.
+EVEN_FRAMES = 0.2
 
 
 def initialize(
-    frames: np.ndarray, num_gaussians: int, *, degree: int, envelope: TimeLikelihood, seed: int
+    frames: np.ndarray,
+    num_gaussians: int,
+    *,
+    degree: int,
+    envelope: TimeLikelihood,
+    seed: int,
+    times: np.ndarray | None = None,
+    motion: Motion | None = None,
 ) -> FoldedSplats:
-    """Starting splats for `frames`, uint8 (num_frames, height, width, 3).
+    """Starting splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
-    Positions are drawn by image gradient within each frame, m_t at that frame, sigma_t log-uniformly, sizes by the
-    local density of starts, colours from the pixel, folds at rest.
+    Positions are drawn by image gradient within each frame, m_t at that frame, sizes by the local density of starts,
+    colours from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a share of the time
+    for which that works; without, folds are at rest and sigma_t is log-uniform.
     """
     rng = np.random.default_rng([seed, 0])
-    num_frames, height, width, _ = frames.shape
-    home = np.sort(rng.integers(num_frames, size=num_gaussians))
-    pixel, density = np.empty(num_gaussians, np.int64), np.empty(num_gaussians)
-    color = np.empty((num_gaussians, 3), np.float32)
-    for k in np.unique(home):
-        here = np.flatnonzero(home == k)
-        share = detail(frames[k]).ravel()
-        pixel[here] = _draw(share, rng.random(len(here)))
-        density[here] = share[pixel[here]]
-        color[here] = frames[k].reshape(-1, 3)[pixel[here]] / np.float32(255)
-    y, x = np.divmod(pixel, width)
-    position = np.stack([x, y], -1) + rng.random((num_gaussians, 2)) - [width / 2, height / 2]
-    shortest = max(TIME_SCALES[0], 1 / (num_frames - 1))
-    spread = np.exp(rng.uniform(np.log(shortest), np.log(max(TIME_SCALES[1], shortest)), num_gaussians))
-    time = np.clip((home + rng.uniform(-0.5, 0.5, num_gaussians)) / (num_frames - 1), 1e-3, 1 - 1e-3)
-    alive = _mean_alive(time, spread)
-    scale = SCALE_FACTOR / np.sqrt(alive * density)
-    unit = max(height, width)
+    num_frames = len(frames)
+    times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
+    share_of = lambda k: detail(frames[k])  # noqa: E731
+    make = lambda home, position: born(frames, home, position, times, degree, envelope, motion, rng)  # noqa: E731
+    pilot = np.repeat(np.arange(num_frames), PILOT)
+    _, spread = make(pilot, drawn(pilot, share_of, rng)[0])
+    chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
+    home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
+    position, density = drawn(home, share_of, rng)
+    splats, spread = make(home, position)
+    alive = num_alive(times[home], spread, times)[home]
+    scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     order = rng.permutation(num_gaussians)  # depth has nothing to do with time
+    splats = dataclasses.replace(splats, log_scale=np.log(np.stack([scale, scale], -1), dtype=np.float32))
+    return jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, splats)
 
-    def leaf(values: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(values[order], dtype=np.float32)
 
-    return FoldedSplats(
-        loc=leaf(position / unit),
-        log_scale=leaf(np.log(np.stack([scale, scale], -1) / unit)),
-        angle_logit=leaf(_logit(rng.uniform(0.01, 0.99, num_gaussians))),
-        time_loc_logit=leaf(_logit(time)),
-        log_time_scale=leaf(np.log(spread)),
-        coefficients=np.zeros((num_gaussians, degree, 2), np.float32),
-        opacity_logit=leaf(_logit(np.full(num_gaussians, START_OPACITY))),
-        color_dc=leaf((color - 0.5) / SH_C0),
-        envelope=envelope,
-    )
+def drawn(
+    home: np.ndarray, share_of: Callable[[int], np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (num, 2) in pixels, one for each of the frames `home`, and their density, per pixel, there.
+
+    `share_of(k)` is the density over the pixels of frame k, (height, width), summing to 1.
+    """
+    position, density = np.empty((len(home), 2)), np.empty(len(home))
+    for k in np.unique(home):
+        here, share = np.flatnonzero(home == k), share_of(k)
+        pixel = _draw(share.ravel(), rng.random(len(here)))
+        density[here] = share.ravel()[pixel]
+        position[here] = np.stack(np.divmod(pixel, share.shape[1])[::-1], -1)
+    return position + rng.random(position.shape), density
+
+
+def born(
+    frames: np.ndarray,
+    home: np.ndarray,
+    position: np.ndarray,
+    times: np.ndarray,
+    degree: int,
+    envelope: TimeLikelihood,
+    motion: Motion | None,
+    rng: np.random.Generator,
+) -> tuple[FoldedSplats, np.ndarray]:
+    """Splats at `position` in frames `home`, one pixel wide, with the frames' own colours; and their sigma_t."""
+    num, (height, width) = len(home), frames.shape[1:3]
+    interval = np.diff(times).min()
+    if motion is None:
+        time = times[home] + rng.uniform(-0.5, 0.5, num) * interval
+        coefficients = np.zeros((num, degree, 2), np.float32)
+        shortest = max(TIME_SCALES[0], interval)
+        spread = np.exp(rng.uniform(np.log(shortest), np.log(max(TIME_SCALES[1], shortest)), num))
+    else:
+        time = times[home]
+        coefficients, spread = along_tracks(motion, home, position, degree, rng)
+        coefficients /= np.float32(interval) ** np.arange(1, degree + 1)[:, None]
+        spread = spread * interval
+    column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
+    color, unit = frames[home, row, column] / np.float32(255), max(height, width)
+    leaves = {
+        "loc": (position - [width / 2, height / 2]) / unit,
+        "log_scale": np.full((num, 2), -np.log(unit)),
+        "angle_logit": _logit(rng.uniform(0.01, 0.99, num)),
+        "time_loc_logit": _logit(np.clip(time, 1e-3, 1 - 1e-3)),
+        "log_time_scale": np.log(spread),
+        "coefficients": coefficients / unit,
+        "opacity_logit": _logit(np.full(num, START_OPACITY)),
+        "color_dc": (color - 0.5) / SH_C0,
+    }
+    return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope), spread
+
+
+def along_tracks(
+    motion: Motion, home: np.ndarray, position: np.ndarray, degree: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`."""
+    coefficients, spread = np.empty((len(home), degree, 2), np.float32), np.empty(len(home))
+    for start in range(0, len(home), CHUNK):
+        part = slice(start, start + CHUNK)
+        tracks = motion.follow(home[part], position[part].astype(np.float32))
+        shares = np.exp(rng.uniform(*np.log(TRACK_SHARES), len(tracks.known)))
+        wide = np.maximum(shares * tracks.reach / 2, LEAST_FRAMES)
+        folds, miss = fitted_folds(tracks, wide, degree)
+        for _ in range(SHORTENINGS):
+            off = np.flatnonzero((miss > MISS) & (wide > LEAST_FRAMES))
+            if not len(off):
+                break
+            wide[off] = np.maximum(wide[off] * SHORTENING, LEAST_FRAMES)
+            folds[off], miss[off] = fitted_folds(tracks[off], wide[off], degree)
+        coefficients[part], spread[part] = folds, wide
+    return coefficients, spread
 
 
 def detail(frame: np.ndarray) -> np.ndarray:
@@ -76,10 +155,28 @@ def _draw(share: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     return np.minimum(np.searchsorted(summed, uniform * summed[-1], side="right"), len(share) - 1)
 
 
-def _mean_alive(time: np.ndarray, spread: np.ndarray) -> float:
-    """Gaussians alive at a time, averaged over [0, 1]."""
-    first, last = time - TAU_MAX * spread, time + TAU_MAX * spread
-    return float((np.minimum(last, 1) - np.maximum(first, 0)).sum())
+def num_alive(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Gaussians alive at each of the frames."""
+    first = np.searchsorted(times, time - TAU_MAX * spread)
+    last = np.searchsorted(times, time + TAU_MAX * spread, side="right")
+    step = np.bincount(first, minlength=len(times) + 1) - np.bincount(last, minlength=len(times) + 1)
+    return np.cumsum(step)[:-1]
+
+
+def _even_chance(home: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """How often to start in each frame, so that all are covered alike by windows of `CORE` sigma_t.
+
+    `home` and `spread` are of starts tried, `PILOT` in every frame. Source: Richardson 1972, Lucy 1974.
+    """
+    num = len(times)
+    covers = np.zeros((num, num + 1))  # [k, j]: how often frame j is covered by starts in frame k
+    np.add.at(covers, (home, np.searchsorted(times, times[home] - CORE * spread)), 1 / PILOT)
+    np.add.at(covers, (home, np.searchsorted(times, times[home] + CORE * spread, side="right")), -1 / PILOT)
+    covers = np.cumsum(covers, axis=1)[:, :-1]
+    chance = np.full(num, 1 / num)
+    for _ in range(ROUNDS):
+        chance *= (covers / (chance @ covers)).sum(1) / covers.sum(1)
+    return chance / chance.sum()
 
 
 def _logit(p: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from foldgauss.fold import PolynomialFold
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.frame_times import FrameTimes
+from foldgauss.video.shots import out_of_cuts
 
 #: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
 SH_C0 = 0.28209479177387814
@@ -128,10 +129,14 @@ class VideoModel(eqx.Module):
     def render(
         self, t: float, size: tuple[int, int] | None = None, *, engine: str = "auto"
     ) -> Float[Array, "height width 3"]:
-        """The picture at any time t in [0, 1], values about [0, 1]; see `foldgauss.render.render`."""
+        """The picture at any time t in [0, 1], values about [0, 1]; see `foldgauss.render.render`.
+
+        Between two shots it is the nearer shot's. Frame k is at `frame_times.times()[k]`.
+        """
         size = self.size if size is None else size
         check_size(size)
-        splats = _splats_in_pixels(self, jnp.asarray(t, jnp.float32), tuple(size))
+        t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
+        splats = _splats_in_pixels(self, t, tuple(size))
         return render(splats, size, engine=engine, options=self.options)
 
     def frames(self, times: np.ndarray | None = None, size: tuple[int, int] | None = None) -> Iterator[np.ndarray]:

@@ -19,6 +19,7 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.conditioning import Shape, condition, update_windows
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import pack
+from foldgauss.video.shots import out_of_cuts
 
 ROWS = 64  # of pixels per task
 
@@ -51,6 +52,7 @@ class Playback:
         self._shape = Shape(model.splats.degree, power, floor, self.size, aspect=height / width)
         self._window = np.empty((len(self._rows), 2), np.float32)
         update_windows(self._rows, np.arange(len(self._rows)), self._window)
+        self._times = np.asarray(model.frame_times.times())
         self._black = np.zeros(3, np.float32)
 
     def splats(self, t: float) -> Splats2D:
@@ -59,12 +61,12 @@ class Playback:
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
 
     def frame(self, t: float) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture at time t."""
-        return to_bytes(self._image(t))
+        """The picture at time t; between two shots the nearer one's."""
+        return to_bytes(self._image(out_of_cuts(t, self._times)))
 
     def frames(self, times: Float[np.ndarray, "frames"] | None = None) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         """The pictures at `times` (default: the model's frame times), one by one."""
-        for t in np.asarray(self.model.frame_times.times() if times is None else times):
+        for t in np.asarray(self._times if times is None else times):
             yield self.frame(t)
 
     def _image(self, t: float) -> Float[np.ndarray, "3 height width"]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
+from foldgauss.video.packing import columns
 
 CHUNK = 2048  # rows per task
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
@@ -18,21 +19,28 @@ _f, _u = nb.float32, nb.uint64
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, rates):
+def _update(start, stop, touched, rows, grad, first, second, counts, rates, unit, spread, time, fold):
     beta1, beta2 = _f(BETA1), _f(BETA2)
-    width = _u(rows.shape[1])
+    width, own = _u(rows.shape[1]), rates.copy()
     for k in range(start, stop):
         i = touched[k]
         counts[i] += 1
         unbias1 = _f(1.0) / (_f(1.0) - beta1 ** _f(counts[i]))
         unbias2 = _f(1.0) / (_f(1.0) - beta2 ** _f(counts[i]))
         row, g, m, v = rows[i], grad[i], first[i], second[i]
+        if unit > _f(0.0):
+            wide = math.exp(row[spread]) / unit
+            own[time] = rates[time] * wide
+            short, power = _f(1.0) / wide, _f(1.0)
+            for c in range(fold, width, 2):
+                power *= short
+                own[c], own[c + 1] = rates[c] * power, rates[c + 1] * power
         for c in range(width):
             gradient = g[c]
             g[c] = _f(0.0)
             m[c] = beta1 * m[c] + (_f(1.0) - beta1) * gradient
             v[c] = beta2 * v[c] + (_f(1.0) - beta2) * gradient * gradient
-            row[c] -= rates[c] * m[c] * unbias1 / (math.sqrt(v[c] * unbias2) + _f(EPSILON))
+            row[c] -= own[c] * m[c] * unbias1 / (math.sqrt(v[c] * unbias2) + _f(EPSILON))
 
 
 def sparse_adam(
@@ -43,15 +51,32 @@ def sparse_adam(
     counts: np.ndarray,
     touched: np.ndarray,
     rates: np.ndarray,
+    *,
+    unit_time: float = 0.0,
 ) -> None:
     """One step on rows `touched`, in place; their gradients are set back to zero.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps each row
-    has taken; `rates`: float32 (width,), learning rates by column.
+    has taken; `rates`: float32 (width,), learning rates by column. With `unit_time` > 0 the rates of m_t and of the
+    fold are those at sigma_t = `unit_time`, and others' as `config.LearningRates` says.
     """
+    place = columns(0)  # the fold comes last, so its degree moves none of these
+    at = place["log_time_scale"].start, place["time_loc_logit"].start, place["coefficients"].start
     num = len(touched)
 
     def work(start: int) -> None:
-        _update(start, min(start + CHUNK, num), touched, rows, grad, first, second, counts, rates)
+        _update(
+            start,
+            min(start + CHUNK, num),
+            touched,
+            rows,
+            grad,
+            first,
+            second,
+            counts,
+            rates,
+            np.float32(unit_time),
+            *at,
+        )
 
     run_tasks(work, range(0, num, CHUNK))

@@ -10,7 +10,8 @@ from clips import moving_blobs
 
 from foldgauss import _threads
 from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps
-from foldgauss.video.fit import check_frames, planned_steps, start, to_model
+from foldgauss.video.config import chosen_num_gaussians, planned_steps
+from foldgauss.video.fit import check_frames, start, to_model
 
 fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
 
@@ -51,6 +52,10 @@ def test_learns_a_clip():
         {"final_rate": 0.0},
         {"floor": 0.1},
         {"steps": None, "minutes": 0.01},
+        {"follow_motion": False},
+        {"own_time": False},
+        {"square_share": 0.0},
+        {"square_share": 1.0},
     ],
     ids=str,
 )
@@ -91,9 +96,8 @@ def test_a_frame_twice_in_a_batch_counts_twice(monkeypatch):
     for batch in ([1], [1, 1]):
         config = dataclasses.replace(CONFIG, batch_size=len(batch))
         state = start(frames, config)
-        planes = np.ascontiguousarray(np.moveaxis(frames, -1, 1))
         monkeypatch.setattr(fit_module, "_update_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m))
-        stepper = fit_module._Stepper(planes, config, state)
+        stepper = fit_module._Stepper(frames, config, state)
         monkeypatch.setattr(stepper, "_batch", lambda step, batch=batch: np.array(batch))
         stepper(state, 0.0)
         steps.append((seen["t"], state.rows.copy()))
@@ -162,6 +166,54 @@ def test_planned_steps():
     assert planned_steps(FitConfig(batch_size=4), 1000) == 3000
     assert planned_steps(FitConfig(steps=7), 1000) == 7
     assert planned_steps(FitConfig(minutes=1), 1000) is None
+    assert planned_steps(FitConfig(minutes=1, steps=9), 1000) == 9
+
+
+@pytest.mark.parametrize(
+    ("budgets", "binds"),
+    [
+        ({"steps": 7, "minutes": 10.0}, "steps"),
+        ({"steps": 10**6, "minutes": 0.02}, "minutes"),
+        ({"steps": 400, "target_psnr": 20.0}, "target_psnr"),
+        ({"steps": 7, "target_psnr": 99.0}, "steps"),
+        ({"steps": None, "minutes": 0.02, "target_psnr": 99.0}, "minutes"),
+    ],
+    ids=str,
+)
+def test_the_first_budget_binds(budgets, binds):
+    *before, (_, last) = fit_steps(moving_blobs(), dataclasses.replace(CONFIG, **budgets))
+    assert last.stopped_by == binds
+    assert last.progress == 1
+    assert not any(info.stopped_by for _, info in before)
+    if binds == "steps":
+        assert last.step == 7
+    if binds == "target_psnr":
+        assert last.step < 400
+        assert last.psnr >= 20
+
+
+def test_minutes_are_turned_into_steps_once():
+    """A fit by minutes that was stopped goes on by the plan that it had: to the same bits as if it had not been."""
+    frames, config = moving_blobs(), dataclasses.replace(CONFIG, steps=None, minutes=0.05)
+    kept = None
+    for state, info in fit_steps(frames, config):
+        if state.plan and kept is None:
+            kept = jax.tree.map(np.array, state)
+    assert kept.plan == state.plan == info.step
+    assert kept.step < state.step
+    for again, _ in fit_steps(frames, config, kept):
+        pass
+    assert again.step == state.step
+    np.testing.assert_array_equal(again.rows, state.rows)
+
+
+def test_size_of_the_file_bounds_the_number():
+    config = FitConfig(num_gaussians=10_000, max_size_mb=0.1)
+    num = chosen_num_gaussians(config, 6, 48, 64)
+    assert 0.9e5 < 4 * num * (11 + 2 * 3) + 4096 < 1e5
+    assert chosen_num_gaussians(dataclasses.replace(config, max_size_mb=100.0), 6, 48, 64) == 10_000
+    with pytest.raises(ValueError, match="max_size_mb: expected at least"):
+        chosen_num_gaussians(dataclasses.replace(config, max_size_mb=1e-3), 6, 48, 64)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +225,10 @@ def test_planned_steps():
         ({"steps": 0}, "steps"),
         ({"minutes": 0}, "minutes"),
         ({"minutes": float("nan")}, "minutes"),
-        ({"steps": 10, "minutes": 1.0}, "at most one"),
+        ({"target_psnr": 0}, "target_psnr"),
+        ({"max_size_mb": -1.0}, "max_size_mb"),
+        ({"square_share": 1.5}, "square_share"),
+        ({"follow_motion": 1}, "follow_motion"),
         ({"batch_size": 0}, "batch_size"),
         ({"power": -1.0}, "power"),
         ({"ssim_share": 2.0}, "ssim_share"),

@@ -7,6 +7,7 @@ import pytest
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
+from foldgauss.video import FitConfig, fit
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.initialize import initialize
 from foldgauss.video.model import VideoModel
@@ -81,3 +82,17 @@ def test_bad_models_and_sizes_are_refused():
     broken = eqx.tree_at(lambda m: m.splats.loc, model, jnp.asarray(model.splats.loc).at[3].set(jnp.nan))
     with pytest.raises(ValueError, match="finite"):
         Playback(broken)
+
+
+def test_between_shots_is_the_nearer_one():
+    frames = np.concatenate([np.full((3, 32, 48, 3), 200, np.uint8), np.full((3, 32, 48, 3), 40, np.uint8)])
+    model = fit(frames, FitConfig(num_gaussians=200, steps=60)).model
+    times = np.asarray(model.frame_times.times())
+    assert times[3] - times[2] > 0.5  # the cut
+    early, late = 0.9 * times[2] + 0.1 * times[3], 0.1 * times[2] + 0.9 * times[3]
+    playback = Playback(model)
+    np.testing.assert_array_equal(playback.frame(early), playback.frame(times[2]))
+    np.testing.assert_array_equal(playback.frame(late), playback.frame(times[3]))
+    assert abs(np.mean(playback.frame(early)) - 200) < 15
+    assert abs(np.mean(playback.frame(late)) - 40) < 15
+    np.testing.assert_allclose(model.render(early), model.render(float(times[2])), atol=1e-6)

@@ -5,6 +5,7 @@ import numpy as np
 import optax
 import pytest
 
+from foldgauss.video.packing import columns
 from foldgauss.video.sparse_adam import BETA1, BETA2, EPSILON, sparse_adam
 
 
@@ -51,3 +52,21 @@ def test_zero_gradient_is_no_step():
     moments = np.zeros_like(rows), np.zeros_like(rows)
     sparse_adam(rows, np.zeros_like(rows), *moments, np.zeros(4, np.int32), np.arange(4), np.ones(11, np.float32))
     np.testing.assert_array_equal(rows, 1)
+
+
+def test_rates_in_units_of_own_time():
+    """A first step is the rate itself: c_k moves by (unit / sigma_t)^k of it, m_t by sigma_t / unit, others as ever."""
+    degree, unit, spread = 3, 0.06, np.array([0.03, 0.06, 0.24], np.float32)
+    place = columns(degree)
+    rows = np.zeros((3, place["coefficients"].stop), np.float32)
+    rows[:, place["log_time_scale"].start] = np.log(spread)
+    before, grad, moments = rows.copy(), np.ones_like(rows), (np.zeros_like(rows), np.zeros_like(rows))
+    rates = np.full(rows.shape[1], 1e-3, np.float32)
+    sparse_adam(rows, grad, *moments, np.zeros(3, np.int32), np.arange(3), rates, unit_time=unit)
+    factor = (before - rows) / 1e-3
+    for k in range(1, degree + 1):
+        own = factor[:, place["coefficients"]].reshape(3, degree, 2)[:, k - 1]
+        np.testing.assert_allclose(own, ((unit / spread) ** k)[:, None] * np.ones(2), rtol=1e-4)
+    np.testing.assert_allclose(factor[:, place["time_loc_logit"].start], spread / unit, rtol=1e-4)
+    np.testing.assert_allclose(factor[:, place["loc"]], 1, rtol=1e-4)
+    np.testing.assert_allclose(factor[:, place["log_time_scale"]], 1, rtol=1e-3)

@@ -1,0 +1,83 @@
+"""Tracks of a clip whose motion is known, their folds, and cuts."""
+
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.video.motion import LONGEST, Motion, Tracks, fitted_folds
+
+
+def panning(num_frames: int, step: tuple[float, float], height: int = 96, width: int = 160, seed: int = 0):
+    """A smooth random texture that moves by `step` pixels (x, y) a frame."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:height, 0:width].astype(np.float64)
+    waves = rng.normal(size=(30, 2)) * 0.25
+    phase, weight = rng.uniform(0, 2 * np.pi, 30), rng.uniform(0, 1, (30, 3))
+    frames = np.empty((num_frames, height, width, 3), np.uint8)
+    for k in range(num_frames):
+        turn = waves[:, 0, None, None] * (x - k * step[0]) + waves[:, 1, None, None] * (y - k * step[1])
+        picture = np.einsum("nhw,nc->hwc", np.sin(turn + phase[:, None, None]), weight)
+        frames[k] = np.clip(128 + 25 * picture, 0, 255)
+    return frames
+
+
+@pytest.mark.parametrize("step", [(2.0, 0.0), (-1.5, 1.0), (0.0, 0.0)])
+def test_tracks_follow_a_panning_camera(step):
+    frames = panning(16, step)
+    position = np.random.default_rng(1).uniform([50, 40], [110, 56], (200, 2)).astype(np.float32)
+    tracks = Motion.of(frames).follow(np.full(200, 8), position)
+    assert tracks.known[:, LONGEST].all()
+    assert np.median(tracks.reach) >= 10
+    elapsed = np.arange(-LONGEST, LONGEST + 1)[None, :, None]
+    miss = np.abs(tracks.shift - elapsed * np.array(step))[tracks.known]
+    assert np.percentile(miss, 95) < 0.6
+    # One stretch, around the point's own frame, within the clip.
+    assert not tracks.known[:, : LONGEST - 8].any()
+    assert (np.abs(np.diff(tracks.known.astype(int), axis=1)).sum(1) <= 2).all()
+    folds, rms = fitted_folds(tracks, np.full(200, 4.0), 3)
+    assert np.median(rms) < 0.3
+    u = -np.array([-3.0, 3.0])  # own time minus t
+    moved = (folds[:, None] * u[:, None, None] ** np.arange(1, 4)[:, None]).sum(2)
+    np.testing.assert_allclose(
+        np.median(moved, 0), [[-3 * step[0], -3 * step[1]], [3 * step[0], 3 * step[1]]], atol=0.4
+    )
+
+
+def test_cuts_are_found():
+    one, other, third = panning(7, (2, 0)), panning(5, (0, 0), seed=5), panning(4, (0, -1), seed=9)
+    assert Motion.of(np.concatenate([one, other, third])).cuts() == [7, 12]
+    assert Motion.of(one).cuts() == []
+    assert Motion.of(moving_blobs()).cuts() == []
+    assert Motion.of(np.full((3, 20, 30, 3), 7, np.uint8)).cuts() == []
+
+
+def test_tracks_end_at_a_cut():
+    frames = np.concatenate([panning(7, (2, 0)), panning(7, (2, 0), seed=5)])
+    position = np.random.default_rng(1).uniform([50, 40], [110, 56], (100, 2)).astype(np.float32)
+    tracks = Motion.of(frames).follow(np.full(100, 5), position)
+    assert tracks.known[:, LONGEST + 2 :].mean() < 0.03
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 5])
+def test_folds_of_known_tracks(degree):
+    """A cubic track, seen whole: its coefficients come back; a degree that is too low misses it."""
+    elapsed = np.arange(-LONGEST, LONGEST + 1)
+    u = -elapsed[:, None] / 10.0
+    shift = (np.array([[3.0, -1.0]]) * u + np.array([[0.5, 2.0]]) * u**2 + np.array([[0.2, 0.0]]) * u**3)[None]
+    tracks = Tracks(shift.astype(np.float32), np.ones((1, 2 * LONGEST + 1), bool))
+    folds, rms = fitted_folds(tracks, np.array([20.0]), degree)
+    assert folds.shape == (1, degree, 2)
+    if degree >= 3:
+        near, powers = np.abs(elapsed) <= 15, (-elapsed[:, None]) ** np.arange(1.0, degree + 1)
+        np.testing.assert_allclose(
+            (powers @ folds[0])[near], shift[0][near], atol=0.3
+        )  # of up to 8 pixels; a ridge holds it back
+        assert rms[0] < 0.1
+        assert not folds[0, 3:].any()
+    else:
+        assert rms[0] > 0.3
+
+
+def test_a_long_clip_keeps_small_maps():
+    frames = np.zeros((3, 40, 60, 3), np.uint8)
+    assert Motion.of(frames).small.shape == (3, 40, 60, 3)
