@@ -324,7 +324,7 @@ class _FitColumn(ProgressColumn):
     def render(self, task) -> str:
         info: FitInfo | None = task.fields.get("info")
         if info is None:
-            return "compiling" if not task.finished else ""
+            return "following the motion, compiling" if not task.finished else ""
         left = f"{info.seconds_left:.0f} s left" if np.isfinite(info.seconds_left) else ""
         return f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  {info.num_gaussians:,} Gaussians  {left}"
 
