@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Int
 from numpy.polynomial import hermite_e
+
+from foldgauss._triangular import solve_upper_matrix
 
 __all__ = ["Regression", "hermite", "hermite_to_powers", "weighted_regression"]
 
@@ -72,5 +73,5 @@ def weighted_regression(
     rank_deficient = (diagonal <= 8 * degree * jnp.finfo(v.dtype).eps * length).any() | (length == 0).any()
     safe = jnp.where(rank_deficient, jnp.eye(degree + 1, dtype=r.dtype), r)
     projected = jnp.where(active[:, None], jnp.matmul(q.T, row * y), 0)
-    coefficients = lax.linalg.triangular_solve(safe, projected, left_side=True, lower=False)
+    coefficients = solve_upper_matrix(safe, projected)
     return Regression(coefficients, jnp.matmul(design, coefficients), safe, log_unit, rank_deficient)

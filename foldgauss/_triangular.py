@@ -49,6 +49,18 @@ def solve_upper(tril: Matrix, b: Columns) -> Columns:
     return x[::-1]
 
 
+def solve_upper_matrix(upper: Float[Array, "dim dim"], b: Float[Array, "dim columns"]) -> Float[Array, "dim columns"]:
+    """R^-1 B for one upper triangle; many by `jax.vmap`.
+
+    Written out not only for speed: jaxlib 0.10's solver for batches waits, on a worker of XLA's pool, for other workers
+    of that pool, so two independent solves of batches can wait for each other for ever on two cores.
+    """
+    if upper.shape[-1] > UNROLLED_SIZE:
+        return lax.linalg.triangular_solve(upper, b, left_side=True, lower=False)
+    rows = solve_upper(upper.T[None], [row[:, None] for row in b])
+    return jnp.concatenate([row.T for row in rows])
+
+
 def lower_times(tril: Matrix, x: Columns) -> Columns:
     """L x, reading the lower triangle only."""
     if tril.shape[-1] > UNROLLED_SIZE:

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 from foldgauss._checks import invalid, one_of
 from foldgauss._profile import Profile, Space, maximise
 from foldgauss._regression import hermite, hermite_to_powers
+from foldgauss._triangular import solve_upper_matrix
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.fold import PolynomialFold
@@ -322,22 +323,18 @@ def _assembled(plan: _Plan, data: _Data, space: Space, when, status, steps, used
     )
     freedom = data.total - (used.astype(data.total.dtype) + 1)
     unbiased = jnp.sqrt(jnp.where(freedom > 0, 1 / jnp.where(freedom > 0, freedom, 1), jnp.nan))
+    triangle = space.regression.triangle
     return Fit(
         distribution=dist,
         log_likelihood=data.total * (space.value - jnp.log(data.scale).sum()),
         num_points=data.total,
         status=status,
         steps=steps,
-        triangle_inverse=_inverse(space.regression.triangle),
+        triangle_inverse=solve_upper_matrix(triangle, jnp.eye(len(triangle), dtype=triangle.dtype)),
         residual_scale=unbiased * _norm(space.tril) * data.scale,
         time=plan.time,
         covariance=plan.covariance,
     )
-
-
-def _inverse(triangle):
-    eye = jnp.eye(triangle.shape[0], dtype=triangle.dtype)
-    return lax.linalg.triangular_solve(triangle, eye, left_side=True, lower=False)
 
 
 def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
