@@ -260,9 +260,7 @@ def interrupted(monkeypatch):
     return arm
 
 
-@pytest.mark.skipif(
-    not hasattr(signal, "pthread_kill"), reason="a signal to oneself is caught on POSIX only; CI runs it on Linux"
-)
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
     """A signal keeps the fit; --resume ends it; the model equals that of a fit that was never stopped."""

@@ -85,7 +85,7 @@ def forward(
 
     Returns the trace: its `image` is planar, (channels, height, width), its `statistics` are there if asked for.
     Any number of channels from 1 on; kernels for 1 to 4 are compiled each, one for all others. Raises ValueError for
-    a tile size that is not this engine's, and where colours and background have not the same channels, at least one.
+    a tile size that is not this engine's, a size below 1, and arrays that are not float32 or do not fit together.
     """
     leaves = (mean, factor, opacity, color, background)
     return forward_frames([leaves], size, compositing=compositing, options=options, statistics=statistics)[0]

@@ -104,8 +104,8 @@ def fit_steps(
     """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one."""
     check_frames(frames)
     state = start(frames, config) if state is None else state
-    step, pace = _Stepper(frames, config, state), _Pace(config, len(frames))
-    stopped_by = _stopped_by(state, config)
+    step, pace = _Stepper(frames, config, state), _Pace(config)
+    stopped_by = _stopped_by(state, config, len(frames))
     if stopped_by:  # a kept state that needs no more steps
         yield state, _info(state, config, math.nan, 0, stopped_by)
     while not stopped_by:
@@ -117,7 +117,7 @@ def fit_steps(
         state.seconds += time.perf_counter() - begun
         if not state.plan:
             state.plan = pace.plan(state)
-        stopped_by = _stopped_by(state, config, seen=state.step * config.batch_size >= len(frames))
+        stopped_by = _stopped_by(state, config, len(frames))
         yield state, _info(state, config, loss, num_alive, stopped_by)
 
 
@@ -125,7 +125,7 @@ class _Pace:
     """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that one which
     was stopped goes on as if it had not been."""
 
-    def __init__(self, config: FitConfig, num_frames: int):
+    def __init__(self, config: FitConfig):
         self.config, self.since = config, None
 
     def plan(self, state: FitState) -> int:
@@ -151,9 +151,10 @@ def _progress(state: FitState) -> float:
     return min(state.step / state.plan, 1.0) if state.plan else 0.0
 
 
-def _stopped_by(state: FitState, config: FitConfig, *, seen: bool = True) -> str | None:
-    """The budget that binds now; `seen`: whether every frame was, which the running PSNR is told from."""
-    if config.target_psnr is not None and seen and state.step and _psnr(state) >= config.target_psnr:
+def _stopped_by(state: FitState, config: FitConfig, num_frames: int) -> str | None:
+    """The budget that binds now; the running PSNR counts once every frame was seen."""
+    seen = state.step * config.batch_size >= num_frames
+    if config.target_psnr is not None and seen and _psnr(state) >= config.target_psnr:
         return "target_psnr"
     if not state.plan or state.step < state.plan:
         return None

@@ -173,9 +173,7 @@ def _run(script: str) -> str:
     return done.stdout
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "sched_setaffinity"), reason="os.sched_setaffinity exists on Linux only; CI runs it there"
-)
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="core affinity exists on Linux only; CI runs it there")
 def test_jit_pinned_to_one_core():
     """A callback inside jit was seen to hang on one core; `jax_cpu_enable_async_dispatch=False` is the known cure."""
     script = """
