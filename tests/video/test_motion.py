@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
+from foldgauss.video import motion
 from foldgauss.video.motion import LONGEST, Motion, Tracks, fitted_folds
 
 
@@ -78,6 +79,13 @@ def test_folds_of_known_tracks(degree):
         assert rms[0] > 0.3
 
 
-def test_a_long_clip_keeps_small_maps():
-    frames = np.zeros((3, 40, 60, 3), np.uint8)
-    assert Motion.of(frames).small.shape == (3, 40, 60, 3)
+def test_maps_shrink_to_their_share_of_memory(monkeypatch):
+    frames = panning(4, (2.0, 0.0))
+    assert Motion.of(frames).small.shape == (4, 96, 160, 3)
+    monkeypatch.setattr(motion, "MAP_BYTES", 0)  # as where the clip is long: then the share of the frames' bytes counts
+    small = Motion.of(frames)
+    kept = small.small.nbytes + small.there.nbytes + small.back.nbytes
+    assert 0.1 * frames.nbytes < kept <= motion.MAP_SHARE * frames.nbytes
+    tracks = small.follow(np.full(20, 1), np.full((20, 2), [80.0, 48.0], np.float32))
+    assert tracks.known[:, LONGEST + 1].all()
+    np.testing.assert_allclose(tracks.shift[:, LONGEST + 1], np.tile([2.0, 0.0], (20, 1)), atol=0.5)
