@@ -88,7 +88,23 @@ def _plain(start, listed, geometry, color, background, ceiling, finished, image,
                 for c in range(_u(3)):
                     plane = base + (c + _u(1)) * _u(_PIXELS)
                     store(scratch, plane, load(scratch, plane) + weight * every(color[i, c]))
-        _cpu_kernels._write_tile(scratch, background, image, light, top, left)
+        _write_rows(scratch, background, image, light, top, left)
+
+
+@kernel
+def _write_rows(scratch, background, image, light, top, left):
+    """`_cpu_kernels._write_tile` for a tile that is kept row by row."""
+    height, width = light.shape
+    columns = min(_TILE, width - left)
+    for y in range(min(_TILE, height - top)):
+        base, out = _u(y * _TILE), light[top + y, left : left + columns]
+        for x in range(_u(columns)):
+            out[x] = scratch[base + x]
+        for c in range(_u(len(background))):
+            plane, out = (c + _u(1)) * _u(_PIXELS), image[c, top + y, left : left + columns]
+            behind = background[c]
+            for x in range(_u(columns)):
+                out[x] = scratch[base + plane + x] + scratch[base + x] * behind
 
 
 def plain_numba(lists: Lists, trace: cpu.Trace, planes: Planes) -> None:
@@ -118,12 +134,14 @@ def _list_boxes(first, last, across, num_tiles):
 
 @kernel
 def _boxes(geometry, span, across, first, last):
-    """The tiles of every splat's bounding box, from the half-width and the rows that the engine's projection gave."""
+    """The tiles of every splat's bounding box, from the turn and the rows that the engine's projection gave."""
     for i in range(len(span)):
         if span[i, 1] <= span[i, 0]:
             first[i], last[i] = 0, 0
             continue
-        left, right = geometry[i, 0] - geometry[i, 7], geometry[i, 0] + geometry[i, 7]
+        own = geometry[i]
+        radius = _cpu_kernels._edge(own[2], own[3], own[4], _cpu_kernels._level(own[5], own[6]), own[7])
+        left, right = own[0] - radius, own[0] + radius
         first[i, 0] = min(max(left, _f(0.0)) / _f(_TILE), _f(across))
         last[i, 0] = min(max(right, _f(0.0)) / _f(_TILE) + _f(1.0), _f(across))
         first[i, 1], last[i, 1] = span[i, 0], span[i, 1]

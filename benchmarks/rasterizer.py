@@ -14,14 +14,14 @@ background, the forward pass included. The reference is dense, so it draws only 
 pairs of its own, pixels times splats.
 
 `cpu` is timed twice: its own functions, as playback and fitting call them, and through the jitted `render` with two
-threads ("cpu, render"), which is the door that engine "xla" has: checks, copies in and out of JAX and, in the backward
+threads ("cpu, render"), which is the door that engine "xla" has: checks, planes made pixels and, in the backward
 pass, a second forward one are then counted. `xla_over_cpu_forward` and `xla_over_cpu_forward_backward` compare the
 engines through that door; all other figures of `cpu` are of its own functions.
 
 The C++ rivals (`rasterizer_kernel.cpp`, compiled on the spot) are serial and get their lists for nothing:
 
 * `cpu_over_cpp`: one thread of the engine's `forward_row` calls, which list by tile and blend, over C++ `exact`, the
-  same algorithm by hand from the lists that the engine made: equal pairs, equal pixel rows, the same early stop.
+  same algorithm by hand from the lists that the engine made: equal pairs, equal cells, the same early stop.
 * `plain_over_cpp`: the textbook loop (bounding boxes, every pixel of every listed pair, no early stop) in Numba over
   the same in C++, on equal lists.
 * `exact_over_plain`: the engine's projection, a listing by bounding boxes and the plain loop in Numba, over the
@@ -30,11 +30,12 @@ The C++ rivals (`rasterizer_kernel.cpp`, compiled on the spot) are serial and ge
 Engines must agree: see `check_agreement`. With --all the cost is also measured against the number of splats (at one
 size) and of pixels (at one number of splats, whose sizes grow with the picture), and plotted with the line of best fit.
 
-What bounds `cpu`, as LLVM 20 compiles it for AVX-512, per 16 pixels visited (the pixel rows of a tile that the ellipse
-reaches, until the tile is opaque): forward 23 vector instructions, 12 of them multiply-adds; backward 23 (8) to walk
-a block again and 27 (13) to walk it back. A Zen 4 core starts two 512-bit instructions per cycle, of them one
-multiply-add: 12 and 25 cycles, so 3.4 and 7.1 ns at 3.5 GHz, 0.21 and 0.45 ns per visited pair, on one thread. Beside
-them stand the listing, loading the blocks, and 33 instructions per splat and tile to sum over a row's lanes.
+What bounds `cpu`, as LLVM 20 compiles it for AVX-512, per 16 pixels visited (the cells of 4x4 pixels that the ellipse
+reaches, until the tile is opaque): forward 25 vector instructions, 15 of them multiplications; backward 21 (11) to walk
+a block again and 20 (13) to walk it back. A Zen 4 core starts two 512-bit instructions per cycle, of them one
+multiplication: 15 and 24 cycles, so 4.3 and 6.9 ns at 3.5 GHz, 0.27 and 0.43 ns per visited pair, on one thread. Beside
+them stand the listing, loading the blocks, and 33 instructions per splat and tile to sum over a cell's lanes. (Rows of
+16 pixels instead of cells took 12 and 25 cycles, but a third more of them were visited.)
 """
 
 import contextlib
@@ -74,6 +75,7 @@ LINE_WIDTHS, LINE_NUM = (640, 960, 1280, 1920, 2560), 50_000
 #: Entries whose pixels are counted one by one; of more, every n-th is.
 MOST_COUNTED = 500_000
 XLA_TILE = 8  # what the engine lists by
+CELL = 4  # pixels along a side of what the engine `cpu` visits or skips
 
 
 class Pairs(NamedTuple):
@@ -81,7 +83,7 @@ class Pairs(NamedTuple):
 
     boxes: int  # in tiles touched by the bounding box of the cutoff ellipse
     listed: int  # in the engine's lists
-    visited: int  # on pixel rows that the engine's loop runs over
+    visited: int  # in cells that the engine's loop runs over
     above: int  # with alpha above the cutoff, whatever light is left
 
 
@@ -115,13 +117,15 @@ def count_pairs(scene: Scene, trace: cpu.Trace) -> Pairs:
     used = np.concatenate([used - start[:-1] for start, _, used in trace.lists])
     mean, opacity = scene.leaves[0], scene.leaves[2]
     conic = np.linalg.inv(_covariance(scene))
-    rows = _num_rows(mean[splat], conic[splat], _reach(scene)[splat], left, top) * (position < used[tile])
+    covariance, reach = _covariance(scene), _reach(scene)
+    cells = _num_cells(mean[splat], conic[splat], covariance[splat], reach[splat], left, top)
+    cells *= position < used[tile]
     sample, above = np.arange(0, len(splat), -(-len(splat) // MOST_COUNTED)), 0
     for part in np.array_split(sample, -(-len(sample) // 20_000)):
         i = splat[part]
         above += _num_above(mean[i], conic[i], opacity[i], left[part], top[part])
     above = round(above * len(splat) / len(sample))
-    return Pairs(num_boxes(scene) * cpu.PIXELS, trace.num_pairs, int(rows.sum()) * cpu.TILE, above)
+    return Pairs(num_boxes(scene) * cpu.PIXELS, trace.num_pairs, int(cells.sum()) * CELL**2, above)
 
 
 def _covariance(scene: Scene) -> np.ndarray:
@@ -149,21 +153,25 @@ def num_boxes(scene: Scene, tile: int = cpu.TILE) -> int:
     return int((last - first).prod(axis=1).sum())
 
 
-def _num_rows(mean, conic, reach, left, top) -> np.ndarray:
-    """Pixel rows of a tile that the cutoff ellipse reaches within the tile's columns, by entry.
+def _num_cells(mean, conic, covariance, reach, left, top) -> np.ndarray:
+    """Cells of a tile that the cutoff ellipse reaches, by entry.
 
-    On the column dx the ellipse spans dy = (-xy dx -+ sqrt(yy reach - det dx^2)) / yy; it is highest and lowest where
-    dx = -+ xy sqrt(reach / (xx det)), or at the nearest column of the tile.
+    On the line dy the ellipse spans dx = (-xy dy -+ sqrt(xx reach - det dy^2)) / xx of the conic; it reaches furthest
+    to the right on dy = c_xy sqrt(reach / c_xx) of the covariance, or in a band of cells on the nearest line.
     """
     xx, xy, yy = conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1]
     det, x, y = xx * yy - xy**2, mean[:, 0] - left - 0.5, mean[:, 1] - top - 0.5
-    turn = xy * np.sqrt(reach / (xx * det))
-    ends = []
-    for side in (-1, 1):
-        dx = np.clip(-side * turn, -x, cpu.TILE - 1 - x)
-        ends.append(y + (-xy * dx + side * np.sqrt(np.maximum(yy * reach - det * dx**2, 0))) / yy)
-    first, last = np.maximum(np.ceil(ends[0]), 0), np.minimum(np.floor(ends[1]), cpu.TILE - 1)
-    return np.maximum(last - first + 1, 0)
+    turn, total = covariance[:, 0, 1] * np.sqrt(reach / covariance[:, 0, 0]), np.zeros(len(mean), np.int64)
+    for upper in range(0, cpu.TILE, CELL):
+        ends, met = [], True
+        for side in (-1, 1):
+            dy = np.clip(side * turn, upper - y, upper + CELL - 1 - y)
+            room = xx * reach - det * dy**2
+            met &= room >= 0
+            ends.append(x + (-xy * dy + side * np.sqrt(np.maximum(room, 0))) / xx)
+        first, last = np.maximum(np.ceil(ends[0]), 0), np.minimum(np.floor(ends[1]), cpu.TILE - 1)
+        total += np.where(met & (first <= last), last // CELL - first // CELL + 1, 0).astype(np.int64)
+    return total
 
 
 def _num_above(mean, conic, opacity, left, top) -> int:

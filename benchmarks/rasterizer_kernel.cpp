@@ -1,9 +1,10 @@
 // The CPU engine's loops in C++, serial: what a compiler makes of the same work. `benchmarks/rasterizer.py` compiles it
-// on the spot and calls it through ctypes. Tiles are 16x16, a row of a tile is one AVX-512 vector; everything is float.
+// on the spot and calls it through ctypes. Tiles are 16x16; everything is float.
 //
-//   plain  every pixel of every listed pair, the textbook loop: no tile is left early, no pixel row is skipped
-//   exact  what the engine does with the same lists: only the pixel rows that a splat reaches and that have light left,
-//          a tile left once dark
+//   plain  every pixel of every listed pair, the textbook loop, a row of a tile as one vector: no tile is left early,
+//          nothing is skipped
+//   exact  what the engine does with the same lists: cells of 4x4 pixels, one vector each, only those that a splat
+//          reaches and that have light left, a tile left once dark
 //
 // Columns of `geometry` and of the blocks are those of `foldgauss/render/_cpu_kernels.py`:
 // alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2), drawn where the exponent is at least LEAST.
@@ -14,11 +15,13 @@
 
 namespace {
 
-constexpr int TILE = 16, BLOCK = 64, COLUMNS = 8, CHANNELS = 3;
-enum { X, Y, P, Q, R, LOG, LEAST };
+constexpr int TILE = 16, CELL = 4, CELLS = 4, BLOCK = 64, COLUMNS = 8, CHANNELS = 3;
+enum { X, Y, P, Q, R, LOG, LEAST, TURN };
 
 typedef float Row __attribute__((vector_size(64)));  // 16 pixels; g++ splits it where registers are narrower
 typedef int32_t Whole __attribute__((vector_size(64)));
+const Row CELL_X = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
+const Row CELL_Y = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 const Row COLUMN = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
 // 2^x for -126 < x <= 0, as the engine.
@@ -54,6 +57,16 @@ struct Tile {
         return all_dark(most, finished);
     }
 
+    // From cells to rows of pixels.
+    void turn() {
+        for (int plane = 0; plane <= CHANNELS; ++plane) {
+            Row *own = plane ? color[plane - 1] : light, cells[TILE];
+            std::copy_n(own, TILE, cells);
+            for (int y = 0; y < TILE; ++y)
+                for (int x = 0; x < TILE; ++x) own[y][x] = cells[y / CELL * CELLS + x / CELL][y % CELL * CELL + x % CELL];
+        }
+    }
+
     void write(const float *background, float *image, float *out, int top, int left, int height, int width) const {
         for (int y = 0; y < std::min(TILE, height - top); ++y)
             for (int x = 0; x < std::min(TILE, width - left); ++x) {
@@ -65,10 +78,9 @@ struct Tile {
     }
 };
 
-// One row of pixels of one splat: its share of the light, and its colours.
-inline void blend_row(float p, float shear, float drop, float least, const float *own, int stride, float ceiling,
-                      float finished, Row &light, Row *color, int step) {
-    const Row across = p * COLUMN + shear, power = drop - across * across;
+// One vector of pixels of one splat: its share of the light, and its colours.
+inline void blend_pixels(Row power, float least, const float *own, int stride, float ceiling, float finished, Row &light,
+                         Row *color, int step) {
     Row alpha = power_of_two(power);
     alpha = alpha < ceiling ? alpha : Row{} + ceiling;
     alpha = power >= least ? alpha : Row{};
@@ -77,42 +89,61 @@ inline void blend_row(float p, float shear, float drop, float least, const float
     for (int c = 0; c < CHANNELS; ++c) color[c * step] += weight * own[c * stride];
 }
 
-// Pixel rows first <= row < last of a tile that the ellipse reaches; see `_pixel_rows` of the engine.
-inline void pixel_rows(float x, float y, float p, float q, float r, float level, int &first, int &last) {
-    const float square = q * q + r * r, inverse = 1.0f / square, shear = p * q;
-    const float turn = -q * std::sqrt(level) / (p * r), left = -x, right = TILE - 1 - x;
-    const float above = std::min(std::max(turn, left), right), below = std::min(std::max(-turn, left), right);
-    const float half_above = std::sqrt(std::max(square * level - (p * r * above) * (p * r * above), 0.0f));
-    const float half_below = std::sqrt(std::max(square * level - (p * r * below) * (p * r * below), 0.0f));
-    const float low = std::min(std::max(y - (shear * below + half_below) * inverse, 0.0f), float(TILE));
-    const float high = std::min(std::max(y - (shear * above - half_above) * inverse, -1.0f), float(TILE - 1));
-    first = static_cast<int>(low);
-    first += first < low;
-    last = std::max(static_cast<int>(high + 1.0f), first);
+// Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy.
+inline float edge(float p, float q, float r, float level, float dy) {
+    return (std::sqrt(std::max(level - r * dy * r * dy, 0.0f)) - q * dy) / p;
 }
 
-// As the engine: a row of pixels after another, its light and colours in registers, the splats that reach it in turn.
-void blend_block(int num, const float *block, const int *first, const int *last, float ceiling, float finished,
-                 Tile &tile) {
-    for (int row = 0; row < TILE; ++row) {
-        alignas(64) float shear[BLOCK], drop[BLOCK];
-        uint64_t left = 0;
+// Cells first <= k < end of every band of cells that the ellipses reach; see `_cells_of` of the engine.
+void cells_of(int num, const float *block, int *first, int *end) {
+    for (int band = 0; band < CELLS; ++band) {
+        const float upper = band * CELL, lower = upper + CELL - 1;
         for (int e = 0; e < num; ++e) {
-            left |= uint64_t((first[e] <= row) & (row < last[e])) << e;
-            const float dy = row - block[Y * BLOCK + e], along = block[R * BLOCK + e] * dy;
-            shear[e] = block[Q * BLOCK + e] * dy - block[P * BLOCK + e] * block[X * BLOCK + e];
-            drop[e] = block[LOG * BLOCK + e] - along * along;
+            const float x = block[X * BLOCK + e], y = block[Y * BLOCK + e], turn = block[TURN * BLOCK + e];
+            const float p = block[P * BLOCK + e], q = block[Q * BLOCK + e], r = block[R * BLOCK + e];
+            const float level = (block[LOG * BLOCK + e] - block[LEAST * BLOCK + e]) * 1.001f + 1e-3f;
+            const float on_right = std::min(std::max(turn, upper - y), lower - y);
+            const float on_left = std::min(std::max(-turn, upper - y), lower - y);
+            const float left = x - edge(p, -q, r, level, on_left), right = x + edge(p, q, r, level, on_right);
+            const float low = std::min(std::max(left, 0.0f), float(TILE));
+            const float high = std::min(std::max(right, -1.0f), float(TILE - 1));
+            int column = static_cast<int>(low);
+            column += column < low;
+            const int stop = static_cast<int>(high + 1.0f);
+            const bool reached = (stop > column) & (r * on_right * r * on_right <= level);
+            first[band * BLOCK + e] = column / CELL;
+            end[band * BLOCK + e] = reached ? (stop + CELL - 1) / CELL : 0;
         }
-        if (!left || all_dark(tile.light[row], finished)) continue;
-        Row light = tile.light[row], color[CHANNELS];
-        for (int c = 0; c < CHANNELS; ++c) color[c] = tile.color[c][row];
+    }
+}
+
+// As the engine: a cell after another, its light and colours in registers, the splats that reach it in turn.
+void blend_block(int num, const float *block, const int *first, const int *end, float ceiling, float finished,
+                 Tile &tile) {
+    for (int cell = 0; cell < CELLS * CELLS; ++cell) {
+        alignas(64) float shear[BLOCK], rise[BLOCK];
+        const int band = cell / CELLS, column = cell % CELLS;
+        uint64_t left = 0;
+        for (int e = 0; e < num; ++e)
+            left |= uint64_t((first[band * BLOCK + e] <= column) & (column < end[band * BLOCK + e])) << e;
+        if (!left || all_dark(tile.light[cell], finished)) continue;
+        for (int e = 0; e < num; ++e) {
+            const float dx = column * CELL - block[X * BLOCK + e], dy = band * CELL - block[Y * BLOCK + e];
+            shear[e] = block[P * BLOCK + e] * dx + block[Q * BLOCK + e] * dy;
+            rise[e] = block[R * BLOCK + e] * dy;
+        }
+        Row light = tile.light[cell], color[CHANNELS];
+        for (int c = 0; c < CHANNELS; ++c) color[c] = tile.color[c][cell];
         for (; left; left &= left - 1) {
             const int e = __builtin_ctzll(left);
-            blend_row(block[P * BLOCK + e], shear[e], drop[e], block[LEAST * BLOCK + e], block + 7 * BLOCK + e, BLOCK,
-                      ceiling, finished, light, color, 1);
+            const Row across = block[P * BLOCK + e] * CELL_X + (block[Q * BLOCK + e] * CELL_Y + shear[e]);
+            const Row along = block[R * BLOCK + e] * CELL_Y + rise[e];
+            const Row power = block[LOG * BLOCK + e] - along * along - across * across;
+            blend_pixels(power, block[LEAST * BLOCK + e], block + 8 * BLOCK + e, BLOCK, ceiling, finished, light, color,
+                         1);
         }
-        tile.light[row] = light;
-        for (int c = 0; c < CHANNELS; ++c) tile.color[c][row] = color[c];
+        tile.light[cell] = light;
+        for (int c = 0; c < CHANNELS; ++c) tile.color[c][cell] = color[c];
     }
 }
 
@@ -134,8 +165,8 @@ void plain(int height, int width, const int64_t *start, const int32_t *listed, c
             const float p = own[P], q = own[Q], r = own[R], log = own[LOG], least = own[LEAST];
             for (int row = 0; row < TILE; ++row) {
                 const float dy = row - y;
-                blend_row(p, q * dy - p * x, log - r * dy * r * dy, least, rgb, 1, ceiling, finished, tile.light[row],
-                          &tile.color[0][row], TILE);
+                const Row across = p * COLUMN + (q * dy - p * x), power = log - r * dy * r * dy - across * across;
+                blend_pixels(power, least, rgb, 1, ceiling, finished, tile.light[row], &tile.color[0][row], TILE);
             }
         }
         tile.write(background, image, light, top, left, height, width);
@@ -146,8 +177,8 @@ void exact(int height, int width, const int64_t *start, const int32_t *listed, c
            const float *colors, const float *background, float ceiling, float finished, float *image, float *light) {
     const int across = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;
     Tile tile;
-    alignas(64) float block[(7 + CHANNELS) * BLOCK];
-    alignas(64) int first[BLOCK], last[BLOCK];
+    alignas(64) float block[(COLUMNS + CHANNELS) * BLOCK];
+    alignas(64) int first[CELLS * BLOCK], end[CELLS * BLOCK];
     for (int t = 0; t < across * down; ++t) {
         const int left = t % across * TILE, top = t / across * TILE;
         tile.clear();
@@ -159,16 +190,13 @@ void exact(int height, int width, const int64_t *start, const int32_t *listed, c
                 const float *rgb = colors + int64_t(listed[k + e]) * CHANNELS;
                 block[X * BLOCK + e] = own[X] - left - 0.5f;
                 block[Y * BLOCK + e] = own[Y] - top - 0.5f;
-                for (int j = P; j <= LEAST; ++j) block[j * BLOCK + e] = own[j];
-                for (int c = 0; c < CHANNELS; ++c) block[(7 + c) * BLOCK + e] = rgb[c];
+                for (int j = P; j < COLUMNS; ++j) block[j * BLOCK + e] = own[j];
+                for (int c = 0; c < CHANNELS; ++c) block[(COLUMNS + c) * BLOCK + e] = rgb[c];
             }
-            for (int e = 0; e < num; ++e) {
-                const float level = (block[LOG * BLOCK + e] - block[LEAST * BLOCK + e]) * 1.001f + 1e-3f;
-                pixel_rows(block[X * BLOCK + e], block[Y * BLOCK + e], block[P * BLOCK + e], block[Q * BLOCK + e],
-                           block[R * BLOCK + e], level, first[e], last[e]);
-            }
-            blend_block(num, block, first, last, ceiling, finished, tile);
+            cells_of(num, block, first, end);
+            blend_block(num, block, first, end, ceiling, finished, tile);
         }
+        tile.turn();
         tile.write(background, image, light, top, left, height, width);
     }
 }

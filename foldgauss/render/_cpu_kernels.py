@@ -14,19 +14,26 @@ from foldgauss.render._vectors import (
     any_of,
     between,
     choose,
+    columns_of_cell,
+    columns_of_rows,
     every,
     folded,
-    lanes,
     load,
     lowest_bit,
+    rows_of_cell,
     scale,
     split,
     store,
+    turned,
 )
 
-TILE = LANES  # a row of a tile is one vector
+TILE = 16
 PIXELS = TILE * TILE
 _SHIFT = 4  # log2(TILE)
+#: A tile is CELLS x CELLS cells of CELL x CELL pixels; the pixels of a cell are one vector. Compact shapes meet fewer
+#: of the square cells than of rows of 16, by a third: what a splat costs is the cells that it meets.
+CELL, CELLS = 4, 4
+assert CELL * CELL == LANES
 #: A splat is drawn if it is thicker than about 1e-6 px (standard deviations along x at fixed y, and along y at fixed x)
 #: and, over all, not wider or higher than 1e9 px: what is thinner no pixel's centre meets but by design, and of what is
 #: wider float32 does not hold the determinant. Within these bounds nothing here overflows.
@@ -38,11 +45,12 @@ _f, _i, _u = nb.float32, nb.int32, nb.uint64
 
 # Columns of the per-splat geometry. The exponent is kept in powers of two, log2 of the opacity included:
 # alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2). Whitened before it is squared: the three terms of the usual conic
-# cancel for thin, slanted splats. Drawn where the exponent is at least LEAST; RX is half the drawn ellipse's width.
-_X, _Y, _P, _Q, _R, _LOG, _LEAST, _RX = range(8)
-# A tile is blended in blocks of splats, whose parameters are laid out one after another: those above without the
-# half-width, then the colours. Between blocks the tile is left if no light is.
-BLOCK, _COLOR = 64, 7
+# cancel for thin, slanted splats. Drawn where the exponent is at least LEAST; the drawn ellipse reaches furthest to the
+# right on the line dy = TURN, to the left on -TURN.
+_X, _Y, _P, _Q, _R, _LOG, _LEAST, _TURN = range(8)
+# A tile is blended in blocks of splats, whose parameters are laid out one after another: those above, then the
+# colours. Between blocks the tile is left if no light is.
+BLOCK, _COLOR = 64, 8
 # Sums of a gradient slot: of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where v = P dx + Q dy and w = R dy (in
 # whitened coordinates the moments of thin splats do not cancel either), then the colours'. Whole vectors of them.
 _MOMENTS = 6
@@ -51,7 +59,7 @@ FEW = 4
 # Planes of the scratch: the light left; then, forward, the colours; backward, the light that comes from behind and
 # the incoming gradients.
 _BEHIND, _G = PIXELS, 2 * PIXELS
-# What the backward pass notes of each pixel row of a splat: alpha and weight, a vector of each.
+# What the backward pass notes of each cell of a splat: alpha and weight, a vector of each.
 _NOTES = 2 * LANES
 
 
@@ -116,7 +124,7 @@ def project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff,
         geometry[i, _R] = r
         geometry[i, _LOG] = log
         geometry[i, _LEAST] = max(log_cutoff, log - radius)
-        geometry[i, _RX] = radius_x
+        geometry[i, _TURN] = _f(xy / xx) * radius_x
         # Pixel rows whose centres lie within the radius; clipped before the cast, so no float is too large for it.
         first = math.ceil(max(y - radius_y - _f(0.5), _f(0.0)))
         last = math.floor(min(y + radius_y - _f(0.5), _f(height - 1)))
@@ -158,9 +166,41 @@ def _edge(p, q, r, level, dy):
 
 
 @inline
+def _columns(left, right, width):
+    """Columns first <= k < stop of pixels whose centres lie in left <= k <= right, of 0 <= k < width."""
+    # Held within the picture before the cast; truncated, as ceil and floor would be calls into libm here.
+    # The bound stands first in `max`, which so makes it of NaN, whose cast could be any number.
+    low = min(max(_f(0.0), left), width)
+    high = min(max(_f(-1.0), right), width - _f(1.0))
+    first = _i(low)
+    first += _i(_f(first) < low)
+    return first, _i(high + _f(1.0))
+
+
+@inline
 def _level(log, least):
     """What (P dx + Q dy)^2 + (R dy)^2 is at the edge of what is listed."""
     return (log - least) * (_f(1.0) + SLACK) + SLACK
+
+
+@kernel
+def _load_geometry(geometry, num, which, left, top, block):
+    """The geometry of splats which[:num], column after column, their centres relative to (left, top).
+
+    `which` has room for BLOCK of them: up to a multiple of 16 it is filled up with the last.
+    """
+    for e in range(num, (num + LANES - 1) // LANES * LANES):
+        which[e] = which[num - 1]
+    for e in range(_u(0), _u(num), _u(LANES)):
+        columns = columns_of_rows(geometry, which, e)
+        store(block, _u(_X * BLOCK) + e, columns[_X] - every(left))
+        store(block, _u(_Y * BLOCK) + e, columns[_Y] - every(top))
+        store(block, _u(_P * BLOCK) + e, columns[_P])
+        store(block, _u(_Q * BLOCK) + e, columns[_Q])
+        store(block, _u(_R * BLOCK) + e, columns[_R])
+        store(block, _u(_LOG * BLOCK) + e, columns[_LOG])
+        store(block, _u(_LEAST * BLOCK) + e, columns[_LEAST])
+        store(block, _u(_TURN * BLOCK) + e, columns[_TURN])
 
 
 @kernel
@@ -173,17 +213,11 @@ def _tiles_of(num, block, upper, lower, width, first, end):
         x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
         p, q, r = block[_u(_P * BLOCK) + e], block[_u(_Q * BLOCK) + e], block[_u(_R * BLOCK) + e]
         level = _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e])
-        # The ellipse is widest to the right at dy = turn, to the left at -turn; within the band, at the nearest line.
-        turn = -p * q * block[_u(_RX * BLOCK) + e] / (q * q + r * r)
+        # Within the band it is widest on the line that is nearest to the turn.
+        turn = block[_u(_TURN * BLOCK) + e]
         right = x + _edge(p, q, r, level, min(max(turn, upper - y), lower - y))
         left = x - _edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
-        # Held within the picture before the cast; truncated, as ceil and floor would be calls into libm here.
-        # The bound stands first in `max`, which so makes it of NaN, whose cast could be any number.
-        low = min(max(_f(0.0), left - _f(0.5)), width)
-        high = min(max(_f(-1.0), right - _f(0.5)), width - _f(1.0))
-        column = _i(low)
-        column += _i(_f(column) < low)
-        stop = _i(high + _f(1.0))
+        column, stop = _columns(left - _f(0.5), right - _f(0.5), width)
         first[e] = column >> _i(_SHIFT)
         end[e] = max((stop + _i(TILE - 1)) >> _i(_SHIFT), first[e]) if stop > column else first[e]
 
@@ -194,13 +228,11 @@ def _bucket_tiles(geometry, entries, top, height, width):
     num_tiles, count = (width + TILE - 1) // TILE, len(entries)
     first, end = np.empty(count, np.int32), np.empty(count, np.int32)
     upper, lower = _f(top) + _f(0.5), _f(min(top + TILE, height)) - _f(0.5)
-    block = np.empty(8 * BLOCK, np.float32)
+    block, which = _aligned(8 * BLOCK), np.empty(BLOCK, np.int32)
     for begin in range(0, count, BLOCK):
         num = min(BLOCK, count - begin)
-        for e in range(_u(num)):
-            i = entries[_u(begin) + e]
-            for k in range(_u(8)):
-                block[k * _u(BLOCK) + e] = geometry[i, k]
+        which[:num] = entries[begin : begin + num]
+        _load_geometry(geometry, num, which, _f(0.0), _f(0.0), block)
         _tiles_of(num, block, upper, lower, _f(width), first[begin : begin + num], end[begin : begin + num])
     # How many more entries a tile has than the one before it.
     more = np.zeros(num_tiles + 1, np.int64)
@@ -220,27 +252,27 @@ def _bucket_tiles(geometry, entries, top, height, width):
     return tile_start, listed
 
 
-@inline
-def _pixel_rows(x, y, p, q, r, level):
-    """Pixel rows (first, end) of a tile that the ellipse (p dx + q dy)^2 + (r dy)^2 = level reaches within its columns.
+@kernel
+def _cells_of(num, block, first, end):
+    """Cells first <= k < end of every band of cells that the block's splats reach, band after band.
 
-    The centre (x, y) is relative to the centre of the tile's first pixel. The ellipse is highest at dx = turn and
-    lowest at -turn; within the columns, at the nearest one.
+    Exact for the rectangle of a cell's pixel centres.
     """
-    square = q * q + r * r
-    inverse, shear = _f(1.0) / square, p * q
-    turn = -q * math.sqrt(level) / (p * r)
-    left, right = -x, _f(TILE - 1) - x
-    above, below = min(max(turn, left), right), min(max(-turn, left), right)
-    half_above = math.sqrt(max(square * level - (p * r * above) * (p * r * above), _f(0.0)))
-    half_below = math.sqrt(max(square * level - (p * r * below) * (p * r * below), _f(0.0)))
-    # Held within the tile before the cast; truncated, as ceil and floor would be calls into libm here.
-    # NaN, too: see `_tiles_of`.
-    low = min(max(_f(0.0), y - (shear * below + half_below) * inverse), _f(TILE))
-    high = min(max(_f(-1.0), y - (shear * above - half_above) * inverse), _f(TILE - 1))
-    first = _i(low)
-    first += _i(_f(first) < low)
-    return first, _i(high + _f(1.0))
+    for band in range(_u(CELLS)):
+        upper, at = _f(_i(band) * _i(CELL)), band * _u(BLOCK)
+        lower = upper + _f(CELL - 1)
+        for e in range(_u(num)):
+            x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
+            p, q, r = block[_u(_P * BLOCK) + e], block[_u(_Q * BLOCK) + e], block[_u(_R * BLOCK) + e]
+            level = _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e])
+            turn = block[_u(_TURN * BLOCK) + e]
+            on_right, on_left = min(max(turn, upper - y), lower - y), min(max(-turn, upper - y), lower - y)
+            left, right = x - _edge(p, -q, r, level, on_left), x + _edge(p, q, r, level, on_right)
+            column, stop = _columns(left, right, _f(TILE))
+            # The line nearest to the turn meets the ellipse if any line of the band does.
+            reached = (stop > column) & (r * on_right * r * on_right <= level)
+            first[at + e] = column // _i(CELL)
+            end[at + e] = (stop + _i(CELL - 1)) // _i(CELL) if reached else _i(0)
 
 
 @inline
@@ -252,55 +284,54 @@ def _aligned(size):
 
 
 @kernel
-def _load_block(geometry, color, background, entries, listed, left, top, block, first, last):
-    """The parameters of up to BLOCK splats of a tile, one after another, and the pixel rows that each one reaches."""
+def _load_block(geometry, color, background, entries, listed, left, top, block, first, end):
+    """The parameters of up to BLOCK splats of a tile, one after another, and the cells that each one reaches.
+
+    Centres are relative to the centre of the tile's first pixel.
+    """
+    which = end  # which is written last
     for e in range(_u(len(listed))):
         i = entries[listed[e]]
-        block[_u(_X * BLOCK) + e] = geometry[i, _X] - left - _f(0.5)
-        block[_u(_Y * BLOCK) + e] = geometry[i, _Y] - top - _f(0.5)
-        block[_u(_P * BLOCK) + e] = geometry[i, _P]
-        block[_u(_Q * BLOCK) + e] = geometry[i, _Q]
-        block[_u(_R * BLOCK) + e] = geometry[i, _R]
-        block[_u(_LOG * BLOCK) + e] = geometry[i, _LOG]
-        block[_u(_LEAST * BLOCK) + e] = geometry[i, _LEAST]
+        which[e] = i
         for c in range(_u(len(background))):
             block[_u(_COLOR * BLOCK) + c * _u(BLOCK) + e] = color[i, c]
-    for e in range(_u(len(listed))):
-        first[e], last[e] = _pixel_rows(
-            block[_u(_X * BLOCK) + e],
-            block[_u(_Y * BLOCK) + e],
-            block[_u(_P * BLOCK) + e],
-            block[_u(_Q * BLOCK) + e],
-            block[_u(_R * BLOCK) + e],
-            _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e]),
-        )
-        last[e] = max(first[e], last[e])
-    last[len(listed) :] = 0
+    _load_geometry(geometry, len(listed), which, left + _f(0.5), top + _f(0.5), block)
+    _cells_of(len(listed), block, first, end)
+    for band in range(CELLS):
+        end[band * BLOCK + len(listed) : (band + 1) * BLOCK] = 0
+
+
+@inline
+def _offsets(block, e, x, y):
+    """P dx + Q dy and R dy of 16 splats of a block, from e on, at the pixel (x, y) of their tile."""
+    dx, dy = every(x) - load(block, _u(_X * BLOCK) + e), every(y) - load(block, _u(_Y * BLOCK) + e)
+    across = load(block, _u(_P * BLOCK) + e) * dx + load(block, _u(_Q * BLOCK) + e) * dy
+    return across, load(block, _u(_R * BLOCK) + e) * dy
 
 
 @kernel
-def _blend(num, block, first, last, shear, drop, scratch, background, over, ceiling, finished, marks):
-    """Add a block's splats to the tile: scratch holds the light left, then the colours.
+def _blend(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks):
+    """Add a block's splats to the tile: scratch holds the light left, then the colours, cell after cell.
 
-    One row of pixels after another, whose light and first FEW colours stay in registers while the splats that reach
-    it, a bit each, are taken in turn. Along a row alpha = 2^(drop - (P column + shear)^2).
+    A cell's light and first FEW colours stay in registers while the splats that reach it, a bit each, are taken in
+    turn; `shear` and `rise` are room for P dx + Q dy and R dy at its first pixel.
     `marks`: None, or room for two vectors for each splat, to add its weights and to keep its largest alphas in.
     """
     share, highest = every(_f(1.0) if over else _f(0.0)), every(ceiling)
-    stop, none, columns = every(finished), every(_f(0.0)), lanes()
+    stop, none = every(finished), every(_f(0.0))
+    x, y = columns_of_cell(), rows_of_cell()
     channels, color = _u(len(background)), _u(_COLOR * BLOCK)
-    for row in range(_u(TILE)):
-        base, here, left = row * _u(TILE), every(_f(_i(row))), _u(0)
+    for cell in range(_u(CELLS * CELLS)):
+        base, band, column, left = cell * _u(LANES), cell // _u(CELLS), cell % _u(CELLS), _u(0)
         for e in range(_u(0), _u(num), _u(LANES)):
-            left |= between(first, last, e, _i(row)) << e
-            dy = here - load(block, _u(_Y * BLOCK) + e)
-            along = load(block, _u(_R * BLOCK) + e) * dy
-            offset = load(block, _u(_P * BLOCK) + e) * load(block, _u(_X * BLOCK) + e)
-            store(shear, e, load(block, _u(_Q * BLOCK) + e) * dy - offset)
-            store(drop, e, load(block, _u(_LOG * BLOCK) + e) - along * along)
+            left |= between(first, end, band * _u(BLOCK) + e, _i(column)) << e
         light = load(scratch, base)
         if left == _u(0) or not any_of(light > stop):
             continue
+        for e in range(_u(0), _u(num), _u(LANES)):
+            across, along = _offsets(block, e, _f(_i(column * _u(CELL))), _f(_i(band * _u(CELL))))
+            store(shear, e, across)
+            store(rise, e, along)
         plane = base + _u(PIXELS)
         c_0th, c_1st, c_2nd, c_3rd = load(scratch, plane), none, none, none
         if channels > _u(1):
@@ -312,8 +343,9 @@ def _blend(num, block, first, last, shear, drop, scratch, background, over, ceil
         while left != _u(0):
             e = lowest_bit(left)
             left &= left - _u(1)
-            across = every(block[_u(_P * BLOCK) + e]) * columns + every(shear[e])
-            power = every(drop[e]) - across * across
+            across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[e]))
+            along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[e])
+            power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
             alpha = _exp2(power)
             alpha = choose(alpha < highest, alpha, highest)
             alpha = choose(power >= every(block[_u(_LEAST * BLOCK) + e]), alpha, none)
@@ -370,18 +402,40 @@ def _dark(scratch, finished):
 
 
 @kernel
+def _turn(scratch, plane):
+    """Turn a plane of the scratch from cells into rows of pixels, or back."""
+    for band in range(_u(CELLS)):
+        at = plane + band * _u(TILE * CELL)
+        cells = load(scratch, at), load(scratch, at + _u(16)), load(scratch, at + _u(32)), load(scratch, at + _u(48))
+        rows = turned(cells[0], cells[1], cells[2], cells[3])
+        store(scratch, at, rows[0])
+        store(scratch, at + _u(16), rows[1])
+        store(scratch, at + _u(32), rows[2])
+        store(scratch, at + _u(48), rows[3])
+
+
+@kernel
 def _write_tile(scratch, background, image, light, top, left):
+    """Write a tile into the picture; its scratch is turned into rows."""
     height, width = light.shape
-    columns = min(TILE, width - left)
-    for y in range(min(TILE, height - top)):
+    rows, columns = min(TILE, height - top), min(TILE, width - left)
+    for plane in range(_u(1 + len(background))):
+        _turn(scratch, plane * _u(PIXELS))
+    for y in range(rows):
         base, out = _u(y * TILE), light[top + y, left : left + columns]
-        for x in range(_u(columns)):
-            out[x] = scratch[base + x]
-        for c in range(len(background)):
-            plane, out = _u((c + 1) * PIXELS), image[c, top + y, left : left + columns]
-            behind = background[c]
+        if columns == TILE:
+            store(out, _u(0), load(scratch, base))
+        else:
             for x in range(_u(columns)):
-                out[x] = scratch[base + plane + x] + scratch[base + x] * behind
+                out[x] = scratch[base + x]
+        for c in range(len(background)):
+            plane, out = base + _u((c + 1) * PIXELS), image[c, top + y, left : left + columns]
+            behind = background[c]
+            if columns == TILE:
+                store(out, _u(0), load(scratch, plane) + load(scratch, base) * every(behind))
+            else:
+                for x in range(_u(columns)):
+                    out[x] = scratch[plane + x] + scratch[base + x] * behind
 
 
 @kernel
@@ -427,16 +481,16 @@ def forward_row(
         num_lights += _num_lights(tile_start[tile], tile_start[tile + 1])
     used, lights = np.empty(len(tile_start) - 1, np.int64), np.empty((num_lights if over else 0, PIXELS), np.float32)
     scratch, block = _aligned((1 + len(background)) * PIXELS), _aligned((_COLOR + len(background)) * BLOCK)
-    first, last = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    shear, drop = _aligned(BLOCK), _aligned(BLOCK)
+    first, end = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
+    shear, rise = _aligned(BLOCK), _aligned(BLOCK)
     if statistics is not None:
         statistics[row_start[row] : row_start[row + 1]] = 0.0
     kept = 0
     for tile in range(len(used)):
         scratch[:] = 0.0
         for y in range(min(TILE, height - top)):  # pixels outside the picture have no light from the start
-            for x in range(min(TILE, width - tile * TILE)):
-                scratch[y * TILE + x] = 1.0
+            scratch[y * TILE : y * TILE + min(TILE, width - tile * TILE)] = 1.0
+        _turn(scratch, _u(0))
         used[tile] = tile_start[tile + 1]
         for k in range(tile_start[tile], tile_start[tile + 1], BLOCK):
             if over and k > tile_start[tile]:
@@ -447,8 +501,8 @@ def forward_row(
                     lights[kept, p] = scratch[p]
                 kept += 1
             part = listed[k : min(k + BLOCK, tile_start[tile + 1])]
-            _load_block(geometry, color, background, entries, part, _f(tile * TILE), _f(top), block, first, last)
-            _blend(len(part), block, first, last, shear, drop, scratch, background, over, ceiling, finished, marks)
+            _load_block(geometry, color, background, entries, part, _f(tile * TILE), _f(top), block, first, end)
+            _blend(len(part), block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks)
             if statistics is not None:
                 _add_marks(part, marks, statistics[row_start[row] : row_start[row + 1]])
         _write_tile(scratch, background, image, light, top, tile * TILE)
@@ -456,33 +510,38 @@ def forward_row(
 
 
 @kernel
-def _list_rows(num, block, first, last, items, shear, drop):
-    """Write an item for every pixel row that a splat of the block reaches; returns their number.
+def _list_cells(num, block, first, end, items, stop, shear, rise):
+    """Write an item for every cell that a splat of the block reaches, those of splat e before stop[e]; their number.
 
-    One flat list, since a loop over each splat's own few rows would mispredict its end for every splat.
+    One flat list, since a loop over each splat's own few cells would mispredict its end for every splat.
     """
-    stop = _u(0)
+    total = _u(0)
     for e in range(_u(num)):
-        x, y, log = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e], block[_u(_LOG * BLOCK) + e]
+        x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
         p, q, r = block[_u(_P * BLOCK) + e], block[_u(_Q * BLOCK) + e], block[_u(_R * BLOCK) + e]
-        for k in range(_u(TILE)):  # always all 16, one vector: what is too much the next splat writes over
-            row = first[e] + _i(k)
-            dy = _f(row) - y
-            items[stop + k] = (row << _i(8)) | _i(e)
-            shear[stop + k] = q * dy - p * x
-            drop[stop + k] = log - r * dy * r * dy
-        stop += _u(last[e] - first[e])
-    return stop
+        for band in range(_u(CELLS)):
+            column, after = first[band * _u(BLOCK) + e], end[band * _u(BLOCK) + e]
+            dx, dy = _f(column * _i(CELL)) - x, _f(_i(band) * _i(CELL)) - y
+            item = (_i(band) * _i(CELLS) + column) << _i(8) | _i(e)
+            for k in range(_u(CELLS)):  # always all of them, one vector: what is too much the next ones write over
+                items[total + k] = item + (_i(k) << _i(8))
+                shear[total + k] = p * (dx + _f(_i(k) * _i(CELL))) + q * dy
+                rise[total + k] = r * dy
+            total += _u(max(after - column, _i(0)))
+        stop[e] = total
+    return total
 
 
 @kernel
-def _note(num_items, items, shear, drop, block, scratch, notes, over, ceiling, finished):
+def _note(num_items, items, shear, rise, block, scratch, notes, over, ceiling, finished):
     """Walk forward through a block once more, noting alpha and weight of every item; scratch: the light."""
-    highest, stop, none, columns = every(ceiling), every(finished), every(_f(0.0)), lanes()
+    highest, stop, none = every(ceiling), every(finished), every(_f(0.0))
+    x, y = columns_of_cell(), rows_of_cell()
     for n in range(_u(num_items)):
-        e, base, note = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(TILE), n * _u(_NOTES)
-        across = every(block[_u(_P * BLOCK) + e]) * columns + every(shear[n])
-        power = every(drop[n]) - across * across
+        e, base, note = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(LANES), n * _u(_NOTES)
+        across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[n]))
+        along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[n])
+        power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
         light = load(scratch, base)
         alpha = _exp2(power)
         alpha = choose(alpha < highest, alpha, highest)
@@ -496,27 +555,26 @@ def _note(num_items, items, shear, drop, block, scratch, notes, over, ceiling, f
 
 
 @kernel
-def _unblend(begin, end, items, shear, e, block, scratch, notes, background, over, flat, many, slot):
+def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, background, over, flat, many, slot):
     """Add the gradient sums of splat e, items begin..end of a tile, to its slot; light from behind moves before it.
 
     With B the light, times incoming gradient, that one unit of light would bring back from behind the splat,
     dL/dalpha = T (c . g - B): nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha that `_note` capped
     at, from which on it does not follow the exponent. `many`: room for the sums of the channels beyond FEW.
     """
-    num, limit, none, columns = _u(len(background)), every(flat), every(_f(0.0)), lanes()
-    slant = every(block[_u(_P * BLOCK) + e])
-    color = _u(_COLOR * BLOCK) + e
-    y, r = block[_u(_Y * BLOCK) + e], block[_u(_R * BLOCK) + e]
+    num, limit, none = _u(len(background)), every(flat), every(_f(0.0))
+    x, y, color = columns_of_cell(), rows_of_cell(), _u(_COLOR * BLOCK) + e
+    slant = every(block[_u(_P * BLOCK) + e]) * x + every(block[_u(_Q * BLOCK) + e]) * y
+    slope_y = every(block[_u(_R * BLOCK) + e]) * y
     s_1, s_v, s_w, s_vv, s_vw, s_ww = none, none, none, none, none, none
     s_0th, s_1st, s_2nd, s_3rd = none, none, none, none
     if num > _u(FEW):
         for c in range(num - _u(FEW)):
             store(many, c * _u(LANES), none)
     for n in range(begin, end):
-        row, note = items[n] >> _i(8), n * _u(_NOTES)
-        base = _u(row) * _u(TILE)
+        base, note = _u(items[n] >> _i(8)) * _u(LANES), n * _u(_NOTES)
         alpha, weight = load(notes, note), load(notes, note + _u(LANES))
-        across = slant * columns + every(shear[n])
+        across, along = slant + every(shear[n]), slope_y + every(rise[n])
         plane = base + _u(_G)
         grad = load(scratch, plane)
         own = every(block[color]) * grad
@@ -538,7 +596,6 @@ def _unblend(begin, end, items, shear, e, block, scratch, notes, background, ove
                 grad = load(scratch, plane + (c + _u(FEW)) * _u(PIXELS))
                 own = own + every(block[color + (c + _u(FEW)) * _u(BLOCK)]) * grad
                 store(many, c * _u(LANES), load(many, c * _u(LANES)) + weight * grad)
-        along = every(r * (_f(row) - y))
         gain = own
         if over:
             behind = load(scratch, base + _u(_BEHIND))
@@ -589,10 +646,10 @@ def backward_row(
     entries, slots = entries[row_start[row] : row_start[row + 1]], slots[row_start[row] : row_start[row + 1]]
     slots[:] = 0.0
     scratch, block = _aligned((2 + channels) * PIXELS), _aligned((_COLOR + channels) * BLOCK)
-    size = (BLOCK + 1) * TILE  # with the tail that `_list_rows` writes
-    items, shear, drop = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32)
-    first, last = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    notes, many = _aligned(BLOCK * TILE * _NOTES), _aligned(max(channels - FEW, 0) * LANES)
+    size = BLOCK * CELLS * CELLS + CELLS  # with the tail that `_list_cells` writes
+    items, shear, rise = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32)
+    first, end, stop = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32), np.empty(BLOCK, np.uint64)
+    notes, many = _aligned(BLOCK * CELLS * CELLS * _NOTES), _aligned(max(channels - FEW, 0) * LANES)
     kept = len(lights)
     for tile in range(len(used) - 1, -1, -1):
         left, columns = tile * TILE, min(TILE, width - tile * TILE)
@@ -605,25 +662,26 @@ def backward_row(
                 for x in range(_u(columns)):
                     scratch[plane + x] = row_of_grad[x]
                     scratch[base + _u(_BEHIND) + x] += row_of_grad[x] * behind
+        for plane in range(_u(_BEHIND), _u((2 + channels) * PIXELS), _u(PIXELS)):
+            _turn(scratch, plane)
         start = tile_start[tile]
         for k in range((used[tile] - start - 1) // BLOCK, -1, -1):
             part = listed[start + k * BLOCK : min(start + (k + 1) * BLOCK, used[tile])]
-            _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, last)
-            num_items = _list_rows(len(part), block, first, last, items, shear, drop)
+            _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, end)
+            num_items = _list_cells(len(part), block, first, end, items, stop, shear, rise)
             if over and k > 0:
                 kept -= 1
                 for p in range(_u(PIXELS)):
                     scratch[p] = lights[kept, p]
             else:
                 scratch[:PIXELS] = 1.0
-            _note(num_items, items, shear, drop, block, scratch, notes, over, flat, finished)
-            end = num_items
+            _note(num_items, items, shear, rise, block, scratch, notes, over, flat, finished)
             for e in range(len(part) - 1, -1, -1):
-                begin = end - _u(last[e] - first[e])
+                begin, own = stop[e - 1] if e else _u(0), slots[part[e]]
                 _unblend(
-                    begin, end, items, shear, _u(e), block, scratch, notes, background, over, flat, many, slots[part[e]]
+                    *(begin, stop[e], items, shear, rise, _u(e), block, scratch, notes),
+                    *(background, over, flat, many, own),
                 )
-                end = begin
 
 
 @kernel

@@ -59,14 +59,29 @@ def every(typing_context, scalar):
     return VECTOR(types.float32), lambda context, builder, signature, args: _broadcast(builder, args[0])
 
 
+def _constant(numbers):
+    def generate(context, builder, signature, args):
+        return ir.Constant(_FLOATS, numbers)
+
+    return VECTOR(), generate
+
+
 @intrinsic
 def lanes(typing_context):
     """The vector (0, 1, ..., 15)."""
+    return _constant([float(k) for k in range(LANES)])
 
-    def generate(context, builder, signature, args):
-        return ir.Constant(_FLOATS, [float(k) for k in range(LANES)])
 
-    return VECTOR(), generate
+@intrinsic
+def columns_of_cell(typing_context):
+    """The vector (0, 1, 2, 3, 0, 1, ...): the pixels' columns in a cell of 4 x 4, row by row."""
+    return _constant([float(k % 4) for k in range(LANES)])
+
+
+@intrinsic
+def rows_of_cell(typing_context):
+    """The vector (0, 0, 0, 0, 1, 1, ...): likewise their rows."""
+    return _constant([float(k // 4) for k in range(LANES)])
 
 
 @intrinsic
@@ -195,6 +210,46 @@ def scale(typing_context, value, whole):
 
 def _shuffled(builder, a, b, picks):
     return builder.shuffle_vector(a, b, ir.Constant(_INTS, picks))
+
+
+@intrinsic
+def columns_of_rows(typing_context, array, indices, start):
+    """The 8 columns of 16 rows of a contiguous float32 array (num, 8): of rows indices[start : start + 16], int32."""
+
+    def generate(context, builder, signature, args):
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        index = context.make_array(signature.args[1])(context, builder, args[1]).data
+        half, word = ir.VectorType(ir.FloatType(), 8), ir.IntType(64)
+        rows = []
+        for k in range(LANES):
+            place = builder.gep(index, [builder.add(args[2], ir.Constant(word, k))])
+            row = builder.mul(builder.sext(builder.load(place), word), ir.Constant(word, 8))
+            rows.append(builder.load(builder.bitcast(builder.gep(data, [row]), half.as_pointer()), align=4))
+        pairs = [_shuffled(builder, rows[k], rows[k + 8], [*range(LANES)]) for k in range(8)]
+        for bit in (1, 2, 4):  # lanes and rows change places, one bit of their numbers after another
+            for k in (k for k in range(8) if not k & bit):
+                low, high = pairs[k], pairs[k | bit]
+                from_low = [lane if not lane & bit else lane - bit + LANES for lane in range(LANES)]
+                from_high = [lane + bit if not lane & bit else lane + LANES for lane in range(LANES)]
+                pairs[k], pairs[k | bit] = (_shuffled(builder, low, high, picks) for picks in (from_low, from_high))
+        return context.make_tuple(builder, signature.return_type, pairs)
+
+    return types.UniTuple(VECTOR, 8)(array, indices, types.uint64), generate
+
+
+@intrinsic
+def turned(typing_context, a, b, c, d):
+    """Four vectors as a 4 x 4 matrix of groups of 4 lanes, transposed: four cells of pixels become four rows of 16."""
+
+    def generate(context, builder, signature, args):
+        low = [*range(4), *range(16, 20), *range(4, 8), *range(20, 24)]
+        high = [*range(8, 12), *range(24, 28), *range(12, 16), *range(28, 32)]
+        pairs = [[_shuffled(builder, *two, picks) for picks in (low, high)] for two in (args[:2], args[2:])]
+        left, right = [*range(8), *range(16, 24)], [*range(8, 16), *range(24, 32)]
+        rows = [_shuffled(builder, pairs[0][k], pairs[1][k], picks) for k in range(2) for picks in (left, right)]
+        return context.make_tuple(builder, signature.return_type, rows)
+
+    return types.UniTuple(VECTOR, 4)(VECTOR, VECTOR, VECTOR, VECTOR), generate
 
 
 @intrinsic(prefer_literal=True)

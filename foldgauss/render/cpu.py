@@ -6,10 +6,11 @@ How a picture is made, and why so:
   array order, hence depth order, with no sort. Each row is then one task: it buckets its splats by tile, again
   counting, and blends tile after tile. Rows share nothing, so any number of threads gives the same bits. Several
   frames are one such heap of rows.
-* Inside a tile only the pixel rows that the splat's cutoff ellipse reaches are visited, and a row of 16 pixels is
-  one AVX-512 vector (`_vectors`), with an exponential made of a polynomial and an addition to the exponent.
+* Inside a tile only the cells of 4x4 pixels that the splat's cutoff ellipse reaches are visited, and a cell is
+  one AVX-512 vector (`_vectors`), with an exponential made of a polynomial and an addition to the exponent. Before,
+  a vector was a row of 16 pixels: a third more of them were visited, for 5 to 10% more time in all.
 * The backward pass takes a tile's blocks of 64 splats from back to front, as the light at the start of each block was
-  kept. A block is walked forward once more, noting alpha and weight of every pixel row, then backward with the light
+  kept. A block is walked forward once more, noting alpha and weight of every cell, then backward with the light
   that comes from behind: dL/dalpha_i = T_i (c_i . g - B_i), which holds for alpha 1 too, since nothing is divided
   by 1 - alpha. Gradients go to one slot per (splat, row) and are summed per splat afterwards: deterministic,
   no atomics.

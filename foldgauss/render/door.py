@@ -2,17 +2,25 @@
 
 import functools
 import math
+from collections.abc import Callable
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._checks import invalid, one_of
+from foldgauss._threads import run_tasks
 from foldgauss.render import cpu
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
 from foldgauss.render.xla import render_xla
+
+try:
+    from jax.experimental.buffer_callback import buffer_callback
+except ImportError:  # it is experimental: where JAX has it no more, its slower sister does
+    buffer_callback = None
 
 ENGINES = ("auto", "cpu", "xla", "reference")
 COMPOSITINGS = ("over", "sum")
@@ -75,20 +83,28 @@ def render(
         engine = "cpu" if jax.default_backend() == "cpu" and _cpu_takes(options) else "xla"
     if engine == "cpu":
         cpu.check_options(options)
-    height, width = map(int, size)
+    # Engine "xla" looks at the numbers themselves where it can, to size its lists.
+    rendered = _compiled if engine == "cpu" else _rendered
+    return rendered(splats, background, tuple(map(int, size)), compositing, engine, options)
+
+
+def _rendered(splats, background, size, compositing, engine, options):
+    """The picture, all arguments checked."""
+    dtype = splats.mean.dtype
     leaves = (*_finite_splats(splats), background)
     if engine == "reference":
-        return render_reference(
-            Splats2D(*leaves[:4]), (height, width), background, compositing=compositing, options=options
-        )
+        return render_reference(Splats2D(*leaves[:4]), size, background, compositing=compositing, options=options)
     # Below single precision a sum of hundreds of splats has no digits left; float64 stays what it is, but in "cpu".
     inner = jnp.float32 if engine == "cpu" or dtype.itemsize < 4 else dtype
     leaves = tuple(leaf.astype(inner) for leaf in leaves)
     if engine == "xla":
-        image = render_xla(leaves, (height, width), compositing=compositing, options=options)
+        image = render_xla(leaves, size, compositing=compositing, options=options)
     else:
-        image = _render_cpu((height, width), compositing, options, *leaves)
+        image = _render_cpu(size, compositing, options, *leaves)
     return image.astype(dtype)
+
+
+_compiled = jax.jit(_rendered, static_argnums=(2, 3, 4, 5))
 
 
 def _cpu_takes(options: RenderOptions) -> bool:
@@ -115,12 +131,12 @@ def _finite_splats(splats: Splats2D) -> tuple[jax.Array, ...]:
 def _render_cpu(size, compositing, options, *leaves):
     """The CPU engine as a JAX function of float32 leaves."""
 
-    def draw(*leaves):
-        trace = cpu.forward(*_as_numpy(leaves), size, compositing=compositing, options=options)
-        return np.moveaxis(trace.image, 0, -1)
+    def draw(image, *leaves):
+        trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
+        _interleave(trace.image, image)
 
     shape = jax.ShapeDtypeStruct((*size, len(leaves[-1])), jnp.float32)
-    return jax.pure_callback(draw, shape, *leaves, vmap_method="sequential")
+    return _on_host(draw, shape, *leaves)
 
 
 def _render_cpu_fwd(size, compositing, options, *leaves):
@@ -130,16 +146,65 @@ def _render_cpu_fwd(size, compositing, options, *leaves):
 def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
     """Renders again, since a trace cannot travel through JAX: a third of the backward pass's own cost."""
 
-    def differentiate(grad_image, *leaves):
-        trace = cpu.forward(*_as_numpy(leaves), size, compositing=compositing, options=options)
-        return cpu.backward(trace, np.ascontiguousarray(np.moveaxis(np.asarray(grad_image), -1, 0)))
+    def differentiate(gradients, grad_image, *leaves):
+        trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
+        for out, made in zip(gradients, cpu.backward(trace, _separated(grad_image)), strict=True):
+            out[...] = made
 
     shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in leaves)
-    return jax.pure_callback(differentiate, shapes, grad_image, *leaves, vmap_method="sequential")
-
-
-def _as_numpy(leaves):
-    return tuple(np.ascontiguousarray(leaf, np.float32) for leaf in leaves)
+    return _on_host(differentiate, shapes, grad_image, *leaves)
 
 
 _render_cpu.defvjp(_render_cpu_fwd, _render_cpu_bwd)
+
+
+def _on_host(function: Callable, shapes, *arrays: jax.Array):
+    """What `function(out, *arrays)` writes into `out`, of `shapes`: a call of NumPy code from compiled code.
+
+    On the CPU without copies; `jax.pure_callback` brings arrays in and out of JAX again, for a millisecond or more.
+    """
+
+    def in_place(_, out, *buffers):
+        function(jax.tree.map(np.asarray, out), *map(np.asarray, buffers))
+
+    def copied(*arrays):
+        out = jax.tree.map(lambda shape: np.empty(shape.shape, shape.dtype), shapes)
+        function(out, *(np.ascontiguousarray(array) for array in arrays))
+        return out
+
+    through_copies = functools.partial(jax.pure_callback, copied, shapes, vmap_method="sequential")
+    if buffer_callback is None:
+        return through_copies(*arrays)
+    directly = buffer_callback(in_place, shapes, vmap_method="sequential")
+    return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)
+
+
+STRIP = 64  # rows of pixels per task
+
+
+def _interleave(planes: np.ndarray, image: np.ndarray) -> None:
+    """Write planes (channels, height, width) into an image (height, width, channels)."""
+
+    def work(top: int) -> None:
+        own = planes[:, top : top + STRIP]
+        if 2 <= len(planes) <= 4:
+            cv2.merge(list(own), image[top : top + STRIP])
+        else:
+            image[top : top + STRIP] = np.moveaxis(own, 0, -1)
+
+    run_tasks(work, range(0, len(image), STRIP))
+
+
+def _separated(image: np.ndarray) -> np.ndarray:
+    """The planes (channels, height, width) of an image (height, width, channels)."""
+    planes = np.empty((image.shape[2], *image.shape[:2]), np.float32)
+
+    def work(top: int) -> None:
+        own = planes[:, top : top + STRIP]
+        if 2 <= len(planes) <= 4:
+            cv2.split(image[top : top + STRIP], list(own))
+        else:
+            own[...] = np.moveaxis(image[top : top + STRIP], -1, 0)
+
+    run_tasks(work, range(0, len(image), STRIP))
+    return planes

@@ -265,10 +265,11 @@ def test_gradients_that_do_not_fit_are_refused(shape):
         cpu.backward(trace, np.zeros(shape, np.float32))
 
 
-def test_nan_reaches_no_tile_and_no_row():
+def test_nan_reaches_no_tile_and_no_cell():
     """No such geometry is made, but an index made of it would write anywhere."""
     nan, num = np.float32(np.nan), kernels.BLOCK
     first, end = np.full(num, -7, np.int32), np.full(num, -7, np.int32)
+    first_cell, end_cell = np.full((2, kernels.CELLS * num), -7, np.int32)
     one, width = np.float32(1), np.float32(64)
     for column in range(8):
         block = np.ones((8, num), np.float32)
@@ -276,12 +277,13 @@ def test_nan_reaches_no_tile_and_no_row():
         kernels._tiles_of(num, block.ravel(), one, one, width, first, end)
         assert 0 <= first.min() <= end.max() <= 4
         assert (first <= end).all()
-        values = np.ones(6, np.float32)
-        values[column % 6] = nan
-        low, high = kernels._pixel_rows(*values)
-        assert 0 <= low <= cpu.TILE >= high
+        kernels._cells_of(num, block.ravel(), first_cell, end_cell)
+        assert 0 <= first_cell.min() <= first_cell.max() <= kernels.CELLS
+        assert 0 <= end_cell.min() <= end_cell.max() <= kernels.CELLS
     kernels._tiles_of(num, np.full(8 * num, nan), one, one, width, first, end)
     np.testing.assert_array_equal(first, end)
+    kernels._cells_of(num, np.full(8 * num, nan), first_cell, end_cell)
+    assert (end_cell <= first_cell).all()
 
 
 @pytest.mark.parametrize("wrong", ["sign", "order"])

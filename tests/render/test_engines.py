@@ -1,5 +1,6 @@
 """Every engine against the judge, `reference`: pictures and all gradients."""
 
+import dataclasses
 import functools
 import os
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 from scenes import KINDS, check_slope, scene
 
 from foldgauss import _threads
-from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project, render
+from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, door, project, render
 from foldgauss.render.footprint import pixel_centres
 from foldgauss.render.reference import splat_alpha
 
@@ -321,6 +322,37 @@ def test_auto_takes_xla_where_the_cpu_engine_refuses():
     np.testing.assert_array_equal(
         render(splats, size, options=options), render(splats, size, engine="xla", options=options)
     )
+
+
+def test_a_second_call_compiles_nothing(caplog):
+    """Outside jit, too: a callback made anew would cost some 15 ms a call."""
+    splats, size = scene("plain")
+    gradient = jax.grad(lambda color: render(dataclasses.replace(splats, color=color), size, engine="cpu").sum())
+    for call in (lambda: render(splats, size, engine="cpu"), lambda: gradient(splats.color)):
+        call()
+        with jax.log_compiles():
+            caplog.clear()
+            call()
+            assert not caplog.records
+            jax.jit(lambda x: x + 1)(0.0)
+            assert caplog.records  # so they are seen
+
+
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_the_slower_callback_draws_the_same(channels, monkeypatch):
+    """Where JAX no longer has `buffer_callback`."""
+    splats, size = scene("plain")
+    color = jnp.asarray(np.random.default_rng(0).uniform(size=(len(splats.mean), channels)), jnp.float32)
+    splats = dataclasses.replace(splats, color=color)
+    draw = jax.value_and_grad(lambda own: jnp.sum(render(own, size, engine="cpu") ** 2))
+    value, gradient = draw(splats)
+    monkeypatch.setattr(door, "buffer_callback", None)
+    jax.clear_caches()
+    again, same = draw(splats)
+    assert value == again
+    jax.tree.map(np.testing.assert_array_equal, gradient, same)
+    monkeypatch.undo()
+    jax.clear_caches()
 
 
 @pytest.mark.parametrize("engine", ["cpu", "xla"])
