@@ -2,11 +2,12 @@
 
     python -m benchmarks.fit_clip [--json FILE] [--clip bunny|bikes|carphone|PATH] [--size HxW] [--frames A:B]
                                   [--gaussians N] [--degree K] [--steps N | --minutes M] [--seed S]
-                                  [--set NAME=VALUE ...] [--plot FILE]
+                                  [--preset standard|draft|paper] [--set NAME=VALUE ...] [--plot FILE]
 
 Without options: all 132 Bunny frames at 160x320, 40,000 Gaussians, degree 3, 2 minutes. Other clips keep their own size
-and get `default_num_gaussians` by it. `--set` changes any other field of `FitConfig`, to switch an idea off:
-`--set follow_motion=False`. `benchmarks.fit_bunny` and `benchmarks.fit_clips` are this with other defaults.
+and get `default_num_gaussians` by it; other presets have their own numbers. `--set` changes any other field of
+`FitConfig`, to switch an idea off: `--set follow_motion=False`. `benchmarks.fit_bunny` and `benchmarks.fit_clips` are
+this with other defaults.
 
 The way there is the running PSNR of the fit itself (about one pass through the frames, before rounding to 8 bits);
 `--plot` draws it. The end is `foldgauss.video.metrics.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean
@@ -25,7 +26,8 @@ from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.datasets import sample_clip
 from foldgauss.io.video_file import Clip, read_video
-from foldgauss.video.fit import FitConfig, FitInfo, fit
+from foldgauss.video.config import PRESETS, FitConfig
+from foldgauss.video.fit import FitInfo, fit
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 
@@ -42,16 +44,14 @@ def read(options: argparse.Namespace) -> Clip:
 
 
 def configuration(options: argparse.Namespace) -> FitConfig:
-    num = BUNNY_GAUSSIANS if options.clip == "bunny" and options.size is None else None
-    minutes = MINUTES if options.minutes is None else options.minutes
-    return FitConfig(
-        num_gaussians=num if options.gaussians is None else options.gaussians,
-        degree=options.degree,
-        steps=options.steps,
-        minutes=None if options.steps is not None else minutes,
-        seed=options.seed,
-        **dict(options.set or ()),
-    )
+    names = {"num_gaussians": "gaussians"} | {name: name for name in ("degree", "steps", "minutes", "seed")}
+    given = {name: getattr(options, own) for name, own in names.items() if getattr(options, own) is not None}
+    if options.preset == "standard":
+        if options.clip == "bunny" and options.size is None:
+            given = {"num_gaussians": BUNNY_GAUSSIANS} | given
+        if options.steps is None:
+            given = {"minutes": MINUTES} | given
+    return FitConfig.preset(options.preset, **given | dict(options.set or ()))
 
 
 def run(clip: Clip, config: FitConfig) -> tuple[VideoModel, list[FitInfo], float]:
@@ -102,7 +102,8 @@ def measure(options: argparse.Namespace) -> tuple[dict, dict, list[dict]]:
     figures = {"psnr": scores.mean_psnr, "ssim": scores.mean_ssim, "gaussians": num, "minutes": seconds / 60}
     figures |= {"steps": steps, "worst_frame_psnr": min(scores.psnr), "ms_per_step": 1e3 * kept[-1].seconds / steps}
     setting = {"clip": Path(options.clip).name, "size": clip.size, "num_frames": clip.num_frames}
-    setting |= {"num_gaussians": num, "degree": config.degree, "seed": config.seed, "set": dict(options.set or ())}
+    setting |= {"num_gaussians": num, "degree": config.degree, "seed": config.seed}
+    setting |= {"preset": options.preset, "set": dict(options.set or ())}
     course = [{"seconds": info.seconds, "step": info.step, "psnr": info.psnr} for info in kept]
     return figures, setting, course
 
@@ -132,11 +133,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=_common.size, metavar="HxW", help="[160x320 for bunny, else the clip's]")
     parser.add_argument("--frames", type=_frames, metavar="A:B", help="frames A <= i < B [all]")
     parser.add_argument("--gaussians", type=_common.whole, help="[40000 for bunny, else by the frame's size]")
-    parser.add_argument("--degree", type=int, default=3, help="of the folds [3]")
+    parser.add_argument("--degree", type=int, help="of the folds [3]")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=_common.whole, help="how long, in steps")
     length.add_argument("--minutes", type=float, help=f"how long, in minutes of fitting [{MINUTES:g}]")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
+    parser.add_argument(
+        "--preset", choices=tuple(PRESETS), default="standard", help="see `FitConfig.preset` [standard]"
+    )
     parser.add_argument("--set", action="append", type=_setting, metavar="NAME=VALUE", help="a field of FitConfig")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the course here (PNG)")
     return parser

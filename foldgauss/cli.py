@@ -1,7 +1,8 @@
-"""The command `foldgauss`: arguments, progress and exit codes. The work is done on the floors below."""
+"""The command `foldgauss`: arguments and exit codes. The work is done on the floors below."""
 
 import hashlib
 import json
+import re
 import signal
 import sys
 import time
@@ -17,7 +18,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     TextColumn,
     TimeElapsedColumn,
 )
@@ -25,14 +25,16 @@ from rich.table import Table
 
 from foldgauss import __version__
 from foldgauss._checks import invalid
+from foldgauss._progress import Manner, Observer, previewing, print_json, watching
 from foldgauss._threads import num_threads
 from foldgauss.datasets import sample_clip
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable
+from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.model_file import read_header
 from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import MAX_FPS, VIDEO_SUFFIXES, Clip, memory_limit, read_video, write_image, write_video
 from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
-from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, to_model
 from foldgauss.video.frame_times import interpolated_times
 from foldgauss.video.metrics import Evaluation, evaluate
@@ -43,6 +45,7 @@ MAX_UPSAMPLE = 100_000  # above, a clip of seconds plays for days
 #: A running fit is kept on disk this often, in seconds.
 CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
+DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -84,11 +87,16 @@ def root(
 def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
 ) -> None:
-    """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out."""
+    """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out.
+
+    A later demo replaces the files of an earlier one; a folder with other files in it is left alone.
+    """
+    _refuse_foreign(out_dir)
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
     _make_folder(out_dir)
     out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
-    state, info = _fit_with_progress(clip.frames, DEMO_CONFIG)
+    with watching(_manner(), err) as observe:
+        state, info = _run_fit(clip.frames, DEMO_CONFIG, observe)
     model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
     pictures: list[np.ndarray] = []
     scores = _evaluate_with_progress(model, clip.frames, pictures.append)
@@ -119,74 +127,104 @@ def fit(
     out_path: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name].")
     ] = None,
+    preset: Annotated[
+        str, typer.Option(help=f"Recipe that other options change: {', '.join(PRESETS)} (slow: the published one).")
+    ] = "standard",
     size: Size = None,
     frames: Frames = None,
     gaussians: Annotated[
         int | None,
-        typer.Option("--gaussians", "--max-gaussians", help="Number of Gaussians [default: by the frame's size]."),
+        typer.Option(help="Number of Gaussians at the start [default: by the preset, or the frame's size]."),
     ] = None,
+    max_gaussians: Annotated[int | None, typer.Option(help="Largest number of Gaussians, grown or not.")] = None,
     max_size_mb: Annotated[
         float | None,
         typer.Option("--max-size-mb", help="Largest model file, in 10^6 bytes; limits the Gaussians."),
     ] = None,
-    degree: Annotated[int, typer.Option(help="Degree of the fold polynomial.")] = FitConfig.degree,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips].")] = None,
+    degree: Annotated[
+        int | None, typer.Option(help="Degree of the fold polynomial [default: 3; draft: 2; paper: 7].")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips; draft: 800; paper: 30000].")
+    ] = None,
     minutes: Annotated[float | None, typer.Option(help="Time to fit for.")] = None,
     target_psnr: Annotated[float | None, typer.Option("--target-psnr", help="Stop at this PSNR, in dB.")] = None,
-    batch_size: Annotated[int, typer.Option(help="Frames per step.")] = FitConfig.batch_size,
+    batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
     power: Annotated[
-        float, typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code.")
-    ] = FitConfig.power,
+        float | None,
+        typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 2]."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
+    history: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.jsonl", help="Write every step's figures here as it is done; FILE.png: the curves."),
+    ] = None,
+    preview: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Keep a picture of the running fit here, new every 10 s.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings and errors.")] = False,
+    log_json: Annotated[bool, typer.Option("--log-json", help="Tell progress and figures as lines of JSON.")] = False,
 ) -> None:
     """Fit a model to a clip, until the first of the given budgets binds.
 
     A stopped fit is kept and goes on with --resume.
     """
+    changes = {
+        "num_gaussians": gaussians,
+        "max_gaussians": max_gaussians,
+        "degree": degree,
+        "steps": steps,
+        "minutes": minutes,
+        "target_psnr": target_psnr,
+        "max_size_mb": max_size_mb,
+        "batch_size": batch_size,
+        "power": power,
+        "seed": seed,
+    }
     try:
-        config = FitConfig(
-            num_gaussians=gaussians,
-            degree=degree,
-            steps=steps,
-            minutes=minutes,
-            target_psnr=target_psnr,
-            max_size_mb=max_size_mb,
-            batch_size=batch_size,
-            power=power,
-            seed=seed,
-        )
+        config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(str(error)) from error
     target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
     kept = target.with_name(f"{target.name}.checkpoint")
     if target.exists() and video.exists() and target.samefile(video):
         raise WrongUse(f"--out: expected another file than the clip, got {target}.")
+    manner = _manner(quiet, log_json)
     _refuse_existing(target, overwrite)
+    curves = _check_records(target, video, history, preview, overwrite or resume)
     if kept.exists() and not (resume or overwrite):
         raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
     if resume and not kept.exists():
         raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
     check_writable(target)
     clip = read_video(video, frames=_parse_frames(frames), size=_parse_size(size))
-    _say_clip(clip, config)
+    _say_clip(clip, config, manner)
     source = _fingerprint(clip)
     state = load_checkpoint(kept, config=config, source=source) if resume else None
 
     def keep(state: FitState) -> None:
         save_checkpoint(kept, state, config=config, source=source)
 
-    state, info = _fit_with_progress(clip.frames, config, state, keep)
+    recorded = None if history is None else HistoryFile(history, None if state is None else state.step)
+    previews = None if preview is None else previewing(preview, clip, config)
+    with watching(manner, err, history=recorded, preview=previews) as observe:
+        state, info = _run_fit(clip.frames, config, observe, state, keep)
     model = to_model(state, config, clip.size, clip.fps)
     about = _provenance(clip, config) | {"frames": _parse_frames(frames)}
     save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
     kept.unlink(missing_ok=True)
-    scores = _evaluate_with_progress(model, clip.frames)
+    if history is not None:
+        _draw_curves(curves, history)
+    scores = _evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
     save_video_model(target, model, metadata=about | _scores(scores))
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
-    figures["stopped_by"] = info.stopped_by
-    _print_figures(str(target), figures | {"file_bytes": target.stat().st_size})
+    figures |= {"stopped_by": info.stopped_by, "file_bytes": target.stat().st_size}
+    if manner == "json":
+        print_json("done", {"model": str(target)} | figures)
+    elif manner != "quiet":
+        _print_figures(str(target), figures)
 
 
 @app.command()
@@ -195,6 +233,9 @@ def render(
     out_path: Annotated[Path, typer.Option("--out", help="FILE.mp4, FILE.webm, or a folder for PNG frames.")],
     size: Size = None,
     upsample: Annotated[int, typer.Option(help="Frames per original interval.")] = 1,
+    background: Annotated[
+        str, typer.Option(metavar="RRGGBB", help="Colour behind a model of a clip with alpha, as ffffff.")
+    ] = "000000",
     overwrite: Overwrite = False,
 ) -> None:
     """Draw a model as a video, in between its frames too."""
@@ -202,7 +243,7 @@ def render(
         raise WrongUse(str(invalid("--upsample", expected="a whole number >= 1", got=upsample)))
     if upsample > MAX_UPSAMPLE:
         raise WrongUse(str(invalid("--upsample", expected=f"at most {MAX_UPSAMPLE:,}", got=upsample)))
-    picture_size = _parse_size(size)
+    picture_size, behind = _parse_size(size), _parse_color(background)
     if out_path.suffix and not out_path.is_dir():
         if out_path.suffix.lower() not in VIDEO_SUFFIXES:
             wanted = " or ".join(VIDEO_SUFFIXES)
@@ -219,7 +260,7 @@ def render(
             f"got {upsample}. Write to a folder instead."
         )
     with _bar("Rendering", len(times)) as advance:
-        pictures = _counted(model.frames(times, picture_size), advance)
+        pictures = _counted(model.frames(times, picture_size, background=behind), advance)
         path = write_video(out_path, pictures, min(fps, MAX_FPS), overwrite=overwrite)
     out.print(f"{path}: {len(times)} frames at {fps:g} frames a second", soft_wrap=True)
 
@@ -230,12 +271,15 @@ def evaluate_command(
     video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
     frames: Frames = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare a model with its clip: PSNR and SSIM per frame, size of the file, bits per pixel."""
     if json_path is not None:
+        _refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
     model = load_video_model(model_path)
-    kept = read_header(model_path)["metadata"].get("frames")
+    about = read_header(model_path)["metadata"]
+    kept = about.get("frames")
     wanted = _parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     clip = read_video(video, frames=wanted, size=model.size)
     if clip.num_frames != model.num_frames:
@@ -243,9 +287,12 @@ def evaluate_command(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
             "Name the frames it was fitted to."
         )
+    _say_other_frames(about, clip)
     scores = _evaluate_with_progress(model, clip.frames)
     num_bytes = model_path.stat().st_size
     figures = _figures(model, scores) | {"file_bytes": num_bytes}
+    if clip.has_alpha:
+        figures["mean_psnr_on_white"] = round(evaluate(model, clip.frames, background=(1.0, 1.0, 1.0)).mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
     if json_path is not None:
         _write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
@@ -296,15 +343,65 @@ def _parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     return (int(first) if first else None), (int(last) if last else None)
 
 
+def _parse_color(text: str) -> tuple[float, float, float]:
+    digits = text.removeprefix("#")
+    if not re.fullmatch("[0-9a-fA-F]{6}", digits):
+        raise WrongUse(f"--background: expected six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}.")
+    return tuple(byte / 255 for byte in bytes.fromhex(digits))
+
+
 def _refuse_huge(size: tuple[int, int] | None) -> None:
     """A picture is held in floats, some copies of it."""
     if size is not None and 64 * size[0] * size[1] > memory_limit():
         raise WrongUse(f"--size: expected a picture that fits in memory, got {size[0]}x{size[1]}. Take a smaller one.")
 
 
-def _refuse_existing(path: Path, overwrite: bool) -> None:
+def _refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
     if path.exists() and not overwrite:
-        raise WrongUse(f"--out: {path} exists. Choose another path, or add --overwrite.")
+        raise WrongUse(f"{option}: {path} exists. Choose another path, or add --overwrite.")
+
+
+def _manner(quiet: bool = False, log_json: bool = False) -> Manner:
+    """How a fit is shown: as asked, else a bar on a terminal and lines in a log."""
+    if quiet and log_json:
+        raise WrongUse("--quiet: expected one of --quiet and --log-json, got both. Leave one out.")
+    if quiet or log_json:
+        return "quiet" if quiet else "json"
+    return "bar" if err.is_terminal else "lines"
+
+
+def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
+    """Refuse places for the history, its curves and the preview that cannot be right; returns that of the curves."""
+    curves = Path() if history is None else history.with_suffix(".png")
+    asked = {"--history": (history, ".jsonl"), "--preview": (preview, ".png")}
+    for option, (path, suffix) in asked.items():
+        if path is not None and path.suffix != suffix:
+            raise WrongUse(str(invalid(option, expected=f"a name ending in {suffix}", got=path)))
+    places = [("--history", history), ("--history", None if history is None else curves), ("--preview", preview)]
+    taken = {target.resolve(), video.resolve()}
+    for option, path in places:
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
+        taken.add(path.resolve())
+        _refuse_existing(path, overwrite, option)
+        check_writable(path)
+    return curves
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """A demo replaces its own files only, so nothing else may be among them."""
+    try:
+        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
+    except OSError:  # missing, or no folder: making it says so
+        return
+    foreign = sorted(names - DEMO_FILES)
+    if foreign:
+        raise WrongUse(
+            f"--out: expected a new folder or one that a demo wrote, got {folder} with {foreign[0]!r} in it. "
+            "Choose another folder."
+        )
 
 
 def _make_folder(path: Path) -> None:
@@ -318,34 +415,19 @@ def _make_folder(path: Path) -> None:
 # -------------------------------------------------------------------------------------------- progress
 
 
-class _FitColumn(ProgressColumn):
-    """Step, loss, PSNR, Gaussians and time left of a fit."""
-
-    def render(self, task) -> str:
-        info: FitInfo | None = task.fields.get("info")
-        if info is None:
-            return "following the motion, compiling" if not task.finished else ""
-        left = f"{info.seconds_left:.0f} s left" if np.isfinite(info.seconds_left) else ""
-        return f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  {info.num_gaussians:,} Gaussians  {left}"
-
-
-def _fit_with_progress(
+def _run_fit(
     frames: np.ndarray,
     config: FitConfig,
+    observe: Observer,
     resumed: FitState | None = None,
     keep: Callable[[FitState], object] | None = None,
 ) -> tuple[FitState, FitInfo]:
-    """Run the fit under a bar; `keep` is called now and then, and before leaving on a signal."""
-    columns = TextColumn("Fitting"), BarColumn(bar_width=12), _FitColumn()
-    with Progress(*columns, console=err) as progress, _signals() as asked:
-        task = progress.add_task("fit", total=1.0)
-        kept_at, shown_at = time.monotonic(), 0.0
+    """Run the fit; `observe` sees each step, `keep` is called now and then, and before leaving on a signal."""
+    with _signals() as asked:
+        kept_at = time.monotonic()
         for state, info in fit_steps(frames, config, resumed):
-            now = time.monotonic()
-            if now - shown_at > 0.1 or info.progress >= 1:
-                progress.update(task, completed=info.progress, info=info)
-                shown_at = now
-            if keep is not None and now - kept_at > CHECKPOINT_SECONDS:
+            observe(state, info)  # first: what is kept at a step is in the history
+            if keep is not None and time.monotonic() - kept_at > CHECKPOINT_SECONDS:
                 _keep_if_possible(keep, state)
                 kept_at = time.monotonic()
             if asked and info.progress < 1:
@@ -389,14 +471,14 @@ def _signals() -> Iterator[list[str]]:
 
 
 @contextmanager
-def _bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+def _bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], None]]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=err) as progress:
+    with Progress(*columns, console=err, disable=not shown) as progress:
         task = progress.add_task(title, total=total)
         yield lambda: progress.advance(task)
 
@@ -408,10 +490,14 @@ def _counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]
 
 
 def _evaluate_with_progress(
-    model: VideoModel, frames: np.ndarray, keep: Callable[[np.ndarray], None] = lambda picture: None
+    model: VideoModel,
+    frames: np.ndarray,
+    keep: Callable[[np.ndarray], None] = lambda picture: None,
+    *,
+    shown: bool = True,
 ) -> Evaluation:
     """Scores of every frame; `keep` is handed the pictures they were read off."""
-    with _bar("Evaluating", model.num_frames) as advance:
+    with _bar("Evaluating", model.num_frames, shown) as advance:
 
         def on_frame(picture: np.ndarray) -> None:
             keep(picture)
@@ -423,7 +509,15 @@ def _evaluate_with_progress(
 # --------------------------------------------------------------------------------------------- results
 
 
-def _say_clip(clip: Clip, config: FitConfig) -> None:
+def _draw_curves(path: Path, history: Path) -> None:
+    """The fit is done by now: what goes wrong with its curves is told, no more."""
+    try:
+        write_curves(path, read_history(history))
+    except (ImportError, OSError, ValueError) as error:
+        err.print(f"warning: no curves in {path}: {error}", soft_wrap=True)
+
+
+def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
     height, width = clip.size
     if clip.num_declared > clip.num_frames:
         err.print(
@@ -434,11 +528,29 @@ def _say_clip(clip: Clip, config: FitConfig) -> None:
     steps = planned_steps(config, clip.num_frames)
     budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
     plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
+    if manner == "json":
+        about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
+        print_json("start", about | {"num_gaussians": num, "degree": config.degree, "threads": num_threads()})
+    if manner in ("json", "quiet"):
+        return
+    growing = "" if config.growth is None else " at the start"
     out.print(
-        f"{clip.source}: {clip.num_frames} frames of {height}x{width}, {num:,} Gaussians of degree {config.degree}, "
+        f"{clip.source}: {clip.num_frames} frames of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
+        f"{num:,} Gaussians{growing} of degree {config.degree}, "
         f"{plan}, {num_threads()} threads",
         soft_wrap=True,
     )
+
+
+def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
+    """Any clip of the right size may be compared with a model, but not unawares."""
+    digest = about.get("frames_digest")  # files from before it was kept have none
+    if digest is not None and digest != _fingerprint(clip)["frames_digest"]:
+        err.print(
+            f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
+            "another clip or range, or the same one decoded by another version of OpenCV.",
+            soft_wrap=True,
+        )
 
 
 def _figures(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
@@ -455,7 +567,7 @@ def _figures(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
 
 
 def _provenance(clip: Clip, config: FitConfig) -> dict[str, Any]:
-    return {"clip": Path(clip.source).name, "seed": config.seed}
+    return {"clip": Path(clip.source).name, "seed": config.seed, "frames_digest": _fingerprint(clip)["frames_digest"]}
 
 
 def _scores(scores: Evaluation) -> dict[str, Any]:
@@ -470,6 +582,7 @@ def _fingerprint(clip: Clip) -> dict[str, Any]:
 
 _LABELS = {
     "mean_psnr": ("mean PSNR", "{:.2f} dB"),
+    "mean_psnr_on_white": ("mean PSNR over white", "{:.2f} dB"),
     "mean_ssim": ("mean SSIM", "{:.4f}"),
     "lowest_psnr": ("lowest PSNR of a frame", "{:.2f} dB"),
     "num_frames": ("frames", "{:,}"),

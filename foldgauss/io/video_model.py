@@ -16,6 +16,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.config import FitConfig
 from foldgauss.video.fit import TIME_ADAM, FitState
 from foldgauss.video.frame_times import FrameTimes
+from foldgauss.video.growth import Statistics
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import columns, unpack
 
@@ -103,6 +104,7 @@ def _describe_checkpoint(state: FitState) -> dict:
         "num_gaussians": num,
         "width": width,
         "num_intervals": len(state.time_logits),
+        "growing": state.statistics is not None,
         "step": state.step,
         "plan": state.plan,
         "seconds": state.seconds,
@@ -116,13 +118,15 @@ def _checkpoint_skeleton(header: dict) -> FitState:
     def floats(*shape: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, np.float32)
 
+    counts = jax.ShapeDtypeStruct((num,), np.int32)
     return FitState(
         rows=floats(num, width),
         first=floats(num, width),
         second=floats(num, width),
-        counts=jax.ShapeDtypeStruct((num,), np.int32),
+        counts=counts,
         time_logits=floats(intervals),
         time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
+        statistics=Statistics(floats(num), floats(num), counts) if header["growing"] else None,
         step=int(header["step"]),
         plan=int(header["plan"]),
         seconds=float(header["seconds"]),

@@ -58,6 +58,11 @@ class Trace:
     lights: list[np.ndarray]  # per row: the light at the start of blocks
     constants: tuple  # background, over, ceiling, finished
 
+    @property
+    def seen(self) -> np.ndarray:
+        """Which splats reach the picture: (num,), bool."""
+        return np.diff(self.buckets[2]) > 0
+
 
 def check_options(options: RenderOptions) -> None:
     """Raise ValueError for options that this engine does not know."""

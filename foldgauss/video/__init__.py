@@ -3,6 +3,7 @@
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
 from foldgauss.video.frame_times import FrameTimes, interpolated_times
+from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
 
@@ -14,6 +15,7 @@ __all__ = [
     "FitState",
     "FoldedSplats",
     "FrameTimes",
+    "Growth",
     "LearningRates",
     "VideoModel",
     "evaluate",

@@ -2,10 +2,11 @@
 
 import dataclasses
 import math
-from numbers import Integral, Real
+from typing import Any
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, one_of, whole, within
 from foldgauss.render import RenderOptions
+from foldgauss.video.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,18 +42,62 @@ MAX_GAUSSIANS = 10_000_000
 MAX_DEGREE = 16
 #: 0.1 px^2 of low pass fits finer detail than the usual 0.3.
 FINE = RenderOptions(low_pass=0.1)
+#: Where Gaussians start, and which rates fall.
+INITIALIZATIONS, FALLING = ("clip", "uniform"), ("all", "loc")
+#: The published rates, those of lengths in our unit; published positions learn in units of the scene's extent.
+PUBLISHED_RATES = LearningRates(
+    loc=1.6e-4 * EXTENT,
+    coefficients=1e-3 * PUBLISHED_UNIT,
+    log_scale=5e-3,
+    angle_logit=1e-3,
+    opacity_logit=2.5e-2,
+    color_dc=2.5e-3,
+    time_loc_logit=1e-3,
+    log_time_scale=1e-3,
+    frame_times=1e-3,
+)
+#: What each preset changes, see `FitConfig.preset`.
+PRESETS: dict[str, dict[str, Any]] = {
+    "standard": {},
+    "draft": {"num_gaussians": 10_000, "degree": 2, "steps": 800},
+    "paper": {
+        "num_gaussians": 500_000,
+        "degree": 7,
+        "steps": PUBLISHED_STEPS,
+        "batch_size": 3,
+        "power": 2.0,
+        "ssim_share": 0.2,
+        "initialization": "uniform",
+        "follow_motion": False,
+        "own_time": False,
+        "only_alive": False,
+        "square_share": 0.0,
+        "rates": PUBLISHED_RATES,
+        "final_rate": 0.01,
+        "falling": "loc",
+        "two_cameras": True,
+        "growth": Growth(),
+        "options": RenderOptions.standard(),
+    },
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig:
-    """Everything a fit depends on beside the frames.
+    """Everything a fit depends on beside the frames; `preset` has some of them ready.
 
     `steps`, `minutes` and `target_psnr` are budgets: the fit ends with the first that binds. With neither steps nor
     minutes, steps are `DEFAULT_STEPS`, or more for long clips. `max_size_mb` bounds the number of Gaussians by the
     model file's size.
+
+    With `two_cameras` half of the views of a pass are those of the camera opposite: each frame's mirrored picture, and
+    the splats as seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so this
+    gives the gradients of the front view to rounding; a pass is twice as long, and that is all. It is there for
+    fidelity to the paper.
     """
 
-    num_gaussians: int | None = None  # None: by the size of the frames, `default_num_gaussians`
+    num_gaussians: int | None = None  # at the start; None: by the size of the frames, `default_num_gaussians`
+    max_gaussians: int | None = None  # at any time; None: `MAX_GAUSSIANS`
     degree: int = 3
     steps: int | None = None
     minutes: float | None = None
@@ -64,26 +109,36 @@ class FitConfig:
     ssim_share: float = 0.2
     seed: int = 0
     learn_frame_times: bool = True
+    #: Drawn from the "clip", its detail and its colours, or "uniform" over frame and time, see `initialize_uniform`.
+    initialization: str = "clip"
     follow_motion: bool = True  # start along the optical flow, shot by shot; False: at rest
     own_time: bool = True  # rates in units of each Gaussian's own time, see `LearningRates`
     square_share: float = 0.3  # of the plan, at its end: squared error alone, which is what PSNR measures
+    #: Adam's steps are for Gaussians alive in the batch; False: for all, by momentum, as published.
+    only_alive: bool = True
     rates: LearningRates = LearningRates()
-    final_rate: float = 0.07  # all rates fall exponentially to this share of themselves
+    final_rate: float = 0.07  # rates fall exponentially to this share of themselves
+    falling: str = "all"  # which do: all, or "loc", that of positions alone
+    two_cameras: bool = False  # see above
+    growth: Growth | None = None  # None: the number of Gaussians stays
     options: RenderOptions = FINE
 
     def __post_init__(self) -> None:
-        whole = {"num_gaussians": 1, "degree": 0, "steps": 1, "batch_size": 1, "seed": 0}
-        for name, least in whole.items():
+        numbers = {"num_gaussians": 1, "max_gaussians": 1, "degree": 0, "steps": 1, "batch_size": 1, "seed": 0}
+        for name, least in numbers.items():
             value = getattr(self, name)
-            if value is None and name in ("num_gaussians", "steps"):
+            if value is None and name in ("num_gaussians", "max_gaussians", "steps"):
                 continue
-            if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+            if not whole(value, least):
                 raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
             object.__setattr__(self, name, int(value))  # NumPy's integers have no place in a checkpoint
-        for name, most in {"degree": MAX_DEGREE, "num_gaussians": MAX_GAUSSIANS}.items():
+        for name, most in {
+            "degree": MAX_DEGREE,
+            "num_gaussians": MAX_GAUSSIANS,
+            "max_gaussians": MAX_GAUSSIANS,
+        }.items():
             if (getattr(self, name) or 0) > most:
                 raise invalid(name, expected=f"at most {most:,}", got=f"{getattr(self, name):,}")
-        # "[" includes the bound, "(" does not.
         ranges = {
             "minutes": "(0, inf)",
             "target_psnr": "(0, inf)",
@@ -98,23 +153,45 @@ class FitConfig:
             value = getattr(self, name)
             if value is None and name in ("minutes", "target_psnr", "max_size_mb"):
                 continue
-            if not _within(value, bounds):
+            if not within(value, bounds):
                 raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
             object.__setattr__(self, name, float(value))
-        flags = dict.fromkeys(("learn_frame_times", "follow_motion", "own_time"), bool)
-        for name, kind in (flags | {"rates": LearningRates, "options": RenderOptions}).items():
+        one_of("initialization", self.initialization, INITIALIZATIONS)
+        one_of("falling", self.falling, FALLING)
+        flags = ("learn_frame_times", "follow_motion", "own_time", "only_alive", "two_cameras")
+        kinds = dict.fromkeys(flags, bool) | {"rates": LearningRates, "options": RenderOptions}
+        if self.growth is not None:
+            kinds |= {"growth": Growth}
+        for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
                 raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
+        if self.initialization == "uniform" and self.follow_motion:
+            raise invalid("follow_motion", expected="False with initialization 'uniform'", got=True)
 
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> "FitConfig":
+        """A named recipe, with `changes` to its fields; `minutes` given without `steps` replace a preset's steps.
 
-def _within(value: object, bounds: str) -> bool:
-    """Whether `value` is a finite number in an interval written as "[0, 1)"."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-        return False
-    low, high = (float(part) for part in bounds[1:-1].split(","))
-    return (low < value or (bounds[0] == "[" and low == value)) and (
-        value < high or (bounds[-1] == "]" and value == high)
-    )
+        * "standard": `FitConfig()`.
+        * "draft": a first look in a fraction of the time: 10,000 Gaussians of degree 2, 800 steps.
+        * "paper": the published recipe. 500,000 Gaussians that start uniformly and grow (`Growth`), degree 7, batches
+          of 3, 30,000 steps, L1 + 0.2 D-SSIM, two opposing cameras, the published rates, of which that of positions
+          alone falls (to 1/100), Adam's momentum for all, the published rasteriser's constants. With other numbers of
+          steps the schedule of growth is scaled in proportion; rates are not, so plans of a few thousand steps end
+          early on their way. Unknown, and so ours: the box of the starts and the threshold of the time gradient. Not
+          taken over: the published code leaves out Gaussians thinner than 1e-4 of its units.
+          Source: VeGaS, "Implementation Details", and constants of its published code.
+
+        Raises ValueError for an unknown name or change. Example: `FitConfig.preset("paper", steps=3000)`.
+        """
+        one_of("preset", name, tuple(PRESETS))
+        unknown = changes.keys() - {field.name for field in dataclasses.fields(cls)}
+        if unknown:
+            raise invalid("changes", expected="fields of FitConfig", got=", ".join(sorted(unknown)))
+        chosen = dict(PRESETS[name])
+        if changes.get("minutes") is not None:
+            chosen["steps"] = None
+        return cls(**(chosen | changes))
 
 
 #: Room for a model file's header.
@@ -129,16 +206,21 @@ def default_num_gaussians(height: int, width: int) -> int:
 
 
 def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int) -> int:
-    """What `num_gaussians` and `max_size_mb` come to. Raises ValueError if not one Gaussian fits."""
-    wanted = config.num_gaussians or default_num_gaussians(height, width)
+    """Gaussians at the start: `num_gaussians`, or fewer as `most_gaussians` bids. Raises ValueError as it does."""
+    return min(config.num_gaussians or default_num_gaussians(height, width), most_gaussians(config, num_frames))
+
+
+def most_gaussians(config: FitConfig, num_frames: int) -> int:
+    """What `max_gaussians` and `max_size_mb` come to. Raises ValueError if not one Gaussian fits."""
+    most = config.max_gaussians or MAX_GAUSSIANS
     if config.max_size_mb is None:
-        return wanted
+        return most
     each = 4 * (11 + 2 * config.degree)  # bytes
     room = int((1e6 * config.max_size_mb - HEADER_BYTES - 4 * num_frames) // each)
     if room < 1:
         least = (HEADER_BYTES + 4 * num_frames + each) / 1e6
         raise invalid("max_size_mb", expected=f"at least {least:.3f} for this clip", got=config.max_size_mb)
-    return min(wanted, room)
+    return min(most, room)
 
 
 def planned_steps(config: FitConfig, num_frames: int) -> int | None:

@@ -15,13 +15,15 @@ import optax
 
 from foldgauss._checks import invalid
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.render import cpu
+from foldgauss.render import cpu, pixels_per_unit
+from foldgauss.video.alpha import random_background
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
-from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
 from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.initialize import initialize
+from foldgauss.video.growth import Growth, Statistics, dim, grown
+from foldgauss.video.initialize import initialize, initialize_uniform
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
-from foldgauss.video.model import VideoModel
+from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack, unpack
 from foldgauss.video.shots import time_logits
@@ -44,7 +46,7 @@ class FitInfo(NamedTuple):
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["rows", "first", "second", "counts", "time_logits", "time_moments"],
+    data_fields=["rows", "first", "second", "counts", "time_logits", "time_moments", "statistics"],
     meta_fields=["step", "plan", "seconds", "error"],
 )
 @dataclasses.dataclass
@@ -57,6 +59,7 @@ class FitState:
     counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
     time_logits: np.ndarray  # float32 (num_frames - 1,)
     time_moments: optax.OptState
+    statistics: Statistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
     step: int
     plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
     seconds: float
@@ -79,7 +82,10 @@ def fit(
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
     every: int = 10,
 ) -> FitResult:
-    """Fit a video of folded Gaussians to `frames`, uint8 (num_frames, height, width, 3).
+    """Fit a video of folded Gaussians to `frames`, uint8 (num_frames, height, width, 3), or with alpha (..., 4).
+
+    Alpha, to which colours are premultiplied, is learned by drawing frames and splats over random backgrounds: `psnr`
+    and `loss` are then those over these, and the model is drawn over black unless told otherwise.
 
     `observers` are called with (state, info) after every step: progress bars, checkpoints. Raises ValueError for
     frames or settings that cannot be fitted. Without `minutes` the bits are the same for any number of threads.
@@ -117,6 +123,8 @@ def fit_steps(
         state.seconds += time.perf_counter() - begun
         if not state.plan:
             state.plan = pace.plan(state)
+        if state.statistics is not None and state.plan:
+            step.grow(state)
         stopped_by = _stopped_by(state, config, len(frames))
         yield state, _info(state, config, loss, num_alive, stopped_by)
 
@@ -153,12 +161,17 @@ def _progress(state: FitState) -> float:
 
 def _stopped_by(state: FitState, config: FitConfig, num_frames: int) -> str | None:
     """The budget that binds now; the running PSNR counts once every frame was seen."""
-    seen = state.step * config.batch_size >= num_frames
+    seen = state.step * config.batch_size >= _num_views(config, num_frames)
     if config.target_psnr is not None and seen and _psnr(state) >= config.target_psnr:
         return "target_psnr"
     if not state.plan or state.step < state.plan:
         return None
     return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
+
+
+def _num_views(config: FitConfig, num_frames: int) -> int:
+    """Views of a pass: every frame, then with two cameras every frame mirrored."""
+    return 2 * num_frames if config.two_cameras else num_frames
 
 
 def _psnr(state: FitState) -> float:
@@ -176,19 +189,11 @@ def _info(state: FitState, config: FitConfig, loss: float, num_alive: int, stopp
 
 def start(frames: np.ndarray, config: FitConfig) -> FitState:
     """State before the first step."""
+    frames = np.ascontiguousarray(frames[..., :3])  # as seen over black, where there is alpha
     begun, num_frames = time.perf_counter(), len(frames)
     motion = Motion.of(frames) if config.follow_motion else None
     logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
-    splats = initialize(
-        frames,
-        chosen_num_gaussians(config, *frames.shape[:3]),
-        degree=config.degree,
-        envelope=_envelope(config),
-        seed=config.seed,
-        times=np.asarray(FrameTimes(logits).times()),
-        motion=motion,
-    )
-    rows = pack(splats)
+    rows = pack(_splats(frames, config, logits, motion))
     return FitState(
         rows=rows,
         first=np.zeros_like(rows),
@@ -196,11 +201,21 @@ def start(frames: np.ndarray, config: FitConfig) -> FitState:
         counts=np.zeros(len(rows), np.int32),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
+        statistics=None if config.growth is None else Statistics.zeros(len(rows)),
         step=0,
         plan=0 if config.minutes is not None else planned_steps(config, num_frames),
         seconds=time.perf_counter() - begun,
         error=0.0,
     )
+
+
+def _splats(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
+    """Where the Gaussians start."""
+    num, shape = chosen_num_gaussians(config, *frames.shape[:3]), {"degree": config.degree, "seed": config.seed}
+    if config.initialization == "uniform":
+        return initialize_uniform(num, frames.shape[1:3], envelope=_envelope(config), **shape)
+    times = np.asarray(FrameTimes(logits).times())
+    return initialize(frames, num, envelope=_envelope(config), times=times, motion=motion, **shape)
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
@@ -215,12 +230,12 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
 
 
 def check_frames(frames: np.ndarray) -> None:
-    """Raise ValueError unless `frames` is a uint8 array (num_frames >= 2, height, width, 3)."""
+    """Raise ValueError unless `frames` is a uint8 array (num_frames >= 2, height, width, 3 or 4)."""
     shape, dtype = getattr(frames, "shape", None), getattr(frames, "dtype", None)
-    if shape is None or len(shape) != 4 or shape[3] != 3 or shape[0] < 2 or dtype != np.uint8 or 0 in shape:
+    if shape is None or len(shape) != 4 or shape[3] not in (3, 4) or shape[0] < 2 or dtype != np.uint8 or 0 in shape:
         raise invalid(
             "frames",
-            expected="a uint8 array (num_frames >= 2, height, width, 3)",
+            expected="a uint8 array (num_frames >= 2, height, width, 3 or 4)",
             got=f"{dtype} {shape}",
         )
 
@@ -230,58 +245,124 @@ class _Stepper:
 
     def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState):
         self.frames, self.config = frames, config
+        self.background = np.zeros(3, np.float32)  # another in every step for frames with alpha
         self.num_frames, height, width, _ = frames.shape
         self.shape = Shape(config.degree, config.power, config.floor, (height, width))
         self.rates = np.empty(state.rows.shape[1], np.float32)
+        self.falling = np.ones(state.rows.shape[1], bool)
         for name, place in columns(config.degree).items():
             self.rates[place] = getattr(config.rates, name)
-        self.black = np.zeros(3, np.float32)
+            self.falling[place] = config.falling in ("all", name)
+        self._make_room(state)
+
+    def _make_room(self, state: FitState) -> None:
+        """Buffers as long as the state's arrays."""
         self.grad = np.zeros_like(state.rows)
         self.window = np.empty((len(state.rows), 2), np.float32)
         update_windows(state.rows, np.arange(len(state.rows)), self.window)
 
     def __call__(self, state: FitState, progress: float) -> tuple[float, float, int]:
         """Advance `state`; returns loss, mean squared error and the number of Gaussians that took part."""
+        if self.frames.shape[3] == 4:
+            self.background = random_background(self.config.seed, state.step)
         decay = self.config.final_rate**progress if self.config.final_rate > 0 else 1 - progress
         times = np.asarray(_frame_times(state.time_logits))
         by_time = np.zeros_like(times)
         losses, alive, squared = [], [], progress >= 1 - self.config.square_share
-        for k in self._batch(state.step):
-            loss, done, d_time = self._frame(state.rows, int(k), times[k], squared)
+        views = None if state.statistics is None else []
+        for view in self._batch(state.step):
+            k = int(view) % self.num_frames
+            mirrored = int(view) >= self.num_frames
+            loss, done, d_time = self._frame(state.rows, k, times[k], squared, mirrored=mirrored, views=views)
             by_time[k] += d_time  # a batch may hold a frame twice
             losses.append(loss)
             alive.append(done.alive)
+        if state.statistics is not None:
+            state.statistics.add(views, self.grad[:, columns(self.config.degree)["time_loc_logit"]][:, 0])
         touched = alive[0] if len(alive) == 1 else np.unique(np.concatenate(alive))
-        rates = self.rates * np.float32(decay)
+        num_alive = len(touched)
+        if not self.config.only_alive:
+            touched = np.arange(len(state.rows))
+        rates = np.where(self.falling, self.rates * np.float32(decay), self.rates)
         moments = state.first, state.second, state.counts
         unit = UNIT_TIME if self.config.own_time else 0.0
         sparse_adam(state.rows, self.grad, *moments, touched, rates, unit_time=unit)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
-            rate = np.float32(self.config.rates.frame_times * decay)
+            rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0))
             state.time_logits, state.time_moments = _update_times(state.time_logits, state.time_moments, by_time, rate)
         mean = np.mean([(loss.value, loss.mean_squared_error) for loss in losses], axis=0)
-        return float(mean[0]), float(mean[1]), len(touched)
+        return float(mean[0]), float(mean[1]), num_alive
+
+    def grow(self, state: FitState) -> None:
+        """Births, deaths and resets that are due now that the plan is known; after the last, statistics end."""
+        growth = self.config.growth.for_plan(state.plan)
+        if growth.grows_at(state.step):
+            self._replace(state, growth)
+        if growth.resets_at(state.step):
+            dim(state.rows, state.first, state.second, growth, self.config.degree)
+        if state.step + 1 >= growth.until_step:
+            state.statistics = None
+
+    def _replace(self, state: FitState, growth: Growth) -> None:
+        """Births and deaths: moments of those that stay are theirs, those of the new ones are zero."""
+        stay, born = grown(
+            state.rows,
+            state.statistics,
+            growth,
+            degree=self.config.degree,
+            pixels=pixels_per_unit(self.shape.size),
+            most=most_gaussians(self.config, self.num_frames),
+            step=state.step,
+            seed=self.config.seed,
+        )
+        state.rows = np.concatenate([state.rows[stay], born])
+        state.first, state.second = (
+            np.concatenate([part[stay], np.zeros_like(born)]) for part in (state.first, state.second)
+        )
+        state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
+        state.statistics = Statistics.zeros(len(state.rows))
+        self._make_room(state)
 
     def _batch(self, step: int) -> np.ndarray:
-        """Frames of a step: every pass visits all frames once, in an order that depends on seed and pass only."""
-        first = step * self.config.batch_size
+        """Views of a step: every pass visits all once, in an order that depends on seed and pass only.
+
+        View k is frame k; from the number of frames on, frame k - num_frames, mirrored.
+        """
+        first, num = step * self.config.batch_size, _num_views(self.config, self.num_frames)
         positions = np.arange(first, first + self.config.batch_size)
-        return np.array([self._order(p // self.num_frames)[p % self.num_frames] for p in positions])
+        return np.array([self._order(p // num)[p % num] for p in positions])
 
     def _order(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng([self.config.seed, 1, epoch]).permutation(self.num_frames)
+        num = _num_views(self.config, self.num_frames)
+        return np.random.default_rng([self.config.seed, 1, epoch]).permutation(num)
 
-    def _frame(self, rows: np.ndarray, k: int, t: np.float32, squared: bool) -> tuple[ImageLoss, Conditioned, float]:
-        """Loss of frame k; its gradients are added to `self.grad`, dL/dt_k is returned."""
-        target = _planar(self.frames[k])
+    def _frame(
+        self,
+        rows: np.ndarray,
+        k: int,
+        t: np.float32,
+        squared: bool,
+        *,
+        mirrored: bool,
+        views: list[tuple[np.ndarray, np.ndarray]] | None,
+    ) -> tuple[ImageLoss, Conditioned, float]:
+        """Loss of frame k; its gradients are added to `self.grad`, dL/dt_k is returned.
+
+        To `views`, where asked for, comes what `Statistics.add` wants.
+        """
+        target = _planar(self.frames[k], self.background)
         done = condition(rows, self.window, t, self.shape)
+        mean, factor = done.mean, done.factor
+        if mirrored:
+            target = np.ascontiguousarray(target[:, :, ::-1])
+            mean, factor = _mirrored(mean, factor, self.shape.size[1])
         trace = cpu.forward(
-            done.mean,
-            done.factor,
+            mean,
+            factor,
             done.opacity,
             done.color,
-            self.black,
+            self.background,
             self.shape.size,
             options=self.config.options,
         )
@@ -289,15 +370,30 @@ class _Stepper:
             loss = squared_loss(trace.image, target)
         else:
             loss = image_loss(trace.image, target, ssim_share=self.config.ssim_share)
-        *gradients, _ = cpu.backward(trace, loss.gradient / np.float32(self.config.batch_size))
-        return loss, done, pull_back(rows, done, tuple(gradients), self.shape, self.grad)
+        d_mean, d_factor, *others, _ = cpu.backward(trace, loss.gradient / np.float32(self.config.batch_size))
+        if mirrored:
+            d_mean, d_factor = _mirrored(d_mean, d_factor, 0)
+        if views is not None:
+            seen = trace.seen
+            half = np.float32(self.shape.size[::-1]) / 2
+            views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
+        return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), self.shape, self.grad)
 
 
-def _planar(frame: np.ndarray) -> np.ndarray:
-    """Bytes (height, width, 3) as floats (3, height, width), as the kernels want them."""
+def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Splats as the camera opposite sees them, in pixels, left for right; its transpose, for gradients, at width 0."""
+    other = np.float32([-1, 1])
+    return mean * other + np.float32([width, 0]), factor * other[:, None]
+
+
+def _planar(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Bytes (height, width, 3) as floats (3, height, width), as the kernels want them; with alpha over `background`."""
     out = np.empty((3, *frame.shape[:2]), np.float32)
-    for plane, own in zip(out, cv2.split(frame), strict=True):
+    *colors, last = cv2.split(frame)
+    for plane, own in zip(out, colors if frame.shape[2] == 4 else (*colors, last), strict=True):
         np.multiply(own, np.float32(1 / 255), out=plane)
+    if frame.shape[2] == 4:
+        out += background[:, None, None] * (1 - last * np.float32(1 / 255))
     return out
 
 

@@ -1,4 +1,4 @@
-"""Where the Gaussians start: drawn from the clip's own detail, with its own colours."""
+"""Where the Gaussians start: drawn from the clip's own detail, with its own colours; or uniformly, as published."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,8 +6,10 @@ from collections.abc import Callable
 import cv2
 import jax
 import numpy as np
+from scipy.spatial import cKDTree
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.growth import PUBLISHED_UNIT
 from foldgauss.video.model import SH_C0, TAU_MAX, FoldedSplats
 from foldgauss.video.motion import Motion, fitted_folds
 
@@ -28,6 +30,12 @@ PILOT, CORE, ROUNDS = 32, 1.5, 50
 #: Share of the starts that is spread so that all frames, however short the tracks there, are covered alike. With more,
 #: the worst frames get better and the mean worse.
 EVEN_FRAMES = 0.2
+#: Uniform starts. VeGaS: sigma_t and fold coefficients lie between these (the latter in published units), opacity is
+#: 0.1, colours are below one step of 8 bits. 3DGS: scales are the mean distance to so many neighbours.
+UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBOURS = (0.01, 1.0), 1.0, 0.1, 1 / 255, 3
+#: Their box is the frame, larger by this. How large the published "bounding box" is, the paper does not say; folds
+#: carry Gaussians into the frame and out of it anyway.
+UNIFORM_BOX = 1.1
 
 
 def initialize(
@@ -62,6 +70,36 @@ def initialize(
     order = rng.permutation(num_gaussians)  # depth has nothing to do with time
     splats = dataclasses.replace(splats, log_scale=np.log(np.stack([scale, scale], -1), dtype=np.float32))
     return jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, splats)
+
+
+def initialize_uniform(
+    num_gaussians: int, size: tuple[int, int], *, degree: int, envelope: TimeLikelihood, seed: int
+) -> FoldedSplats:
+    """The published starts for frames of `size` (height, width): uniform, whatever the clip shows.
+
+    Positions lie in a box `UNIFORM_BOX` times the frame, m_t in (0, 1), sigma_t, folds and angles likewise uniformly;
+    Gaussians are round, as wide as the mean distance to their `NEIGHBOURS` nearest, faint and almost black.
+    Source: VeGaS, "Implementation Details", and constants of its published code.
+    """
+    rng = np.random.default_rng([seed, 0])
+    frame = np.array(size[::-1]) / max(size)
+    loc = rng.uniform(-0.5, 0.5, (num_gaussians, 2)) * UNIFORM_BOX * frame
+    near = min(NEIGHBOURS, num_gaussians - 1)
+    # The nearest is the point itself; one that is alone is as wide as the frame.
+    scale = cKDTree(loc).query(loc, near + 1)[0][:, 1:].mean(axis=1) if near else np.ones(1)
+    limit = UNIFORM_FOLD * PUBLISHED_UNIT
+    share = lambda: rng.uniform(1e-6, 1 - 1e-6, num_gaussians)  # noqa: E731
+    leaves = {
+        "loc": loc,
+        "log_scale": np.log(np.stack([scale, scale], -1)),
+        "angle_logit": _logit(share()),
+        "time_loc_logit": _logit(share()),
+        "log_time_scale": np.log(rng.uniform(*UNIFORM_TIME_SCALES, num_gaussians)),
+        "coefficients": rng.uniform(-limit, limit, (num_gaussians, degree, 2)),
+        "opacity_logit": _logit(np.full(num_gaussians, UNIFORM_OPACITY)),
+        "color_dc": (rng.uniform(0, UNIFORM_COLOR, (num_gaussians, 3)) - 0.5) / SH_C0,
+    }
+    return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope)
 
 
 def drawn(

@@ -7,6 +7,7 @@ import numpy as np
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from foldgauss._checks import invalid
+from foldgauss.video.alpha import BLACK, checked_background, composited
 from foldgauss.video.model import VideoModel
 
 
@@ -48,18 +49,27 @@ class Evaluation:
         return float(np.mean(self.ssim))
 
 
-def evaluate(model: VideoModel, frames: np.ndarray, on_frame: Callable[[np.ndarray], None] | None = None) -> Evaluation:
-    """Compare `model` at its frame times with `frames`, uint8 (num_frames, *model.size, 3).
+def evaluate(
+    model: VideoModel,
+    frames: np.ndarray,
+    on_frame: Callable[[np.ndarray], None] | None = None,
+    *,
+    background: tuple[float, float, float] = BLACK,
+) -> Evaluation:
+    """Compare `model` at its frame times with `frames`, uint8 (num_frames, *model.size, 3), or with alpha (..., 4).
 
+    Both stand over `background`: black says whether what is seen is right, white besides whether nothing else is.
     Pictures are rounded to 8 bits first, as anyone who watches them gets them. `on_frame` is called with each picture.
     Raises ValueError if number or size of the frames differ from the model's.
     """
-    expected = (model.num_frames, *model.size, 3)
-    if frames.shape != expected or frames.dtype != np.uint8:
-        raise invalid("frames", expected=f"uint8 {expected}", got=f"{frames.dtype} {frames.shape}")
+    expected = (model.num_frames, *model.size)
+    if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4) or frames.dtype != np.uint8:
+        wanted = f"uint8 {(*expected, 3)}, or 4 with alpha"
+        raise invalid("frames", expected=wanted, got=f"{frames.dtype} {frames.shape}")
     scores = []
-    for k, picture in enumerate(model.frames()):
-        scores.append((psnr(frames[k], picture), ssim(frames[k], picture)))
+    for k, picture in enumerate(model.frames(background=background)):
+        target = frames[k] if frames.shape[-1] == 3 else composited(frames[k], checked_background(background))
+        scores.append((psnr(target, picture), ssim(target, picture)))
         if on_frame is not None:
             on_frame(picture)
     return Evaluation(*map(tuple, zip(*scores, strict=True)))

@@ -13,6 +13,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.fold import PolynomialFold
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
+from foldgauss.video.alpha import BLACK, checked_background
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.shots import out_of_cuts
 
@@ -127,9 +128,14 @@ class VideoModel(eqx.Module):
         return self.splats.at(t).to_pixels(self.size if size is None else size, aspect=height / width)
 
     def render(
-        self, t: float, size: tuple[int, int] | None = None, *, engine: str = "auto"
+        self,
+        t: float,
+        size: tuple[int, int] | None = None,
+        *,
+        engine: str = "auto",
+        background: tuple[float, float, float] = BLACK,
     ) -> Float[Array, "height width 3"]:
-        """The picture at any time t in [0, 1], values about [0, 1]; see `foldgauss.render.render`.
+        """The picture at any time t in [0, 1], values about [0, 1], over `background`; see `foldgauss.render.render`.
 
         Between two shots it is the nearer shot's. Frame k is at `frame_times.times()[k]`.
         """
@@ -137,13 +143,20 @@ class VideoModel(eqx.Module):
         check_size(size)
         t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
-        return render(splats, size, engine=engine, options=self.options)
+        behind = jnp.asarray(checked_background(background), splats.mean.dtype)
+        return render(splats, size, background=behind, engine=engine, options=self.options)
 
-    def frames(self, times: np.ndarray | None = None, size: tuple[int, int] | None = None) -> Iterator[np.ndarray]:
-        """Pictures at `times` (default: the frame times) one by one, uint8 (height, width, 3)."""
+    def frames(
+        self,
+        times: np.ndarray | None = None,
+        size: tuple[int, int] | None = None,
+        *,
+        background: tuple[float, float, float] = BLACK,
+    ) -> Iterator[np.ndarray]:
+        """Pictures at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
         from foldgauss.video.playback import Playback  # which knows this class
 
-        yield from Playback(self, size).frames(times)
+        yield from Playback(self, size, background=background).frames(times)
 
 
 @eqx.filter_jit

@@ -16,6 +16,7 @@ from foldgauss._threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Splats2D, cpu
 from foldgauss.render.splats import check_size
+from foldgauss.video.alpha import BLACK, checked_background
 from foldgauss.video.conditioning import Shape, condition, update_windows
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import pack
@@ -31,13 +32,21 @@ class Playback:
 
     **Shapes:** pictures are uint8 (height, width, 3). **Units:** times are those of the model, in [0, 1].
 
+    `background`: red, green and blue in [0, 1] behind all splats; black as the fit had it, where frames have no alpha.
+
     **Example:** `for picture in Playback(model).frames(): ...`
 
     **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for a size that is none, and for a model
     with NaN or infinities in it (its pictures would have holes) or with several envelopes.
     """
 
-    def __init__(self, model: VideoModel, size: tuple[int, int] | None = None):
+    def __init__(
+        self,
+        model: VideoModel,
+        size: tuple[int, int] | None = None,
+        *,
+        background: tuple[float, float, float] = BLACK,
+    ):
         self.model = model
         size = model.size if size is None else size
         check_size(size)
@@ -53,7 +62,7 @@ class Playback:
         self._window = np.empty((len(self._rows), 2), np.float32)
         update_windows(self._rows, np.arange(len(self._rows)), self._window)
         self._times = np.asarray(model.frame_times.times())
-        self._black = np.zeros(3, np.float32)
+        self._background = checked_background(background)
 
     def splats(self, t: float) -> Splats2D:
         """The splats of the Gaussians alive at time t, in pixels of a picture of `size`; NumPy leaves."""
@@ -72,7 +81,7 @@ class Playback:
     def _image(self, t: float) -> Float[np.ndarray, "3 height width"]:
         splats = self.splats(t)
         leaves = splats.mean, splats.factor, splats.opacity, splats.color
-        return cpu.forward(*leaves, self._black, self.size, options=self.model.options).image
+        return cpu.forward(*leaves, self._background, self.size, options=self.model.options).image
 
 
 def _the_one(envelope: TimeLikelihood, name: str) -> float:

@@ -13,6 +13,7 @@ from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit_steps
 from foldgauss.video.fit import to_model
+from foldgauss.video.growth import Growth
 from foldgauss.video.packing import unpack
 
 CONFIG = FitConfig(num_gaussians=60, steps=8, degree=2)
@@ -73,6 +74,29 @@ def test_checkpoint_goes_on_to_the_same_bits(tmp_path):
     for state, _ in fit_steps(frames(), CONFIG, kept):
         pass
     same(whole, to_model(state, CONFIG, (24, 32), 25.0))
+
+
+def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
+    """Kept between two births: the second is decided by the gradients of before, too."""
+    monkeypatch.setattr(Growth, "for_plan", lambda self, plan: self)
+    growth = Growth(from_step=1, until_step=25, every=10, screen_gradient=2e-3, time_gradient=5e-3)
+    config = dataclasses.replace(CONFIG, steps=30, growth=growth)
+    path, numbers = tmp_path / "c", []
+    for state, info in fit_steps(frames(), config):
+        numbers.append(info.num_gaussians)
+        if info.step == 17:
+            save_checkpoint(path, state, config=config, source=SOURCE)
+    assert 60 < numbers[10] < numbers[20]
+    whole = to_model(state, config, (24, 32), 25.0)
+    kept = load_checkpoint(path, config=config, source=SOURCE)
+    assert kept.statistics.seen.any()
+    for state, _ in fit_steps(frames(), config, kept):
+        pass
+    same(whole, to_model(state, config, (24, 32), 25.0))
+    save_checkpoint(path, state, config=config, source=SOURCE)  # growth is over
+    assert load_checkpoint(path, config=config, source=SOURCE).statistics is None
+    with pytest.raises(ValueError, match="resume: expected growth="):
+        load_checkpoint(path, config=dataclasses.replace(config, growth=None), source=SOURCE)
 
 
 def test_checkpoint_of_another_fit_is_refused(tmp_path):

@@ -269,7 +269,8 @@ def test_bad_rates():
     "frames",
     [
         np.zeros((1, 20, 20, 3), np.uint8),
-        np.zeros((3, 20, 20, 4), np.uint8),
+        np.zeros((3, 20, 20, 2), np.uint8),
+        np.zeros((3, 20, 20, 5), np.uint8),
         np.zeros((3, 20, 20), np.uint8),
         np.zeros((3, 20, 20, 3), np.float32),
         np.zeros((3, 0, 20, 3), np.uint8),

@@ -1,0 +1,60 @@
+"""Masks of objects from images: numbers, not colours."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from foldgauss._checks import invalid
+
+#: Kinds of image whose stored numbers are the labels: palette ("P"), grey ("L") and black and white ("1").
+_NUMBERED = ("P", "L", "1")
+_WHITE = 255
+
+
+def read_labels(paths: Sequence[Path]) -> np.ndarray:
+    """Masks as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 what is void.
+
+    A palette image gives the *index* of each pixel, whatever colour it is shown in (OpenCV gives the colour, hence
+    Pillow here); a grey one its level. Masks that are black and white throughout, as those of DAVIS 2016, become 0 and
+    1. Raises ValueError for an image that does not decode, has colours instead of numbers, or differs in size.
+    """
+    masks, grey = [], True
+    for path in paths:
+        mask, mode = _read(path)
+        grey = grey and mode != "P"
+        if masks and mask.shape != masks[0].shape:
+            raise invalid(
+                "path",
+                expected=f"masks of one size, {_text(masks[0].shape)} as in {paths[0].name!r}",
+                got=f"{_text(mask.shape)} in {str(path)!r}",
+            )
+        masks.append(mask)
+    labels = np.stack(masks)
+    if grey and set(np.unique(labels)) <= {0, _WHITE}:
+        labels = (labels == _WHITE).astype(np.uint8)
+    return labels
+
+
+def _read(path: Path) -> tuple[np.ndarray, str]:
+    """(numbers, kind of image) of one mask."""
+    try:
+        with Image.open(path) as image:
+            mode, pixels = image.mode, np.array(image)
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        raise invalid(
+            "path", expected="masks that decode", got=f"{str(path)!r}, which does not", cure="Copy it again."
+        ) from error
+    if mode not in _NUMBERED:
+        raise invalid(
+            "path",
+            expected="masks with a number per pixel (palette or grey)",
+            got=f"an image of kind {mode!r} in {str(path)!r}",
+            cure="Its colours were stored in place of the labels; take the original PNG.",
+        )
+    return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
+
+
+def _text(shape: tuple[int, ...]) -> str:
+    return f"{shape[0]}x{shape[1]} (height x width)"

@@ -1,0 +1,217 @@
+"""What a running fit shows and leaves behind, as a user meets it: history, curves, preview, lines, JSON, nothing."""
+
+import json
+import re
+import signal
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from foldgauss import _progress, cli
+from foldgauss.io import read_video, write_video
+from foldgauss.io.history import read_history
+
+QUICK = ["--gaussians", "300", "--steps", "20"]
+
+
+def run(*arguments):
+    """Exit code of the command, run in this process."""
+    with pytest.raises(SystemExit) as done:
+        cli.main([str(argument) for argument in arguments])
+    return done.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """Six frames of a blob that moves."""
+    y, x = np.mgrid[0:48, 0:64]
+    blob = np.exp(-((x - np.linspace(12, 45, 6)[:, None, None]) ** 2 + (y - 24) ** 2) / 40)
+    path = tmp_path_factory.mktemp("clip") / "clip.mp4"
+    return write_video(path, np.stack([255 * blob, 128 + 0 * blob, 255 - 200 * blob], -1).astype(np.uint8), 12.0)
+
+
+def test_history_and_its_curves(clip, tmp_path):
+    pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
+    target, path = tmp_path / "m.safetensors", tmp_path / "m.jsonl"
+    assert run("fit", clip, "--out", target, *QUICK, "--history", path) == 0
+    history = read_history(path)
+    assert [info.step for info in history] == list(range(1, 21))
+    assert history[-1].stopped_by == "steps"
+    assert history[-1].num_gaussians == 300
+    assert history[-1].psnr > history[5].psnr
+    assert np.all(np.diff([info.seconds for info in history]) > 0)
+    assert min(cv2.imread(str(tmp_path / "m.png")).shape[:2]) > 300
+    # Nothing that is there is replaced unasked, be it the history or its curves.
+    before = path.read_bytes()
+    assert run("fit", clip, "--out", tmp_path / "2.safetensors", *QUICK, "--history", path) == 2
+    path.rename(tmp_path / "away.jsonl")
+    assert run("fit", clip, "--out", tmp_path / "2.safetensors", *QUICK, "--history", path) == 2
+    assert (tmp_path / "away.jsonl").read_bytes() == before
+    assert run("fit", clip, "--out", target, *QUICK[:-1], "10", "--history", path, "--overwrite") == 0
+    assert len(read_history(path)) == 10
+
+
+def test_history_of_a_resumed_fit_has_each_step_once(clip, tmp_path, monkeypatch):
+    """Kept at step 8, killed at step 12 with half a line written."""
+    target, path = tmp_path / "m.safetensors", tmp_path / "m.jsonl"
+    arguments = ["fit", clip, "--out", target, *QUICK, "--history", path]
+    steps = cli.fit_steps
+
+    def killed(*given):
+        for state, info in steps(*given):
+            monkeypatch.setattr(cli, "CHECKPOINT_SECONDS", -1.0 if info.step == 8 else 1e9)
+            if info.step == 13:
+                raise OSError("killed")
+            yield state, info
+
+    monkeypatch.setattr(cli, "fit_steps", killed)
+    assert run(*arguments) == 1
+    first = read_history(path)
+    assert [info.step for info in first] == list(range(1, 13))
+    with open(path, "a") as file:
+        file.write('{"step": 13, "pro')
+    monkeypatch.setattr(cli, "fit_steps", steps)
+    assert run(*arguments, "--resume") == 0
+    history = read_history(path)
+    assert [info.step for info in history] == list(range(1, 21))
+    assert history[:8] == first[:8]
+    losses = [[info.loss for info in part[8:12]] for part in (history, first)]
+    assert losses[0] == losses[1]  # those steps were taken again, to the bit
+    assert np.all(np.diff([info.seconds for info in history]) > 0)
+
+
+def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", tmp_path / "h.jsonl") == 0
+    assert "warning: no curves" in (message := capsys.readouterr().err)
+    assert "foldgauss[plot]" in message
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["h.jsonl", "m.safetensors"]
+
+
+def test_a_full_disk_ends_the_history_and_not_the_fit(clip, tmp_path, monkeypatch, capsys):
+    target, write = tmp_path / "m.safetensors", cli.HistoryFile.__call__
+
+    def full(self, state, info):
+        if info.step >= 5:
+            raise OSError(28, "No space left on device")
+        write(self, state, info)
+
+    monkeypatch.setattr(cli.HistoryFile, "__call__", full)
+    assert run("fit", clip, "--out", target, *QUICK, "--history", tmp_path / "h.jsonl") == 0
+    assert target.exists()
+    assert len(read_history(tmp_path / "h.jsonl")) == 4
+    message = capsys.readouterr().err
+    assert message.count("No space left") == 1
+    assert "no more history from step 5 on" in message
+
+
+def test_preview_is_renewed_and_always_whole(clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(_progress, "PREVIEW_SECONDS", 0.0)
+    path, seen, write = tmp_path / "look.png", [], _progress.write_image
+    monkeypatch.setattr(_progress, "write_image", lambda *a: seen.append(cv2.imread(str(write(*a)))))
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--preview", path) == 0
+    assert len(seen) == 20
+    original = cv2.cvtColor(read_video(clip).frames[3], cv2.COLOR_RGB2BGR)
+    top, left = 26, 8  # see io.pictures: a band with the title, a margin
+    for picture in seen:
+        np.testing.assert_array_equal(picture[top : top + 48, left : left + 64], original)
+
+    def error(picture):
+        drawn = picture[top : top + 48, 64 + 2 * left : 2 * (64 + left)]
+        return np.mean((drawn.astype(float) - original) ** 2)
+
+    assert error(seen[-1]) < 0.8 * error(seen[0])
+    monkeypatch.undo()
+    assert run("fit", clip, "--out", tmp_path / "2.safetensors", *QUICK, "--preview", path) == 2  # it exists
+
+
+def test_quiet_says_nothing(clip, tmp_path, capfd):
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--quiet") == 0
+    assert capfd.readouterr() == ("", "")
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--quiet") == 2
+    assert capfd.readouterr().err.startswith("error: --out")
+
+
+def test_log_json_is_json_line_by_line(clip, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(_progress, "JSON_SECONDS", 0.0)
+    target = tmp_path / "m :car: [b].safetensors"
+    assert run("fit", clip, "--out", target, *QUICK, "--log-json") == 0
+    told = capfd.readouterr()
+    assert told.err == ""
+    start, *progress, done = map(json.loads, told.out.splitlines())
+    assert (start["event"], start["num_frames"], start["num_gaussians"]) == ("start", 6, 300)
+    assert {line["event"] for line in progress} == {"progress"}
+    assert [line["step"] for line in progress] == list(range(1, 21))
+    assert progress[-1]["progress"] == 1
+    assert (done["event"], done["stopped_by"], done["steps"]) == ("done", "steps", 20)
+    assert done["model"] == str(target)
+    assert done["file_bytes"] == target.stat().st_size
+    assert done["mean_psnr"] > 15
+
+
+def test_json_lines_come_now_and_then_and_at_the_end(clip, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(_progress, "JSON_SECONDS", 1e9)
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--log-json") == 0
+    lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert [line.get("step") for line in lines] == [None, 1, 20, None]
+
+
+def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
+    """Standard error is no terminal here."""
+    monkeypatch.setattr(_progress, "FIRST_LINE_SECONDS", 0.0)
+    monkeypatch.setattr(_progress, "LINE_SECONDS", 0.0)
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 0
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("Fitting")]
+    assert len(lines) == 20
+    assert re.fullmatch(r"Fitting  50%  10 steps  loss 0\.\d+  \d+\.\d+ dB  300 Gaussians  \d+ s left", lines[9])
+    assert lines[-1].startswith("Fitting 100%  20 steps")
+    monkeypatch.undo()  # a fit shorter than the first pause tells its end alone
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--overwrite") == 0
+    assert len(re.findall("^Fitting", capfd.readouterr().err, re.M)) == 1
+
+
+def test_the_clock_rings_first_soon_and_then_now_and_then(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
+    rings, rung = _progress._Clock(30.0, first=10.0), []
+    for second in range(100, 200):
+        now[0] = float(second)
+        if rings():
+            rung.append(second)
+    assert rung == [110, 140, 170]
+
+
+def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
+    steps = cli.fit_steps
+
+    def stepping(*given):
+        for state, info in steps(*given):
+            if info.step == 7:
+                signal.raise_signal(signal.SIGINT)
+            yield state, info
+
+    monkeypatch.setattr(cli, "fit_steps", stepping)
+    path = tmp_path / "h.jsonl"
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", path, "--quiet") == 1
+    assert [info.step for info in read_history(path)] == list(range(1, 8))
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_places_that_cannot_be_right(clip, tmp_path, capsys):
+    out = tmp_path / "m.safetensors"
+    for given, code, says in (
+        (["--history", tmp_path / "h.txt"], 2, "--history: expected a name ending in .jsonl"),
+        (["--preview", tmp_path / "p.jpg"], 2, "--preview: expected a name ending in .png"),
+        (["--preview", tmp_path / "h.png", "--history", tmp_path / "h.jsonl"], 2, "--preview: .*another use"),
+        (["--history", tmp_path / "no" / "h.jsonl"], 1, "folder"),
+        (["--preview", tmp_path / "no" / "p.png"], 1, "folder"),
+        (["--quiet", "--log-json"], 2, "--quiet: .*both"),
+    ):
+        assert run("fit", clip, "--out", out, *QUICK, *given) == code, given
+        message = capsys.readouterr().err
+        assert re.search(says, message), message
+        assert len(message.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())

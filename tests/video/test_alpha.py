@@ -1,0 +1,86 @@
+"""Frames with alpha: what is behind them is not learned, that something is behind them is."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video.alpha import checked_background, composited, random_background
+from foldgauss.video.fit import _planar, to_model
+from foldgauss.video.playback import Playback
+
+CONFIG = FitConfig(num_gaussians=800, steps=250)
+WHITE, GREEN = (1.0, 1.0, 1.0), (0.0, 1.0, 0.0)
+
+
+def clip():
+    """A soft disc that moves, half transparent in its middle; premultiplied."""
+    colors = moving_blobs(num_frames=5).astype(float)
+    y, x = np.mgrid[0:48, 0:64]
+    away = np.hypot(x - np.linspace(22, 42, 5)[:, None, None], y - 24)
+    alpha = np.clip((16 - away) / 4, 0, 1) * np.where(away < 6, 0.5, 1.0)
+    return np.concatenate([colors * alpha[..., None], 255 * alpha[..., None]], -1).round().astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit(clip(), CONFIG)
+
+
+def test_composited_by_hand():
+    frame = np.array([[[100, 50, 0, 128], [0, 0, 0, 0], [9, 8, 7, 255], [0, 0, 0, 51]]], np.uint8)
+    over = composited(frame, np.float32([1, 0.5, 0]))
+    assert over.tolist() == [[[227, 114, 0], [255, 128, 0], [9, 8, 7], [204, 102, 0]]]
+    np.testing.assert_array_equal(composited(frame, np.float32([0, 0, 0])), frame[..., :3])
+
+
+def test_targets_are_the_frames_over_the_background():
+    frame, background = clip()[2], np.float32([0.2, 0.7, 1.0])
+    target = np.moveaxis(_planar(frame, background), 0, -1)
+    np.testing.assert_allclose(255 * target, composited(frame, background), atol=0.51)
+    np.testing.assert_array_equal(
+        _planar(frame[..., :3].copy(), background), _planar(frame[..., :3].copy(), 0 * background)
+    )
+
+
+def test_alpha_is_learned(fitted):
+    frames = clip()
+    scores = {color: evaluate(fitted.model, frames, background=color).mean_psnr for color in ((0, 0, 0), WHITE, GREEN)}
+    assert min(scores.values()) > 30
+    opaque = fit(frames[..., :3].copy(), CONFIG).model
+    assert evaluate(opaque, frames).mean_psnr > 30
+    assert evaluate(opaque, frames, background=WHITE).mean_psnr < 15  # a fit that saw black alone paints it
+    assert abs(fitted.history[-1].psnr - np.mean(list(scores.values()))) < 3
+
+
+def test_drawn_on_black_unless_told_otherwise(fitted):
+    model = fitted.model
+    black, white = next(model.frames()), next(model.frames(background=WHITE))
+    assert black[0, 0].max() < 16
+    assert white[0, 0].min() > 239
+    np.testing.assert_array_equal(black, next(model.frames(background=(0, 0, 0))))
+    slow = np.asarray(model.render(0.0, background=GREEN))
+    np.testing.assert_allclose(255 * slow.clip(0, 1), Playback(model, background=GREEN).frame(0.0), atol=2)
+    for wrong in ((0, 0), (0, 0, 2), "red", (0, 0, np.nan)):
+        with pytest.raises(ValueError, match="background: expected red, green and blue"):
+            checked_background(wrong)
+
+
+def test_backgrounds_depend_on_seed_and_step():
+    one = random_background(0, 3)
+    np.testing.assert_array_equal(one, random_background(0, 3))
+    assert len({tuple(random_background(seed, step)) for seed in (0, 1) for step in range(50)}) == 100
+    np.testing.assert_allclose(np.mean([random_background(0, k) for k in range(3000)], 0), 0.5, atol=0.03)  # 5 sigma
+
+
+def test_a_stopped_fit_goes_on_to_the_same_bits():
+    frames, config = clip(), dataclasses.replace(CONFIG, steps=30)
+    kept = next(state for state, info in fit_steps(frames, config) if info.step == 12)
+    for state, _ in fit_steps(frames, config, kept):
+        pass
+    again = to_model(state, config, (48, 64), 25.0)
+    for one, other in zip(*(jax.tree.leaves(m) for m in (again, fit(frames, config).model)), strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,390 @@
+"""Births, deaths and resets: each criterion acts, on the Gaussians it names and on no others."""
+
+import dataclasses
+import sys
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.video import FitConfig, fit_steps
+from foldgauss.video.config import chosen_num_gaussians, most_gaussians
+from foldgauss.video.fit import start, to_model
+from foldgauss.video.growth import EXTENT, PUBLISHED_STEPS, Growth, Statistics, dim, grown
+from foldgauss.video.packing import columns
+
+fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
+
+DEGREE, PLACE = 2, columns(2)
+GROWTH = Growth()
+PIXELS = 100.0
+SMALL, LARGE = 0.5 * GROWTH.clone_below, 2 * GROWTH.clone_below
+
+
+def gaussians(num=5, scale=SMALL, opacity_logit=1.0):
+    rows = np.random.default_rng(0).normal(size=(num, 11 + 2 * DEGREE)).astype(np.float32)
+    rows[:, PLACE["log_scale"]] = np.log(scale)
+    rows[:, PLACE["opacity_logit"]] = opacity_logit
+    return rows
+
+
+def statistics(num=5, screen=(), time=(), steps=4):
+    """Means over `steps` steps: for the named Gaussians as given, 0 for others."""
+    sums = Statistics.zeros(num)
+    for part, means in ((sums.screen, screen), (sums.time, time)):
+        for index, mean in dict(means).items():
+            part[index] = steps * mean
+    sums.seen[:] = steps
+    return sums
+
+
+def change(rows, sums, *, growth=GROWTH, most=1000, step=600, seed=0):
+    return grown(rows, sums, growth, degree=DEGREE, pixels=PIXELS, most=most, step=step, seed=seed)
+
+
+def test_nothing_happens_below_the_thresholds():
+    stay, born = change(gaussians(), statistics(screen={1: 1.9e-4}, time={2: 1.9e-4}))
+    assert stay.tolist() == [0, 1, 2, 3, 4]
+    assert len(born) == 0
+
+
+@pytest.mark.parametrize("criterion", ["screen", "time"])
+def test_a_small_one_is_cloned(criterion):
+    rows = gaussians()
+    stay, born = change(rows, statistics(**{criterion: {3: 2.1e-4}}))
+    assert stay.tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(born, rows[[3]])
+
+
+@pytest.mark.parametrize("criterion", ["screen", "time"])
+def test_a_large_one_is_split(criterion):
+    rows = gaussians(scale=LARGE)
+    stay, born = change(rows, statistics(**{criterion: {1: 2.1e-4}}))
+    assert stay.tolist() == [0, 2, 3, 4]
+    assert born.shape == (2, rows.shape[1])
+    np.testing.assert_allclose(np.exp(born[:, PLACE["log_scale"]]), LARGE / 1.6, rtol=1e-5)
+    others = [c for name in PLACE if name not in ("loc", "log_scale") for c in range(*PLACE[name].indices(99))]
+    np.testing.assert_array_equal(born[:, others], rows[[1, 1]][:, others])
+    assert not np.array_equal(born[0, PLACE["loc"]], born[1, PLACE["loc"]])
+
+
+def test_either_axis_makes_it_large():
+    rows = gaussians()
+    rows[2, PLACE["log_scale"]] = np.log([SMALL, LARGE])
+    assert 2 not in change(rows, statistics(screen={2: 1e-3}))[0]
+
+
+def test_halves_are_drawn_from_their_parent():
+    """Many halves of one Gaussian: their covariance is the parent's, turned as it is."""
+    num, angle, scales = 20_000, 0.7, np.array([0.1, 0.06])
+    rows = np.repeat(gaussians(1), num, axis=0)
+    share = angle / (2 * np.pi)
+    rows[:, PLACE["angle_logit"]] = np.log(share / (1 - share))
+    rows[:, PLACE["log_scale"]] = np.log(scales)
+    _, born = change(rows, statistics(num, screen=dict.fromkeys(range(num), 1.0)), most=10**6)
+    away = born[:, PLACE["loc"]] - rows[0, PLACE["loc"]]
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    expected = turn @ np.diag(scales**2) @ turn.T
+    # Standard error of a covariance of 40,000: 1 / sqrt(20,000) of it; five of them.
+    np.testing.assert_allclose(np.cov(away.T), expected, atol=5 * scales[0] ** 2 / np.sqrt(num))
+    np.testing.assert_allclose(away.mean(0), 0, atol=5 * scales[0] / np.sqrt(2 * num))
+
+
+def test_the_mean_is_over_the_steps_in_which_it_was_seen():
+    sums = Statistics.zeros(3)
+    by_time = np.float32([-4e-4, 4e-4, 0])
+    sums.add([(np.array([0]), np.float32([3e-4]))], by_time)
+    sums.add([(np.array([0, 2]), np.float32([1e-4, 5e-4])), (np.array([2]), np.float32([7e-4]))], -by_time)
+    np.testing.assert_allclose(sums.screen, [4e-4, 0, 7e-4], rtol=1e-5)  # the largest of a batch
+    np.testing.assert_allclose(sums.time, [8e-4, 0, 0], rtol=1e-5)  # signs do not cancel; unseen, nothing counts
+    assert sums.seen.tolist() == [2, 0, 1]
+    _, born = change(gaussians(3), sums)
+    assert len(born) == 2  # 0 by 4e-4 / 2 of the screen's and by time's 4e-4; 2 by 7e-4 / 1
+
+
+def test_the_faint_are_pruned():
+    rows = gaussians()
+    rows[[1, 4], PLACE["opacity_logit"]] = np.log(0.0099 / 0.9901)
+    rows[2, PLACE["opacity_logit"]] = np.log(0.0101 / 0.9899)
+    stay, born = change(rows, statistics(screen={1: 1.0}))
+    assert stay.tolist() == [0, 2, 3]
+    assert len(born) == 0  # its clone is as faint
+
+
+def test_the_big_are_pruned_late():
+    rows = gaussians()
+    rows[0, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 0.1 * EXTENT])
+    rows[1, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 20 / 3 / PIXELS])
+    rows[2, PLACE["log_scale"]] = np.log([SMALL, 0.99 * 20 / 3 / PIXELS])
+    assert change(rows, statistics(), step=3000)[0].tolist() == [0, 1, 2, 3, 4]
+    assert change(rows, statistics(), step=3100)[0].tolist() == [2, 3, 4]
+    few = dataclasses.replace(GROWTH, prune_radius=1e6)
+    assert change(rows, statistics(), step=3100, growth=few)[0].tolist() == [1, 2, 3, 4]
+
+
+def test_the_most_restless_go_first_where_there_is_no_room():
+    rows = gaussians(6)
+    rows[4, PLACE["log_scale"]] = np.log(LARGE)
+    wanted = statistics(6, screen={0: 3e-4, 2: 9e-4}, time={3: 5e-4, 4: 8e-4})
+    stay, born = change(rows, wanted, most=8)
+    assert stay.tolist() == [0, 1, 2, 3, 5]
+    assert len(stay) + len(born) == 8
+    np.testing.assert_array_equal(born[0], rows[2])
+    for most in (6, 3):  # full, or more than full
+        assert len(change(rows, wanted, most=most)[1]) == 0
+
+
+def test_one_is_always_left():
+    rows = gaussians(opacity_logit=-9.0)
+    rows[3, PLACE["opacity_logit"]] = -8
+    assert change(rows, statistics())[0].tolist() == [3]
+
+
+def test_halves_depend_on_seed_and_step_alone():
+    def born(**options):
+        return change(gaussians(scale=LARGE), statistics(screen={1: 1.0}), **options)[1]
+
+    np.testing.assert_array_equal(born(), born())
+    assert not np.array_equal(born(), born(seed=1))
+    assert not np.array_equal(born(), born(step=700))
+
+
+def test_dimming():
+    rows, moments = gaussians(), [np.ones((5, 11 + 2 * DEGREE), np.float32) for _ in range(2)]
+    rows[2, PLACE["opacity_logit"]] = -7
+    before = rows.copy()
+    dim(rows, *moments, GROWTH, DEGREE)
+    opacity = 1 / (1 + np.exp(-rows[:, PLACE["opacity_logit"]][:, 0]))
+    np.testing.assert_allclose(opacity, [0.01, 0.01, 1 / (1 + np.exp(7)), 0.01, 0.01], rtol=1e-4)
+    before[:, PLACE["opacity_logit"]] = rows[:, PLACE["opacity_logit"]]
+    np.testing.assert_array_equal(before, rows)
+    for part in moments:
+        assert (part[:, PLACE["opacity_logit"]] == 0).all()
+        assert part.sum() == part.size - 5
+    rows = rows[rows[:, PLACE["opacity_logit"]][:, 0] > -6]
+    assert len(change(rows, statistics(len(rows)))[0]) == len(rows)  # those reset are not at once too faint
+
+
+def test_the_published_schedule():
+    growth = GROWTH.for_plan(PUBLISHED_STEPS)
+    assert growth == GROWTH
+    grows = [step for step in range(1, 30_001) if growth.grows_at(step)]
+    assert (grows[0], grows[-1], len(grows)) == (600, 14_900, 144)
+    assert [step for step in range(1, 30_001) if growth.resets_at(step)] == [3000, 6000, 9000, 12_000]
+
+
+def test_the_schedule_scales_with_the_plan():
+    tenth = GROWTH.for_plan(3000)
+    assert [getattr(tenth, name) for name in ("from_step", "until_step", "every", "big_from", "reset_every")] == [
+        50,
+        1500,
+        10,
+        300,
+        300,
+    ]
+    double = GROWTH.for_plan(60_000)
+    assert (double.from_step, double.every, double.reset_every) == (1000, 200, 6000)
+    short = GROWTH.for_plan(300)  # means over 10 steps still; no reset from which there is no way back
+    assert (short.until_step, short.every, short.reset_every) == (150, 10, 200)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"from_step": -1},
+        {"until_step": 1.5},
+        {"every": 0},
+        {"reset_every": 0},
+        {"big_from": True},
+        {"screen_gradient": 0.0},
+        {"time_gradient": float("nan")},
+        {"clone_below": "1"},
+        {"shrinking": 0.5},
+        {"prune_opacity": 1.0},
+        {"prune_radius": 0},
+        {"prune_scale": -1},
+        {"reset_opacity": 0.001},
+    ],
+    ids=str,
+)
+def test_bad_growth(changes):
+    with pytest.raises(ValueError, match=rf"growth\.{next(iter(changes))}: expected"):
+        Growth(**changes)
+
+
+# ------------------------------------------------------------------------------------------------ in a fit
+
+FRAMES = moving_blobs(5, 24, 40)
+#: Every birth and reset within 60 steps; thresholds that a small clip reaches.
+QUICK = Growth(
+    from_step=1,
+    until_step=45,
+    every=10,
+    screen_gradient=1e-3,
+    time_gradient=1.0,
+    clone_below=0.05,
+    big_from=25,
+    prune_radius=1e3,
+    prune_scale=10.0,
+    reset_every=20,
+)
+CONFIG = FitConfig(num_gaussians=150, steps=60, degree=2, batch_size=2, growth=QUICK)
+
+
+@pytest.fixture
+def unscaled(monkeypatch):
+    """Steps of the schedule as they stand."""
+    monkeypatch.setattr(Growth, "for_plan", lambda self, plan: self)
+
+
+def run(config, kept=None):
+    """Numbers of Gaussians by step, and the last state."""
+    numbers = []
+    for state, info in fit_steps(FRAMES, config, kept):
+        numbers.append(info.num_gaussians)
+        assert len({len(part) for part in (state.rows, state.first, state.second, state.counts)}) == 1
+    return numbers, state
+
+
+@pytest.mark.usefixtures("unscaled")
+def test_a_fit_grows_when_it_should():
+    numbers, state = run(CONFIG)
+    changed = [step for step in range(2, 61) if numbers[step - 1] != numbers[step - 2]]
+    assert changed
+    assert set(changed) <= {10, 20, 30, 40}
+    assert numbers[-1] > 200
+    assert state.statistics is None
+    assert (state.counts == 60).sum() < len(state.counts)
+
+
+@pytest.mark.usefixtures("unscaled")
+@pytest.mark.parametrize("criterion", ["screen_gradient", "time_gradient"])
+def test_either_gradient_alone_makes_it_grow(criterion):
+    off = {"screen_gradient": 1e9, "time_gradient": 1e9, "reset_every": 1000}
+    growth = dataclasses.replace(QUICK, **off)
+    assert max(run(dataclasses.replace(CONFIG, growth=growth))[0]) == 150
+    on = dataclasses.replace(growth, **{criterion: 1e-5})
+    assert max(run(dataclasses.replace(CONFIG, growth=on))[0]) > 200
+
+
+@pytest.mark.usefixtures("unscaled")
+def test_caps():
+    numbers, _ = run(dataclasses.replace(CONFIG, max_gaussians=170))
+    assert max(numbers) == 170
+    small = dataclasses.replace(CONFIG, max_size_mb=0.015)
+    most = most_gaussians(small, len(FRAMES))
+    assert 150 < most < 200
+    assert max(run(small)[0]) == most
+
+
+def test_caps_bound_the_start_too():
+    config = FitConfig(num_gaussians=500, max_gaussians=300)
+    assert chosen_num_gaussians(config, 5, 24, 40) == 300
+    assert chosen_num_gaussians(dataclasses.replace(config, max_size_mb=0.01), 5, 24, 40) < 100
+    assert chosen_num_gaussians(dataclasses.replace(config, max_gaussians=None), 5, 24, 40) == 500
+    assert len(start(FRAMES, config).rows) == 300
+
+
+@pytest.mark.usefixtures("unscaled")
+def test_new_gaussians_come_last_with_empty_moments():
+    steps, before = fit_steps(FRAMES, CONFIG), None
+    for state, info in steps:
+        if info.step == 9:
+            before = jax.tree.map(np.array, state)
+        if info.step == 10:
+            break
+    old = np.flatnonzero(state.counts > 0)
+    new = np.flatnonzero(state.counts == 0)
+    assert len(new) > 0
+    # Those never seen have taken no step either; all that have stand before all that are new.
+    assert new[new > old.max()].size >= len(state.rows) - len(before.rows)
+    born = new[new > old.max()]
+    assert not state.first[born].any()
+    assert not state.second[born].any()
+    assert state.first[old].any(axis=1).all()
+    assert state.statistics.seen.shape == (len(state.rows),)
+    assert not state.statistics.seen.any()
+
+
+@pytest.mark.usefixtures("unscaled")
+def test_a_reset_dims_the_fit():
+    highest = {}
+    for state, info in fit_steps(FRAMES, CONFIG):
+        highest[info.step] = state.rows[:, PLACE["opacity_logit"]].max()
+    for step in (20, 40):
+        assert highest[step - 1] > -4
+        assert highest[step] == pytest.approx(np.log(0.01 / 0.99), rel=1e-5)
+    assert highest[60] > highest[40] + 0.3
+
+
+def test_the_screen_gradient_is_in_units_of_half_the_picture():
+    """Against finite differences: the loss as one Gaussian's mean moves by a share of half the picture."""
+    config = FitConfig(num_gaussians=1, degree=0, seed=3, ssim_share=0.0, growth=Growth(), follow_motion=False)
+    frames = moving_blobs(2, 24, 40)
+
+    def stepper_of(state):
+        return fit_module._Stepper(frames, config, state)
+
+    state = start(frames, config)
+    state.rows[:, PLACE["log_scale"]] = np.log(0.1)
+    state.rows[:, PLACE["log_time_scale"]] = 1.0
+    unit, k = 40.0, stepper_of(state)._batch(0)[0]
+
+    def loss(dx, dy):
+        rows = state.rows.copy()
+        rows[0, PLACE["loc"]] += np.float32([dx * 20 / unit, dy * 12 / unit])
+        step = stepper_of(state)
+        return step._frame(rows, k, np.float32(k), False, mirrored=False, views=None)[0].value
+
+    small = 0.02
+    slope = [(loss(small, 0) - loss(-small, 0)) / (2 * small), (loss(0, small) - loss(0, -small)) / (2 * small)]
+    stepper_of(state)(state, 0.0)
+    assert state.statistics.seen.tolist() == [1]
+    assert state.statistics.screen[0] == pytest.approx(np.hypot(*slope), rel=0.05)
+
+
+@pytest.mark.usefixtures("unscaled")
+@pytest.mark.parametrize("stop", [7, 10, 23, 45])
+def test_a_stopped_fit_goes_on_to_the_same_bits(stop):
+    whole = run(CONFIG)
+    for state, info in fit_steps(FRAMES, CONFIG):
+        if info.step == stop:
+            break
+    again = run(CONFIG, jax.tree.map(np.array, state))
+    assert again[0] == whole[0][stop:]
+    for one, other in zip(
+        *(jax.tree.leaves(to_model(state, CONFIG, (24, 40), 25.0)) for _, state in (whole, again)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_who_is_outside_the_picture_is_not_seen():
+    config = dataclasses.replace(CONFIG, growth=Growth(), initialization="uniform", follow_motion=False)
+    state = start(FRAMES, config)
+    state.rows[:, PLACE["coefficients"]] = 0
+    state.rows[:, PLACE["log_time_scale"]] = 1.0
+    state.rows[:5, PLACE["loc"]] = 3.0
+    _, _, num_alive = fit_module._Stepper(FRAMES, config, state)(state, 0.0)
+    assert num_alive == 150
+    assert state.statistics.seen[:5].tolist() == [0] * 5
+    assert state.statistics.seen[5:].mean() > 0.8
+
+
+def test_without_growth_there_are_no_statistics():
+    assert start(FRAMES, dataclasses.replace(CONFIG, growth=None)).statistics is None
+
+
+def test_growth_waits_for_the_plan():
+    """By minutes, the pace is measured first; the schedule is that of the plan."""
+    growth = dataclasses.replace(QUICK, from_step=0, every=1, until_step=PUBLISHED_STEPS, reset_every=PUBLISHED_STEPS)
+    config = dataclasses.replace(CONFIG, steps=None, minutes=0.02, growth=growth)
+    without = 0
+    for state, info in fit_steps(FRAMES, config):
+        without += not state.plan
+        if info.num_gaussians != 150:
+            break
+        assert state.statistics.seen.max() > info.step / 2  # gradients count from the first step on
+    assert without > 10
+    assert state.plan > 0
+    assert info.step % 10 == 0  # every = 1 of 30,000 is held at `LEAST_EVERY`

@@ -1,0 +1,244 @@
+"""Presets: the published recipe as far as it can be read off, its starts, its two cameras; and drafts."""
+
+import dataclasses
+import sys
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project
+from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video.config import PRESETS, chosen_num_gaussians, planned_steps
+from foldgauss.video.fit import start, to_model
+from foldgauss.video.growth import Growth
+from foldgauss.video.initialize import initialize_uniform
+from foldgauss.video.model import SH_C0
+from foldgauss.video.packing import columns
+
+fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
+
+FRAMES = moving_blobs(4, 24, 40)
+TAN = np.tan(0.6911112 / 2)  # the published frame's half width, in its units
+
+
+def test_standard_is_the_default():
+    assert FitConfig.preset("standard") == FitConfig()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_changes_override_a_preset(name):
+    config = FitConfig.preset(name, degree=5, seed=9)
+    assert dataclasses.replace(FitConfig.preset(name), degree=5, seed=9) == config
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_minutes_replace_a_presets_steps(name):
+    assert planned_steps(FitConfig.preset(name, minutes=2), 10) is None
+    assert planned_steps(FitConfig.preset(name, minutes=2, steps=7), 10) == 7
+
+
+def test_unknown_names():
+    with pytest.raises(ValueError, match="preset: expected one of 'standard', 'draft', 'paper', got 'papers'"):
+        FitConfig.preset("papers")
+    with pytest.raises(ValueError, match="changes: expected fields of FitConfig, got degrees"):
+        FitConfig.preset("paper", degrees=3)
+
+
+def test_a_draft_is_smaller_than_the_standard():
+    draft, standard = FitConfig.preset("draft"), FitConfig()
+    assert planned_steps(draft, 24) < planned_steps(standard, 24) / 3
+    assert chosen_num_gaussians(draft, 24, 160, 320) < chosen_num_gaussians(standard, 24, 160, 320) / 3
+    assert evaluate(fit(FRAMES, FitConfig.preset("draft", num_gaussians=400, steps=150)).model, FRAMES).mean_psnr > 25
+
+
+def test_the_published_numbers():
+    paper = FitConfig.preset("paper")
+    assert (paper.num_gaussians, paper.degree, paper.batch_size, paper.steps) == (500_000, 7, 3, 30_000)
+    assert (paper.power, paper.ssim_share, paper.square_share, paper.floor) == (2.0, 0.2, 0.0, 0.0)
+    assert paper.options == RenderOptions()
+    assert paper.growth == Growth()
+    rates = paper.rates
+    # A published length is half a frame's width per tan; ours the whole: 1 / (2 tan).
+    assert rates.loc == pytest.approx(1.6e-4 * 1.1 / (2 * TAN))
+    assert rates.coefficients == pytest.approx(1e-3 / (2 * TAN))
+    assert (rates.color_dc, rates.opacity_logit, rates.log_scale) == (2.5e-3, 2.5e-2, 5e-3)
+    assert {rates.angle_logit, rates.time_loc_logit, rates.log_time_scale, rates.frame_times} == {1e-3}
+    assert paper.growth.clone_below == pytest.approx(0.011 / (2 * TAN))
+
+
+# -------------------------------------------------------------------------------------------------- starts
+
+
+def uniform(num=5000, size=(24, 40), seed=0, degree=3):
+    return initialize_uniform(num, size, degree=degree, envelope=TimeLikelihood(2.0), seed=seed)
+
+
+def test_uniform_starts_are_as_published():
+    splats = uniform()
+    sigmoid = lambda x: 1 / (1 + np.exp(-x))  # noqa: E731
+    # Mean and variance of each uniform law, to five standard errors of 5000 draws or more.
+    for values, low, high in (
+        (splats.loc[:, 0], -0.55, 0.55),
+        (splats.loc[:, 1], -0.55 * 0.6, 0.55 * 0.6),
+        (sigmoid(splats.time_loc_logit), 0, 1),
+        (sigmoid(splats.angle_logit), 0, 1),
+        (np.exp(splats.log_time_scale), 0.01, 1),
+        (splats.coefficients * 2 * TAN, -1, 1),
+        (0.5 + SH_C0 * splats.color_dc, 0, 1 / 255),
+    ):
+        wide, values = high - low, np.ravel(values)
+        assert values.min() >= low - 1e-6
+        assert values.max() <= high + 1e-6
+        assert abs(values.mean() - (low + high) / 2) < 5 * wide / np.sqrt(12 * len(values))
+        assert abs(values.var() - wide**2 / 12) < 5 * wide**2 / 12 * np.sqrt(0.8 / len(values))
+    np.testing.assert_allclose(sigmoid(splats.opacity_logit), 0.1, rtol=1e-5)
+
+
+def test_uniform_starts_are_as_wide_as_their_neighbours_are_far():
+    splats = uniform(60)
+    far = np.sort(np.linalg.norm(splats.loc[:, None] - splats.loc[None], axis=-1), axis=1)[:, 1:4].mean(1)
+    np.testing.assert_allclose(np.exp(splats.log_scale), np.stack([far, far], -1), rtol=1e-4)
+
+
+@pytest.mark.parametrize("num", [1, 2, 3])
+def test_few_uniform_starts(num):
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(uniform(num)))
+
+
+def test_uniform_starts_depend_on_the_seed():
+    assert np.array_equal(uniform().loc, uniform().loc)
+    assert not np.array_equal(uniform().loc, uniform(seed=1).loc)
+
+
+def test_the_config_chooses_the_starts():
+    config = FitConfig(num_gaussians=50, initialization="uniform", follow_motion=False)
+    rows = start(FRAMES, config).rows
+    np.testing.assert_array_equal(rows[:, columns(3)["loc"]], uniform(50).loc)
+
+
+# ------------------------------------------------------------------------------------------------- cameras
+
+
+def splats_in_pixels(size, num=40):
+    rng = np.random.default_rng(1)
+    mean = rng.uniform(0, 1, (num, 2)) * size[::-1]
+    leaves = mean, rng.normal(0, 3, (num, 2, 2)), rng.uniform(0.2, 0.9, num), rng.uniform(0, 1, (num, 3))
+    return [np.float32(leaf) for leaf in leaves]
+
+
+def test_the_camera_opposite_sees_the_mirrored_picture():
+    """And so does `render.camera`'s."""
+    size = (24, 40)
+    mean, factor, *others = splats_in_pixels(size)
+    front = cpu.forward(mean, factor, *others, np.zeros(3, np.float32), size)
+    seen = fit_module._mirrored(mean, factor, 40)
+    back = cpu.forward(*seen, *others, np.zeros(3, np.float32), size)
+    np.testing.assert_allclose(back.image, front.image[:, :, ::-1], atol=2e-6)
+    model = Splats2D((mean - [20, 12]).astype(np.float32) / 40, factor / 40, *others)
+    camera = Camera.opposing(24 / 40)
+    splats = Gaussians3D.from_flat(model)
+    by_camera = project(splats, camera, size)
+    np.testing.assert_allclose(by_camera.mean, seen[0], atol=1e-3)
+    covariance = lambda f: np.asarray(f) @ np.swapaxes(f, 1, 2)  # noqa: E731
+    np.testing.assert_allclose(covariance(by_camera.factor), covariance(seen[1]), rtol=1e-3, atol=1e-3)
+
+
+def test_both_views_give_the_same_gradients():
+    config = FitConfig(num_gaussians=200, steps=30)
+    for state, _ in fit_steps(FRAMES, config):
+        pass
+    gradients, losses = [], []
+    for mirrored in (False, True):
+        step = fit_module._Stepper(FRAMES, config, state)
+        loss, _, by_time = step._frame(state.rows, 2, np.float32(0.6), False, mirrored=mirrored, views=None)
+        gradients.append(np.append(step.grad, by_time))
+        losses.append(loss.value)
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    assert np.abs(gradients[0]).max() > 1e-4
+    np.testing.assert_allclose(*gradients, atol=1e-4 * np.abs(gradients[0]).max())
+
+
+def test_a_pass_sees_every_frame_from_both_sides():
+    config = FitConfig(num_gaussians=20, two_cameras=True, batch_size=2)
+    step = fit_module._Stepper(FRAMES, config, start(FRAMES, config))
+    passes = [np.concatenate([step._batch(4 * k + i) for i in range(4)]) for k in range(2)]
+    assert sorted(passes[0]) == sorted(passes[1]) == list(range(8))
+    assert passes[0].tolist() != passes[1].tolist()
+
+
+def test_views_from_the_back_are_taken_for_what_they_are():
+    """An uneven clip is learned from both sides: were a target or a gradient not mirrored, it would not be."""
+    config = FitConfig(num_gaussians=400, steps=200)
+    one, two = (
+        evaluate(fit(FRAMES, dataclasses.replace(config, two_cameras=two)).model, FRAMES).mean_psnr
+        for two in (False, True)
+    )
+    assert two > 28
+    assert abs(one - two) < 1
+
+
+# --------------------------------------------------------------------------------------------------- steps
+
+
+def test_all_take_part_where_only_alive_is_off():
+    short = {"num_gaussians": 300, "steps": 12, "rates": PRESETS["paper"]["rates"]}
+    for only_alive in (True, False):
+        for state, info in fit_steps(FRAMES, FitConfig(only_alive=only_alive, **short)):
+            assert info.num_alive <= 300
+        assert (state.counts.min() < 12) == only_alive
+        assert state.counts.max() <= 12
+
+
+@pytest.mark.parametrize("falling", ["all", "loc"])
+def test_which_rates_fall(falling):
+    """Where the last step's rate is 0, only what does not fall still moves."""
+    config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, falling=falling)
+    state = start(FRAMES, config)
+    stepper, before = fit_module._Stepper(FRAMES, config, state), state.rows.copy()
+    times = state.time_logits.copy()
+    stepper(state, 1.0)
+    moved = {name: not np.array_equal(state.rows[:, at], before[:, at]) for name, at in columns(3).items()}
+    assert not moved.pop("loc")
+    assert set(moved.values()) == {falling == "loc"}
+    assert np.array_equal(np.asarray(state.time_logits), times) == (falling == "all")
+
+
+def test_a_small_fit_by_the_paper():
+    """All of it at once, through birth and reset; stopped and gone on with, it has the same bits."""
+    config = FitConfig.preset("paper", num_gaussians=300, degree=3, steps=450)
+    whole = []
+    for state, info in fit_steps(FRAMES, config):
+        whole.append(info.num_gaussians)
+        if info.step == 215:  # after the reset, between births
+            kept = jax.tree.map(np.array, state)
+    assert kept.statistics is not None
+    assert len(set(whole)) > 5
+    assert info.psnr > 15
+    for again, _ in fit_steps(FRAMES, config, kept):
+        pass
+    models = [jax.tree.leaves(to_model(one, config, (24, 40), 25.0)) for one in (state, again)]
+    for one, other in zip(*models, strict=True):
+        assert np.isfinite(one).all()
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"max_gaussians": 0}, "max_gaussians"),
+        ({"max_gaussians": 10**12}, "max_gaussians"),
+        ({"initialization": "random"}, "initialization: expected one of 'clip', 'uniform'"),
+        ({"initialization": "uniform"}, "follow_motion: expected False"),
+        ({"falling": "none"}, "falling: expected one of"),
+        ({"two_cameras": 2}, "two_cameras"),
+        ({"only_alive": None}, "only_alive"),
+        ({"growth": True}, "growth: expected a Growth"),
+    ],
+    ids=str,
+)
+def test_bad_settings(changes, message):
+    with pytest.raises(ValueError, match=message):
+        FitConfig(**changes)
