@@ -56,15 +56,15 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pool)
 
 
-def run_tasks(task: Callable[[int], object], items: Iterable[int]) -> None:
-    """Call `task(item)` for every item on the pool and wait; the first error is raised here.
+def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:
+    """Call `task(item)` for every item on the pool, or all on this thread, and wait; the first error is raised here.
 
     Tasks must not call `run_tasks` themselves.
     """
     global _pool
     items = list(items)
     threads = num_threads()
-    if threads == 1 or len(items) <= 1:
+    if serial or threads == 1 or len(items) <= 1:
         for item in items:
             task(item)
         return

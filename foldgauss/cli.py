@@ -154,6 +154,9 @@ def fit(
         float | None,
         typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 2]."),
     ] = None,
+    compositing: Annotated[
+        str | None, typer.Option(help="Blend of the Gaussians: over (front to back) or sum [default: over].")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
@@ -181,6 +184,7 @@ def fit(
         "max_size_mb": max_size_mb,
         "batch_size": batch_size,
         "power": power,
+        "compositing": compositing,
         "seed": seed,
     }
     try:

@@ -4,6 +4,9 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
+import time
 
 import cv2
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 
 from foldgauss import cli
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
+from foldgauss.io.model_file import read_header
 
 SIZE = (48, 64)
 QUICK = ["--gaussians", "400", "--steps", "30"]
@@ -347,6 +351,37 @@ def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
     whole = tmp_path / "whole.safetensors"
     assert run(*arguments[:3], whole, *arguments[4:]) == 0
     assert target.read_bytes() == whole.read_bytes()
+
+
+KEEPING_EVERY_STEP = "from foldgauss import cli; cli.CHECKPOINT_SECONDS = 0.0; cli.main()"
+
+
+@pytest.mark.skipif(
+    not hasattr(signal, "SIGKILL"), reason="a kill that no process hears of is POSIX's; CI runs it on Linux"
+)
+def test_killed_at_any_moment_and_resumed(work, tmp_path):
+    """`kill -9` leaves a checkpoint that is whole, from which the fit ends as if it had never been killed."""
+    target, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
+    options = ["--gaussians", "400", "--steps", "300", "--quiet"]
+    command = [sys.executable, "-c", KEEPING_EVERY_STEP, "fit", work / "clip.mp4", "--out", target, *options]
+    steps = []
+    for turn in range(2):
+        process = subprocess.Popen([*command, *["--resume"] * (turn > 0)])
+        while process.poll() is None and not (kept.exists() and _step_of(kept) > 100 * turn + 37):
+            time.sleep(0.01)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert not target.exists()
+        steps.append(_step_of(kept))
+    assert 37 < steps[0] < steps[1] < 300
+    assert run(*command[3:], "--resume") == 0
+    whole = tmp_path / "whole.safetensors"
+    assert run("fit", work / "clip.mp4", "--out", whole, *options) == 0
+    assert target.read_bytes() == whole.read_bytes()
+
+
+def _step_of(checkpoint):
+    return read_header(checkpoint)["header"]["step"]
 
 
 def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypatch, capsys):

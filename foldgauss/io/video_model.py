@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, one_of
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
-from foldgauss.render import RenderOptions
+from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.config import FitConfig
 from foldgauss.video.fit import TIME_ADAM, FitState
 from foldgauss.video.frame_times import FrameTimes
@@ -74,6 +74,7 @@ def _describe_video(model: VideoModel) -> dict:
         "size": list(model.size),
         "fps": model.fps,
         "options": dataclasses.asdict(model.options),
+        "compositing": model.compositing,
     }
 
 
@@ -84,6 +85,8 @@ def _video_skeleton(header: dict) -> VideoModel:
     height, width = header["size"]
     if min(num, num_frames - 1, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
         raise ValueError("a size, count or rate is out of range")
+    compositing = header.get("compositing", "over")  # files from before there was another
+    one_of("compositing", compositing, COMPOSITINGS)
     row_width = columns(degree)["coefficients"].stop
 
     def build() -> VideoModel:
@@ -93,6 +96,7 @@ def _video_skeleton(header: dict) -> VideoModel:
             size=(height, width),
             fps=float(header["fps"]),
             options=RenderOptions(**header["options"]),
+            compositing=compositing,
         )
 
     return jax.eval_shape(build)  # traced, not computed: nothing is allocated

@@ -2,11 +2,12 @@
 
 from foldgauss.render.camera import Camera, Gaussians3D, project
 from foldgauss.render.colors import solve_colors
-from foldgauss.render.door import ENGINES, render
+from foldgauss.render.door import COMPOSITINGS, ENGINES, render
 from foldgauss.render.splats import RenderOptions, Splats2D, pixels_per_unit
 from foldgauss.render.triangle import Triangles
 
 __all__ = [
+    "COMPOSITINGS",
     "ENGINES",
     "Camera",
     "Gaussians3D",

@@ -85,7 +85,7 @@ def _exp2(x):
 
 
 @kernel
-def project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff, support, geometry, span):
+def project(start, stop, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span):
     """Geometry of splats start..stop and the rows of tiles each one reaches (none: it is not seen).
 
     `support` is the squared support radius in standard deviations, or infinity.
@@ -108,7 +108,12 @@ def project(start, stop, mean, factor, opacity, height, width, low_pass, cutoff,
         q = -xy * inverse * p
         # Also false for NaN, and for a determinant of 0.
         drawable = p < THINNEST and q * q + r * r < THINNEST**2 and max(xx, yy) < half_log2e / WIDEST**2
-        if not (drawable and opacity[i] >= cutoff):
+        if not (drawable and cutoff <= opacity[i] < math.inf):
+            continue
+        finite = True
+        for c in range(color.shape[1]):
+            finite &= math.isfinite(color[i, c])
+        if not finite:
             continue
         log = math.log2(opacity[i])
         reach = (min(log - log_cutoff, radius) * (_f(1.0) + SLACK) + SLACK) / half_log2e

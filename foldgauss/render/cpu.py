@@ -34,6 +34,9 @@ from foldgauss.render.splats import RenderOptions, check_size
 
 TILE, PIXELS = kernels.TILE, kernels.PIXELS
 CHUNK = 8192  # splats per task where splats, not rows, are shared out
+#: Nanoseconds, roughly, that it takes to blend an entry of a row of tiles and to write a pixel; and below which in all
+#: another thread would cost more than it brings.
+ENTRY, PIXEL, SMALL = 80, 1.5, 4e5
 
 
 class Statistics(NamedTuple):
@@ -90,6 +93,7 @@ def forward(
     """Render float32 splats: shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), in pixels.
 
     Returns the trace: its `image` is planar, (channels, height, width), its `statistics` are there if asked for.
+    A splat with a number that is not finite is not drawn and gets no gradient.
     Any number of channels from 1 on; kernels for 1 to 4 are compiled each, one for all others. Raises ValueError for
     a tile size that is not this engine's, a size below 1, and arrays that are not float32 or do not fit together.
     """
@@ -117,7 +121,8 @@ def forward_frames(
     drafts = [_Draft(frame, size, compositing, options, statistics) for frame in frames]
     run_tasks(lambda task: task[0].project(task[1]), [(one, start) for one in drafts for start in one.chunks])
     run_tasks(_Draft.bucket, drafts)
-    run_tasks(lambda task: task[0].blend(task[1]), [(one, row) for one in drafts for row in range(one.num_rows)])
+    rows = [(one, row) for one in drafts for row in range(one.num_rows)]
+    run_tasks(lambda task: task[0].blend(task[1]), rows, serial=sum(one.work for one in drafts) < SMALL)
     if statistics:
         run_tasks(lambda task: task[0].gather(task[1]), [(one, start) for one in drafts for start in one.chunks])
     return [one.trace() for one in drafts]
@@ -169,12 +174,17 @@ class _Draft:
         stop, radius = min(start + CHUNK, len(self.opacity)), self.options.support_radius
         low_pass, cutoff = np.float32(self.options.low_pass), np.float32(self.options.alpha_cutoff)
         support = np.float32(math.inf if radius is None else radius**2)
-        splats = (self.mean, self.factor, self.opacity)
+        splats = (self.mean, self.factor, self.opacity, self.color)
         kernels.project(start, stop, *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span)
 
     def bucket(self) -> None:
         self.buckets = kernels.bucket_rows(self.span, self.num_rows)
         self.marks = None if self.statistics is None else np.empty((len(self.buckets[1]), 2), np.float32)
+
+    @property
+    def work(self) -> float:
+        """Nanoseconds, roughly, that blending takes."""
+        return ENTRY * len(self.buckets[1]) + PIXEL * self.light.size
 
     def blend(self, row: int) -> None:
         room = None if self.marks is None else np.zeros(2 * TILE * kernels.BLOCK, np.float32)

@@ -91,7 +91,10 @@ def render(
 def _rendered(splats, background, size, compositing, engine, options):
     """The picture, all arguments checked."""
     dtype = splats.mean.dtype
-    leaves = (*_finite_splats(splats), background)
+    if engine == "cpu":  # which leaves out what is not finite by itself
+        leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
+    else:
+        leaves = (*_finite_splats(splats), background)
     if engine == "reference":
         return render_reference(Splats2D(*leaves[:4]), size, background, compositing=compositing, options=options)
     # Below single precision a sum of hundreds of splats has no digits left; float64 stays what it is, but in "cpu".
@@ -179,32 +182,34 @@ def _on_host(function: Callable, shapes, *arrays: jax.Array):
     return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)
 
 
-STRIP = 64  # rows of pixels per task
+STRIP = 1 << 17  # pixels per task
 
 
 def _interleave(planes: np.ndarray, image: np.ndarray) -> None:
     """Write planes (channels, height, width) into an image (height, width, channels)."""
 
-    def work(top: int) -> None:
-        own = planes[:, top : top + STRIP]
-        if 2 <= len(planes) <= 4:
-            cv2.merge(list(own), image[top : top + STRIP])
-        else:
-            image[top : top + STRIP] = np.moveaxis(own, 0, -1)
+    rows = -(-STRIP // image.shape[1])
 
-    run_tasks(work, range(0, len(image), STRIP))
+    def work(top: int) -> None:
+        own = planes[:, top : top + rows]
+        if 2 <= len(planes) <= 4:
+            cv2.merge(list(own), image[top : top + rows])
+        else:
+            image[top : top + rows] = np.moveaxis(own, 0, -1)
+
+    run_tasks(work, range(0, len(image), rows))
 
 
 def _separated(image: np.ndarray) -> np.ndarray:
     """The planes (channels, height, width) of an image (height, width, channels)."""
-    planes = np.empty((image.shape[2], *image.shape[:2]), np.float32)
+    planes, rows = np.empty((image.shape[2], *image.shape[:2]), np.float32), -(-STRIP // image.shape[1])
 
     def work(top: int) -> None:
-        own = planes[:, top : top + STRIP]
+        own = planes[:, top : top + rows]
         if 2 <= len(planes) <= 4:
-            cv2.split(image[top : top + STRIP], list(own))
+            cv2.split(image[top : top + rows], list(own))
         else:
-            own[...] = np.moveaxis(image[top : top + STRIP], -1, 0)
+            own[...] = np.moveaxis(image[top : top + rows], -1, 0)
 
-    run_tasks(work, range(0, len(image), STRIP))
+    run_tasks(work, range(0, len(image), rows))
     return planes

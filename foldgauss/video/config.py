@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 from foldgauss._checks import invalid, one_of, whole, within
-from foldgauss.render import RenderOptions
+from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 
 
@@ -70,6 +70,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "initialization": "uniform",
         "follow_motion": False,
         "own_time": False,
+        "quarter_share": 0.0,
+        "half_share": 0.0,
         "only_alive": False,
         "square_share": 0.0,
         "rates": PUBLISHED_RATES,
@@ -113,6 +115,9 @@ class FitConfig:
     initialization: str = "clip"
     follow_motion: bool = True  # start along the optical flow, shot by shot; False: at rest
     own_time: bool = True  # rates in units of each Gaussian's own time, see `LearningRates`
+    #: Of the plan, at its beginning: frames at a quarter, then at half of their size, as far as they are large enough.
+    quarter_share: float = 0.15
+    half_share: float = 0.25
     square_share: float = 0.3  # of the plan, at its end: squared error alone, which is what PSNR measures
     #: Adam's steps are for Gaussians alive in the batch; False: for all, by momentum, as published.
     only_alive: bool = True
@@ -121,6 +126,8 @@ class FitConfig:
     falling: str = "all"  # which do: all, or "loc", that of positions alone
     two_cameras: bool = False  # see above
     growth: Growth | None = None  # None: the number of Gaussians stays
+    #: "over": front to back as 3DGS and VeGaS; "sum": contributions added up, in any order, as GaussianImage.
+    compositing: str = "over"
     options: RenderOptions = FINE
 
     def __post_init__(self) -> None:
@@ -148,6 +155,8 @@ class FitConfig:
             "ssim_share": "[0, 1]",
             "final_rate": "[0, 1]",
             "square_share": "[0, 1]",
+            "quarter_share": "[0, 1]",
+            "half_share": "[0, 1]",
         }
         for name, bounds in ranges.items():
             value = getattr(self, name)
@@ -158,6 +167,10 @@ class FitConfig:
             object.__setattr__(self, name, float(value))
         one_of("initialization", self.initialization, INITIALIZATIONS)
         one_of("falling", self.falling, FALLING)
+        one_of("compositing", self.compositing, COMPOSITINGS)
+        if self.quarter_share + self.half_share > 1:
+            got = f"{self.quarter_share:g} and {self.half_share:g}"
+            raise invalid("quarter_share, half_share", expected="at most 1 together", got=got)
         flags = ("learn_frame_times", "follow_motion", "own_time", "only_alive", "two_cameras")
         kinds = dict.fromkeys(flags, bool) | {"rates": LearningRates, "options": RenderOptions}
         if self.growth is not None:

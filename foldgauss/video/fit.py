@@ -21,11 +21,12 @@ from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_bac
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
-from foldgauss.video.initialize import initialize, initialize_uniform
+from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack, unpack
+from foldgauss.video.pyramid import level_at, levels, shrunk
 from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
 
@@ -109,23 +110,30 @@ def fit_steps(
 ) -> Iterator[tuple[FitState, FitInfo]]:
     """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one."""
     check_frames(frames)
+    if frames.shape[3] == 4 and config.compositing == "sum":
+        cure = "Sums let all light through: drop the alpha, or take 'over'."
+        raise invalid("compositing", expected="'over' for frames with alpha", got="'sum'", cure=cure)
     state = start(frames, config) if state is None else state
-    step, pace = _Stepper(frames, config, state), _Pace(config)
-    stopped_by = _stopped_by(state, config, len(frames))
+    step = _Stepper(frames, config, state)
+    pace = _Pace(config, [level.share for level in step.levels])
+    stopped_by = _stopped_by(state, config, frames.shape)
     if stopped_by:  # a kept state that needs no more steps
         yield state, _info(state, config, math.nan, 0, stopped_by)
     while not stopped_by:
         begun = time.perf_counter()
-        loss, squared_error, num_alive = step(state, _progress(state))
+        # While the pace is measured, at all levels in turn.
+        level = level_at(step.levels, _progress(state)) if state.plan else state.step % len(step.levels)
+        loss, squared_error, num_alive = step(state, _progress(state), level)
         memory = max(1 - config.batch_size / len(frames), 0.5) if state.step else 0.0
         state.error = memory * state.error + (1 - memory) * squared_error
         state.step += 1
-        state.seconds += time.perf_counter() - begun
+        passed = time.perf_counter() - begun
+        state.seconds += passed
         if not state.plan:
-            state.plan = pace.plan(state)
+            state.plan = pace.plan(state, level, passed)
         if state.statistics is not None and state.plan:
             step.grow(state)
-        stopped_by = _stopped_by(state, config, len(frames))
+        stopped_by = _stopped_by(state, config, frames.shape)
         yield state, _info(state, config, loss, num_alive, stopped_by)
 
 
@@ -133,24 +141,26 @@ class _Pace:
     """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that one which
     was stopped goes on as if it had not been."""
 
-    def __init__(self, config: FitConfig):
-        self.config, self.since = config, None
+    def __init__(self, config: FitConfig, shares: list[float]):
+        self.config, self.shares, self.count = config, shares, 0
+        self.seconds = [[] for _ in shares]  # of steps, by level
 
-    def plan(self, state: FitState) -> int:
-        """Steps of the whole fit, or 0 while the pace is not known yet."""
+    def plan(self, state: FitState, level: int, seconds: float) -> int:
+        """Steps of the whole fit, or 0 while the pace is not known yet; `seconds`: those of this step, at `level`."""
         if state.step == self.config.steps:
             return state.step
         budget = 60 * self.config.minutes
         if state.seconds >= budget:
             return state.step
-        if self.since is None and state.step >= WARM_UP:
-            self.since = state.step, state.seconds
-        if self.since is None:
+        self.count += 1
+        if self.count > WARM_UP * len(self.shares):
+            self.seconds[level].append(seconds)
+        if min(map(len, self.seconds)) < LEAST_STEPS or sum(map(sum, self.seconds)) < budget * MEASURED:
             return 0
-        steps, seconds = state.step - self.since[0], state.seconds - self.since[1]
-        if steps < LEAST_STEPS or seconds < budget * MEASURED:
-            return 0
-        planned = state.step + int((budget - state.seconds) * steps / (seconds * SLOWER))
+        seconds = [np.mean(own) for own in self.seconds]
+        # The steps so far count as steps of the first level, which this many are still left of.
+        left = (budget - state.seconds) / SLOWER + state.step * seconds[0]
+        planned = max(int(left / np.dot(self.shares, seconds)), state.step)
         return min(planned, self.config.steps or planned)
 
 
@@ -159,9 +169,11 @@ def _progress(state: FitState) -> float:
     return min(state.step / state.plan, 1.0) if state.plan else 0.0
 
 
-def _stopped_by(state: FitState, config: FitConfig, num_frames: int) -> str | None:
-    """The budget that binds now; the running PSNR counts once every frame was seen."""
-    seen = state.step * config.batch_size >= _num_views(config, num_frames)
+def _stopped_by(state: FitState, config: FitConfig, shape: tuple[int, ...]) -> str | None:
+    """The budget that binds now; the running PSNR counts once every frame was seen at its own size."""
+    num_frames, *size = shape[:3]
+    coarse = math.ceil((1 - levels(config, tuple(size))[-1].share) * state.plan)
+    seen = (state.step - coarse) * config.batch_size >= _num_views(config, num_frames) and state.plan > 0
     if config.target_psnr is not None and seen and _psnr(state) >= config.target_psnr:
         return "target_psnr"
     if not state.plan or state.step < state.plan:
@@ -215,7 +227,9 @@ def _splats(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: M
     if config.initialization == "uniform":
         return initialize_uniform(num, frames.shape[1:3], envelope=_envelope(config), **shape)
     times = np.asarray(FrameTimes(logits).times())
-    return initialize(frames, num, envelope=_envelope(config), times=times, motion=motion, **shape)
+    opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
+    clip = {"times": times, "motion": motion, "opacity": opacity}
+    return initialize(frames, num, envelope=_envelope(config), **clip, **shape)
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
@@ -226,6 +240,7 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
         size=tuple(int(n) for n in size),
         fps=float(fps),
         options=config.options,
+        compositing=config.compositing,
     )
 
 
@@ -247,7 +262,10 @@ class _Stepper:
         self.frames, self.config = frames, config
         self.background = np.zeros(3, np.float32)  # another in every step for frames with alpha
         self.num_frames, height, width, _ = frames.shape
-        self.shape = Shape(config.degree, config.power, config.floor, (height, width))
+        self.levels = levels(config, (height, width))
+        own = config.degree, config.power, config.floor
+        self.shapes = [Shape(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
+        self.shapes.append(Shape(*own, (height, width)))
         self.rates = np.empty(state.rows.shape[1], np.float32)
         self.falling = np.ones(state.rows.shape[1], bool)
         for name, place in columns(config.degree).items():
@@ -261,8 +279,8 @@ class _Stepper:
         self.window = np.empty((len(state.rows), 2), np.float32)
         update_windows(state.rows, np.arange(len(state.rows)), self.window)
 
-    def __call__(self, state: FitState, progress: float) -> tuple[float, float, int]:
-        """Advance `state`; returns loss, mean squared error and the number of Gaussians that took part."""
+    def __call__(self, state: FitState, progress: float, level: int = -1) -> tuple[float, float, int]:
+        """Advance `state` by frames of a level; returns loss, mean squared error and how many Gaussians took part."""
         if self.frames.shape[3] == 4:
             self.background = random_background(self.config.seed, state.step)
         decay = self.config.final_rate**progress if self.config.final_rate > 0 else 1 - progress
@@ -273,7 +291,9 @@ class _Stepper:
         for view in self._batch(state.step):
             k = int(view) % self.num_frames
             mirrored = int(view) >= self.num_frames
-            loss, done, d_time = self._frame(state.rows, k, times[k], squared, mirrored=mirrored, views=views)
+            loss, done, d_time = self._frame(
+                state.rows, k, times[k], self.shapes[level], squared=squared, mirrored=mirrored, views=views
+            )
             by_time[k] += d_time  # a batch may hold a frame twice
             losses.append(loss)
             alive.append(done.alive)
@@ -311,7 +331,7 @@ class _Stepper:
             state.statistics,
             growth,
             degree=self.config.degree,
-            pixels=pixels_per_unit(self.shape.size),
+            pixels=pixels_per_unit(self.shapes[-1].size),
             most=most_gaussians(self.config, self.num_frames),
             step=state.step,
             seed=self.config.seed,
@@ -342,8 +362,9 @@ class _Stepper:
         rows: np.ndarray,
         k: int,
         t: np.float32,
-        squared: bool,
+        shape: Shape,
         *,
+        squared: bool,
         mirrored: bool,
         views: list[tuple[np.ndarray, np.ndarray]] | None,
     ) -> tuple[ImageLoss, Conditioned, float]:
@@ -351,19 +372,20 @@ class _Stepper:
 
         To `views`, where asked for, comes what `Statistics.add` wants.
         """
-        target = _planar(self.frames[k], self.background)
-        done = condition(rows, self.window, t, self.shape)
+        target = _planar(shrunk(self.frames[k], shape.size), self.background)
+        done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
         if mirrored:
             target = np.ascontiguousarray(target[:, :, ::-1])
-            mean, factor = _mirrored(mean, factor, self.shape.size[1])
+            mean, factor = _mirrored(mean, factor, shape.size[1])
         trace = cpu.forward(
             mean,
             factor,
             done.opacity,
             done.color,
             self.background,
-            self.shape.size,
+            shape.size,
+            compositing=self.config.compositing,
             options=self.config.options,
         )
         if squared:
@@ -375,9 +397,9 @@ class _Stepper:
             d_mean, d_factor = _mirrored(d_mean, d_factor, 0)
         if views is not None:
             seen = trace.seen
-            half = np.float32(self.shape.size[::-1]) / 2
+            half = np.float32(shape.size[::-1]) / 2
             views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
-        return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), self.shape, self.grad)
+        return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), shape, self.grad)
 
 
 def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

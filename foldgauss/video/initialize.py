@@ -18,6 +18,8 @@ EVEN_SHARE = 0.15
 #: Starting standard deviation in units of the distance to the neighbours alive at the same time.
 SCALE_FACTOR = 1.3
 START_OPACITY = 0.3
+#: Where contributions are added up, so that those of the neighbours come to 1.
+SUMMED_OPACITY = 1 / (2 * np.pi * SCALE_FACTOR**2)
 #: sigma_t of a start that stands still is drawn log-uniformly between these, in units of the clip's duration.
 TIME_SCALES = (0.02, 0.4)
 #: sigma_t of a start that follows its track, in units of half the track; and in frames at the least.
@@ -47,6 +49,7 @@ def initialize(
     seed: int,
     times: np.ndarray | None = None,
     motion: Motion | None = None,
+    opacity: float = START_OPACITY,
 ) -> FoldedSplats:
     """Starting splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
@@ -58,7 +61,9 @@ def initialize(
     num_frames = len(frames)
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
     share_of = lambda k: detail(frames[k])  # noqa: E731
-    make = lambda home, position: born(frames, home, position, times, degree, envelope, motion, rng)  # noqa: E731
+    make = lambda home, position: born(  # noqa: E731
+        frames, home, position, times, degree, envelope, motion, rng, opacity
+    )
     pilot = np.repeat(np.arange(num_frames), PILOT)
     _, spread = make(pilot, drawn(pilot, share_of, rng)[0])
     chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
@@ -127,6 +132,7 @@ def born(
     envelope: TimeLikelihood,
     motion: Motion | None,
     rng: np.random.Generator,
+    opacity: float,
 ) -> tuple[FoldedSplats, np.ndarray]:
     """Splats at `position` in frames `home`, one pixel wide, with the frames' own colours; and their sigma_t."""
     num, (height, width) = len(home), frames.shape[1:3]
@@ -150,7 +156,7 @@ def born(
         "time_loc_logit": _logit(np.clip(time, 1e-3, 1 - 1e-3)),
         "log_time_scale": np.log(spread),
         "coefficients": coefficients / unit,
-        "opacity_logit": _logit(np.full(num, START_OPACITY)),
+        "opacity_logit": _logit(np.full(num, opacity)),
         "color_dc": (color - 0.5) / SH_C0,
     }
     return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope), spread

@@ -103,8 +103,8 @@ def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, "num"])
 class VideoModel(eqx.Module):
     """A fitted video: what is stored in a model file.
 
-    `size` is (height, width) of the frames it was fitted to, `fps` their rate, `options` the constants it was fitted
-    with and must be drawn with.
+    `size` is (height, width) of the frames it was fitted to, `fps` their rate, `options` the constants and
+    `compositing` the blend ("over" or "sum") it was fitted with and must be drawn with.
     """
 
     splats: FoldedSplats
@@ -112,6 +112,7 @@ class VideoModel(eqx.Module):
     size: tuple[int, int] = eqx.field(static=True)
     fps: float = eqx.field(static=True)
     options: RenderOptions = eqx.field(static=True)
+    compositing: str = eqx.field(static=True, default="over")
 
     @property
     def num_frames(self) -> int:
@@ -144,7 +145,8 @@ class VideoModel(eqx.Module):
         t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
         behind = jnp.asarray(checked_background(background), splats.mean.dtype)
-        return render(splats, size, background=behind, engine=engine, options=self.options)
+        drawn = {"compositing": self.compositing, "options": self.options}
+        return render(splats, size, background=behind, engine=engine, **drawn)
 
     def frames(
         self,

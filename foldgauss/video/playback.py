@@ -81,7 +81,8 @@ class Playback:
     def _image(self, t: float) -> Float[np.ndarray, "3 height width"]:
         splats = self.splats(t)
         leaves = splats.mean, splats.factor, splats.opacity, splats.color
-        return cpu.forward(*leaves, self._background, self.size, options=self.model.options).image
+        drawn = {"compositing": self.model.compositing, "options": self.model.options}
+        return cpu.forward(*leaves, self._background, self.size, **drawn).image
 
 
 def _the_one(envelope: TimeLikelihood, name: str) -> float:

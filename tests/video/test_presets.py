@@ -153,7 +153,9 @@ def test_both_views_give_the_same_gradients():
     gradients, losses = [], []
     for mirrored in (False, True):
         step = fit_module._Stepper(FRAMES, config, state)
-        loss, _, by_time = step._frame(state.rows, 2, np.float32(0.6), False, mirrored=mirrored, views=None)
+        loss, _, by_time = step._frame(
+            state.rows, 2, np.float32(0.6), step.shapes[-1], squared=False, mirrored=mirrored, views=None
+        )
         gradients.append(np.append(step.grad, by_time))
         losses.append(loss.value)
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)

@@ -1,0 +1,143 @@
+"""Coarse to fine: which step sees frames of which size, and what the model makes of it."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video.fit import start, to_model
+from foldgauss.video.pyramid import level_at, levels, shrunk
+
+fit_module = sys.modules["foldgauss.video.fit"]
+HALF = FitConfig(num_gaussians=800, steps=60, quarter_share=0.0, half_share=0.5)
+
+
+def test_a_level_too_small_gives_its_share_to_the_next():
+    config = FitConfig(quarter_share=0.15, half_share=0.25)
+    assert [(round(share, 6), size) for share, size in levels(config, (640, 1280))] == [
+        (0.15, (160, 320)),
+        (0.25, (320, 640)),
+        (0.6, (640, 1280)),
+    ]
+    assert [(round(share, 6), size) for share, size in levels(config, (272, 640))] == [
+        (0.4, (136, 320)),
+        (0.6, (272, 640)),
+    ]
+    assert levels(config, (160, 320)) == [(1.0, (160, 320))]
+    assert levels(dataclasses.replace(config, half_share=0.0), (640, 1280))[0].size == (160, 320)
+    assert [size for _, size in levels(config, (481, 853))] == [(120, 213), (240, 426), (481, 853)]
+
+
+def test_progress_goes_through_the_levels():
+    made = levels(FitConfig(quarter_share=0.25, half_share=0.25), (640, 1280))
+    assert [level_at(made, k / 8) for k in range(9)] == [0, 0, 1, 1, 2, 2, 2, 2, 2]
+    assert level_at(levels(FitConfig(quarter_share=0.5, half_share=0.5), (640, 1280)), 1.0) == 2
+
+
+def test_a_pixel_is_the_mean_of_those_it_stands_for():
+    frame = np.random.default_rng(0).integers(0, 256, (8, 12, 3), np.uint8)
+    mean = frame.reshape(4, 2, 6, 2, 3).mean((1, 3))
+    assert np.abs(shrunk(frame, (4, 6)) - mean).max() <= 0.5
+    assert shrunk(frame, (8, 12)) is frame
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Levels for clips of a few dozen pixels."""
+    monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 8)
+
+
+def test_steps_see_their_level(small, monkeypatch):
+    frames, sizes, forward = moving_blobs(), [], fit_module.cpu.forward
+    monkeypatch.setattr(fit_module.cpu, "forward", lambda *a, **k: sizes.append(a[5]) or forward(*a, **k))
+    fit(frames, HALF)
+    full = frames.shape[1:3]
+    assert sizes == [tuple(n // 2 for n in full)] * 30 + [full] * 30
+
+
+@pytest.mark.parametrize("size", [(24, 40), (25, 41)])
+def test_the_model_stands_still_between_levels(small, size):
+    """Fitted at half size alone, it is right at full size, too: nothing is shifted or scaled."""
+    frames = moving_blobs(height=size[0], width=size[1])
+    config = dataclasses.replace(HALF, steps=300, half_share=1.0)
+    model = fit(frames, config).model
+    assert evaluate(model, frames).mean_psnr > 28
+    shifted = np.roll(frames, 1, axis=2)
+    assert evaluate(model, shifted).mean_psnr < evaluate(model, frames).mean_psnr - 2
+
+
+def test_minutes_are_planned_by_the_pace_of_all_levels(small, monkeypatch):
+    """Steps of 0.1 s at half and 0.4 s at full size, measured in turn, fill the time together."""
+    pace = fit_module._Pace(dataclasses.replace(HALF, steps=None, minutes=100 / 60), [0.5, 0.5])
+    state = start(moving_blobs(), HALF)
+    state.plan, state.step, state.seconds = 0, 0, 0.0
+    while not state.plan:
+        level = state.step % 2
+        passed = (0.1, 0.4)[level]
+        state.step += 1
+        state.seconds += passed
+        state.plan = pace.plan(state, level, passed)
+    m, spent = state.step, state.seconds
+    coarse, fine = state.plan * 0.5 - m, state.plan * 0.5
+    assert spent + (0.1 * coarse + 0.4 * fine) * fit_module.SLOWER == pytest.approx(100, rel=0.02)
+
+
+def test_resumed_at_a_coarse_level(small, tmp_path):
+    frames = moving_blobs()
+    *_, (whole, _) = fit_steps(frames, HALF)
+    rows = whole.rows.copy()
+    for state, info in fit_steps(frames, HALF):
+        if info.step == 20:
+            break
+    save_checkpoint(tmp_path / "kept", state, config=HALF, source={})
+    *_, (again, _) = fit_steps(frames, HALF, load_checkpoint(tmp_path / "kept", config=HALF, source={}))
+    np.testing.assert_array_equal(again.rows, rows)
+
+
+def test_the_target_counts_at_full_size_only(small):
+    frames = moving_blobs()
+    config = dataclasses.replace(HALF, steps=400, target_psnr=5.0)
+    *_, (_, last) = fit_steps(frames, config)
+    assert last.stopped_by == "target_psnr"
+    assert last.step == 200 + len(frames)
+
+
+def test_sums_are_fitted_and_drawn_as_sums(tmp_path):
+    frames = moving_blobs()
+    config = FitConfig(num_gaussians=800, steps=300, compositing="sum")
+    model = fit(frames, config).model
+    assert model.compositing == "sum"
+    assert evaluate(model, frames).mean_psnr > 30
+    over = dataclasses.replace(model, compositing="over")
+    assert evaluate(over, frames).mean_psnr < 28
+    np.testing.assert_allclose(
+        np.clip(np.asarray(model.render(0.5)) * 255, 0, 255), next(iter(model.frames(np.array([0.5])))), atol=1.01
+    )
+    order = np.random.default_rng(0).permutation(800)
+    state = start(frames, config)
+    shuffled = dataclasses.replace(state, rows=state.rows[order])
+    one, other = (np.asarray(to_model(each, config, frames.shape[1:3], 25.0).render(0.3)) for each in (state, shuffled))
+    np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def test_sums_cannot_have_alpha():
+    frames = np.zeros((3, 8, 8, 4), np.uint8)
+    with pytest.raises(ValueError, match=r"^compositing: expected 'over' for frames with alpha, got 'sum'"):
+        next(fit_steps(frames, FitConfig(compositing="sum")))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"half_share": -0.1}, r"^half_share: expected a number in \[0, 1\]"),
+        ({"half_share": 0.7, "quarter_share": 0.7}, "^quarter_share, half_share: expected at most 1 together"),
+        ({"compositing": "under"}, "^compositing: expected one of 'over', 'sum'"),
+    ],
+)
+def test_bad_settings(changes, message):
+    with pytest.raises(ValueError, match=message):
+        FitConfig(**changes)
