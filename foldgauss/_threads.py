@@ -8,7 +8,7 @@ depend on the number of threads, every result is the same to the bit for any num
 import os
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 from foldgauss._checks import invalid
 
@@ -75,6 +75,7 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
     # One queue entry per thread, not per item: a Python future costs about as much as a small tile.
     pending = iter(items)
     guard = threading.Lock()
+    interrupt: KeyboardInterrupt | None = None
 
     def drain() -> None:
         while True:
@@ -88,7 +89,15 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
     try:
         drain()  # the calling thread works too
     finally:
-        errors = [future.exception() for future in futures]
-    for error in errors:
+        # Not before all are done: what they read and write may be freed once this returns.
+        with guard:
+            pending = iter(())
+        for future in futures:
+            while not future.done():
+                try:
+                    wait([future])
+                except KeyboardInterrupt as error:
+                    interrupt = error
+    for error in (interrupt, *(future.exception() for future in futures)):
         if error is not None:
             raise error

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,7 +35,7 @@ from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import MAX_FPS, VIDEO_SUFFIXES, Clip, memory_limit, read_video, write_image, write_video
 from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
 from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
-from foldgauss.video.fit import FitInfo, FitState, fit_steps, to_model
+from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
 from foldgauss.video.frame_times import interpolated_times
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
@@ -211,7 +211,11 @@ def fit(
     def keep(state: FitState) -> None:
         save_checkpoint(kept, state, config=config, source=source)
 
-    recorded = None if history is None else HistoryFile(history, None if state is None else state.step)
+    if overwrite and not resume:
+        kept.unlink(missing_ok=True)  # or a --resume after this fit would go on with the one before
+    recorded = None
+    if history is not None:
+        recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
     previews = None if preview is None else previewing(preview, clip, config)
     with watching(manner, err, history=recorded, preview=previews) as observe:
         state, info = _run_fit(clip.frames, config, observe, state, keep)
@@ -226,7 +230,8 @@ def fit(
     figures = _figures(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
     figures |= {"stopped_by": info.stopped_by, "file_bytes": target.stat().st_size}
     if manner == "json":
-        print_json("done", {"model": str(target)} | figures)
+        with suppress(OSError):  # nobody listens any more, but the model is there
+            print_json("done", {"model": str(target)} | figures)
     elif manner != "quiet":
         _print_figures(str(target), figures)
 
@@ -386,6 +391,10 @@ def _check_records(target: Path, video: Path, history: Path | None, preview: Pat
     for option, path in places:
         if path is None:
             continue
+        if video.is_dir() and path.resolve().parent == video.resolve():
+            raise WrongUse(
+                f"{option}: expected a place outside the clip's folder, got {path}: it would be a frame there."
+            )
         if path.resolve() in taken:
             raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
         taken.add(path.resolve())
@@ -648,7 +657,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _exit_code(error: BaseException) -> int:
     """Wrong use: an argument that cannot be right. Failure: a file that cannot be read or written."""
-    names_an_option = str(error).startswith(("frames:", "size:", "resume:", "max_size_mb:"))
+    names_an_option = str(error).startswith(
+        ("frames:", "size:", "resume:", "max_size_mb:", "compositing:", "history:", "background:")
+    )
     return WRONG_USE if isinstance(error, WrongUse | FileNotFoundError) or names_an_option else FAILURE
 
 

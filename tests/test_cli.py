@@ -475,3 +475,50 @@ def test_an_unforeseen_error_is_one_line(work, tmp_path, monkeypatch, capsys):
     assert "RuntimeError: surprise and more" in message
     assert "--debug" in message
     assert "Traceback" not in message
+
+
+def test_records_stay_out_of_the_clip(tmp_path, capsys):
+    """A picture in the folder of frames would be a frame of the next reading."""
+    frames = tmp_path / "frames"
+    write_video(frames, blobs(), 12.0)
+    for option in ("--preview", "--history"):
+        name = frames / ("p.png" if option == "--preview" else "h.jsonl")
+        assert run("fit", frames, "--out", tmp_path / "m.safetensors", option, name, *QUICK) == 2
+        assert f"error: {option}: expected a place outside the clip's folder" in capsys.readouterr().err
+    assert len(list(frames.iterdir())) == 6
+
+
+def test_the_history_of_another_fit_is_left_alone(work, tmp_path, capsys, interrupted):
+    target, other = tmp_path / "m.safetensors", tmp_path / "other.jsonl"
+    quick = ["fit", work / "clip.mp4", "--gaussians", "400", "--quiet"]
+    assert run(*quick, "--steps", "50", "--seed", "1", "--out", tmp_path / "o.safetensors", "--history", other) == 0
+    before = other.read_bytes()
+    disarm = interrupted(signal.SIGINT)
+    assert run(*quick, "--steps", "80", "--out", target, "--history", tmp_path / "own.jsonl") == 1
+    disarm()
+    resumed = [*quick, "--steps", "80", "--out", target, "--resume", "--history"]
+    assert run(*resumed, other) == 2
+    assert "history: expected that of the fit which is resumed at step 40" in capsys.readouterr().err
+    assert other.read_bytes() == before
+    assert run(*resumed, tmp_path / "own.jsonl") == 0
+    assert [json.loads(line)["step"] for line in (tmp_path / "own.jsonl").read_text().splitlines()] == [*range(1, 81)]
+
+
+def test_overwrite_forgets_a_stopped_fit(work, tmp_path, interrupted, monkeypatch):
+    target, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
+    disarm = interrupted(signal.SIGINT)
+    assert run("fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "80") == 1
+    disarm()
+    assert kept.exists()
+    monkeypatch.setattr(cli, "fit_steps", lambda *given: (_ for _ in ()).throw(OSError("killed")))
+    assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--overwrite") == 1
+    assert not kept.exists()
+
+
+def test_sum_with_alpha_is_wrong_use(tmp_path, capsys):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for k, frame in enumerate(blobs(3)):
+        cv2.imwrite(str(frames / f"{k}.png"), np.dstack([frame, np.full(SIZE, 100, np.uint8)]))
+    assert run("fit", frames, "--out", tmp_path / "m.safetensors", "--compositing", "sum", *QUICK) == 2
+    assert "compositing: expected 'over' for frames with alpha" in capsys.readouterr().err

@@ -58,3 +58,28 @@ def test_environment_variable(monkeypatch):
         _threads.num_threads()
     with pytest.raises(ValueError, match="count"):
         _threads.set_num_threads(0)
+
+
+def test_an_interrupt_waits_for_the_workers():
+    """What they read and write may be freed once the call has ended."""
+    done, interrupted = [], threading.Event()
+
+    def task(k):
+        if threading.current_thread() is threading.main_thread():
+            if not interrupted.is_set():
+                interrupted.set()
+                raise KeyboardInterrupt
+            return
+        interrupted.wait(10)
+        time.sleep(0.2)
+        done.append(k)
+
+    _threads.set_num_threads(2)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _threads.run_tasks(task, range(2))
+        finished = len(done)
+        time.sleep(0.4)
+        assert len(done) == finished
+    finally:
+        _threads.set_num_threads(None)

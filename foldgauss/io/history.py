@@ -23,19 +23,29 @@ class HistoryFile:
     """Appends one line per step to `path` and hands each to the system at once: `tail -f` and a killed fit see it.
 
     An observer of a fit, and a context. Each line is `info_line` of the step. A new history replaces what was there
-    at its first step, not before. With `resumed_at`, the step that a kept fit goes on from, lines beyond it are cut
-    off (the fit takes those steps again), and so is a last line that was not written to its end.
+    at its first step, not before. With `resumed_at`, the step that a kept fit goes on from, and its running `psnr`
+    there, lines beyond it are cut off (the fit takes those steps again), and so is a last line that was not written to
+    its end.
 
-    Raises `OutputError` where the file cannot be written, ValueError where `resumed_at` finds another kind of file.
+    Raises `OutputError` where the file cannot be written, ValueError where `resumed_at` finds another kind of file or
+    the history of another fit.
 
     Example: `with HistoryFile("fit.jsonl") as history: fit(frames, observers=[history])`.
     """
 
-    def __init__(self, path: str | os.PathLike, resumed_at: int | None = None):
+    def __init__(self, path: str | os.PathLike, resumed_at: int | None = None, psnr: float | None = None):
         self.path, self._file, self._last, self._append = Path(path), None, 0, False
         if resumed_at is not None and self.path.exists():
             self._append, kept = True, [line for line in _lines(self.path) if line["step"] <= resumed_at]
             self._last = kept[-1]["step"] if kept else 0
+            same = psnr is None or (kept and kept[-1]["psnr"] == _plain(psnr))
+            if self._last != resumed_at or not same:
+                raise invalid(
+                    "history",
+                    expected=f"that of the fit which is resumed at step {resumed_at}",
+                    got=f"{str(self.path)!r} of another, or with that step missing",
+                    cure="Give a new name, or the file that the fit wrote before.",
+                )
             with atomic_path(self.path) as temporary:
                 temporary.write_text("".join(_text(line) for line in kept))
 

@@ -131,7 +131,7 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> t
         fps = capture.get(cv2.CAP_PROP_FPS)
         # Frames before the range are decoded and dropped: seeking lands on key frames in some containers.
         num_skipped = sum(1 for _ in islice(iter(capture.grab, False), start))
-        kept = [prepare(frame) for frame in _same_size(_decoded(capture, start, stop), path)]
+        kept = _in_blocks(prepare(frame) for frame in _same_size(_decoded(capture, start, stop), path))
     num_decoded = num_skipped + len(kept)
     num_total = max(declared, num_decoded)
     if num_decoded == 0:
@@ -276,6 +276,7 @@ def _refuse_alpha(capture: cv2.VideoCapture, path: Path) -> None:
     packed = kind in _PACKED_ALPHA and int(capture.get(cv2.CAP_PROP_FOURCC)) != 0  # raw video's fourth byte is idle
     with open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
+    packed &= not head.startswith(b"GIF8")  # whose decoder always says so; most have none
     beside = head.startswith(_MATROSKA) and _ALPHA_MODE in head.split(_CLUSTER)[0]
     if packed or (kind[:2] in _PLANAR_ALPHA and kind[2] < ord(" ")) or beside:
         raise _error(
@@ -378,6 +379,22 @@ def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         return image
     shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
     return cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+
+
+#: Larger than any piece of memory that the C library keeps for itself when it is freed.
+BLOCK_BYTES = 64 << 20
+
+
+def _in_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
+    """The frames, copied side by side into large blocks, each of which goes back to the system with its last frame."""
+    kept, block, used = [], np.empty((0, 0), np.uint8), 0
+    for frame in frames:
+        if used == len(block) or block.shape[1:] != frame.shape:
+            block, used = np.empty((max(1, BLOCK_BYTES // frame.nbytes), *frame.shape), np.uint8), 0
+        block[used] = frame
+        kept.append(block[used])
+        used += 1
+    return kept
 
 
 def _stacked(frames: list[np.ndarray]) -> np.ndarray:

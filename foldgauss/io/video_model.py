@@ -44,12 +44,15 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
         before = kept.get(part) or {}
         changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
+        cure = f"Continue {str(path)!r} with the options it was started with, or start anew with --overwrite."
+        if part == "config" and now.keys() != before.keys():
+            cure = "Another version of foldgauss kept it: continue with that, or start anew with --overwrite."
         if changed:
             raise invalid(
                 "resume",
                 expected=", ".join(f"{name}={before.get(name)!r}" for name in changed),
                 got=", ".join(f"{name}={now.get(name)!r}" for name in changed),
-                cure=f"Continue {str(path)!r} with the options it was started with, or start anew with --overwrite.",
+                cure=cure,
             )
     state = _load(path, CHECKPOINT)
     return jax.tree.map(np.array, state)  # the fit updates its arrays in place: they must be its own

@@ -27,9 +27,14 @@ def composited(frame: UInt8[np.ndarray, "height width 4"], background: Float[np.
     return np.minimum(frame[..., :3] + light * behind + 0.5, 255).astype(np.uint8)
 
 
-def checked_background(background: object) -> Float[np.ndarray, "3"]:
-    """As float32 (3,). Raises ValueError unless it is three numbers in [0, 1]."""
+def checked_background(background: object, compositing: str = "over") -> Float[np.ndarray, "3"]:
+    """As float32 (3,). Raises ValueError unless it is three numbers in [0, 1], and black for sums."""
     color = np.asarray(background)
     if color.shape != (3,) or color.dtype.kind not in "fiu" or not ((color >= 0) & (color <= 1)).all():
         raise invalid("background", expected="red, green and blue in [0, 1]", got=background)
+    if compositing == "sum" and color.any():
+        cure = "All of it would come through: sums know no alpha."
+        raise invalid(
+            "background", expected="black for a model fitted with compositing 'sum'", got=background, cure=cure
+        )
     return color.astype(np.float32)

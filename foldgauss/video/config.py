@@ -88,7 +88,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 class FitConfig:
     """Everything a fit depends on beside the frames; `preset` has some of them ready.
 
-    `steps`, `minutes` and `target_psnr` are budgets: the fit ends with the first that binds. With neither steps nor
+    `steps`, `minutes` and `target_psnr` are budgets: the fit ends with the first that binds. Minutes are turned into
+    steps once, by the measured pace; where Gaussians grow (`growth`), the clock ends the fit. With neither steps nor
     minutes, steps are `DEFAULT_STEPS`, or more for long clips. `max_size_mb` bounds the number of Gaussians by the
     model file's size.
 
@@ -103,7 +104,7 @@ class FitConfig:
     degree: int = 3
     steps: int | None = None
     minutes: float | None = None
-    target_psnr: float | None = None  # dB, running mean over a pass through the frames
+    target_psnr: float | None = None  # dB, running mean over a pass through the frames; no coarse levels then
     max_size_mb: float | None = None  # 10^6 bytes
     batch_size: int = 1
     power: float = 2.0  # of the envelope: 1 as in the paper's text, 2 as in its code
@@ -116,8 +117,8 @@ class FitConfig:
     follow_motion: bool = True  # start along the optical flow, shot by shot; False: at rest
     own_time: bool = True  # rates in units of each Gaussian's own time, see `LearningRates`
     #: Of the plan, at its beginning: frames at a quarter, then at half of their size, as far as they are large enough.
-    quarter_share: float = 0.15
-    half_share: float = 0.25
+    quarter_share: float = 0.2
+    half_share: float = 0.4
     square_share: float = 0.3  # of the plan, at its end: squared error alone, which is what PSNR measures
     #: Adam's steps are for Gaussians alive in the batch; False: for all, by momentum, as published.
     only_alive: bool = True

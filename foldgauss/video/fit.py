@@ -26,7 +26,7 @@ from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack, unpack
-from foldgauss.video.pyramid import level_at, levels, shrunk
+from foldgauss.video.pyramid import Level, level_at, levels, shrunk, work_done
 from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
 
@@ -37,7 +37,7 @@ class FitInfo(NamedTuple):
     step: int  # steps done
     progress: float  # share of the plan that is done, in [0, 1]
     loss: float  # of this step's batch
-    psnr: float  # dB, running mean over about one pass through the frames
+    psnr: float  # dB, running mean over about one pass through the frames, at the size they are seen at
     num_gaussians: int
     num_alive: int  # Gaussians that took part in this step
     seconds: float  # spent fitting so far
@@ -116,25 +116,25 @@ def fit_steps(
     state = start(frames, config) if state is None else state
     step = _Stepper(frames, config, state)
     pace = _Pace(config, [level.share for level in step.levels])
-    stopped_by = _stopped_by(state, config, frames.shape)
+    stopped_by = _stopped_by(state, config, len(frames))
     if stopped_by:  # a kept state that needs no more steps
-        yield state, _info(state, config, math.nan, 0, stopped_by)
+        yield state, _info(state, config, step.levels, math.nan, 0, stopped_by)
     while not stopped_by:
         begun = time.perf_counter()
-        # While the pace is measured, at all levels in turn.
-        level = level_at(step.levels, _progress(state)) if state.plan else state.step % len(step.levels)
-        loss, squared_error, num_alive = step(state, _progress(state), level)
-        memory = max(1 - config.batch_size / len(frames), 0.5) if state.step else 0.0
+        level = _level(state, step.levels)
+        loss, squared_error, num_alive = step(state, _progress(state, config), level)
+        another = state.plan > 0 and level != level_at(step.levels, (state.step - 1) / state.plan)
+        memory = max(1 - config.batch_size / len(frames), 0.5) if state.step and not another else 0.0
         state.error = memory * state.error + (1 - memory) * squared_error
         state.step += 1
+        if state.statistics is not None and state.plan:
+            step.grow(state)
         passed = time.perf_counter() - begun
         state.seconds += passed
         if not state.plan:
             state.plan = pace.plan(state, level, passed)
-        if state.statistics is not None and state.plan:
-            step.grow(state)
-        stopped_by = _stopped_by(state, config, frames.shape)
-        yield state, _info(state, config, loss, num_alive, stopped_by)
+        stopped_by = _stopped_by(state, config, len(frames))
+        yield state, _info(state, config, step.levels, loss, num_alive, stopped_by)
 
 
 class _Pace:
@@ -155,7 +155,9 @@ class _Pace:
         self.count += 1
         if self.count > WARM_UP * len(self.shares):
             self.seconds[level].append(seconds)
-        if min(map(len, self.seconds)) < LEAST_STEPS or sum(map(sum, self.seconds)) < budget * MEASURED:
+        enough = sum(map(sum, self.seconds)) >= budget * MEASURED
+        enough |= self.config.steps is not None and state.step >= self.config.steps * MEASURED
+        if min(map(len, self.seconds)) < LEAST_STEPS or not enough:
             return 0
         seconds = [np.mean(own) for own in self.seconds]
         # The steps so far count as steps of the first level, which this many are still left of.
@@ -164,18 +166,25 @@ class _Pace:
         return min(planned, self.config.steps or planned)
 
 
-def _progress(state: FitState) -> float:
-    """Share of the plan that is done; 0 while there is none."""
-    return min(state.step / state.plan, 1.0) if state.plan else 0.0
+def _progress(state: FitState, config: FitConfig) -> float:
+    """Share of the plan that is done; while there is none, of the number of steps asked for, or 0."""
+    plan = state.plan or config.steps
+    return min(state.step / plan, 1.0) if plan else 0.0
 
 
-def _stopped_by(state: FitState, config: FitConfig, shape: tuple[int, ...]) -> str | None:
-    """The budget that binds now; the running PSNR counts once every frame was seen at its own size."""
-    num_frames, *size = shape[:3]
-    coarse = math.ceil((1 - levels(config, tuple(size))[-1].share) * state.plan)
-    seen = (state.step - coarse) * config.batch_size >= _num_views(config, num_frames) and state.plan > 0
-    if config.target_psnr is not None and seen and _psnr(state) >= config.target_psnr:
+def _level(state: FitState, levels: list[Level]) -> int:
+    """The level of the next step; while the pace is measured, all in turn."""
+    return level_at(levels, state.step / state.plan) if state.plan else state.step % len(levels)
+
+
+def _stopped_by(state: FitState, config: FitConfig, num_frames: int) -> str | None:
+    """The budget that binds now; the running PSNR counts once every frame was seen."""
+    seen = state.step * config.batch_size >= _num_views(config, num_frames)
+    if config.target_psnr is not None and seen and running_psnr(state) >= config.target_psnr:
         return "target_psnr"
+    # The pace that minutes are planned by is that of the Gaussians at the start: where they grow, the clock decides.
+    if config.growth is not None and config.minutes is not None and state.seconds >= 60 * config.minutes:
+        return "minutes"
     if not state.plan or state.step < state.plan:
         return None
     return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
@@ -186,17 +195,23 @@ def _num_views(config: FitConfig, num_frames: int) -> int:
     return 2 * num_frames if config.two_cameras else num_frames
 
 
-def _psnr(state: FitState) -> float:
+def running_psnr(state: FitState) -> float:
+    """dB, by the running mean of the squared error."""
     return -10 * math.log10(max(state.error, 1e-12))
 
 
-def _info(state: FitState, config: FitConfig, loss: float, num_alive: int, stopped_by: str | None) -> FitInfo:
-    done = 1.0 if stopped_by else _progress(state)
-    if not state.plan and config.minutes is not None:
+def _info(
+    state: FitState, config: FitConfig, levels: list[Level], loss: float, num_alive: int, stopped_by: str | None
+) -> FitInfo:
+    done = 1.0 if stopped_by else _progress(state, config)
+    if not state.plan and config.minutes is not None and not stopped_by:
         done, left = state.seconds / (60 * config.minutes), 60 * config.minutes - state.seconds
     else:
-        left = state.seconds * (1 - done) / done if done else math.inf
-    return FitInfo(state.step, done, loss, _psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by)
+        work = work_done(levels, done)
+        left = state.seconds * (1 - work) / work if work else math.inf
+    return FitInfo(
+        state.step, done, loss, running_psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by
+    )
 
 
 def start(frames: np.ndarray, config: FitConfig) -> FitState:

@@ -144,7 +144,7 @@ class VideoModel(eqx.Module):
         check_size(size)
         t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
-        behind = jnp.asarray(checked_background(background), splats.mean.dtype)
+        behind = jnp.asarray(checked_background(background, self.compositing), splats.mean.dtype)
         drawn = {"compositing": self.compositing, "options": self.options}
         return render(splats, size, background=behind, engine=engine, **drawn)
 

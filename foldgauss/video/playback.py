@@ -62,7 +62,7 @@ class Playback:
         self._window = np.empty((len(self._rows), 2), np.float32)
         update_windows(self._rows, np.arange(len(self._rows)), self._window)
         self._times = np.asarray(model.frame_times.times())
-        self._background = checked_background(background)
+        self._background = checked_background(background, model.compositing)
 
     def splats(self, t: float) -> Splats2D:
         """The splats of the Gaussians alive at time t, in pixels of a picture of `size`; NumPy leaves."""

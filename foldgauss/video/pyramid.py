@@ -24,8 +24,11 @@ class Level(NamedTuple):
 def levels(config: FitConfig, size: tuple[int, int]) -> list[Level]:
     """The levels of a fit to frames of `size`, coarse to fine; the last is `size` itself.
 
-    A level too small for its frames (`LEAST_SIDE`) gives its share to the next finer one.
+    A level too small for its frames (`LEAST_SIDE`) gives its share to the next finer one. With `target_psnr` there is
+    but one: what is reached at a smaller size says nothing about the clip's own, and the fit must be able to end.
     """
+    if config.target_psnr is not None:
+        return [Level(1.0, tuple(size))]
     made, pending = [], 0.0
     for factor, share in ((4, config.quarter_share), (2, config.half_share)):
         pending += share
@@ -44,6 +47,17 @@ def level_at(made: list[Level], progress: float) -> int:
         if progress < end:
             return index
     return len(made) - 1
+
+
+def work_done(made: list[Level], progress: float) -> float:
+    """Share of the fit's time that is over at `progress`, a step's time being as its frame's area."""
+    end, done, total = 0.0, 0.0, 0.0
+    for level in made:
+        area = level.size[0] * level.size[1]
+        done += area * min(max(progress - end, 0.0), level.share)
+        total += area * level.share
+        end += level.share
+    return min(done / total, 1.0)
 
 
 def shrunk(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:

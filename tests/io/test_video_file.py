@@ -566,3 +566,23 @@ def test_write_image_round_trip_and_refusals(tmp_path):
     with pytest.raises(OutputError):
         write_image(tmp_path / "missing" / "a.png", image)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_gif_is_read(tmp_path):
+    """Its decoder says that it has alpha, whatever it holds."""
+    from PIL import Image
+
+    pictures = [Image.new("RGB", (24, 20), (40 * k, 100, 200)) for k in range(4)]
+    pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=100)
+    clip = read_video(tmp_path / "a.gif")
+    assert clip.frames.shape == (4, 20, 24, 3)
+    assert np.abs(clip.frames[2, 0, 0].astype(int) - [80, 100, 200]).max() < 12
+
+
+def test_frames_of_many_blocks(tmp_path, monkeypatch):
+    monkeypatch.setattr(video_file, "BLOCK_BYTES", 3 * 20 * 24 * 3)
+    frames = np.random.default_rng(0).integers(0, 256, (8, 20, 24, 3), np.uint8)
+    kept = video_file._in_blocks(frames)
+    assert len({id(frame.base) for frame in kept}) == 3
+    np.testing.assert_array_equal(video_file._stacked(kept), frames)
+    assert video_file._in_blocks(iter(())) == []

@@ -388,3 +388,12 @@ def test_growth_waits_for_the_plan():
     assert without > 10
     assert state.plan > 0
     assert info.step % 10 == 0  # every = 1 of 30,000 is held at `LEAST_EVERY`
+
+
+def test_minutes_bind_while_gaussians_grow(monkeypatch):
+    """The pace at the start says nothing of ten times as many."""
+    config = FitConfig.preset("paper", num_gaussians=20, degree=1, steps=None, minutes=0.01)
+    monkeypatch.setattr(fit_module._Pace, "plan", lambda *given: 10**6)
+    *_, (state, last) = fit_steps(FRAMES, config)
+    assert last.stopped_by == "minutes"
+    assert state.seconds < 5

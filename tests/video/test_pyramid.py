@@ -10,7 +10,7 @@ from clips import moving_blobs
 from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fit import start, to_model
-from foldgauss.video.pyramid import level_at, levels, shrunk
+from foldgauss.video.pyramid import level_at, levels, shrunk, work_done
 
 fit_module = sys.modules["foldgauss.video.fit"]
 HALF = FitConfig(num_gaussians=800, steps=60, quarter_share=0.0, half_share=0.5)
@@ -98,12 +98,44 @@ def test_resumed_at_a_coarse_level(small, tmp_path):
     np.testing.assert_array_equal(again.rows, rows)
 
 
-def test_the_target_counts_at_full_size_only(small):
+def test_a_target_is_looked_for_at_full_size(small):
     frames = moving_blobs()
     config = dataclasses.replace(HALF, steps=400, target_psnr=5.0)
+    assert [level.size for level in levels(config, (48, 64))] == [(48, 64)]
     *_, (_, last) = fit_steps(frames, config)
-    assert last.stopped_by == "target_psnr"
-    assert last.step == 200 + len(frames)
+    assert (last.stopped_by, last.step) == ("target_psnr", len(frames))
+
+
+def test_the_running_psnr_starts_anew_at_another_level(small, monkeypatch):
+    frames, errors, step = moving_blobs(), [], fit_module._Stepper.__call__
+    monkeypatch.setattr(
+        fit_module._Stepper, "__call__", lambda *given: errors.append(step(*given)[1]) or (0.0, errors[-1], 1)
+    )
+    seen = [info.psnr for _, info in fit_steps(frames, HALF)]
+    assert seen[30] == pytest.approx(-10 * np.log10(errors[30]))
+    assert seen[31] != pytest.approx(-10 * np.log10(errors[31]))
+
+
+def test_time_is_counted_by_area():
+    made = levels(FitConfig(quarter_share=0.0, half_share=0.5), (640, 1280))
+    assert work_done(made, 0.5) == pytest.approx(0.2)
+    assert work_done(made, 0.75) == pytest.approx(0.6)
+    assert work_done(made, 1.0) == 1
+
+
+@pytest.mark.parametrize("steps", [12, 300])
+def test_steps_with_time_to_spare_are_as_without(small, steps):
+    """Rates fall and frames grow, although the pace is measured first."""
+    frames = moving_blobs()
+    config = dataclasses.replace(HALF, steps=steps)
+    alone, timed = (
+        [info for _, info in fit_steps(frames, dataclasses.replace(config, minutes=minutes))]
+        for minutes in (None, 60.0)
+    )
+    assert [info.step for info in timed] == [info.step for info in alone]
+    assert [info.stopped_by for info in timed] == [info.stopped_by for info in alone]
+    if steps == 300:
+        assert abs(timed[-1].psnr - alone[-1].psnr) < 1
 
 
 def test_sums_are_fitted_and_drawn_as_sums(tmp_path):
@@ -122,6 +154,13 @@ def test_sums_are_fitted_and_drawn_as_sums(tmp_path):
     shuffled = dataclasses.replace(state, rows=state.rows[order])
     one, other = (np.asarray(to_model(each, config, frames.shape[1:3], 25.0).render(0.3)) for each in (state, shuffled))
     np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def test_sums_are_drawn_over_black_alone():
+    model = to_model(start(moving_blobs(), HALF), dataclasses.replace(HALF, compositing="sum"), (48, 64), 25.0)
+    for draw in (lambda: model.render(0.5, background=(1, 1, 1)), lambda: next(model.frames(background=(1, 1, 1)))):
+        with pytest.raises(ValueError, match=r"^background: expected black for a model fitted with compositing 'sum'"):
+            draw()
 
 
 def test_sums_cannot_have_alpha():
