@@ -45,11 +45,17 @@ def weights_for(size, avoid):
 #: XLA takes seconds to compile each: half of the combinations.
 CASES = [("cpu", compositing, name) for compositing in ("over", "sum") for name in OPTIONS]
 CASES += [("xla", "over", "default"), ("xla", "sum", "sharp")]
+#: And of the second half of those, most are for the long runs.
+QUICK_SUMS = ("plain", "needles", "curtain")
+COMBINATIONS = [
+    pytest.param(*case, kind, marks=[pytest.mark.slow] if case[:2] == ("xla", "sum") and kind not in QUICK_SUMS else [])
+    for case in CASES
+    for kind in KINDS
+]
 
 
-@pytest.mark.parametrize(("engine", "compositing", "options"), CASES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_agrees_with_reference(engine, kind, compositing, options):
+@pytest.mark.parametrize(("engine", "compositing", "options", "kind"), COMBINATIONS)
+def test_agrees_with_reference(engine, compositing, options, kind):
     splats, size = scene(kind)
     options = OPTIONS[options]
     avoid = near_a_threshold(splats, size, options)
