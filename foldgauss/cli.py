@@ -148,7 +148,9 @@ def fit(
         int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips; draft: 800; paper: 30000].")
     ] = None,
     minutes: Annotated[float | None, typer.Option(help="Time to fit for.")] = None,
-    target_psnr: Annotated[float | None, typer.Option("--target-psnr", help="Stop at this PSNR, in dB.")] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option("--target-psnr", help="Stop once the running PSNR, which lags, is this, in dB.")
+    ] = None,
     batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
     power: Annotated[
         float | None,
@@ -549,7 +551,7 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
     growing = "" if config.growth is None else " at the start"
     out.print(
         f"{clip.source}: {clip.num_frames} frames of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
-        f"{num:,} Gaussians{growing} of degree {config.degree}, "
+        f"{num:,} Gaussians of degree {config.degree}{growing}, "
         f"{plan}, {num_threads()} threads",
         soft_wrap=True,
     )

@@ -92,8 +92,8 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
     drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
     steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
     for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
-        upper.plot(x, psnr, color=_BLUE, linewidth=1.6)
-        lower.plot(x, loss, color=_RED, linewidth=0.6, alpha=0.3)
+        upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
+        lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3)
         lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6)
         lower.set(xlabel=name, yscale="log")
         lower.set_xlim(left=0)  # the start takes its seconds too

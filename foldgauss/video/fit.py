@@ -89,7 +89,8 @@ def fit(
     and `loss` are then those over these, and the model is drawn over black unless told otherwise.
 
     `observers` are called with (state, info) after every step: progress bars, checkpoints. Raises ValueError for
-    frames or settings that cannot be fitted. Without `minutes` the bits are the same for any number of threads.
+    frames or settings that cannot be fitted. No budget counts the compiling of kernels, some 20 s when they are used
+    for the first time. Without `minutes` the bits are the same for any number of threads.
 
     Example: `fit(frames, FitConfig(steps=1000)).model.render(0.5)`. Source: VeGaS, section 4.
     """
@@ -113,6 +114,7 @@ def fit_steps(
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
         raise invalid("compositing", expected="'over' for frames with alpha", got="'sum'", cure=cure)
+    _warm_up(frames, config)
     state = start(frames, config) if state is None else state
     step = _Stepper(frames, config, state)
     pace = _Pace(config, [level.share for level in step.levels])
@@ -135,6 +137,15 @@ def fit_steps(
             state.plan = pace.plan(state, level, passed)
         stopped_by = _stopped_by(state, config, len(frames))
         yield state, _info(state, config, step.levels, loss, num_alive, stopped_by)
+
+
+def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
+    """Compile the kernels, or load them, on a corner of the clip, before any clock runs: the first time takes 20 s."""
+    tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
+    corner = np.ascontiguousarray(frames[:2, :32, :32])
+    state = start(corner, dataclasses.replace(tiny, follow_motion=False))
+    for progress in (0.0, 1.0):  # with either loss
+        _Stepper(corner, tiny, state)(state, progress)
 
 
 class _Pace:
@@ -205,10 +216,12 @@ def _info(
 ) -> FitInfo:
     done = 1.0 if stopped_by else _progress(state, config)
     if not state.plan and config.minutes is not None and not stopped_by:
-        done, left = state.seconds / (60 * config.minutes), 60 * config.minutes - state.seconds
+        left = 60 * config.minutes - state.seconds
     else:
         work = work_done(levels, done)
         left = state.seconds * (1 - work) / work if work else math.inf
+        if config.minutes is not None:
+            left = min(left, max(60 * config.minutes - state.seconds, 0.0))
     return FitInfo(
         state.step, done, loss, running_psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by
     )

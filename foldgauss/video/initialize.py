@@ -26,7 +26,7 @@ TIME_SCALES = (0.02, 0.4)
 TRACK_SHARES, LEAST_FRAMES = (0.25, 1.2), 0.6
 #: Where the fold misses the track by more than this many pixels, sigma_t is shortened by this, some times.
 MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
-CHUNK = 50_000  # tracks held at once
+CHUNK = 12_000  # tracks held at once: some 3 kB each on the way
 #: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side.
 PILOT, CORE, ROUNDS = 32, 1.5, 50
 #: Share of the starts that is spread so that all frames, however short the tracks there, are covered alike. With more,

@@ -47,8 +47,9 @@ def test_a_pixel_is_the_mean_of_those_it_stands_for():
 
 @pytest.fixture
 def small(monkeypatch):
-    """Levels for clips of a few dozen pixels."""
+    """Levels for clips of a few dozen pixels; only the fit's own steps."""
     monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 8)
+    monkeypatch.setattr(fit_module, "_warm_up", lambda *given: None)  # spies would see it
 
 
 def test_steps_see_their_level(small, monkeypatch):
