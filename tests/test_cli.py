@@ -11,6 +11,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from commands import run
 
 from foldgauss import cli
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
@@ -25,13 +26,6 @@ def blobs(num_frames=6, height=48, width=64):
     t = np.linspace(0.2, 0.7, num_frames)[:, None, None]
     blob = np.exp(-((x - t * width) ** 2 + (y - height / 2) ** 2) / 40)
     return np.stack([255 * blob, 128 + 0 * blob, 255 - 200 * blob], -1).astype(np.uint8)
-
-
-def run(*arguments):
-    """Exit code of the command, run in this process."""
-    with pytest.raises(SystemExit) as done:
-        cli.main([str(argument) for argument in arguments])
-    return done.value.code or 0
 
 
 @pytest.fixture(scope="module")
@@ -356,9 +350,7 @@ def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
 KEEPING_EVERY_STEP = "from foldgauss import cli; cli.CHECKPOINT_SECONDS = 0.0; cli.main()"
 
 
-@pytest.mark.skipif(
-    not hasattr(signal, "SIGKILL"), reason="a kill that no process hears of is POSIX's; CI runs it on Linux"
-)
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="SIGKILL is POSIX's; CI runs it on Linux")
 def test_killed_at_any_moment_and_resumed(work, tmp_path):
     """`kill -9` leaves a checkpoint that is whole, from which the fit ends as if it had never been killed."""
     target, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"

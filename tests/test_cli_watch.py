@@ -8,19 +8,13 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from commands import run
 
 from foldgauss import _progress, cli
 from foldgauss.io import read_video, write_video
 from foldgauss.io.history import read_history
 
 QUICK = ["--gaussians", "300", "--steps", "20"]
-
-
-def run(*arguments):
-    """Exit code of the command, run in this process."""
-    with pytest.raises(SystemExit) as done:
-        cli.main([str(argument) for argument in arguments])
-    return done.value.code or 0
 
 
 @pytest.fixture(scope="module")

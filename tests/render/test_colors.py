@@ -1,5 +1,6 @@
 """Colours by least squares: against the dense solution, and against descended colours on a real frame."""
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,7 +70,6 @@ def test_unseen_splats_keep_their_colours():
 
 def bunny(size):
     """The first frame of the clip, made smaller."""
-    cv2 = pytest.importorskip("cv2")
     done, frame = cv2.VideoCapture(str(sample_clip("bunny"))).read()
     assert done
     frame = cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
