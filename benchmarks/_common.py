@@ -26,8 +26,8 @@ SEED = 0
 #: Seconds of rest before each timed call: XLA goes on working on threads of its own after a large result is
 #: ready, which was seen to slow the next 10 ms of another engine by half.
 PAUSE = 0.05
-#: Calls of a task in one turn, the first not counted.
-BURST = 4
+#: Calls of a task in one turn, the first not counted; and seconds that a turn lasts at least.
+BURST, TURN = 4, 0.1
 
 
 class Task(NamedTuple):
@@ -72,8 +72,9 @@ def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[st
     """Seconds of each task over `rounds` rounds that run all tasks in turn, after `warmup` rounds.
 
     In turn, so that a noisy minute hits all of them; each round starts with another task. A task's turn is a short
-    burst, of which the first call is not counted: after a pause the system may run two threads on one core for some
-    milliseconds, which no fit or playback, where call follows call, would meet.
+    burst, at least BURST calls and TURN seconds, of which the first call is not counted: after a pause the system may
+    run two threads on one core for some milliseconds, and caches are cold, which no fit or playback, where call
+    follows call, would meet.
     """
     names, seconds = list(tasks), {name: [] for name in tasks}
     for round_ in range(-warmup, rounds):
@@ -81,13 +82,15 @@ def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[st
         for name in names[first:] + names[:first]:
             tasks[name].prepare()
             time.sleep(PAUSE)
-            for call in range(BURST):
+            calls, turn = 0, time.perf_counter()
+            while calls < BURST or time.perf_counter() - turn < TURN:
                 begun = time.perf_counter()
                 result = tasks[name].run()
                 passed = time.perf_counter() - begun
                 del result  # after the clock has stopped
-                if round_ >= 0 and call > 0:
+                if round_ >= 0 and calls > 0:
                     seconds[name].append(passed)
+                calls += 1
     return seconds
 
 

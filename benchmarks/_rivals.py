@@ -35,7 +35,8 @@ def own_lists(trace: cpu.Trace) -> Lists:
     """The engine's lists; what lies behind the last light may have been cut from them."""
     row_start, entries, _, _ = trace.buckets
     lengths = [np.diff(start) for start, _, _ in trace.lists]
-    listed = [entries[row_start[row] + listed] for row, (_, listed, _) in enumerate(trace.lists)]
+    parts = zip(trace.parts, trace.lists, strict=True)
+    listed = [entries[row_start[first] + listed] for (first, _), (_, listed, _) in parts]
     return Lists(np.concatenate([[0], np.cumsum(np.concatenate(lengths))]), np.concatenate(listed))
 
 

@@ -20,7 +20,7 @@ engines through that door; all other figures of `cpu` are of its own functions.
 
 The C++ rivals (`rasterizer_kernel.cpp`, compiled on the spot) are serial and get their lists for nothing:
 
-* `cpu_over_cpp`: one thread of the engine's `forward_row` calls, which list by tile and blend, over C++ `exact`, the
+* `cpu_over_cpp`: one thread of the engine's `forward_rows` calls, which list by tile and blend, over C++ `exact`, the
   same algorithm by hand from the lists that the engine made: equal pairs, equal cells, the same early stop.
 * `plain_over_cpp`: the textbook loop (bounding boxes, every pixel of every listed pair, no early stop) in Numba over
   the same in C++, on equal lists.
@@ -215,12 +215,13 @@ def rival_tasks(case: Case, compiled: _rivals.Compiled | None) -> dict[str, Task
     """The engine's rows by themselves, the plain loop, and both in C++; one thread."""
     scene, prepare = case.scene, functools.partial(_use_threads, 1)
     draft = cpu._Draft(scene.leaves, scene.size, "over", RenderOptions(), False)
-    for start in draft.chunks:
+    for start in draft.chunks if len(draft.chunks) > 1 else ():
         draft.project(start)
     draft.bucket()
+    parts = draft.cut(whole=draft.work < cpu.SMALL)
     by_box, planes = _rivals.box_lists(*boxes(scene), scene.size), _rivals.Planes.of_size(scene.size)
     tasks = {
-        "cpu rows forward 1": Task(lambda: [draft.blend(row) for row in range(draft.num_rows)], prepare),
+        "cpu rows forward 1": Task(lambda: [draft.blend(part) for part in parts], prepare),
         "plain forward 1": Task(lambda: _rivals.plain_numba(by_box, case.trace, planes), prepare),
         "plain image forward 1": Task(lambda: _rivals.plain_image(scene, case.trace), prepare),
     }

@@ -63,11 +63,11 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
     """
     global _pool
     items = list(items)
-    threads = num_threads()
-    if serial or threads == 1 or len(items) <= 1:
+    if serial or len(items) <= 1 or num_threads() == 1:
         for item in items:
             task(item)
         return
+    threads = num_threads()
     with _lock:
         if _pool is None:
             _pool = ThreadPoolExecutor(threads, thread_name_prefix="foldgauss")

@@ -84,6 +84,18 @@ def _exp2(x):
     return scale(y, whole)
 
 
+@inline
+def _columns(left, right, width):
+    """Columns (or rows) first <= k < stop of pixels with left <= k <= right, of 0 <= k < width."""
+    # Held within the picture before the cast; truncated, as ceil and floor would be calls into libm here.
+    # The bound stands first in `max`, which so makes it of NaN, whose cast could be any number.
+    low = min(max(_f(0.0), left), width)
+    high = min(max(_f(-1.0), right), width - _f(1.0))
+    first = _i(low)
+    first += _i(_f(first) < low)
+    return first, _i(high + _f(1.0))
+
+
 @kernel
 def project(start, stop, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span):
     """Geometry of splats start..stop and the rows of tiles each one reaches (none: it is not seen).
@@ -130,12 +142,10 @@ def project(start, stop, mean, factor, opacity, color, height, width, low_pass, 
         geometry[i, _LOG] = log
         geometry[i, _LEAST] = max(log_cutoff, log - radius)
         geometry[i, _TURN] = _f(xy / xx) * radius_x
-        # Pixel rows whose centres lie within the radius; clipped before the cast, so no float is too large for it.
-        first = math.ceil(max(y - radius_y - _f(0.5), _f(0.0)))
-        last = math.floor(min(y + radius_y - _f(0.5), _f(height - 1)))
-        if last >= first:
-            span[i, 0] = first // TILE
-            span[i, 1] = last // TILE + 1
+        first, after = _columns(y - radius_y - _f(0.5), y + radius_y - _f(0.5), _f(height))
+        if after > first:
+            span[i, 0] = first >> _i(_SHIFT)
+            span[i, 1] = (after + _i(TILE - 1)) >> _i(_SHIFT)
 
 
 @kernel
@@ -164,22 +174,20 @@ def bucket_rows(span, num_rows):
     return start, entries, first_slot, slot_position
 
 
+@kernel
+def project_and_bucket(
+    num_rows, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span
+):
+    """`project` of all splats, then `bucket_rows`: where there are few, calls from Python are what costs."""
+    num = len(opacity)
+    project(0, num, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span)
+    return bucket_rows(span, num_rows)
+
+
 @inline
 def _edge(p, q, r, level, dy):
     """Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy."""
     return (math.sqrt(max(level - r * dy * r * dy, _f(0.0))) - q * dy) / p
-
-
-@inline
-def _columns(left, right, width):
-    """Columns first <= k < stop of pixels whose centres lie in left <= k <= right, of 0 <= k < width."""
-    # Held within the picture before the cast; truncated, as ceil and floor would be calls into libm here.
-    # The bound stands first in `max`, which so makes it of NaN, whose cast could be any number.
-    low = min(max(_f(0.0), left), width)
-    high = min(max(_f(-1.0), right), width - _f(1.0))
-    first = _i(low)
-    first += _i(_f(first) < low)
-    return first, _i(high + _f(1.0))
 
 
 @inline
@@ -228,32 +236,41 @@ def _tiles_of(num, block, upper, lower, width, first, end):
 
 
 @kernel
-def _bucket_tiles(geometry, entries, top, height, width):
-    """The entries of one band that each of its tiles lists, by tile in array order."""
-    num_tiles, count = (width + TILE - 1) // TILE, len(entries)
-    first, end = np.empty(count, np.int32), np.empty(count, np.int32)
-    upper, lower = _f(top) + _f(0.5), _f(min(top + TILE, height)) - _f(0.5)
+def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
+    """The entries of rows begin..end that each of their tiles lists, tile by tile in array order.
+
+    Counted from the first entry of row `begin` on.
+    """
+    across, base = (width + TILE - 1) // TILE, row_start[begin]
+    count = row_start[end] - base
+    first, after = np.empty(count, np.int32), np.empty(count, np.int32)
     block, which = _aligned(8 * BLOCK), np.empty(BLOCK, np.int32)
-    for begin in range(0, count, BLOCK):
-        num = min(BLOCK, count - begin)
-        which[:num] = entries[begin : begin + num]
-        _load_geometry(geometry, num, which, _f(0.0), _f(0.0), block)
-        _tiles_of(num, block, upper, lower, _f(width), first[begin : begin + num], end[begin : begin + num])
-    # How many more entries a tile has than the one before it.
-    more = np.zeros(num_tiles + 1, np.int64)
-    for e in range(count):
-        more[first[e]] += 1
-        more[end[e]] -= 1
-    tile_start, here = np.zeros(num_tiles + 1, np.int64), 0
-    for tile in range(num_tiles):
-        here += more[tile]
-        tile_start[tile + 1] = tile_start[tile] + here
+    # How many more entries a tile has than the one to its left.
+    more = np.zeros((end - begin, across + 1), np.int64)
+    for row in range(begin, end):
+        upper, lower = _f(row * TILE) + _f(0.5), _f(min((row + 1) * TILE, height)) - _f(0.5)
+        for start in range(row_start[row] - base, row_start[row + 1] - base, BLOCK):
+            stop = min(start + BLOCK, row_start[row + 1] - base)
+            which[: stop - start] = entries[base + start : base + stop]
+            _load_geometry(geometry, stop - start, which, _f(0.0), _f(0.0), block)
+            _tiles_of(stop - start, block, upper, lower, _f(width), first[start:stop], after[start:stop])
+            for e in range(start, stop):
+                more[row - begin, first[e]] += 1
+                more[row - begin, after[e]] -= 1
+    tile_start = np.zeros((end - begin) * across + 1, np.int64)
+    for row in range(end - begin):
+        here = 0
+        for tile in range(across):
+            here += more[row, tile]
+            tile_start[row * across + tile + 1] = tile_start[row * across + tile] + here
     fill = tile_start.copy()
-    listed = np.empty(tile_start[num_tiles], np.int32)
-    for e in range(count):
-        for tile in range(first[e], end[e]):
-            listed[fill[tile]] = e
-            fill[tile] += 1
+    listed = np.empty(tile_start[-1], np.int32)
+    for row in range(begin, end):
+        left = (row - begin) * across
+        for e in range(row_start[row] - base, row_start[row + 1] - base):
+            for tile in range(left + first[e], left + after[e]):
+                listed[fill[tile]] = e
+                fill[tile] += 1
     return tile_start, listed
 
 
@@ -407,40 +424,79 @@ def _dark(scratch, finished):
 
 
 @kernel
+def _light_tile(scratch, rows, columns):
+    """Make the scratch of a tile before its first splat: light 1 on `rows` x `columns` pixels, no colour."""
+    scratch[:] = 0.0
+    if rows == TILE and columns == TILE:
+        for p in range(_u(PIXELS)):
+            scratch[p] = 1.0
+        return
+    for y in range(rows):  # pixels outside the picture have no light from the start
+        scratch[y * TILE : y * TILE + columns] = 1.0
+    _turn(scratch, _u(0))
+
+
+@inline
+def _rows_of_band(scratch, at):
+    """Four rows of pixels, of the four cells that stand in a plane of the scratch from `at` on."""
+    first, second = load(scratch, at), load(scratch, at + _u(LANES))
+    third, fourth = load(scratch, at + _u(2 * LANES)), load(scratch, at + _u(3 * LANES))
+    return turned(first, second, third, fourth)
+
+
+@kernel
 def _turn(scratch, plane):
     """Turn a plane of the scratch from cells into rows of pixels, or back."""
     for band in range(_u(CELLS)):
         at = plane + band * _u(TILE * CELL)
-        cells = load(scratch, at), load(scratch, at + _u(16)), load(scratch, at + _u(32)), load(scratch, at + _u(48))
-        rows = turned(cells[0], cells[1], cells[2], cells[3])
+        rows = _rows_of_band(scratch, at)
         store(scratch, at, rows[0])
-        store(scratch, at + _u(16), rows[1])
-        store(scratch, at + _u(32), rows[2])
-        store(scratch, at + _u(48), rows[3])
+        store(scratch, at + _u(LANES), rows[1])
+        store(scratch, at + _u(2 * LANES), rows[2])
+        store(scratch, at + _u(3 * LANES), rows[3])
 
 
 @kernel
 def _write_tile(scratch, background, image, light, top, left):
-    """Write a tile into the picture; its scratch is turned into rows."""
+    """Write a tile into the picture; its scratch is of use no more."""
     height, width = light.shape
     rows, columns = min(TILE, height - top), min(TILE, width - left)
+    if rows == TILE and columns == TILE:
+        _write_whole_tile(scratch, background, image.reshape(-1), light.reshape(-1), height, width, top, left)
+        return
     for plane in range(_u(1 + len(background))):
         _turn(scratch, plane * _u(PIXELS))
     for y in range(rows):
         base, out = _u(y * TILE), light[top + y, left : left + columns]
-        if columns == TILE:
-            store(out, _u(0), load(scratch, base))
-        else:
-            for x in range(_u(columns)):
-                out[x] = scratch[base + x]
+        for x in range(_u(columns)):
+            out[x] = scratch[base + x]
         for c in range(len(background)):
             plane, out = base + _u((c + 1) * PIXELS), image[c, top + y, left : left + columns]
             behind = background[c]
-            if columns == TILE:
-                store(out, _u(0), load(scratch, plane) + load(scratch, base) * every(behind))
-            else:
-                for x in range(_u(columns)):
-                    out[x] = scratch[plane + x] + scratch[base + x] * behind
+            for x in range(_u(columns)):
+                out[x] = scratch[plane + x] + scratch[base + x] * behind
+
+
+@kernel
+def _write_whole_tile(scratch, background, image, light, height, width, top, left):
+    """`_write_tile` where no edge of the picture is met; `image` and `light` flat."""
+    height, width, corner = _u(height), _u(width), _u(top) * _u(width) + _u(left)
+    for band in range(_u(CELLS)):
+        at = band * _u(TILE * CELL)
+        lit = _rows_of_band(scratch, at)
+        out = corner + band * _u(CELL) * width
+        store(light, out, lit[0])
+        store(light, out + width, lit[1])
+        store(light, out + _u(2) * width, lit[2])
+        store(light, out + _u(3) * width, lit[3])
+        for c in range(_u(len(background))):
+            behind = every(background[c])
+            rows = _rows_of_band(scratch, (c + _u(1)) * _u(PIXELS) + at)
+            store(image, out, rows[0] + lit[0] * behind)
+            store(image, out + width, rows[1] + lit[1] * behind)
+            store(image, out + _u(2) * width, rows[2] + lit[2] * behind)
+            store(image, out + _u(3) * width, rows[3] + lit[3] * behind)
+            out += height * width
 
 
 @kernel
@@ -466,36 +522,47 @@ def _num_lights(start, stop):
 
 
 @kernel
-def forward_row(
-    row, row_start, entries, geometry, color, background, over, ceiling, finished, image, light, statistics, marks
+def forward_rows(
+    begin,
+    end,
+    row_start,
+    entries,
+    geometry,
+    color,
+    background,
+    over,
+    ceiling,
+    finished,
+    image,
+    light,
+    statistics,
+    marks,
 ):
-    """Blend one row of tiles into `image` (channels, height, width) and `light` (height, width).
+    """Blend rows begin..end of tiles into `image` (channels, height, width) and `light` (height, width).
 
     `background` is a tuple of up to FEW channels, so that the channels' loop is unrolled, or an array. `statistics`:
     None, or room for the (sum of weights, largest alpha) of every entry; `marks`, zeros, is `_blend`'s.
 
-    Returns the tiles' lists (start, entries within the row, stop), the light of every pixel of a tile at the start
-    of each block but the first, tile after tile, and how many entries were listed.
+    Returns the tiles' lists (start, entries counted from the rows' first, stop), the light of every pixel of a tile at
+    the start of each block but the first, tile after tile, and how many entries were listed.
     """
     height, width = light.shape
-    top = row * TILE
-    entries = entries[row_start[row] : row_start[row + 1]]
-    tile_start, listed = _bucket_tiles(geometry, entries, top, height, width)
+    across = (width + TILE - 1) // TILE
+    tile_start, listed = _bucket_tiles(geometry, row_start, entries, begin, end, height, width)
+    entries = entries[row_start[begin] : row_start[end]]
     num_lights = 0
     for tile in range(len(tile_start) - 1):
         num_lights += _num_lights(tile_start[tile], tile_start[tile + 1])
     used, lights = np.empty(len(tile_start) - 1, np.int64), np.empty((num_lights if over else 0, PIXELS), np.float32)
     scratch, block = _aligned((1 + len(background)) * PIXELS), _aligned((_COLOR + len(background)) * BLOCK)
-    first, end = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
+    first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     shear, rise = _aligned(BLOCK), _aligned(BLOCK)
     if statistics is not None:
-        statistics[row_start[row] : row_start[row + 1]] = 0.0
+        statistics[row_start[begin] : row_start[end]] = 0.0
     kept = 0
     for tile in range(len(used)):
-        scratch[:] = 0.0
-        for y in range(min(TILE, height - top)):  # pixels outside the picture have no light from the start
-            scratch[y * TILE : y * TILE + min(TILE, width - tile * TILE)] = 1.0
-        _turn(scratch, _u(0))
+        top, left = (begin + tile // across) * TILE, tile % across * TILE
+        _light_tile(scratch, min(TILE, height - top), min(TILE, width - left))
         used[tile] = tile_start[tile + 1]
         for k in range(tile_start[tile], tile_start[tile + 1], BLOCK):
             if over and k > tile_start[tile]:
@@ -506,11 +573,11 @@ def forward_row(
                     lights[kept, p] = scratch[p]
                 kept += 1
             part = listed[k : min(k + BLOCK, tile_start[tile + 1])]
-            _load_block(geometry, color, background, entries, part, _f(tile * TILE), _f(top), block, first, end)
-            _blend(len(part), block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks)
+            _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, after)
+            _blend(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished, marks)
             if statistics is not None:
-                _add_marks(part, marks, statistics[row_start[row] : row_start[row + 1]])
-        _write_tile(scratch, background, image, light, top, tile * TILE)
+                _add_marks(part, marks, statistics[row_start[begin] : row_start[end]])
+        _write_tile(scratch, background, image, light, top, left)
     return *_kept_lists(tile_start, listed, used), lights[:kept], len(listed)
 
 
@@ -627,8 +694,9 @@ def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, backgroun
 
 
 @kernel
-def backward_row(
-    row,
+def backward_rows(
+    begin,
+    end,
     row_start,
     entries,
     tile_start,
@@ -644,20 +712,22 @@ def backward_row(
     grad_image,
     slots,
 ):
-    """Gradient sums of every entry of one row, into its slots; arguments as `forward_row` took and gave them."""
+    """Gradient sums of every entry of rows begin..end, into its slots; arguments as `forward_rows` took and gave."""
     channels, (height, width) = len(background), grad_image.shape[1:]
-    top = row * TILE
+    across = (width + TILE - 1) // TILE
     flat = ceiling * _f(1.0 + 2.0**-23)  # the next float: an alpha at the ceiling itself follows the exponent
-    entries, slots = entries[row_start[row] : row_start[row + 1]], slots[row_start[row] : row_start[row + 1]]
+    entries, slots = entries[row_start[begin] : row_start[end]], slots[row_start[begin] : row_start[end]]
     slots[:] = 0.0
     scratch, block = _aligned((2 + channels) * PIXELS), _aligned((_COLOR + channels) * BLOCK)
     size = BLOCK * CELLS * CELLS + CELLS  # with the tail that `_list_cells` writes
     items, shear, rise = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32)
-    first, end, stop = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32), np.empty(BLOCK, np.uint64)
+    first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
+    stop = np.empty(BLOCK, np.uint64)
     notes, many = _aligned(BLOCK * CELLS * CELLS * _NOTES), _aligned(max(channels - FEW, 0) * LANES)
     kept = len(lights)
     for tile in range(len(used) - 1, -1, -1):
-        left, columns = tile * TILE, min(TILE, width - tile * TILE)
+        top, left = (begin + tile // across) * TILE, tile % across * TILE
+        columns = min(TILE, width - left)
         scratch[_BEHIND:] = 0.0
         for c in range(channels):
             behind = background[c] if over else _f(0.0)
@@ -672,8 +742,8 @@ def backward_row(
         start = tile_start[tile]
         for k in range((used[tile] - start - 1) // BLOCK, -1, -1):
             part = listed[start + k * BLOCK : min(start + (k + 1) * BLOCK, used[tile])]
-            _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, end)
-            num_items = _list_cells(len(part), block, first, end, items, stop, shear, rise)
+            _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, after)
+            num_items = _list_cells(len(part), block, first, after, items, stop, shear, rise)
             if over and k > 0:
                 kept -= 1
                 for p in range(_u(PIXELS)):
@@ -682,9 +752,9 @@ def backward_row(
                 scratch[:PIXELS] = 1.0
             _note(num_items, items, shear, rise, block, scratch, notes, over, flat, finished)
             for e in range(len(part) - 1, -1, -1):
-                begin, own = stop[e - 1] if e else _u(0), slots[part[e]]
+                start_of_own, own = stop[e - 1] if e else _u(0), slots[part[e]]
                 _unblend(
-                    *(begin, stop[e], items, shear, rise, _u(e), block, scratch, notes),
+                    *(start_of_own, stop[e], items, shear, rise, _u(e), block, scratch, notes),
                     *(background, over, flat, many, own),
                 )
 

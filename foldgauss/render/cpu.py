@@ -5,7 +5,7 @@ How a picture is made, and why so:
 * A *row* is a band of tiles across the picture. Splats are bucketed by row in one counting pass, which keeps
   array order, hence depth order, with no sort. Each row is then one task: it buckets its splats by tile, again
   counting, and blends tile after tile. Rows share nothing, so any number of threads gives the same bits. Several
-  frames are one such heap of rows.
+  frames are one such heap of rows. A picture that takes less time than a second thread would cost is one task.
 * Inside a tile only the cells of 4x4 pixels that the splat's cutoff ellipse reaches are visited, and a cell is
   one AVX-512 vector (`_vectors`), with an exponential made of a polynomial and an addition to the exponent. Before,
   a vector was a row of 16 pixels: a third more of them were visited, for 5 to 10% more time in all.
@@ -34,6 +34,7 @@ from foldgauss.render.splats import RenderOptions, check_size
 
 TILE, PIXELS = kernels.TILE, kernels.PIXELS
 CHUNK = 8192  # splats per task where splats, not rows, are shared out
+STANDARD = RenderOptions()
 #: Nanoseconds, roughly, that it takes to blend an entry of a row of tiles and to write a pixel; and below which in all
 #: another thread would cost more than it brings.
 ENTRY, PIXEL, SMALL = 80, 1.5, 4e5
@@ -57,8 +58,9 @@ class Trace:
     inputs: tuple[np.ndarray, ...]  # factor, opacity, color
     geometry: np.ndarray
     buckets: tuple[np.ndarray, ...]  # row_start, entries, first_slot, slot_position
-    lists: list[tuple[np.ndarray, ...]]  # per row: tile_start, listed, used
-    lights: list[np.ndarray]  # per row: the light at the start of blocks
+    parts: list[tuple[int, int]]  # first row of tiles and the one after the last, of each task
+    lists: list[tuple[np.ndarray, ...]]  # per part: tile_start, listed, used
+    lights: list[np.ndarray]  # per part: the light at the start of blocks
     constants: tuple  # background, over, ceiling, finished
 
     @property
@@ -113,19 +115,24 @@ def forward_frames(
 
     Raises ValueError as `forward`.
     """
-    options = RenderOptions() if options is None else options
+    options = STANDARD if options is None else options
     check_options(options)
     check_size(size)
     for frame in frames:
         _check_leaves(*frame)
     drafts = [_Draft(frame, size, compositing, options, statistics) for frame in frames]
-    run_tasks(lambda task: task[0].project(task[1]), [(one, start) for one in drafts for start in one.chunks])
+    run_tasks(_call, [(one.project, start) for one in drafts if len(one.chunks) > 1 for start in one.chunks])
     run_tasks(_Draft.bucket, drafts)
-    rows = [(one, row) for one in drafts for row in range(one.num_rows)]
-    run_tasks(lambda task: task[0].blend(task[1]), rows, serial=sum(one.work for one in drafts) < SMALL)
+    small = sum(one.work for one in drafts) < SMALL
+    run_tasks(_call, [(one.blend, part) for one in drafts for part in one.cut(whole=small)], serial=small)
     if statistics:
-        run_tasks(lambda task: task[0].gather(task[1]), [(one, start) for one in drafts for start in one.chunks])
+        run_tasks(_call, [(one.gather, start) for one in drafts for start in one.chunks])
     return [one.trace() for one in drafts]
+
+
+def _call(task) -> None:
+    method, part = task
+    method(part)
 
 
 def _check_leaves(mean, factor, opacity, color, background) -> None:
@@ -133,11 +140,8 @@ def _check_leaves(mean, factor, opacity, color, background) -> None:
     leaves = (mean, factor, opacity, color, background)
     shapes, dtypes = [np.shape(leaf) for leaf in leaves], {getattr(leaf, "dtype", None) for leaf in leaves}
     num, channels = shapes[2][:1], shapes[4][:1]
-    if (
-        shapes != [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
-        or channels == (0,)
-        or not (num and channels)
-    ):
+    expected = [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
+    if shapes != expected or channels == (0,) or not (num and channels):
         raise invalid(
             "mean, factor, opacity, color, background",
             expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel",
@@ -159,9 +163,6 @@ class _Draft:
         self.num_rows = -(-size[0] // TILE)
         self.geometry, self.span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
         self.image, self.light = np.empty((channels, *size), np.float32), np.empty(size, np.float32)
-        self.lists: list = [()] * self.num_rows
-        self.lights: list = [None] * self.num_rows
-        self.num_listed = np.zeros(self.num_rows, np.int64)
         self.statistics = Statistics(*np.empty((2, num), np.float32)) if statistics else None
         self.constants = (
             tuple(np.asarray(background, np.float32)) if channels <= kernels.FEW else background,
@@ -171,14 +172,21 @@ class _Draft:
         )
 
     def project(self, start: int) -> None:
-        stop, radius = min(start + CHUNK, len(self.opacity)), self.options.support_radius
+        kernels.project(start, min(start + CHUNK, len(self.opacity)), *self._to_project())
+
+    def _to_project(self) -> tuple:
+        radius = self.options.support_radius
         low_pass, cutoff = np.float32(self.options.low_pass), np.float32(self.options.alpha_cutoff)
         support = np.float32(math.inf if radius is None else radius**2)
         splats = (self.mean, self.factor, self.opacity, self.color)
-        kernels.project(start, stop, *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span)
+        return *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span
 
     def bucket(self) -> None:
-        self.buckets = kernels.bucket_rows(self.span, self.num_rows)
+        """List the splats of every row; those of a single chunk are projected here as well."""
+        if len(self.chunks) == 1:
+            self.buckets = kernels.project_and_bucket(self.num_rows, *self._to_project())
+        else:
+            self.buckets = kernels.bucket_rows(self.span, self.num_rows)
         self.marks = None if self.statistics is None else np.empty((len(self.buckets[1]), 2), np.float32)
 
     @property
@@ -186,11 +194,20 @@ class _Draft:
         """Nanoseconds, roughly, that blending takes."""
         return ENTRY * len(self.buckets[1]) + PIXEL * self.light.size
 
-    def blend(self, row: int) -> None:
+    def cut(self, *, whole: bool) -> range:
+        """Part the blending, by rows of tiles or not at all; the parts by number."""
+        step = self.num_rows if whole else 1
+        self.parts = [(row, row + step) for row in range(0, self.num_rows, step)]
+        self.lists: list = [()] * len(self.parts)
+        self.lights: list = [None] * len(self.parts)
+        self.num_listed = [0] * len(self.parts)
+        return range(len(self.parts))
+
+    def blend(self, part: int) -> None:
         room = None if self.marks is None else np.zeros(2 * TILE * kernels.BLOCK, np.float32)
         splats, planes = (self.geometry, self.color), (self.image, self.light)
-        *self.lists[row], self.lights[row], self.num_listed[row] = kernels.forward_row(
-            row, *self.buckets[:2], *splats, *self.constants, *planes, self.marks, room
+        *self.lists[part], self.lights[part], self.num_listed[part] = kernels.forward_rows(
+            *self.parts[part], *self.buckets[:2], *splats, *self.constants, *planes, self.marks, room
         )
 
     def gather(self, start: int) -> None:
@@ -199,8 +216,8 @@ class _Draft:
 
     def trace(self) -> Trace:
         inputs = (self.factor, self.opacity, self.color)
-        made = (inputs, self.geometry, self.buckets, self.lists, self.lights, self.constants)
-        return Trace(self.image, self.light, self.statistics, int(self.num_listed.sum()) * PIXELS, *made)
+        made = (inputs, self.geometry, self.buckets, self.parts, self.lists, self.lights, self.constants)
+        return Trace(self.image, self.light, self.statistics, sum(self.num_listed) * PIXELS, *made)
 
 
 def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -220,16 +237,17 @@ def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) 
     jobs = [(trace, grad, *room) for trace, grad, room in zip(traces, grad_images, rooms, strict=True)]
 
     def unblend(task) -> None:
-        (trace, grad_image, slots, _), row = task
-        lists, splats = (*trace.lists[row], trace.lights[row]), (trace.geometry, trace.inputs[2])
-        kernels.backward_row(row, *trace.buckets[:2], *lists, *splats, *trace.constants, grad_image, slots)
+        (trace, grad_image, slots, _), part = task
+        lists, splats = (*trace.lists[part], trace.lights[part]), (trace.geometry, trace.inputs[2])
+        rows = (*trace.parts[part], *trace.buckets[:2])
+        kernels.backward_rows(*rows, *lists, *splats, *trace.constants, grad_image, slots)
 
     def gather(task) -> None:
         (trace, _, slots, grads), start = task
         stop = min(start + CHUNK, len(trace.geometry))
         kernels.gather(start, stop, *trace.buckets[2:], slots, trace.geometry, *trace.inputs[:2], *grads)
 
-    run_tasks(unblend, [(job, row) for job in jobs for row in range(len(job[0].lists))])
+    run_tasks(unblend, [(job, part) for job in jobs for part in range(len(job[0].parts))])
     run_tasks(gather, [(job, start) for job in jobs for start in range(0, len(job[0].geometry), CHUNK)])
     return [
         (*grads, np.einsum("chw,hw->c", grad_image, trace.light, dtype=np.float32))

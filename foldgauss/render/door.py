@@ -72,7 +72,7 @@ def render(
         )
     if not jnp.issubdtype(splats.mean.dtype, jnp.floating):
         raise invalid("splats.mean", expected="a floating dtype", got=splats.mean.dtype)
-    options = RenderOptions() if options is None else options
+    options = cpu.STANDARD if options is None else options
     channels, dtype = splats.color.shape[-1], splats.mean.dtype
     background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
     if channels == 0:

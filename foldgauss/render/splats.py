@@ -65,8 +65,8 @@ def check_shapes(splats: eqx.Module, **geometry: tuple[int, ...]) -> None:
 
 def check_size(size: tuple[int, int]) -> None:
     """Raise unless `size` is that of a picture, (height, width)."""
-    whole = isinstance(size, tuple | list) and all(isinstance(n, Integral) and n >= 1 for n in size)
-    if not (whole and len(size) == 2):
+    pair = isinstance(size, (tuple, list)) and len(size) == 2
+    if not (pair and all(isinstance(n, Integral) and n >= 1 for n in size)):
         raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
 
 
