@@ -15,13 +15,13 @@ import numpy as np
 from benchmarks._common import Scene
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
+from foldgauss._vectors import choose, every, exp2, lanes, load, store
 from foldgauss.render import RenderOptions, _cpu_kernels, cpu
 from foldgauss.render._cpu_kernels import _f, _i, _u
-from foldgauss.render._vectors import choose, every, lanes, load, store
 
 SOURCE = Path(__file__).with_name("rasterizer_kernel.cpp")
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-mprefer-vector-width=512", "-std=c++17", "-shared", "-fPIC")
-_TILE, _PIXELS, _exp2, _aligned = _cpu_kernels.TILE, _cpu_kernels.PIXELS, _cpu_kernels._exp2, _cpu_kernels._aligned
+_TILE, _PIXELS, _aligned = _cpu_kernels.TILE, _cpu_kernels.PIXELS, _cpu_kernels._aligned
 
 
 class Lists(NamedTuple):
@@ -82,7 +82,7 @@ def _plain(start, listed, geometry, color, background, ceiling, finished, image,
                 base, dy = row * _u(_TILE), _f(_i(row)) - y
                 along = every(p) * columns + every(q * dy - p * x)
                 power = every(log - r * dy * r * dy) - along * along
-                alpha, here = _exp2(power), load(scratch, base)
+                alpha, here = exp2(power), load(scratch, base)
                 alpha = choose(power >= least, choose(alpha < highest, alpha, highest), none)
                 weight = alpha * choose(here > stop, here, none)
                 store(scratch, base, here - weight)

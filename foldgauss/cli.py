@@ -1,5 +1,6 @@
 """The command `foldgauss`: arguments and exit codes. The work is done on the floors below."""
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -47,6 +48,9 @@ CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
+
+#: What a user may take `fit --out` for: the clip as a picture, not the model.
+_OTHER_SUFFIXES = {*VIDEO_SUFFIXES, ".mov", ".avi", ".mkv", ".gif", ".png", ".jpg", ".jpeg", ".json", ".jsonl"}
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 # No markup: names of files may hold brackets.
@@ -192,7 +196,9 @@ def fit(
     try:
         config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
-        raise WrongUse(str(error)) from error
+        raise WrongUse(_as_option(str(error))) from error
+    if out_path is not None and out_path.suffix.lower() in _OTHER_SUFFIXES:
+        raise WrongUse(f"--out: expected a name for the model, as {out_path.stem}.safetensors, got {out_path}.")
     target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
     kept = target.with_name(f"{target.name}.checkpoint")
     if target.exists() and video.exists() and target.samefile(video):
@@ -441,12 +447,13 @@ def _run_fit(
     with _signals() as asked:
         kept_at = time.monotonic()
         for state, info in fit_steps(frames, config, resumed):
+            asked.stepping = True
             observe(state, info)  # first: what is kept at a step is in the history
             if keep is not None and time.monotonic() - kept_at > CHECKPOINT_SECONDS:
                 _keep_if_possible(keep, state)
                 kept_at = time.monotonic()
-            if asked and info.progress < 1:
-                raise _stopped(asked[0], state, info, keep)
+            if asked.name and info.progress < 1:
+                raise _stopped(asked.name, state, info, keep)
     return state, info
 
 
@@ -466,20 +473,33 @@ def _stopped(name: str, state: FitState, info: FitInfo, keep: Callable[[FitState
     return Stopped(f"stopped by {name} after step {info.step}; add --resume to go on from there.")
 
 
+@dataclasses.dataclass
+class _Asked:
+    """The signal that asked a fit to stop; and whether it had taken a step by then, which must not be cut in half."""
+
+    name: str = ""
+    stepping: bool = False
+
+
 @contextmanager
-def _signals() -> Iterator[list[str]]:
-    """Collect SIGINT and SIGTERM in a list, so that a step is never cut in half; a second SIGINT is final."""
-    asked: list[str] = []
-    before = {}
+def _signals() -> Iterator[_Asked]:
+    """Note SIGINT and SIGTERM, for the end of a step; before the first step they stop at once, as a second SIGINT."""
+    asked, before = _Asked(), {}
 
     def note(number, frame) -> None:
-        asked.append(signal.Signals(number).name)
+        asked.name = asked.name or signal.Signals(number).name
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        if not asked.stepping:
+            raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
         before[number] = signal.signal(number, note)
     try:
         yield asked
+    except KeyboardInterrupt as error:
+        if asked.stepping:
+            raise
+        raise Stopped(f"stopped by {asked.name} before the first step; nothing was changed.") from error
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -493,7 +513,7 @@ def _bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], No
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=err, disable=not shown) as progress:
+    with Progress(*columns, console=err, disable=not (shown and err.is_terminal)) as progress:
         task = progress.add_task(title, total=total)
         yield lambda: progress.advance(task)
 
@@ -651,6 +671,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
+        text = _as_option(text) if _names_an_option(text) else text
         if not isinstance(error, ValueError | OSError | MemoryError | Stopped | KeyboardInterrupt):
             text = f"{type(error).__name__}: {text[:300]} (--debug shows where)"
         err.print(f"error: {text}", style="red", soft_wrap=True)
@@ -659,10 +680,19 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _exit_code(error: BaseException) -> int:
     """Wrong use: an argument that cannot be right. Failure: a file that cannot be read or written."""
-    names_an_option = str(error).startswith(
-        ("frames:", "size:", "resume:", "max_size_mb:", "compositing:", "history:", "background:")
-    )
-    return WRONG_USE if isinstance(error, WrongUse | FileNotFoundError) or names_an_option else FAILURE
+    wrong = isinstance(error, WrongUse | FileNotFoundError) or _names_an_option(str(error))
+    return WRONG_USE if wrong else FAILURE
+
+
+def _names_an_option(text: str) -> bool:
+    """Whether an error of the floors below is about what the user gave by an option of the same name."""
+    return text.startswith(("frames:", "size:", "resume:", "max_size_mb:", "compositing:", "history:", "background:"))
+
+
+def _as_option(text: str) -> str:
+    """An error about a setting, as one about its option: num_gaussians is --gaussians."""
+    name, colon, rest = text.partition(":")
+    return f"--{name.replace('num_gaussians', 'gaussians').replace('_', '-')}{colon}{rest}"
 
 
 if __name__ == "__main__":

@@ -93,14 +93,15 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
     steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
     for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
         upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
-        lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3)
-        lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6)
+        lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3, label="each step")
+        lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6, label="running median")
         lower.set(xlabel=name, yscale="log")
         lower.set_xlim(left=0)  # the start takes its seconds too
         for ax in (upper, lower):
             ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("PSNR (dB)")
     axes[1, 0].set_ylabel("loss")
+    axes[1, 0].legend()
     return axes
 
 

@@ -194,6 +194,32 @@ def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
     assert "--resume" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monkeypatch, capsys):
+    def starting(*given):
+        signal.raise_signal(number)
+        raise AssertionError("went on")
+        yield
+
+    monkeypatch.setattr(cli, "fit_steps", starting)
+    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 1
+    assert f"stopped by {number.name} before the first step" in capsys.readouterr().err
+    assert list(tmp_path.glob("m.*")) == []
+
+
+def test_errors_name_the_option(clip, tmp_path, capsys):
+    for given, says in (
+        (["--gaussians", "0"], "--gaussians: expected a whole number >= 1"),
+        (["--target-psnr", "-1"], "--target-psnr: expected a number in (0, inf)"),
+        (["--preset", "best"], "--preset: expected one of"),
+        (["--out", tmp_path / "m.mp4"], "--out: expected a name for the model, as m.safetensors"),
+        (["--max-size-mb", "0.001"], "--max-size-mb: expected at least"),
+        (["--frames", "0:1"], "--frames: expected"),
+    ):
+        assert run("fit", clip, *given) == 2, given
+        assert says in capsys.readouterr().err
+
+
 def test_places_that_cannot_be_right(clip, tmp_path, capsys):
     out = tmp_path / "m.safetensors"
     for given, code, says in (

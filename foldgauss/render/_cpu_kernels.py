@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from foldgauss._kernels import inline, kernel
-from foldgauss.render._vectors import (
+from foldgauss._vectors import (
     LANES,
     any_of,
     between,
@@ -17,12 +17,11 @@ from foldgauss.render._vectors import (
     columns_of_cell,
     columns_of_rows,
     every,
+    exp2,
     folded,
     load,
     lowest_bit,
     rows_of_cell,
-    scale,
-    split,
     store,
     turned,
 )
@@ -66,22 +65,6 @@ _NOTES = 2 * LANES
 def slot_width(channels: int) -> int:
     """Floats of a gradient slot."""
     return -(-(_MOMENTS + channels) // LANES) * LANES
-
-
-@inline
-def _exp2(x):
-    """2^x of a vector within 2e-7: a polynomial of the part in [-0.5, 0.5], the whole part into the exponent.
-
-    For x in [-126, 127]; anything else gives numbers without meaning, for the caller to drop.
-    """
-    whole, part = split(x)
-    y = every(_f(1.3264727e-3))
-    y = y * part + every(_f(9.671513e-3))
-    y = y * part + every(_f(5.5507336e-2))
-    y = y * part + every(_f(0.24022242))
-    y = y * part + every(_f(0.693147))
-    y = y * part + every(_f(1.0))
-    return scale(y, whole)
 
 
 @inline
@@ -368,7 +351,7 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
             across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[e]))
             along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[e])
             power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
-            alpha = _exp2(power)
+            alpha = exp2(power)
             alpha = choose(alpha < highest, alpha, highest)
             alpha = choose(power >= every(block[_u(_LEAST * BLOCK) + e]), alpha, none)
             weight = alpha * choose(light > stop, light, none)
@@ -615,7 +598,7 @@ def _note(num_items, items, shear, rise, block, scratch, notes, over, ceiling, f
         along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[n])
         power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
         light = load(scratch, base)
-        alpha = _exp2(power)
+        alpha = exp2(power)
         alpha = choose(alpha < highest, alpha, highest)
         seen = (power >= every(block[_u(_LEAST * BLOCK) + e])) & (light > stop)
         alpha = choose(seen, alpha, none)

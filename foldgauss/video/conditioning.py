@@ -14,13 +14,16 @@ import numpy as np
 
 from foldgauss._kernels import inline, kernel
 from foldgauss._threads import run_tasks
+from foldgauss._vectors import LANES, choose, cos_and_sin, every, exp, load, root, sigmoid, store
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.model import SH_C0, TAU_MAX
 from foldgauss.video.packing import columns
 
 CHUNK = 4096  # Gaussians per task
 
-_f = nb.float32
+_f, _u = nb.float32, nb.uint64
+#: Numbers that conditioning gives for each Gaussian: mean 2, factor 4, opacity, colour 3, kept 3.
+_NUM_OUT = 13
 
 
 class _Layout(NamedTuple):
@@ -58,15 +61,6 @@ def _sigmoid(x):
     return _f(1.0) / (_f(1.0) + math.exp(-x))
 
 
-@inline
-def _shrink(u, spread, power, floor):
-    """Half of log a(t), and its derivative by -tau^2/2: standard deviations are scaled by exp of the first."""
-    tau = u / spread
-    decay = (_f(1.0) - floor) * math.exp(_f(-0.5) * power * tau * tau)
-    a = floor + decay
-    return _f(0.5) * math.log(a), _f(0.5) * power * decay / a
-
-
 @kernel
 def _windows(at, start, stop, indices, rows, window):
     """The span of time in which each of the named Gaussians is drawn."""
@@ -78,26 +72,82 @@ def _windows(at, start, stop, indices, rows, window):
 
 
 @kernel
-def _condition(at, start, stop, alive, rows, degree, t, unit, cx, cy, power, floor, mean, factor, opacity, color):
-    for k in range(start, stop):
-        i = alive[k]
-        row = rows[i]
-        u = _sigmoid(row[at.time]) - t
-        x, y = _f(0.0), _f(0.0)
-        for j in range(degree - 1, -1, -1):  # Horner
-            x = u * (x + row[at.fold + 2 * j])
-            y = u * (y + row[at.fold + 2 * j + 1])
-        mean[k, 0] = (row[at.loc] + x) * unit + cx
-        mean[k, 1] = (row[at.loc + 1] + y) * unit + cy
-        shrink, _ = _shrink(u, math.exp(row[at.spread]), power, floor)
-        first, second = math.exp(row[at.scale] + shrink) * unit, math.exp(row[at.scale + 1] + shrink) * unit
-        angle = _f(2 * math.pi) * _sigmoid(row[at.angle])
-        cos, sin = math.cos(angle), math.sin(angle)
-        factor[k, 0, 0], factor[k, 0, 1] = cos * first, -sin * second
-        factor[k, 1, 0], factor[k, 1, 1] = sin * first, cos * second
-        opacity[k] = _sigmoid(row[at.opacity])
-        for c in range(3):
-            color[k, c] = max(_f(0.5) + at.sh_c0 * row[at.color + c], _f(0.0))
+def _condition(
+    at,
+    start,
+    stop,
+    alive,
+    rows,
+    degree,
+    t,
+    unit,
+    cx,
+    cy,
+    power,
+    floor,
+    mean,
+    factor,
+    opacity,
+    color,
+    kept,
+):
+    """Sixteen Gaussians at a time: their rows become columns, vectors, and the results rows again."""
+    width = rows.shape[1]
+    columns, out = np.zeros(width * LANES, np.float32), np.empty(_NUM_OUT * LANES, np.float32)
+    for begin in range(start, stop, LANES):
+        num = _u(min(LANES, stop - begin))
+        for e in range(num):
+            row = rows[alive[begin + e]]
+            for c in range(_u(width)):
+                columns[c * _u(LANES) + e] = row[c]
+        _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out)
+        for e in range(num):
+            k = begin + e
+            mean[k, 0], mean[k, 1] = out[e], out[_u(LANES) + e]
+            factor[k, 0, 0], factor[k, 0, 1] = out[_u(2 * LANES) + e], out[_u(3 * LANES) + e]
+            factor[k, 1, 0], factor[k, 1, 1] = out[_u(4 * LANES) + e], out[_u(5 * LANES) + e]
+            opacity[k] = out[_u(6 * LANES) + e]
+            for c in range(_u(3)):
+                color[k, c], kept[k, c] = out[(_u(7) + c) * _u(LANES) + e], out[(_u(10) + c) * _u(LANES) + e]
+
+
+@inline
+def _column(columns, c):
+    return load(columns, _u(c) * _u(LANES))
+
+
+@kernel
+def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
+    none, scale = every(_f(0.0)), every(unit)
+    centre, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
+    u = centre - every(t)
+    x, y = none, none
+    for j in range(degree - 1, -1, -1):  # Horner
+        x = u * (x + _column(columns, at.fold + 2 * j))
+        y = u * (y + _column(columns, at.fold + 2 * j + 1))
+    store(out, _u(0), (_column(columns, at.loc) + x) * scale + every(cx))
+    store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + every(cy))
+    tau = u / spread
+    exponent = every(_f(-0.25) * power) * tau * tau  # of sqrt(a), but for the floor
+    if floor == _f(0.0):
+        first = exp(_column(columns, at.scale) + exponent) * scale
+        second = exp(_column(columns, at.scale + 1) + exponent) * scale
+    else:
+        shrink = root(every(floor) + every(_f(1.0) - floor) * exp(exponent + exponent)) * scale
+        first, second = exp(_column(columns, at.scale)) * shrink, exp(_column(columns, at.scale + 1)) * shrink
+    turn = sigmoid(_column(columns, at.angle))
+    cos, sin = cos_and_sin(turn)
+    store(out, _u(2 * LANES), cos * first)
+    store(out, _u(3 * LANES), none - sin * second)
+    store(out, _u(4 * LANES), sin * first)
+    store(out, _u(5 * LANES), cos * second)
+    store(out, _u(6 * LANES), sigmoid(_column(columns, at.opacity)))
+    for c in range(_u(3)):
+        value = every(_f(0.5)) + every(at.sh_c0) * _column(columns, at.color + c)
+        store(out, (_u(7) + c) * _u(LANES), choose(value < none, none, value))
+    store(out, _u(10 * LANES), centre)
+    store(out, _u(11 * LANES), spread)
+    store(out, _u(12 * LANES), turn)
 
 
 @kernel
@@ -115,6 +165,7 @@ def _pull_back(
     factor,
     opacity,
     color,
+    kept,
     d_mean,
     d_factor,
     d_opacity,
@@ -129,7 +180,7 @@ def _pull_back(
         gx, gy = d_mean[k, 0] * unit, d_mean[k, 1] * unit
         out[at.loc] += gx
         out[at.loc + 1] += gy
-        centre = _sigmoid(row[at.time])
+        centre, spread, turn = kept[k, 0], kept[k, 1], kept[k, 2]
         u = centre - t
         # Fold: dL/dc_j = g u^j, and dL/du by the derivative of the polynomial.
         d_u, u_power = _f(0.0), _f(1.0)
@@ -145,15 +196,16 @@ def _pull_back(
         out[at.scale + 1] += by_second
         by_angle = d_factor[k, 1, 0] * factor[k, 0, 0] - d_factor[k, 0, 0] * factor[k, 1, 0]
         by_angle += d_factor[k, 1, 1] * factor[k, 0, 1] - d_factor[k, 0, 1] * factor[k, 1, 1]
-        turn = _sigmoid(row[at.angle])
         out[at.angle] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
         # Envelope: -tau^2/2 moves with u and with the spread.
-        spread = math.exp(row[at.spread])
-        _, slope = _shrink(u, spread, power, floor)
+        inverse = _f(1.0) / (spread * spread)
+        square, slope = u * u * inverse, _f(0.5) * power
+        if floor > _f(0.0):
+            decay = (_f(1.0) - floor) * math.exp(_f(-0.5) * power * square)
+            slope *= decay / (floor + decay)
         by_exponent = (by_first + by_second) * slope
-        square = u * u / (spread * spread)
         out[at.spread] += by_exponent * square
-        d_u -= by_exponent * u / (spread * spread)
+        d_u -= by_exponent * u * inverse
         out[at.time] += d_u * centre * (_f(1.0) - centre)
         d_time -= d_u
         out[at.opacity] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
@@ -174,6 +226,7 @@ class Conditioned:
     factor: np.ndarray
     opacity: np.ndarray
     color: np.ndarray
+    kept: np.ndarray  # (num, 3), for the way back: m_t, sigma_t and the angle in turns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,15 +258,16 @@ def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> C
     num, (height, width) = len(alive), shape.size
     unit = np.float32(pixels_per_unit(shape.size, aspect=shape.aspect))
     mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
-    opacity, color = np.empty(num, np.float32), np.empty((num, 3), np.float32)
+    opacity, (color, kept) = np.empty(num, np.float32), np.empty((2, num, 3), np.float32)
     constants = np.float32([width / 2, height / 2, shape.power, shape.floor])
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
-        _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, mean, factor, opacity, color)
+        splats = (mean, factor, opacity, color, kept)
+        _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, *splats)
 
     run_tasks(work, range(0, num, CHUNK))
-    return Conditioned(alive, t, unit, mean, factor, opacity, color)
+    return Conditioned(alive, t, unit, mean, factor, opacity, color, kept)
 
 
 def pull_back(
@@ -240,6 +294,7 @@ def pull_back(
             done.factor,
             done.opacity,
             done.color,
+            done.kept,
             *gradients,
             grad,
         )

@@ -118,9 +118,10 @@ def fit_steps(
     state = start(frames, config) if state is None else state
     step = _Stepper(frames, config, state)
     pace = _Pace(config, [level.share for level in step.levels])
+    outlook = _Outlook(state, config, step.levels)
     stopped_by = _stopped_by(state, config, len(frames))
     if stopped_by:  # a kept state that needs no more steps
-        yield state, _info(state, config, step.levels, math.nan, 0, stopped_by)
+        yield state, _info(state, config, outlook, math.nan, 0, stopped_by)
     while not stopped_by:
         begun = time.perf_counter()
         level = _level(state, step.levels)
@@ -136,7 +137,7 @@ def fit_steps(
         if not state.plan:
             state.plan = pace.plan(state, level, passed)
         stopped_by = _stopped_by(state, config, len(frames))
-        yield state, _info(state, config, step.levels, loss, num_alive, stopped_by)
+        yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
 
 def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
@@ -211,17 +212,26 @@ def running_psnr(state: FitState) -> float:
     return -10 * math.log10(max(state.error, 1e-12))
 
 
+class _Outlook:
+    """How long a fit will still take, by the pace of the steps since it began or went on."""
+
+    def __init__(self, state: FitState, config: FitConfig, levels: list[Level]):
+        self.config, self.levels, self.seconds = config, levels, state.seconds
+        self.work = work_done(levels, _progress(state, config))
+
+    def seconds_left(self, state: FitState, progress: float) -> float:
+        """At most what is left of the minutes, where there are any."""
+        most = math.inf if self.config.minutes is None else max(60 * self.config.minutes - state.seconds, 0.0)
+        work = work_done(self.levels, progress)
+        known = work > self.work and (state.plan or progress == 1)
+        return min((state.seconds - self.seconds) * (1 - work) / (work - self.work), most) if known else most
+
+
 def _info(
-    state: FitState, config: FitConfig, levels: list[Level], loss: float, num_alive: int, stopped_by: str | None
+    state: FitState, config: FitConfig, outlook: _Outlook, loss: float, num_alive: int, stopped_by: str | None
 ) -> FitInfo:
     done = 1.0 if stopped_by else _progress(state, config)
-    if not state.plan and config.minutes is not None and not stopped_by:
-        left = 60 * config.minutes - state.seconds
-    else:
-        work = work_done(levels, done)
-        left = state.seconds * (1 - work) / work if work else math.inf
-        if config.minutes is not None:
-            left = min(left, max(60 * config.minutes - state.seconds, 0.0))
+    left = 0.0 if stopped_by else outlook.seconds_left(state, done)
     return FitInfo(
         state.step, done, loss, running_psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by
     )

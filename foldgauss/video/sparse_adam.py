@@ -17,16 +17,21 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
 
 _f, _u = nb.float32, nb.uint64
 
+#: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Powers taken anew
+#: for each row were a third of a step's optimiser.)
+_UNBIAS = np.ones((20_000, 2), np.float32)
+_UNBIAS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(_UNBIAS))[:, None])
+
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, rates, unit, spread, time, fold):
+def _update(start, stop, touched, rows, grad, first, second, counts, rates, unit, spread, time, fold, unbias):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     width, own = _u(rows.shape[1]), rates.copy()
     for k in range(start, stop):
         i = touched[k]
         counts[i] += 1
-        unbias1 = _f(1.0) / (_f(1.0) - beta1 ** _f(counts[i]))
-        unbias2 = _f(1.0) / (_f(1.0) - beta2 ** _f(counts[i]))
+        taken = min(counts[i], len(unbias) - 1)
+        unbias1, unbias2 = unbias[taken, 0], unbias[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
         if unit > _f(0.0):
             wide = math.exp(row[spread]) / unit
@@ -77,6 +82,7 @@ def sparse_adam(
             rates,
             np.float32(unit_time),
             *at,
+            _UNBIAS,
         )
 
     run_tasks(work, range(0, num, CHUNK))

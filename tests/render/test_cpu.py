@@ -305,9 +305,7 @@ def test_mutant_is_caught(wrong, monkeypatch):
 def test_exponential():
     """Within 2e-7 over the powers that are drawn, in a kernel of its own."""
     from foldgauss._kernels import kernel
-    from foldgauss.render._vectors import LANES, load, store
-
-    exp2 = kernels._exp2
+    from foldgauss._vectors import LANES, exp2, load, store
 
     @functools.partial(kernel)
     def apply(x, y):

@@ -283,9 +283,25 @@ def test_bad_frames(frames):
         check_frames(frames)
 
 
+def test_time_left_is_that_of_the_steps(monkeypatch):
+    """A start that takes its time says nothing about the steps: those of this clip take milliseconds each."""
+    start = fit_module.start
+
+    def slow(*given):
+        state = start(*given)
+        state.seconds += 1000
+        return state
+
+    monkeypatch.setattr(fit_module, "start", slow)
+    infos = [info for _, info in fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=20))]
+    assert all(0 < info.seconds_left < 200 for info in infos[:-1])
+    assert infos[-1].seconds_left == 0
+
+
 def test_compiling_is_not_counted(monkeypatch):
     """Kernels are ready before the first step, whatever the settings: no budget is spent on them."""
     seconds = []
+    list(fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=1)))  # the test's own process compiles them too
     monkeypatch.setattr(fit_module, "_warm_up", lambda *given: time.sleep(1.0))
     for _, info in fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=2)):
         seconds.append(info.seconds)

@@ -2,17 +2,21 @@
 
 A value of type `VECTOR` is one LLVM vector: one AVX-512 register, or two or four narrower ones where a machine has no
 wider. What a kernel keeps in local variables then stays in registers over any loops, and how many channels or
-sums there are does not decide whether LLVM finds a vector loop. Arithmetic between vectors is `+`, `-`, `*`;
+sums there are does not decide whether LLVM finds a vector loop. Arithmetic between vectors is `+`, `-`, `*`, `/`;
 comparisons give a `MASK` of 16 bits. Numba's own fast-math flags hold here too.
 
 Kernels that use these are kept on disk under their own file's date: after a change here, remove the kept code.
 """
 
+import math
 import operator
 
+import numba as nb
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
+
+from foldgauss._kernels import inline
 
 LANES = 16
 _FLOATS, _INTS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
@@ -135,7 +139,12 @@ def _on_operator(symbol, kind, operation):
         return None
 
 
-for _symbol, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+for _symbol, _name in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
     _on_operator(_symbol, _Vector, _arithmetic(_name))
 for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.lt, "<")):
     _on_operator(_symbol, _Vector, _comparison(_sign))
@@ -206,6 +215,74 @@ def scale(typing_context, value, whole):
         return builder.bitcast(total, _FLOATS)
 
     return VECTOR(VECTOR, VECTOR), generate
+
+
+@intrinsic
+def root(typing_context, x):
+    """The square root."""
+
+    def generate(context, builder, signature, args):
+        kind = ir.FunctionType(_FLOATS, [_FLOATS])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), args)
+
+    return VECTOR(VECTOR), generate
+
+
+_f = nb.float32
+
+
+@inline
+def exp2(x):
+    """2^x within 2e-7: a polynomial of the part in [-0.5, 0.5], the whole part into the exponent.
+
+    For x in [-126, 127]; anything else gives numbers without meaning, for the caller to drop.
+    """
+    whole, part = split(x)
+    y = every(_f(1.3264727e-3))
+    y = y * part + every(_f(9.671513e-3))
+    y = y * part + every(_f(5.5507336e-2))
+    y = y * part + every(_f(0.24022242))
+    y = y * part + every(_f(0.693147))
+    y = y * part + every(_f(1.0))
+    return scale(y, whole)
+
+
+@inline
+def exp(x):
+    """e^x for any x: within 4e-7 for |x| < 5, 1e-5 for all that float32 holds, whose normal numbers it stays among."""
+    y, most = x * every(_f(math.log2(math.e))), every(_f(126.0))
+    y = choose(y < most, y, most)
+    y = choose(y > every(_f(-126.0)), y, every(_f(-126.0)))
+    return choose(x >= x, exp2(y), x)  # NaN stays what it is
+
+
+@inline
+def sigmoid(x):
+    """1 / (1 + e^-x)."""
+    one = every(_f(1.0))
+    return one / (one + exp(every(_f(0.0)) - x))
+
+
+@inline
+def cos_and_sin(turns):
+    """Cosine and sine of 2 pi x within 5e-7: the series of pi x, to its 12th power, then the angle doubled."""
+    _, part = split(turns)
+    square = part * part
+    y = every(_f(-0.00737043094571435))
+    y = y * square + every(_f(0.08214588661112823))
+    y = y * square + every(_f(-0.5992645293207921))
+    y = y * square + every(_f(2.550164039877345))
+    y = y * square + every(_f(-5.16771278004997))
+    y = y * square + every(_f(3.141592653589793))
+    sine = y * part
+    y = every(_f(0.0019295743094039))
+    y = y * square + every(_f(-0.02580689139001406))
+    y = y * square + every(_f(0.2353306303588935))
+    y = y * square + every(_f(-1.3352627688545893))
+    y = y * square + every(_f(4.058712126416768))
+    y = y * square + every(_f(-4.934802200544679))
+    y = y * square + every(_f(1.0))
+    return (y - sine) * (y + sine), every(_f(2.0)) * sine * y
 
 
 def _shuffled(builder, a, b, picks):

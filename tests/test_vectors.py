@@ -1,0 +1,66 @@
+"""The vectors' functions against NumPy in double precision."""
+
+import numpy as np
+import pytest
+
+from foldgauss import _vectors
+from foldgauss._kernels import kernel
+from foldgauss._vectors import LANES, load, store
+
+WIDE = np.linspace(-87, 87, 1 << 14)
+NEAR = np.linspace(-5, 5, 1 << 14)
+
+
+def apply(function, x):
+    """`function` of vectors on all of x, whose length is a multiple of 16."""
+
+    @kernel
+    def work(x, y):
+        for k in range(np.uint64(0), np.uint64(len(x)), np.uint64(LANES)):
+            store(y, k, function(load(x, k)))
+
+    x = x.astype(np.float32)
+    y = np.empty_like(x)
+    work(x, y)
+    return x.astype(np.float64), y
+
+
+def cosine(x):
+    return _vectors.cos_and_sin(x)[0]
+
+
+def sine(x):
+    return _vectors.cos_and_sin(x)[1]
+
+
+cosine, sine = (_vectors.inline(function) for function in (cosine, sine))
+
+
+@pytest.mark.parametrize(
+    ("function", "truth", "x", "bounds"),
+    [
+        (_vectors.exp, np.exp, NEAR, {"rtol": 4e-7}),
+        (_vectors.exp, np.exp, WIDE, {"rtol": 1e-5}),
+        (_vectors.sigmoid, lambda x: 1 / (1 + np.exp(-x)), NEAR, {"rtol": 5e-7}),
+        (_vectors.root, np.sqrt, abs(WIDE), {"rtol": 2e-7}),
+        (cosine, lambda x: np.cos(2 * np.pi * x), NEAR, {"atol": 5e-7}),
+        (sine, lambda x: np.sin(2 * np.pi * x), NEAR, {"atol": 5e-7}),
+    ],
+)
+def test_functions(function, truth, x, bounds):
+    x, y = apply(function, x)
+    np.testing.assert_allclose(y, truth(x), **({"atol": 0, "rtol": 0} | bounds))
+
+
+def test_what_float32_cannot_hold():
+    """Exponentials stay among the normal numbers; NaN stays NaN."""
+    x = np.array([-np.inf, -1e30, -100, 100, 1e30, np.inf, np.nan, 0] * 2)
+    _, y = apply(_vectors.exp, x)
+    assert (y[:3] > 0).all()
+    assert (y[:3] < 2e-38).all()
+    assert np.isfinite(y[3:6]).all()
+    assert (y[3:6] > 8e37).all()
+    assert np.isnan(y[6])
+    assert y[7] == 1
+    _, y = apply(_vectors.sigmoid, x)
+    np.testing.assert_allclose(y[:8], [0, 0, 0, 1, 1, 1, np.nan, 0.5], atol=1e-37)
