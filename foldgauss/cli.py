@@ -153,7 +153,7 @@ def fit(
     ] = None,
     minutes: Annotated[float | None, typer.Option(help="Time to fit for.")] = None,
     target_psnr: Annotated[
-        float | None, typer.Option("--target-psnr", help="Stop once the running PSNR, which lags, is this, in dB.")
+        float | None, typer.Option("--target-psnr", help="Stop once the mean PSNR of the frames is this, in dB.")
     ] = None,
     batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
     power: Annotated[
@@ -197,12 +197,12 @@ def fit(
         config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(_as_option(str(error))) from error
-    if out_path is not None and out_path.suffix.lower() in _OTHER_SUFFIXES:
-        raise WrongUse(f"--out: expected a name for the model, as {out_path.stem}.safetensors, got {out_path}.")
     target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
     kept = target.with_name(f"{target.name}.checkpoint")
     if target.exists() and video.exists() and target.samefile(video):
         raise WrongUse(f"--out: expected another file than the clip, got {target}.")
+    if out_path is not None and out_path.suffix.lower() in _OTHER_SUFFIXES:
+        raise WrongUse(f"--out: expected a name for the model, as {out_path.stem}.safetensors, got {out_path}.")
     manner = _manner(quiet, log_json)
     _refuse_existing(target, overwrite)
     curves = _check_records(target, video, history, preview, overwrite or resume)

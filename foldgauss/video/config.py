@@ -104,7 +104,7 @@ class FitConfig:
     degree: int = 3
     steps: int | None = None
     minutes: float | None = None
-    target_psnr: float | None = None  # dB, running mean over a pass through the frames; no coarse levels then
+    target_psnr: float | None = None  # dB, mean over all frames; no coarse levels then
     max_size_mb: float | None = None  # 10^6 bytes
     batch_size: int = 1
     power: float = 2.0  # of the envelope: 1 as in the paper's text, 2 as in its code

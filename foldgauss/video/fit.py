@@ -23,9 +23,11 @@ from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
+from foldgauss.video.metrics import psnr
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack, unpack
+from foldgauss.video.playback import Playback
 from foldgauss.video.pyramid import Level, level_at, levels, shrunk, work_done
 from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
@@ -119,7 +121,7 @@ def fit_steps(
     step = _Stepper(frames, config, state)
     pace = _Pace(config, [level.share for level in step.levels])
     outlook = _Outlook(state, config, step.levels)
-    stopped_by = _stopped_by(state, config, len(frames))
+    stopped_by = _stopped_by(state, config, frames)
     if stopped_by:  # a kept state that needs no more steps
         yield state, _info(state, config, outlook, math.nan, 0, stopped_by)
     while not stopped_by:
@@ -136,7 +138,9 @@ def fit_steps(
         state.seconds += passed
         if not state.plan:
             state.plan = pace.plan(state, level, passed)
-        stopped_by = _stopped_by(state, config, len(frames))
+        begun = time.perf_counter()
+        stopped_by = _stopped_by(state, config, frames)
+        state.seconds += time.perf_counter() - begun
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
 
@@ -189,17 +193,37 @@ def _level(state: FitState, levels: list[Level]) -> int:
     return level_at(levels, state.step / state.plan) if state.plan else state.step % len(levels)
 
 
-def _stopped_by(state: FitState, config: FitConfig, num_frames: int) -> str | None:
-    """The budget that binds now; the running PSNR counts once every frame was seen."""
-    seen = state.step * config.batch_size >= _num_views(config, num_frames)
-    if config.target_psnr is not None and seen and running_psnr(state) >= config.target_psnr:
+def _stopped_by(state: FitState, config: FitConfig, frames: np.ndarray) -> str | None:
+    """The budget that binds now."""
+    if config.target_psnr is not None and _reaches(config.target_psnr, state, config, frames):
         return "target_psnr"
-    # The pace that minutes are planned by is that of the Gaussians at the start: where they grow, the clock decides.
-    if config.growth is not None and config.minutes is not None and state.seconds >= 60 * config.minutes:
+    # The pace that minutes are planned by is that of the Gaussians at the start, and of steps alone: where they grow,
+    # or frames are looked at between steps, the clock decides.
+    by_clock = config.growth is not None or config.target_psnr is not None
+    if by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes:
         return "minutes"
     if not state.plan or state.step < state.plan:
         return None
     return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
+
+
+def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
+    """Whether the mean PSNR over all frames is `target` now.
+
+    The running one lags: from `LAG` dB below the target on, every few passes all frames are drawn.
+    """
+    steps = -(-_num_views(config, len(frames)) // config.batch_size)  # of a pass
+    if state.step < steps or running_psnr(state) < target - LAG:
+        return False
+    return running_psnr(state) >= target or (
+        state.step % (LOOK_PASSES * steps) == 0 and _mean_psnr(state, config, frames) >= target
+    )
+
+
+def _mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
+    """dB, mean over all frames as they are shown, over black."""
+    playback = Playback(to_model(state, config, frames.shape[1:3], 1.0))
+    return float(np.mean([psnr(frame[..., :3], shown) for frame, shown in zip(frames, playback.frames(), strict=True)]))
 
 
 def _num_views(config: FitConfig, num_frames: int) -> int:
@@ -461,6 +485,8 @@ def _envelope(config: FitConfig) -> TimeLikelihood:
     return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
 
 
+#: A fit to a target looks at all frames once in so many passes, when the running PSNR is at most so many dB below it.
+LOOK_PASSES, LAG = 4, 6.0
 #: The pace is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
 #: share of the time.
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05
