@@ -249,7 +249,7 @@ def exp2(x):
 
 @inline
 def exp(x):
-    """e^x for any x: within 4e-7 for |x| < 5, 1e-5 for all that float32 holds, whose normal numbers it stays among."""
+    """e^x: within 4e-7 for |x| < 5, 1e-5 for |x| < 87.3; beyond it stays at the ends of these."""
     y, most = x * every(_f(math.log2(math.e))), every(_f(126.0))
     y = choose(y < most, y, most)
     y = choose(y > every(_f(-126.0)), y, every(_f(-126.0)))

@@ -202,7 +202,9 @@ def fit(
     if target.exists() and video.exists() and target.samefile(video):
         raise WrongUse(f"--out: expected another file than the clip, got {target}.")
     if out_path is not None and out_path.suffix.lower() in _OTHER_SUFFIXES:
-        raise WrongUse(f"--out: expected a name for the model, as {out_path.stem}.safetensors, got {out_path}.")
+        raise WrongUse(
+            f"--out: expected a name for the model, as {out_path.with_suffix('.safetensors')}, got {out_path}."
+        )
     manner = _manner(quiet, log_json)
     _refuse_existing(target, overwrite)
     curves = _check_records(target, video, history, preview, overwrite or resume)
@@ -219,14 +221,16 @@ def fit(
     def keep(state: FitState) -> None:
         save_checkpoint(kept, state, config=config, source=source)
 
-    if overwrite and not resume:
-        kept.unlink(missing_ok=True)  # or a --resume after this fit would go on with the one before
+    def begin() -> None:
+        if overwrite and not resume:
+            kept.unlink(missing_ok=True)  # or a --resume after this fit would go on with the one before
+
     recorded = None
     if history is not None:
         recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
     previews = None if preview is None else previewing(preview, clip, config)
     with watching(manner, err, history=recorded, preview=previews) as observe:
-        state, info = _run_fit(clip.frames, config, observe, state, keep)
+        state, info = _run_fit(clip.frames, config, observe, state, keep, begin)
     model = to_model(state, config, clip.size, clip.fps)
     about = _provenance(clip, config) | {"frames": _parse_frames(frames)}
     save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
@@ -442,12 +446,18 @@ def _run_fit(
     observe: Observer,
     resumed: FitState | None = None,
     keep: Callable[[FitState], object] | None = None,
+    begin: Callable[[], object] = lambda: None,
 ) -> tuple[FitState, FitInfo]:
-    """Run the fit; `observe` sees each step, `keep` is called now and then, and before leaving on a signal."""
+    """Run the fit; `observe` sees each step, `keep` is called now and then, and before leaving on a signal.
+
+    `begin` is called once there is a first step, and so something in place of what was there before.
+    """
     with _signals() as asked:
         kept_at = time.monotonic()
         for state, info in fit_steps(frames, config, resumed):
-            asked.stepping = True
+            if not asked.stepping:
+                asked.stepping = True
+                begin()
             observe(state, info)  # first: what is kept at a step is in the history
             if keep is not None and time.monotonic() - kept_at > CHECKPOINT_SECONDS:
                 _keep_if_possible(keep, state)
@@ -499,7 +509,7 @@ def _signals() -> Iterator[_Asked]:
     except KeyboardInterrupt as error:
         if asked.stepping:
             raise
-        raise Stopped(f"stopped by {asked.name} before the first step; nothing was changed.") from error
+        raise Stopped(f"stopped by {asked.name} before the first step.") from error
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -671,7 +681,9 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
-        text = _as_option(text) if _names_an_option(text) else text
+        option = _as_option(text)
+        if _names_an_option(text) and option.partition(":")[0] in arguments:
+            text = option
         if not isinstance(error, ValueError | OSError | MemoryError | Stopped | KeyboardInterrupt):
             text = f"{type(error).__name__}: {text[:300]} (--debug shows where)"
         err.print(f"error: {text}", style="red", soft_wrap=True)

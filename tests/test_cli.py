@@ -1,5 +1,6 @@
 """The command as a user meets it: real files, exit codes, one-line errors, nothing half-written."""
 
+import itertools
 import json
 import os
 import re
@@ -502,9 +503,19 @@ def test_overwrite_forgets_a_stopped_fit(work, tmp_path, interrupted, monkeypatc
     assert run("fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "80") == 1
     disarm()
     assert kept.exists()
-    monkeypatch.setattr(cli, "fit_steps", lambda *given: (_ for _ in ()).throw(OSError("killed")))
-    assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--overwrite") == 1
-    assert not kept.exists()
+    steps = cli.fit_steps
+
+    def killed(after):
+        def stepping(*given):
+            yield from itertools.islice(steps(*given), after)
+            raise OSError("killed")
+
+        return stepping
+
+    for after in (0, 1):  # only a first step takes the place of what was kept
+        monkeypatch.setattr(cli, "fit_steps", killed(after))
+        assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--overwrite") == 1
+        assert kept.exists() == (after == 0)
 
 
 def test_sum_with_alpha_is_wrong_use(tmp_path, capsys):

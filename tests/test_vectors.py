@@ -1,10 +1,11 @@
 """The vectors' functions against NumPy in double precision."""
 
+import numba as nb
 import numpy as np
 import pytest
 
 from foldgauss import _vectors
-from foldgauss._kernels import kernel
+from foldgauss._kernels import _OPTIONS
 from foldgauss._vectors import LANES, load, store
 
 WIDE = np.linspace(-87, 87, 1 << 14)
@@ -14,7 +15,7 @@ NEAR = np.linspace(-5, 5, 1 << 14)
 def apply(function, x):
     """`function` of vectors on all of x, whose length is a multiple of 16."""
 
-    @kernel
+    @nb.njit(**_OPTIONS)  # not kept on disk: it is another function every time
     def work(x, y):
         for k in range(np.uint64(0), np.uint64(len(x)), np.uint64(LANES)):
             store(y, k, function(load(x, k)))

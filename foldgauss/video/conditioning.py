@@ -198,14 +198,14 @@ def _pull_back(
         by_angle += d_factor[k, 1, 1] * factor[k, 0, 1] - d_factor[k, 0, 1] * factor[k, 1, 1]
         out[at.angle] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
         # Envelope: -tau^2/2 moves with u and with the spread.
-        inverse = _f(1.0) / (spread * spread)
-        square, slope = u * u * inverse, _f(0.5) * power
+        tau = u / spread
+        square, slope = tau * tau, _f(0.5) * power
         if floor > _f(0.0):
             decay = (_f(1.0) - floor) * math.exp(_f(-0.5) * power * square)
             slope *= decay / (floor + decay)
         by_exponent = (by_first + by_second) * slope
         out[at.spread] += by_exponent * square
-        d_u -= by_exponent * u * inverse
+        d_u -= by_exponent * tau / spread
         out[at.time] += d_u * centre * (_f(1.0) - centre)
         d_time -= d_u
         out[at.opacity] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])

@@ -89,7 +89,8 @@ class FitConfig:
     """Everything a fit depends on beside the frames; `preset` has some of them ready.
 
     `steps`, `minutes` and `target_psnr` are budgets: the fit ends with the first that binds. Minutes are turned into
-    steps once, by the measured pace; where Gaussians grow (`growth`), the clock ends the fit. With neither steps nor
+    steps once, by the measured pace; where Gaussians grow (`growth`), or with a target, the clock ends the fit. A target
+    is looked for once in four passes through the frames. With neither steps nor
     minutes, steps are `DEFAULT_STEPS`, or more for long clips. `max_size_mb` bounds the number of Gaussians by the
     model file's size.
 

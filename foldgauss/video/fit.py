@@ -151,6 +151,8 @@ def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
     for progress in (0.0, 1.0):  # with either loss
         _Stepper(corner, tiny, state)(state, progress)
+    if config.target_psnr is not None:
+        _mean_psnr(state, tiny, corner)
 
 
 class _Pace:
@@ -208,16 +210,14 @@ def _stopped_by(state: FitState, config: FitConfig, frames: np.ndarray) -> str |
 
 
 def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
-    """Whether the mean PSNR over all frames is `target` now.
+    """Whether the mean PSNR over all frames is `target`, looked at once in `LOOK_PASSES` passes.
 
-    The running one lags: from `LAG` dB below the target on, every few passes all frames are drawn.
+    The running one says little of it: it lags, is that of a mean over unlike frames, and with alpha one over random
+    backgrounds.
     """
     steps = -(-_num_views(config, len(frames)) // config.batch_size)  # of a pass
-    if state.step < steps or running_psnr(state) < target - LAG:
-        return False
-    return running_psnr(state) >= target or (
-        state.step % (LOOK_PASSES * steps) == 0 and _mean_psnr(state, config, frames) >= target
-    )
+    due = state.step > 0 and state.step % (LOOK_PASSES * steps) == 0
+    return due and bool(np.isfinite(state.rows).all()) and _mean_psnr(state, config, frames) >= target
 
 
 def _mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
@@ -485,8 +485,8 @@ def _envelope(config: FitConfig) -> TimeLikelihood:
     return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
 
 
-#: A fit to a target looks at all frames once in so many passes, when the running PSNR is at most so many dB below it.
-LOOK_PASSES, LAG = 4, 6.0
+#: A fit to a target looks at all frames once in so many passes, which is a tenth of its time.
+LOOK_PASSES = 4
 #: The pace is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
 #: share of the time.
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05

@@ -1,10 +1,10 @@
 """The CPU engine by itself: channels, ceilings, support radius, statistics, several frames."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
+import numba as nb
 import numpy as np
 import pytest
 from scenes import scene
@@ -304,10 +304,10 @@ def test_mutant_is_caught(wrong, monkeypatch):
 
 def test_exponential():
     """Within 2e-7 over the powers that are drawn, in a kernel of its own."""
-    from foldgauss._kernels import kernel
+    from foldgauss._kernels import _OPTIONS
     from foldgauss._vectors import LANES, exp2, load, store
 
-    @functools.partial(kernel)
+    @nb.njit(**_OPTIONS)  # not kept on disk: it is another function every time
     def apply(x, y):
         for k in range(np.uint64(0), np.uint64(len(x)), np.uint64(LANES)):
             store(y, k, exp2(load(x, k)))

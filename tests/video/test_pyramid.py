@@ -104,7 +104,7 @@ def test_a_target_is_looked_for_at_full_size(small):
     config = dataclasses.replace(HALF, steps=400, target_psnr=5.0)
     assert [level.size for level in levels(config, (48, 64))] == [(48, 64)]
     *_, (_, last) = fit_steps(frames, config)
-    assert (last.stopped_by, last.step) == ("target_psnr", len(frames))
+    assert (last.stopped_by, last.step) == ("target_psnr", 4 * len(frames))
 
 
 def test_the_running_psnr_starts_anew_at_another_level(small, monkeypatch):
