@@ -89,10 +89,9 @@ class FitConfig:
     """Everything a fit depends on beside the frames; `preset` has some of them ready.
 
     `steps`, `minutes` and `target_psnr` are budgets: the fit ends with the first that binds. Minutes are turned into
-    steps once, by the measured pace; where Gaussians grow (`growth`), or with a target, the clock ends the fit. A target
-    is looked for once in four passes through the frames. With neither steps nor
-    minutes, steps are `DEFAULT_STEPS`, or more for long clips. `max_size_mb` bounds the number of Gaussians by the
-    model file's size.
+    steps once, by the measured pace; where Gaussians grow (`growth`), or with a target, the clock ends the fit. A
+    target is looked for once in four passes through the frames. With neither steps nor minutes, steps are
+    `DEFAULT_STEPS`, or more for long clips. `max_size_mb` bounds the number of Gaussians by the model file's size.
 
     With `two_cameras` half of the views of a pass are those of the camera opposite: each frame's mirrored picture, and
     the splats as seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so this
