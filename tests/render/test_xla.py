@@ -102,7 +102,7 @@ def test_a_few_wide_splats_take_one_round_inside_jit():
     assert plans[1].capacity < 2 * num  # but no more than that
 
 
-@pytest.mark.parametrize(("capacity", "most"), [(200, 2), (64, 4)])
+@pytest.mark.parametrize(("capacity", "most"), [(200, 2), pytest.param(64, 4, marks=pytest.mark.slow)])
 def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
     splats, size = scene("huge")
