@@ -4,6 +4,7 @@ from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
 from foldgauss.divergence import kl_divergence
 from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood, plain_envelope
 from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
+from foldgauss.mixture import FoldedMixture, GaussianMixture
 
 __version__ = "0.1.0"
 
@@ -12,8 +13,10 @@ __all__ = [
     "CallableFold",
     "Constant",
     "FoldedGaussian",
+    "FoldedMixture",
     "FourierFold",
     "Gaussian",
+    "GaussianMixture",
     "Normal",
     "PolynomialFold",
     "SplineFold",

@@ -17,7 +17,7 @@ from foldgauss._checks import invalid
 from foldgauss._restrict import checked_indices
 from foldgauss._spikes import ROUNDING, centre_at, modes_of, spikes_of
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.gaussian import Gaussian
+from foldgauss.gaussian import Gaussian, given_first
 from foldgauss.quadrature import REACH, SEARCH_GRID, Panels, adaptive_panels, diverges, peaks, within_any
 
 __all__ = ["TimeDensity", "TimeMixture", "conditional_gaussian", "time_density", "time_mixture"]
@@ -301,20 +301,8 @@ def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixtur
 
 def conditional_gaussian(parent, values: Float[Array, "*#batch given"], t: Float[Array, "*#batch"]) -> Gaussian:
     """The later space coordinates given t and the first ones: exact, all of it is Gaussian given t."""
-    at, given = parent.condition_time(t), values.shape[-1]
-    if not given:
-        return at
-    batch = jnp.broadcast_shapes(at.batch_shape, values.shape[:-1])
-    loc, tril = jnp.broadcast_to(at.loc, (*batch, at.loc.shape[-1])), at.base_tril
-    gain = _gain(tril, given)
-    residual = _over(values, batch) - loc[..., :given]
-    mean = loc[..., given:] + (gain * residual[..., None, :]).sum(-1)
-    return Gaussian(mean, tril[..., given:, given:], log_scale=at.log_scale, validate_args=False)
-
-
-def _gain(tril: Float[Array, "*batch dim dim"], given: int) -> Float[Array, "*batch kept given"]:
-    """Regression of the later coordinates on the first: L_kg L_gg^-1."""
-    return lax.linalg.triangular_solve(tril[..., :given, :given], tril[..., given:, :given], lower=True)
+    at = parent.condition_time(t)
+    return given_first(at, values) if values.shape[-1] else at
 
 
 @eqx.filter_jit

@@ -24,8 +24,10 @@ from foldgauss._batch import (
     common_dtype,
     parts_of,
 )
+from foldgauss._checks import invalid
 from foldgauss._factor import check_space, check_tril
 from foldgauss._far import far_reaching
+from foldgauss._restrict import checked_indices, restricted_tril
 from foldgauss._triangular import UNROLLED_SIZE, Columns, columns_of, lower_times, solve_lower, solve_upper, stacked
 
 __all__ = ["Gaussian", "Normal"]
@@ -147,6 +149,16 @@ class Gaussian(eqx.Module):
             return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
         return (factor[..., :, None, :] * factor[..., None, :, :]).sum(-1)
 
+    @property
+    def mean(self) -> Float[Array, "*batch dim"]:
+        """`loc`, for the whole batch."""
+        return jnp.broadcast_to(self.loc, (*self.batch_shape, *self.event_shape))
+
+    @property
+    def variance(self) -> Float[Array, "*batch dim"]:
+        """Of each coordinate: the diagonal of `covariance_matrix`."""
+        return jnp.diagonal(self.covariance_matrix, axis1=-2, axis2=-1)
+
     def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
         """log N(loc, Sigma)(value)."""
         value = as_value(value, self.loc.dtype)
@@ -169,6 +181,40 @@ class Gaussian(eqx.Module):
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         scale = jnp.exp(log_scale)[..., None]
         return loc + stacked([scale * y for y in lower_times(tril, columns_of(noise))])
+
+    def marginal(self, indices) -> "Gaussian":
+        """The distribution of some coordinates, in the order wanted; the indices are kept.
+
+        **Raises:** ValueError on indices that are none.
+        """
+        indices = checked_indices(indices, self.event_shape[0])
+        tril = restricted_tril(self.base_tril, indices)
+        return Gaussian(self.loc[..., np.array(indices)], tril, log_scale=self.log_scale, validate_args=False)
+
+    def condition(self, indices, values: Float[Array, "*#batch n"]) -> "Gaussian":
+        """The other coordinates, in ascending order, given these.
+
+        **Shapes:** values (*batch, n), in the indices' order.
+
+        **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
+        """
+        indices = checked_indices(indices, self.event_shape[0])
+        rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
+        if not rest:
+            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+        values = as_value(values, self.loc.dtype)
+        check_event("values", values, (len(indices),))
+        return given_first(self.marginal((*indices, *rest)), values)
+
+
+def given_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussian:
+    """The later coordinates given the first ones: `loc_k + L_kg L_gg^-1 (values - loc_g)`, and the factor L_kk."""
+    given = values.shape[-1]
+    values, loc, tril, log_scale = align([(values, 1), (dist.loc, 1), (dist.base_tril, 2), (dist.log_scale, 0)])
+    z = stacked(solve_lower(tril[..., :given, :given], columns_of(values - loc[..., :given])))
+    # One sum per coordinate, not a product of matrices: there are many, and they are small.
+    mean = loc[..., given:] + (tril[..., given:, :given] * z[..., None, :]).sum(-1)
+    return Gaussian(mean, tril[..., given:, given:], log_scale=log_scale, validate_args=False)
 
 
 # --- densities ----------------------------------------------------------------------------------------------

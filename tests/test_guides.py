@@ -27,6 +27,17 @@ def test_distribution():
 
 
 @pytest.mark.slow
+def test_mixture():
+    pytest.importorskip("numpyro", reason="numpyro is an optional extra")
+    names = _run("mixture.md")
+    assert names["x"].shape == (1000, 3)
+    assert names["curve"].shape == (50, 2)
+    np.testing.assert_allclose(names["same"].weights, names["mixture"].weights, rtol=1e-5)
+    mass = names["image"].sum() / names["pixels_per_unit"]((90, 160)) ** 2
+    np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
+
+
+@pytest.mark.slow
 def test_rendering():
     names = _run("rendering.md")
     image, target = names["image"], names["target"]

@@ -1,6 +1,7 @@
 """Videos as folded splats: the model, its fit and its quality. Frames are arrays here; files are `foldgauss.io`'s."""
 
 from foldgauss.video.config import FitConfig, LearningRates
+from foldgauss.video.density import density_image
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
 from foldgauss.video.frame_times import FrameTimes, interpolated_times
 from foldgauss.video.growth import Growth
@@ -18,6 +19,7 @@ __all__ = [
     "Growth",
     "LearningRates",
     "VideoModel",
+    "density_image",
     "evaluate",
     "fit",
     "fit_steps",

@@ -6,11 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from foldgauss._batch import known
+from foldgauss._checks import invalid
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import TimeLikelihood
-from foldgauss.fold import PolynomialFold
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
+from foldgauss.mixture import FoldedMixture
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.alpha import BLACK, checked_background
@@ -23,6 +26,8 @@ SH_C0 = 0.28209479177387814
 TIME_CUTOFF = 0.01
 #: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
 TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
+#: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
+PEAK_OPACITY = 0.99
 
 
 class FoldedSplats(eqx.Module):
@@ -73,6 +78,50 @@ class FoldedSplats(eqx.Module):
             envelope=self.envelope,
         )
 
+    @classmethod
+    def from_mixture(cls, mixture: FoldedMixture, *, color: ArrayLike) -> "FoldedSplats":
+        """A mixture's components as splats, in their order: `gaussians()` is `mixture.components`.
+
+        Weights become opacities, `w_k / max w` times `PEAK_OPACITY`: in this model they scale what is seen. So
+        `to_mixture` is the inverse. The density itself, as a picture, is `density_image`.
+
+        Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
+        folds and a time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0.
+        Raises ValueError for any other mixture or colour.
+
+        Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.
+        """
+        components = mixture.components
+        if mixture.event_shape != (3,) or mixture.batch_shape != ():
+            got = f"event {mixture.event_shape}, batch {mixture.batch_shape}"
+            raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Index its leaves.")
+        time_loc, dtype, num = components.time_loc, components.loc.dtype, mixture.num_components
+        outside = known((time_loc <= 0) | (time_loc >= 1))
+        if outside is not None and outside.any():
+            cure = "A video's time is [0, 1]: move and scale the mixture's."
+            raise invalid("mixture.components.time_loc", expected="times in (0, 1)", got=known(time_loc), cure=cure)
+        log_scale, angle = _axes(components.scale_tril)
+        log_weights = mixture.log_weights
+        log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
+        return cls(
+            loc=components.loc,
+            log_scale=log_scale,
+            angle_logit=jax.scipy.special.logit(angle / (2 * jnp.pi)),
+            time_loc_logit=jax.scipy.special.logit(time_loc),
+            log_time_scale=jnp.log(components.time_scale),
+            coefficients=_coefficients(components.fold, num, dtype),
+            opacity_logit=log_opacity - jnp.log(-jnp.expm1(log_opacity)),
+            color_dc=(_checked_color(color, num, dtype) - 0.5) / SH_C0,
+            envelope=_as_time_likelihood(components.envelope),
+        )
+
+    def to_mixture(self) -> FoldedMixture:
+        """The splats as a mixture, in model space: their Folded-Gaussians with weights in proportion to opacity.
+
+        Colours are left out. Example: `model.splats.to_mixture().log_prob(jnp.array([0.0, 0.1, 0.5]))`.
+        """
+        return FoldedMixture(self.gaussians(), logits=jax.nn.log_sigmoid(self.opacity_logit))
+
     def at(self, t: Float[Array, ""]) -> Splats2D:
         """The splats of time t, in model space: every Gaussian conditioned on t (eq:vegas_equiv_cond).
 
@@ -98,6 +147,50 @@ def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, "num"])
     side = (first - second) * (first + second) * sin * cos / top
     rows = [jnp.stack([top, jnp.zeros_like(top)], -1), jnp.stack([side, first * second / top], -1)]
     return jnp.stack(rows, -2)
+
+
+def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, "num"]]:
+    """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
+
+    Closed-form singular values of [[p, 0], [q, r]]. The angle counts modulo pi, and is from [pi/2, 3 pi/2].
+    """
+    p, q, r = tril[:, 0, 0], tril[:, 1, 0], tril[:, 1, 1]
+    first = 0.5 * (jnp.hypot(p + r, q) + jnp.hypot(p - r, q))
+    log_scale = jnp.stack([jnp.log(first), jnp.log(p) + jnp.log(r) - jnp.log(first)], axis=-1)
+    twice_cross, difference = 2 * p * q, (p - r) * (p + r) - q * q
+    round_one = (twice_cross == 0) & (difference == 0)  # any angle will do; a gradient there has no meaning
+    return log_scale, jnp.pi + 0.5 * jnp.arctan2(twice_cross, jnp.where(round_one, 1, difference))
+
+
+def _coefficients(fold: AbstractFold, num: int, dtype) -> Float[Array, "num degree 2"]:
+    if isinstance(fold, ZeroFold):
+        return jnp.zeros((num, 0, 2), dtype)
+    if not isinstance(fold, PolynomialFold):
+        cure = "Splats hold polynomial folds only."
+        raise invalid("mixture.components.fold", expected="a PolynomialFold", got=type(fold).__name__, cure=cure)
+    return fold.coefficients
+
+
+def _as_time_likelihood(envelope: AbstractEnvelope) -> TimeLikelihood:
+    if isinstance(envelope, Constant):
+        return TimeLikelihood(power=0.0)
+    if not isinstance(envelope, TimeLikelihood):
+        got, cure = type(envelope).__name__, "Splats hold these only."
+        expected = "a TimeLikelihood or Constant"
+        raise invalid("mixture.components.envelope", expected=expected, got=got, cure=cure)
+    return envelope
+
+
+def _checked_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
+    color = jnp.asarray(color, dtype)
+    if color.shape not in ((3,), (num, 3)):
+        raise invalid(
+            "color", expected=f"shape (3,) or ({num}, 3)", got=f"shape {color.shape}", cure="RGB about [0, 1]."
+        )
+    values = known(color)
+    if values is not None and not (values >= 0).all():
+        raise invalid("color", expected="numbers >= 0", got=values.tolist(), cure="Light is not taken away.")
+    return jnp.broadcast_to(color, (num, 3))
 
 
 class VideoModel(eqx.Module):

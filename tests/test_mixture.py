@@ -1,0 +1,577 @@
+"""Mixtures of Folded-Gaussians: against scipy, their own components, quadrature and samples; zero weights; far out."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from foldgauss import mixture as mixture_module
+from foldgauss.distribution import FoldedGaussian, Gaussian
+from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood
+from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
+from foldgauss.mixture import FoldedMixture, GaussianMixture, IntegratedMixture, TimePosterior
+
+WEIGHTS = [0.5, 0.2, 0.3]
+TRIL = [[[0.3, 0.0], [0.1, 0.2]], [[0.2, 0.0], [-0.1, 0.4]], [[0.25, 0.0], [0.0, 0.3]]]
+#: Standard errors that a statistic may be off: false alarms are one in 500 million.
+ALARM = 6
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+def _components(**changes):
+    parameters = {
+        "loc": [[0.1, -0.4], [-0.5, 0.3], [0.6, 0.2]],
+        "scale_tril": TRIL,
+        "time_loc": [0.2, 0.5, 0.9],
+        "time_scale": [0.3, 0.2, 0.4],
+        "fold": PolynomialFold(np.random.default_rng(0).normal(size=(3, 2, 2))),
+        "envelope": TimeLikelihood(power=1.0),
+    }
+    return FoldedGaussian(**(parameters | changes))
+
+
+def _mixture(**changes):
+    return FoldedMixture(_components(**changes), weights=WEIGHTS)
+
+
+def _points(mixture, n, key=1):
+    return mixture.sample(jax.random.key(key), (n,))
+
+
+# Jitted once for the module, and called with eight points: most of a test's time would be compilation.
+GRADIENT = eqx.filter_jit(jax.grad(lambda parts: parts[0].log_prob(parts[1]).sum()))
+
+
+def _naive_log_prob(mixture, x):
+    """The definition, of the components' own densities."""
+    with jax.numpy_rank_promotion("allow"):
+        return jax.scipy.special.logsumexp(mixture.components.log_prob(x[..., None, :]) + mixture.log_weights, axis=-1)
+
+
+# --- oracles -------------------------------------------------------------------------------------------------
+
+
+def test_a_mixture_that_does_not_bend_is_scipys(x64):
+    components = _components(fold=ZeroFold(2), envelope=Constant())
+    mixture = FoldedMixture(components, weights=WEIGHTS)
+    means = np.c_[components.loc, components.time_loc]
+    covariances = np.zeros((3, 3, 3))
+    covariances[:, :2, :2] = np.asarray(TRIL) @ np.swapaxes(TRIL, -1, -2)
+    covariances[:, 2, 2] = np.asarray(components.time_scale) ** 2
+    twins = [stats.multivariate_normal(m, c) for m, c in zip(means, covariances, strict=True)]
+    x = np.random.default_rng(0).normal(size=(50, 3))
+    density = sum(w * twin.pdf(x) for w, twin in zip(WEIGHTS, twins, strict=True))
+    np.testing.assert_allclose(mixture.log_prob(x), np.log(density), rtol=1e-12)
+    np.testing.assert_allclose(mixture.pdf(x), density, rtol=1e-12)
+    shares = np.stack([w * twin.pdf(x) / density for w, twin in zip(WEIGHTS, twins, strict=True)], -1)
+    np.testing.assert_allclose(mixture.responsibilities(x), shares, atol=1e-13)
+    mean = np.asarray(WEIGHTS) @ means
+    between = np.einsum("k,ki,kj->ij", WEIGHTS, means - mean, means - mean)
+    np.testing.assert_allclose(mixture.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(
+        mixture.covariance_matrix, np.tensordot(WEIGHTS, covariances, 1) + between, rtol=1e-11, atol=1e-15
+    )
+    # And at one time, with Bayes' rule by scipy.
+    at = mixture.condition_time(0.3)
+    weights = WEIGHTS * stats.norm.pdf(0.3, means[:, 2], np.asarray(components.time_scale))
+    np.testing.assert_allclose(at.weights, weights / weights.sum(), rtol=1e-12)
+    np.testing.assert_allclose(mixture.expected_space(0.3), weights @ means[:, :2] / weights.sum(), rtol=1e-12)
+
+
+KINDS = {
+    "floor": {"envelope": TimeLikelihood(power=2.0, floor=1e-3)},
+    "plain": {"envelope": TimeLikelihood(power=1.0)},
+    "own envelope": {"envelope": CallableEnvelope(lambda t, m, scale: -jnp.abs((t - m) / scale))},
+    "own fold": {"fold": CallableFold(lambda u: jnp.stack([jnp.sin(u), u]))},
+    "spline": {"fold": SplineFold(np.linspace(-2, 2, 9), np.random.default_rng(2).normal(size=(5, 2)))},
+    "fourier": {"fold": FourierFold(*np.random.default_rng(3).normal(size=(2, 2, 2)), period=1.0)},
+}
+
+
+def _kinds():
+    return [pytest.param(kind, marks=[] if kind == "spline" else pytest.mark.slow) for kind in KINDS]
+
+
+@pytest.mark.parametrize("kind", _kinds())
+def test_pairs_agree_with_the_components_own_densities(kind, x64):
+    mixture = _mixture(**KINDS[kind])
+    x = _points(mixture, 40)
+    own = np.asarray(mixture.components.log_prob(x[:, None]))
+    np.testing.assert_allclose(mixture.component_log_prob(x), own, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(mixture.log_prob(x), special.logsumexp(own + np.log(WEIGHTS), axis=-1), rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("floor", [0.0, 1e-3])
+def test_pairs_agree_far_out_and_where_nothing_is_a_number(dtype, floor):
+    with jax.enable_x64(dtype == np.float64):
+        cast = lambda *x: [jnp.asarray(y, dtype) for y in x]  # noqa: E731
+        loc, tril, time_loc, time_scale = cast([[0.1, -0.4], [1e4, 1e4]], TRIL[:2], [0.2, 0.5], [0.3, 1e-3])
+        fold = PolynomialFold(jnp.ones((2, 2, 2), dtype))
+        envelope = TimeLikelihood(2.0, floor)
+        components = FoldedGaussian(loc, tril, time_loc=time_loc, time_scale=time_scale, fold=fold, envelope=envelope)
+        mixture = FoldedMixture(components, weights=jnp.asarray([0.5, 0.5], dtype))
+        ends = [0.0, 0.2, 0.51, 5.0, 1e4, -1e19, 1e30, float(jnp.finfo(dtype).max), np.inf, np.nan]
+        s, t = (grid.ravel() for grid in np.meshgrid(ends, ends))
+        x = jnp.asarray(np.stack([s, s, t], -1), dtype)
+        pairs, own = (np.asarray(f(x)) for f in (mixture.component_log_prob, _own_log_prob(components)))
+    has_nan = np.isnan(x).any(-1)
+    assert np.isnan(pairs[has_nan]).all()
+    pairs, own = pairs[~has_nan], own[~has_nan]
+    assert not np.isnan(pairs).any()
+    np.testing.assert_array_equal(np.isneginf(pairs), np.isneginf(own))
+    assert not np.isposinf(pairs).any()
+    finite = np.isfinite(own)
+    np.testing.assert_allclose(pairs[finite], own[finite], rtol=100 * np.finfo(dtype).eps)
+
+
+def _own_log_prob(components):
+    return lambda x: components.log_prob(x[:, None])
+
+
+def test_chunks_change_nothing(monkeypatch):
+    mixture = _mixture()
+    x = _points(mixture, 40)
+    whole = mixture.log_prob(x), mixture.responsibilities(x)
+    monkeypatch.setattr(mixture_module, "_CHUNK", 3 * 16)
+    x = jnp.concatenate([x, x[:1]])  # another shape: the programs above are not found again
+    np.testing.assert_allclose(mixture.log_prob(x)[:40], whole[0], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(mixture.responsibilities(x)[:40], whole[1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_chunks_change_no_gradient(monkeypatch, x64):
+    mixture = _mixture()
+    x = _points(mixture, 43)
+    gradient = jax.grad(lambda mixture, x: _naive_log_prob(mixture, x).sum(), argnums=(0, 1))(mixture, x)
+    monkeypatch.setattr(mixture_module, "_CHUNK", 3 * 16)
+    found = jax.jit(jax.grad(lambda mixture, x: mixture.log_prob(x).sum(), argnums=(0, 1)))(mixture, x)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(gradient), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+# --- normalisation, draws and moments, each with what would be seen to be wrong ------------------------------
+
+
+def test_density_integrates_to_one():
+    mixture = _mixture(envelope=TimeLikelihood(1.0, 0.2))
+    wider = _mixture(
+        scale_tril=1.3 * np.asarray(TRIL),
+        time_scale=1.3 * np.asarray([0.3, 0.2, 0.4]),
+        envelope=TimeLikelihood(1.0, 0.2),
+    )
+    x = _points(wider, 40_000)
+    log_q = np.asarray(wider.log_prob(x), np.float64)
+
+    def mass(log_p):
+        ratio = np.exp(np.asarray(log_p, np.float64) - log_q)
+        return ratio.mean() - 1, ratio.std() / np.sqrt(len(ratio))
+
+    off, error = mass(mixture.log_prob(x))
+    assert error < 5e-3
+    assert abs(off) < ALARM * error
+    # Power: components of which one is counted by a tenth too much, and a joint without the weights' norm.
+    log_components = np.asarray(mixture.component_log_prob(x), np.float64)
+    wrong = special.logsumexp(log_components + np.log(WEIGHTS) + np.log([1.1, 1.0, 1.0]), axis=-1)
+    off, error = mass(wrong)
+    assert abs(off) > ALARM * error
+
+
+def _deviations(draws, mean):
+    """How many standard errors the draws' average is off, the largest of all coordinates."""
+    draws = np.asarray(draws, np.float64)
+    return np.abs((draws.mean(0) - np.asarray(mean)) / (draws.std(0) / np.sqrt(len(draws)))).max()
+
+
+def test_draws_have_the_moments_and_the_weights():
+    mixture = _mixture()
+    x, component = mixture.sample(jax.random.key(0), (40_000,), return_component=True)
+    assert x.shape == (40_000, 3)
+    assert component.shape == (40_000,)
+    one_hot = np.asarray(component)[:, None] == np.arange(3)
+    assert _deviations(one_hot, WEIGHTS) < ALARM
+    assert _deviations(x, mixture.mean) < ALARM
+    centred = np.asarray(x) - np.asarray(mixture.mean)
+    products = centred[:, :, None] * centred[:, None, :]
+    assert _deviations(products, mixture.covariance_matrix) < ALARM
+    # Power: without the centres' own spread the covariance is seen to be wrong, without weights the mean.
+    within = np.tensordot(WEIGHTS, mixture.components.covariance_matrix, 1)
+    assert _deviations(products, within) > ALARM
+    assert _deviations(x, np.asarray(mixture.components.mean).mean(0)) > ALARM
+    # Draws are of the component that is named.
+    own = np.asarray(x)[np.asarray(component) == 1]
+    assert _deviations(own, mixture.components.mean[1]) < ALARM
+    np.testing.assert_array_equal(mixture.sample(jax.random.key(0), (40_000,)), x)
+
+
+def test_draws_at_a_time_have_the_regression():
+    # Draws of the joint, weighted by a narrow window about a time, against the conditional mixture in closed form.
+    mixture, t, width = _mixture(), 0.45, 0.02
+    x, component = mixture.sample(jax.random.key(3), (200_000,), return_component=True)
+    near = np.abs(np.asarray(x)[:, 2] - t) < width
+    s, one_hot = np.asarray(x)[near, :2], np.asarray(component)[near][:, None] == np.arange(3)
+    assert len(s) > 3000
+    at = mixture.condition_time(t)
+    assert _deviations(one_hot, at.weights) < ALARM
+    assert _deviations(s, mixture.expected_space(t)) < ALARM
+    centred = s - np.asarray(mixture.expected_space(t))
+    products = centred[:, :, None] * centred[:, None, :]
+    assert _deviations(products, mixture.space_covariance(t)) < ALARM
+    assert _deviations(one_hot, WEIGHTS) > ALARM  # power: the weights that do not follow time
+    unweighted = np.asarray(WEIGHTS) @ np.asarray(mixture.components.condition_time(jnp.asarray([t])).loc)
+    assert _deviations(s, unweighted) > ALARM
+
+
+# --- parts: a joint is a marginal times a conditional ---------------------------------------------------------
+
+
+_LONG = [pytest.param(given, marks=pytest.mark.slow, id=str(given)) for given in ([2, 1], [0], [1, 0])]
+
+
+@pytest.mark.parametrize("given", [[0, 2], *_LONG])
+def test_joint_is_marginal_times_conditional(given, x64):
+    mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
+    x = _points(mixture, 6)
+    rest = [i for i in range(3) if i not in given]
+    order = sorted(given)
+    first = mixture.marginal(order)
+    then = mixture.condition(given, x[:, np.array(given)])
+    assert isinstance(then, GaussianMixture if 2 in given else IntegratedMixture)
+    log_joint = np.asarray(first.log_prob(x[:, np.array(order)])) + np.asarray(then.log_prob(x[:, np.array(rest)]))
+    tolerance = 1e-10 if 2 in given else 1e-6
+    np.testing.assert_allclose(log_joint, mixture.log_prob(x), rtol=tolerance, atol=tolerance)
+    # Power: with the weights that were, not those that follow what is given, it fails.
+    stale = eqx.tree_at(lambda mixture: mixture.logits, then, jnp.broadcast_to(mixture.log_weights, then.logits.shape))
+    wrong = np.asarray(first.log_prob(x[:, np.array(order)])) + np.asarray(stale.log_prob(x[:, np.array(rest)]))
+    assert np.abs(wrong - np.asarray(mixture.log_prob(x))).max() > 1e-2
+
+
+@pytest.mark.slow
+def test_marginals_and_conditionals_know_their_own(x64):
+    mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
+    x = _points(mixture, 4)
+    plane = mixture.marginal([1, -1])
+    assert isinstance(plane, FoldedMixture)
+    assert plane.event_shape == (2,)
+    space = mixture.marginal([0, 1])
+    assert isinstance(space, IntegratedMixture)
+    np.testing.assert_allclose(space.mean, mixture.mean[:2], rtol=1e-7)
+    np.testing.assert_allclose(space.covariance_matrix, mixture.covariance_matrix[:2, :2], rtol=1e-6)
+    # Integrals over time, by a plain sum.
+    t = np.linspace(-2, 3, 4001)
+    joint = mixture.pdf(np.concatenate([np.broadcast_to(x[0, :2], (4001, 2)), t[:, None]], -1))
+    np.testing.assert_allclose(space.pdf(x[0, :2]), np.asarray(joint).sum() * (t[1] - t[0]), rtol=1e-7)
+    assert space.error_estimate(x[0, :2]) < 1e-6
+    # Step by step or at once.
+    at_once = mixture.condition([0, 2], x[:, np.array([0, 2])])
+    by_steps = mixture.condition([0], x[:, :1]).condition([1], x[:, 2:])
+    np.testing.assert_allclose(by_steps.log_prob(x[:, 1:2]), at_once.log_prob(x[:, 1:2]), rtol=1e-7, atol=1e-9)
+    via_time = mixture.condition_time(x[:, 2]).condition([0], x[:, :1])
+    np.testing.assert_allclose(via_time.log_prob(x[:, 1:2]), at_once.log_prob(x[:, 1:2]), rtol=1e-9)
+    np.testing.assert_allclose(mixture.condition_time(0.3).marginal([1]).mean, mixture.expected_space(0.3)[1:])
+    given = mixture.condition([0], x[0, :1])
+    assert given.sample(jax.random.key(0), (5,)).shape == (5, 2)
+    assert given.mean.shape == (2,)
+    line = mixture.marginal([0])
+    assert 0 < line.cdf(jnp.array([0.1])) < 1
+    np.testing.assert_allclose(
+        jax.grad(lambda s: line.cdf(s).sum())(jnp.array([0.1])), line.pdf(jnp.array([0.1]))[None], rtol=1e-5
+    )
+
+
+@pytest.mark.slow
+def test_time_posterior(x64):
+    mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
+    s = jnp.array([[0.1, -0.2], [-0.4, 0.4]])
+    when = mixture.time_given_space(s)
+    assert isinstance(when, TimePosterior)
+    assert (when.event_shape, when.batch_shape) == ((), (2,))
+    t = np.linspace(-3, 4, 8001)
+    density = np.asarray(when.pdf(t[:, None]))
+    step = t[1] - t[0]
+    np.testing.assert_allclose(density.sum(0) * step, 1, rtol=1e-6)
+    mean = (t[:, None] * density).sum(0) * step
+    np.testing.assert_allclose(when.mean, mean, rtol=1e-6)
+    np.testing.assert_allclose(when.variance, ((t[:, None] - mean) ** 2 * density).sum(0) * step, rtol=1e-6)
+    assert when.covariance_matrix.shape == (2, 1, 1)
+    below = np.asarray(when.cdf(jnp.array([[0.4], [1e3], [-1e3]])))
+    np.testing.assert_allclose(below, [(density[t < 0.4]).sum(0) * step, [1, 1], [0, 0]], atol=2e-3)
+    q = jnp.array([[0.01], [0.5], [0.9]])
+    np.testing.assert_allclose(when.cdf(when.icdf(q)), np.broadcast_to(q, (3, 2)), atol=1e-9)
+    np.testing.assert_array_equal(when.icdf(jnp.array([[0.0], [1.0]])), [[-np.inf] * 2, [np.inf] * 2])
+    assert (when.error_estimate < 1e-6).all()
+    draws = when.sample(jax.random.key(0), (4000,))
+    assert _deviations(draws, when.mean) < ALARM
+
+
+# --- weights of zero, and points far away ---------------------------------------------------------------------
+
+
+def test_a_component_without_weight_is_not_there():
+    mixture = FoldedMixture(_components(), weights=[0.7, 0.0, 0.3])
+    np.testing.assert_allclose(
+        FoldedMixture(_components(), logits=[np.log(0.7), -np.inf, np.log(0.3)]).weights, mixture.weights, rtol=1e-6
+    )
+    np.testing.assert_array_equal(mixture.weights[1], 0)
+    kept = np.array([0, 2])
+    fewer = FoldedMixture(jax.tree.map(lambda leaf: leaf[kept], mixture.components), weights=[0.7, 0.3])
+    x = _points(mixture, 64)
+    np.testing.assert_allclose(mixture.log_prob(x), fewer.log_prob(x), rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(mixture.responsibilities(x)[:, 1], 0)
+    np.testing.assert_array_equal(mixture.condition_time(0.5).weights[1], 0)
+    np.testing.assert_allclose(mixture.mean, fewer.mean, rtol=1e-6)
+    np.testing.assert_allclose(mixture.covariance_matrix, fewer.covariance_matrix, rtol=1e-5, atol=1e-7)
+    _, component = mixture.sample(jax.random.key(0), (20_000,), return_component=True)
+    assert not (component == 1).any()
+    assert (component == 2).any()
+    gradient, _ = GRADIENT((mixture, x[:8]))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert all((leaf[1] == 0).all() for leaf in jax.tree.leaves(gradient))
+    assert np.abs(gradient.logits[0]) > 1e-3
+
+
+def test_gradients_are_true():
+    # Central differences in float64 would need another program: these are of float32, in steps of some thousandths.
+    mixture, x = _mixture(envelope=TimeLikelihood(1.0, 0.2)), _points(_mixture(), 8)
+    gradient, by_x = GRADIENT((mixture, x))
+    rng = np.random.default_rng(0)
+    for part, slope in ((mixture, gradient), (x, by_x)):
+        leaves, structure = jax.tree.flatten(part)
+        step = [0.003 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
+        step = [np.tril(move) if move.shape[-2:] == (2, 2) and move.ndim == 3 else move for move in step]
+        ends = [
+            jax.tree.unflatten(structure, [a + sign * b for a, b in zip(leaves, step, strict=True)]) for sign in (1, -1)
+        ]
+        high, low = (_mixture_and_points(mixture, x, end) for end in ends)
+        expected = sum(float((a * b).sum()) for a, b in zip(jax.tree.leaves(slope), step, strict=True))
+        np.testing.assert_allclose(0.5 * (high - low), expected, rtol=0.05)
+
+
+def _mixture_and_points(mixture, x, end):
+    mixture, x = (end, x) if isinstance(end, FoldedMixture) else (mixture, end)
+    return float(np.asarray(mixture.log_prob(x), np.float64).sum())
+
+
+def test_weights_of_zero_have_finite_gradients():
+    components, x = _components(), _points(_mixture(), 8)
+    by_weights = lambda w: FoldedMixture(components, weights=w).log_prob(x).sum()  # noqa: E731
+    gradient = jax.jit(jax.grad(by_weights))(jnp.array([0.7, 0.0, 0.3]))
+    assert np.isfinite(gradient).all()
+    by_time = lambda w: FoldedMixture(components, weights=w).expected_space(0.4).sum()  # noqa: E731
+    assert np.isfinite(jax.grad(by_time)(jnp.array([0.7, 0.0, 0.3]))).all()
+
+
+def test_nothing_of_a_broken_component_without_weight_is_seen():
+    components = _components(loc=[[0.1, -0.4], [np.nan, np.inf], [0.6, 0.2]])
+    mixture = FoldedMixture(components, weights=[0.7, 0.0, 0.3])
+    x = jnp.zeros((4, 3))
+    assert np.isfinite(mixture.log_prob(x)).all()
+    assert np.isfinite(mixture.mean).all()
+    np.testing.assert_allclose(mixture.responsibilities(x).sum(-1), 1, rtol=1e-6)
+
+
+def test_far_points_and_offsets():
+    mixture = _mixture()
+    far = jnp.array([[1e3, 0.0, 0.5], [0.0, 0.0, 3.0], [1e30, 1e30, 1e30], [0.0, np.inf, 0.0], [0.1, 0.1, -1e25]])
+    log_p = np.asarray(mixture.log_prob(far))
+    assert not np.isnan(log_p).any()
+    assert not np.isposinf(log_p).any()
+    assert np.isfinite(log_p[:2]).all()
+    np.testing.assert_array_equal(log_p[2:4], -np.inf)
+    shares = np.asarray(mixture.responsibilities(far))
+    np.testing.assert_allclose(shares.sum(-1), 1, rtol=1e-6)
+    np.testing.assert_allclose(shares[2], WEIGHTS, rtol=1e-6)
+    far = jnp.concatenate([far, jnp.zeros((3, 3))])
+    gradient = GRADIENT((mixture, far))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert np.isnan(mixture.log_prob(jnp.array([np.nan, 0.0, 0.0])))
+    for t in (1e3, -1e25, np.inf):
+        np.testing.assert_allclose(mixture.condition_time(t).weights.sum(), 1, rtol=1e-6)
+    # Far from the origin: the same numbers in float32, where E[x^2] - mu^2 would have no digit left.
+    moved = _mixture(loc=np.asarray(_components().loc) + 1e4)
+    offset = np.float32([1e4, 1e4, 0])
+    x = np.asarray(mixture.components.mean, np.float32) + offset
+    there = x - offset  # what is left of the points beside the offset: exact
+    np.testing.assert_allclose(moved.log_prob(x), mixture.log_prob(there), atol=0.05)
+    np.testing.assert_allclose(moved.covariance_matrix, mixture.covariance_matrix, rtol=1e-2, atol=1e-3)
+    np.testing.assert_allclose(moved.mean - mixture.mean, [1e4, 1e4, 0], rtol=1e-6, atol=1e-6)
+
+
+# --- shapes, jit, vmap, dtypes --------------------------------------------------------------------------------
+
+
+def test_batches_of_mixtures():
+    loc = np.random.default_rng(0).normal(size=(4, 3, 2))
+    mixture = FoldedMixture(_components(loc=loc), weights=np.tile(WEIGHTS, (4, 1)))
+    assert (mixture.batch_shape, mixture.event_shape, mixture.num_components) == ((4,), (3,), 3)
+    x, component = mixture.sample(jax.random.key(0), (5,), return_component=True)
+    assert (x.shape, component.shape) == ((5, 4, 3), (5, 4))
+    one = jax.tree.map(lambda leaf: leaf[2], mixture)
+    assert one.batch_shape == ()
+    np.testing.assert_allclose(mixture.log_prob(x)[:, 2], one.log_prob(x[:, 2]), rtol=1e-5)
+    np.testing.assert_allclose(mixture.mean[2], one.mean, rtol=1e-6)
+    at = mixture.condition_time(jnp.full((5, 4), 0.3))
+    assert (at.batch_shape, at.event_shape) == ((5, 4), (2,))
+    np.testing.assert_allclose(at.mean[1, 2], one.expected_space(0.3), rtol=1e-5)
+    each = jax.jit(jax.vmap(FoldedMixture.log_prob, in_axes=(0, 1), out_axes=1))(mixture, x)
+    np.testing.assert_allclose(each, mixture.log_prob(x), rtol=1e-5)
+    # Weights alone may carry the batch; one set of weights may serve all.
+    assert FoldedMixture(_components(), logits=np.zeros((7, 3))).mean.shape == (7, 3)
+    assert FoldedMixture(_components(loc=loc), logits=np.zeros(3)).log_weights.shape == (4, 3)
+
+
+def test_made_and_used_inside_transformations():
+    components, x = _components(), _points(_mixture(), 8)
+    made = jax.jit(jax.vmap(lambda w: FoldedMixture(components, weights=w)))(jnp.array([WEIGHTS, [1.0, 1.0, 1.0]]))
+    assert made.batch_shape == (2,)
+    np.testing.assert_allclose(made.log_prob(x[:, None])[:, 0], _mixture().log_prob(x), rtol=1e-5)
+    count = []
+
+    @jax.jit
+    def log_prob(mixture, x):
+        count.append(1)
+        return mixture.log_prob(x)
+
+    np.testing.assert_allclose(log_prob(_mixture(), x), _mixture().log_prob(x), rtol=1e-5)
+    log_prob(FoldedMixture(components, logits=[0.0, 1.0, 2.0]), x)
+    assert len(count) == 1
+
+
+@pytest.mark.slow
+def test_gradients_are_those_of_the_definition(x64):
+    mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
+    x = _points(mixture, 5)
+    of = lambda f: jax.jit(jax.grad(lambda mixture, x: f(mixture, x).sum(), argnums=(0, 1)))(mixture, x)  # noqa: E731
+    found, expected = of(FoldedMixture.log_prob), of(_naive_log_prob)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_are_those_of_the_definition(x64):
+    mixture = _mixture()
+    x = _points(mixture, 1)[0]
+    of = lambda f: jax.jit(jax.hessian(lambda x: f(mixture, x)))(x)  # noqa: E731
+    second, expected = of(FoldedMixture.log_prob), of(_naive_log_prob)
+    np.testing.assert_allclose(second, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_float32_and_float64_are_kept():
+    assert _mixture().log_prob(jnp.zeros(3)).dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert _mixture().logits.dtype == jnp.float64
+        single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), _components())
+        mixture = FoldedMixture(single, weights=WEIGHTS)
+        assert mixture.logits.dtype == jnp.float32
+        assert mixture.log_prob(np.zeros((2, 3), np.float32)).dtype == jnp.float32
+
+
+@pytest.mark.slow
+def test_networks_as_folds():
+    network = eqx.nn.MLP(1, 2, 4, 1, key=jax.random.key(0))
+    mixture = _mixture(fold=CallableFold(lambda u: network(u[None])))
+    x = mixture.sample(jax.random.key(1), (9,))
+    assert x.shape == (9, 3)
+    np.testing.assert_allclose(mixture.log_prob(x), _naive_log_prob(mixture, x), rtol=1e-5, atol=1e-5)
+
+
+# --- errors ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({}, "logits, weights"),
+        ({"logits": [0.0] * 3, "weights": WEIGHTS}, "logits, weights"),
+        ({"weights": [0.5, 0.5]}, "weights"),
+        ({"weights": [0.5, -0.1, 0.6]}, "weights"),
+        ({"weights": [0.0, 0.0, 0.0]}, "weights"),
+        ({"weights": [np.nan, 0.5, 0.5]}, "weights"),
+        ({"weights": [np.inf, 0.5, 0.5]}, "weights"),
+        ({"logits": [np.inf, 0.0, 0.0]}, "logits"),
+        ({"logits": [-np.inf] * 3}, "logits"),
+        ({"logits": 0.0}, "logits"),
+    ],
+)
+def test_wrong_weights_are_named(given, named):
+    with pytest.raises(ValueError, match=f"^{named}: expected"):
+        FoldedMixture(_components(), **given)
+
+
+WRONG = {
+    "components: Gaussian": lambda: FoldedMixture(Gaussian(np.zeros((3, 2)), np.eye(2)), weights=WEIGHTS),
+    "components: one": lambda: FoldedMixture(
+        FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0), weights=[1.0]
+    ),
+    "x: two": lambda: _mixture().log_prob(jnp.zeros(2)),
+    "indices: all": lambda: _mixture().condition([0, 1, 2], jnp.zeros(3)),
+    "indices: all of space": lambda: _mixture().condition_time(0.3).condition([0, 1], jnp.zeros(2)),
+    "indices: none such": lambda: _mixture().marginal([3]),
+    "values: too many": lambda: _mixture().condition([0], jnp.zeros(2)),
+    "s: three": lambda: _mixture().time_given_space(jnp.zeros(3)),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_named(case):
+    with pytest.raises(ValueError, match=f"^{case.split(':')[0]}: expected"):
+        WRONG[case]()
+
+
+# --- bridges --------------------------------------------------------------------------------------------------
+
+
+def test_in_a_numpyro_model():
+    numpyro = pytest.importorskip("numpyro", reason="numpyro is an optional extra")
+    mixture = _mixture()
+    x = _points(mixture, 40)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        site = mixture.to_numpyro()
+        assert (site.batch_shape, site.event_shape) == ((), (3,))
+        np.testing.assert_allclose(site.log_prob(x), mixture.log_prob(x), rtol=1e-6)
+        np.testing.assert_array_equal(site.sample(jax.random.key(2), (4,)), mixture.sample(jax.random.key(2), (4,)))
+        np.testing.assert_allclose(site.mean, mixture.mean)
+        np.testing.assert_allclose(site.variance, mixture.variance)
+
+        def model(x):
+            weights = numpyro.sample("weights", numpyro.distributions.Dirichlet(jnp.ones(3)))
+            with numpyro.plate("points", len(x)):
+                numpyro.sample("x", FoldedMixture(_components(), weights=weights).to_numpyro(), obs=x)
+
+        values = {"weights": jnp.asarray(WEIGHTS)}
+        log_density, _ = numpyro.infer.util.log_density(model, (x,), {}, values)
+        np.testing.assert_allclose(log_density, np.log(2) + mixture.log_prob(x).sum(), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_nuts_finds_the_weights():
+    numpyro = pytest.importorskip("numpyro", reason="numpyro is an optional extra")
+    x = _points(_mixture(), 400)
+    components = _components()
+
+    def model(x):
+        weights = numpyro.sample("weights", numpyro.distributions.Dirichlet(jnp.ones(3)))
+        with numpyro.plate("points", len(x)):
+            numpyro.sample("x", FoldedMixture(components, weights=weights).to_numpyro(), obs=x)
+
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        chain = numpyro.infer.MCMC(numpyro.infer.NUTS(model), num_warmup=200, num_samples=300, progress_bar=False)
+        chain.run(jax.random.key(0), x)
+        draws = np.asarray(chain.get_samples()["weights"])
+    np.testing.assert_array_less(np.abs(draws.mean(0) - WEIGHTS), 5 * draws.std(0))
+    assert draws.std(0).max() < 0.06
+
+
+def test_as_scipy_object():
+    frozen = _mixture().to_scipy()
+    x = frozen.rvs(5, random_state=0)
+    np.testing.assert_allclose(frozen.logpdf(x), _mixture().log_prob(x), rtol=1e-6)
+    assert frozen.cov.shape == (3, 3)
+    assert frozen.marginal([0, 2]).dim == 2
