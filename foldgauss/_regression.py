@@ -10,7 +10,7 @@ from numpy.polynomial import hermite_e
 
 from foldgauss._triangular import solve_upper_matrix
 
-__all__ = ["Regression", "hermite", "hermite_to_powers", "weighted_regression"]
+__all__ = ["Regression", "hermite", "hermite_columns", "hermite_to_powers", "weighted_regression"]
 
 _Points = Float[Array, "n d-1"]
 
@@ -33,10 +33,15 @@ def hermite(v: Float[Array, "*batch"], degree: int) -> Float[Array, "*batch k"]:
 
     **Source:** the three-term recurrence of the probabilists' Hermite polynomials.
     """
+    return jnp.stack(hermite_columns(v, degree), axis=-1)
+
+
+def hermite_columns(v: Float[Array, "*batch"], degree: int) -> list[Float[Array, "*batch"]]:
+    """The columns of `hermite`, not yet side by side."""
     columns = [jnp.ones_like(v), v][: degree + 1]
     for k in range(1, degree):
         columns.append((v * columns[k] - math.sqrt(k) * columns[k - 1]) / math.sqrt(k + 1))
-    return jnp.stack(columns, axis=-1)
+    return columns
 
 
 def hermite_to_powers(degree: int) -> np.ndarray:

@@ -27,6 +27,14 @@ def test_distribution():
 
 
 @pytest.mark.slow
+def test_estimator():
+    pytest.importorskip("sklearn", reason="scikit-learn is an optional extra")
+    names = _run("estimator.md")
+    assert names["mixture"].converged_
+    assert names["mixture"].score(names["x"]) > 0.5
+
+
+@pytest.mark.slow
 def test_mixture():
     pytest.importorskip("numpyro", reason="numpyro is an optional extra")
     names = _run("mixture.md")

@@ -1,0 +1,212 @@
+"""What one pass over the points leaves for the update of the components: sums, in chunks, over devices.
+
+For component k, with responsibilities r_i, frequency weights w_i and z_i = (He_0(v_i) .. He_q(v_i), e_i) with the
+whitened residual e_i = L^-1 (s_i - curve):
+
+    gram = sum_i w_i r_i / a_i z_i z_i'
+
+holds the whole weighted regression of space on time. It is centred before it is squared: v is of order one, and the
+residuals are those from the component's present curve, whitened.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from foldgauss._batch import cast
+from foldgauss._components import Pairs, Parameters, log_likelihoods, pairs_of
+from foldgauss._regression import hermite_columns
+from foldgauss.envelope import AbstractEnvelope, Constant
+
+__all__ = ["PAIRS_PER_CHUNK", "Points", "Statistics", "Times", "accumulate", "points_of", "scores", "time_steps"]
+
+#: Pairs of point and component held at once. Arrays of this many numbers stay in a core's cache.
+PAIRS_PER_CHUNK = 2**17
+
+
+class Points(eqx.Module):
+    """Points in chunks of equal size, the last one padded with rows of weight 0.
+
+    The leading axis counts devices; an array sharded along it is summed over by JAX's own partitioner.
+    """
+
+    x: Float[Array, "devices chunks rows d"]
+    weights: Float[Array, "devices chunks rows"]
+    size: int = eqx.field(static=True)
+
+
+class Times(NamedTuple):
+    """time_loc and time_scale of each component: where the envelope is to be taken."""
+
+    loc: Float[Array, "k"]
+    scale: Float[Array, "k"]
+
+
+class Statistics(NamedTuple):
+    """`log_a` and `gram` have a leading axis: the value, and with `order=2` its derivatives by the times' steps
+    (d0, d1, d00, d01, d11), see `time_steps`."""
+
+    log_likelihood: Float[Array, ""]
+    mass: Float[Array, "k"]  # sum of w r
+    first: Float[Array, "k"]  # of w r v
+    second: Float[Array, "k"]  # of w r v^2
+    log_a: Float[Array, "order k"]  # of w r log a
+    gram: Float[Array, "order k m m"]
+
+
+def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1) -> Points:
+    """Points (n, d) and weights (n,), chunked and padded; few distinct shapes, so that few programs are compiled."""
+    n, d = x.shape
+    most = max(2 ** int(math.log2(max(PAIRS_PER_CHUNK // num_components, 16))), 16)
+    per_device = -(-n // devices)
+    rows = min(most, max(2 ** math.ceil(math.log2(max(per_device, 1))), 16))
+    chunks = -(-per_device // rows)
+    missing = devices * chunks * rows - n
+    x = np.concatenate([x, np.zeros((missing, d), x.dtype)]) if missing else x
+    weights = np.concatenate([weights, np.zeros(missing, weights.dtype)]) if missing else weights
+    shape = (devices, chunks, rows)
+    x, weights = x.reshape(*shape, d), weights.reshape(shape)
+    if devices == 1:
+        return Points(jnp.asarray(x), jnp.asarray(weights), n)
+    mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:devices]), ("points",))
+    where = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("points"))
+    return Points(jax.device_put(x, where), jax.device_put(weights, where), n)
+
+
+def accumulate(
+    params: Parameters,
+    envelope: AbstractEnvelope,
+    points: Points,
+    *,
+    times: Times | None = None,
+    order: int = 0,
+    inverse_temperature: Float[Array, ""] | None = None,
+    responsibilities: Float[Array, "devices chunks rows k"] | None = None,
+) -> Statistics:
+    """The sums of `Statistics`, with the envelope at `times` (default: where the components are).
+
+    Responsibilities are those of `params`, or given. With an inverse temperature b below 1 they are
+    proportional to the densities to the power b.
+    """
+
+    envelope = cast(envelope, points.x.dtype)
+
+    def of_chunk(chunk):
+        x, weights, given = chunk
+        pairs = pairs_of(params, envelope, x)
+        log_likelihood = log_likelihoods(pairs.log_density)
+        if given is None:
+            given = _responsibilities(pairs.log_density, log_likelihood, inverse_temperature)
+        total = jnp.where(weights > 0, weights * log_likelihood, 0).sum()
+        return _summed(params, envelope, x[:, -1:], pairs, weights[:, None] * given, total, times, order)
+
+    def of_device(chunks):
+        if chunks[0].shape[0] == 1:
+            return of_chunk(jax.tree.map(lambda z: z[0], chunks))
+        shapes = jax.eval_shape(of_chunk, jax.tree.map(lambda z: z[0], chunks))
+        zero = jax.tree.map(lambda z: jnp.zeros(z.shape, z.dtype), shapes)
+        return lax.scan(lambda sums, chunk: (jax.tree.map(jnp.add, sums, of_chunk(chunk)), None), zero, chunks)[0]
+
+    chunks = (points.x, points.weights, responsibilities)
+    if points.x.shape[0] == 1:
+        return of_device(jax.tree.map(lambda z: z[0], chunks))
+    return jax.tree.map(lambda z: z.sum(0), jax.vmap(of_device)(chunks))
+
+
+def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, "devices*chunks*rows"]:
+    """log p(x) of every point."""
+
+    def of_chunk(x):
+        return log_likelihoods(pairs_of(params, envelope, x).log_density)
+
+    def of_device(chunks):
+        return of_chunk(chunks[0])[None] if chunks.shape[0] == 1 else lax.map(of_chunk, chunks)
+
+    devices = points.x.shape[0]
+    value = of_device(points.x[0])[None] if devices == 1 else jax.vmap(of_device)(points.x)
+    return value.reshape(-1)
+
+
+def _responsibilities(log_density, log_likelihood, inverse_temperature):
+    if inverse_temperature is not None:
+        log_density = inverse_temperature * log_density
+        log_likelihood = log_likelihoods(log_density)
+    # A point that no component reaches belongs to none; its log-likelihood of -inf tells the tale.
+    reached = jnp.isfinite(log_likelihood)[:, None]
+    return jnp.where(reached, jnp.exp(log_density - jnp.where(reached, log_likelihood[:, None], 0)), 0)
+
+
+def _summed(params, envelope, t, pairs: Pairs, mass, total, times, order) -> Statistics:
+    degree, v = params.degree, pairs.v
+    basis = hermite_columns(v, degree)
+    if isinstance(envelope, Constant):
+        weights = [mass]
+        log_a = [jnp.zeros(mass.shape[1], v.dtype)]
+    else:
+        times = Times(params.time_loc, params.time_scale) if times is None else times
+        log_as = _log_a(envelope, t, times, order)
+        log_a = [(mass * z).sum(0) for z in log_as]
+        weights = _over_a(mass, log_as)
+    gram = jnp.stack([_gram(w, basis, pairs.whitened) for w in weights])
+    first = mass * v
+    return Statistics(total, mass.sum(0), first.sum(0), (first * v).sum(0), jnp.stack(log_a), gram)
+
+
+def _gram(weights, basis, whitened):
+    """sum_i weights_ik z_ik z_ik', (k, m, m)."""
+    if whitened[0].ndim == 3:
+        z = jnp.concatenate([jnp.stack(basis, -1), whitened[0]], -1)
+        return jnp.einsum("nk,nka,nkb->kab", weights, z, z)
+    # Made once: else XLA would make them again in each of the sums.
+    weights, basis, whitened = lax.optimization_barrier((weights, basis, whitened))
+    z = basis + whitened
+    upper = {}
+    for a in range(len(z)):
+        left = weights if a == 0 else weights * z[a]  # z[0] is 1
+        for b in range(a, len(z)):
+            upper[a, b] = (left if b == 0 else left * z[b]).sum(0)
+    rows = [[upper[min(a, b), max(a, b)] for b in range(len(z))] for a in range(len(z))]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+# --- the envelope's derivatives by steps of time ------------------------------------------------------------
+
+
+def time_steps(times: Times, steps: Float[Array, "2 ..."]) -> Times:
+    """time_loc + time_scale d0, time_scale exp(d1): steps of natural size."""
+    return Times(times.loc + times.scale * steps[0], times.scale * jnp.exp(steps[1]))
+
+
+def _log_a(envelope, t, times: Times, order: int) -> list[Float[Array, "n k"]]:
+    """log a, with order 2 also its derivatives by d0, d1, d00, d01, d11 at 0."""
+
+    def value(steps):
+        at = time_steps(times, steps)
+        return envelope.log_a(t, time_loc=at.loc[None], time_scale=at.scale[None])
+
+    zero = jnp.zeros((2, *times.loc.shape), times.loc.dtype)
+    if order == 0:
+        return [value(zero)]
+    directions = [zero.at[j].set(1) for j in range(2)]
+    slope = lambda j: lambda steps: jax.jvp(value, (steps,), (directions[j],))[1]  # noqa: E731
+    curvature = lambda i, j: jax.jvp(slope(i), (zero,), (directions[j],))[1]  # noqa: E731
+    return [value(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
+
+
+def _over_a(mass, log_a) -> list[Float[Array, "n k"]]:
+    """mass / a and its derivatives: e^-l, -l_i e^-l, (l_i l_j - l_ij) e^-l."""
+    largest = 0.95 * float(np.log(jnp.finfo(mass.dtype).max))
+    # One exponential of the sum: 1/a alone overflows where the responsibility is small enough.
+    log_mass = jnp.log(jnp.where(mass > 0, mass, 1))
+    weight = jnp.where(mass > 0, jnp.exp(jnp.minimum(log_mass - log_a[0], largest)), 0)
+    if len(log_a) == 1:
+        return [weight]
+    _, l0, l1, l00, l01, l11 = log_a
+    factors = [-l0, -l1, l0 * l0 - l00, l0 * l1 - l01, l1 * l1 - l11]
+    return [weight, *(weight * factor for factor in factors)]

@@ -1,0 +1,544 @@
+"""`FoldedGaussianMixture`: a mixture of Folded-Gaussians as a scikit-learn estimator.
+
+Where scikit-learn's GaussianMixture has ellipsoids, this has tubes that bend over time; with `degree=1` it is the same
+model. Needs scikit-learn: `pip install "foldgauss[sklearn]"`.
+"""
+
+import contextlib
+import warnings
+from numbers import Integral
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float, Int
+from sklearn.base import BaseEstimator, DensityMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+
+from foldgauss._checks import invalid, one_of, whole, within
+from foldgauss._components import Parameters, log_likelihoods, pairs_of
+from foldgauss._em import EMStatus, Run, best, expectation_maximisation, used_degrees
+from foldgauss._online import FORGETTING, batch_sums, online_step
+from foldgauss._prune import compressed, num_parameters, pruned
+from foldgauss._scaling import Scaling, scaling_of, to_mixture, variances_of
+from foldgauss._starts import STARTS, from_joint, start
+from foldgauss._statistics import Points, points_of, scores
+from foldgauss._updates import Model
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.mixture import FoldedMixture
+
+__all__ = ["EMStatus", "FoldedGaussianMixture"]
+
+_COVARIANCES = ("full", "diag", "spherical", "tied")
+_ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
+_CURES = {
+    EMStatus.NOT_CONVERGED: "Raise max_iter or tol, or scale the data.",
+    EMStatus.NOT_FINITE: "A component collapsed, or a point is out of all reach: raise reg_covar or the envelope's "
+    "floor, or lower n_components or degree.",
+    EMStatus.SINGULAR: "A component's points lie on its curve, at one time, or in a plane: raise reg_covar, or lower "
+    "n_components or degree.",
+}
+#: Of the points, this many for each component that "auto" starts with.
+_POINTS_PER_COMPONENT = 8
+
+
+class FoldedGaussianMixture(DensityMixin, BaseEstimator):
+    """A mixture of Folded-Gaussians, fitted by expectation maximisation.
+
+        p(x) = sum_k w_k N(t | m_k, sigma_k^2) N(s | loc_k + f_k(m_k - t), a_k(t) Sigma_k),   x = (s, t)
+
+    Parameters and fitted attributes are those of scikit-learn's GaussianMixture where they mean the same. With the
+    default envelope a = 1, `degree=1` *is* its model with `covariance_type="full"` and `degree=0` with
+    `covariance_type="diag"` its "diag".
+
+    **Parameters:**
+
+    * `n_components`: K, or "auto": from `max_components`, those that do not pay (`criterion`) are taken away.
+    * `degree`: of every component's polynomial f, or "auto": from `max_degree`, per component.
+    * `covariance_type`: of Sigma_k, "full", "diag", "spherical" or "tied". Times have variances of their own always.
+    * `envelope`: "constant" (a = 1), "time_likelihood" (the paper's, `TimeLikelihood(power=1, floor=1e-3)`), or any
+      envelope. It is not fitted; see `gradient_fit` for that.
+    * `time_column`: the column of X that is time; the last one, as in `FoldedGaussian`.
+    * `tol`, `max_iter`, `n_init`, `reg_covar`, `weights_init`, `means_init`, `precisions_init`, `random_state`,
+      `warm_start`, `verbose`: as in GaussianMixture. `reg_covar` is added to the variances of each Sigma_k
+      and of time, in the units of X.
+    * `reg_relative`: added too, this share of each column's own variance.
+    * `init_params`: "kmeans", "k-means++", "random", "random_from_data", or "trajectories" (random curves grown along
+      the points: for tracks that cross).
+    * `annealing`: the inverse temperature that EM starts with; 1 is none.
+    * `criterion`: "bic" or "aic", for "auto".
+    * `devices`: how many of JAX's devices the points are spread over.
+
+    **dtype:** float32 data are fitted in float32, all others in float64, whatever JAX is set to.
+
+    **Fitted:** `weights_` (K,), `means_` (K, d) and `covariances_` (K, d, d) of whole components, columns as
+    in X, `locs_` (K, d-1), `space_covariances_` (K, d-1, d-1), `time_means_`, `time_scales_` (K,), `fold_coefficients_`
+    (K, q, d-1) with row j - 1 for u^j, u = m_k - t, `degrees_` (K,), `lower_bound_`, `lower_bounds_`, `n_iter_`,
+    `converged_`, `status_` (`EMStatus`), `n_features_in_`.
+
+    **Example:**
+
+        mixture = FoldedGaussianMixture(3, degree=3, init_params="trajectories", n_init=5).fit(x)
+        mixture.predict(x), mixture.score_samples(x), mixture.condition(-1, 0.5).mean
+
+    **Source:** eq:vegas and eq:foldgauss; Dempster, Laird and Rubin 1977. **Raises:** ValueError naming the parameter.
+    """
+
+    def __init__(
+        self,
+        n_components="auto",
+        *,
+        degree="auto",
+        covariance_type="full",
+        envelope="constant",
+        time_column=-1,
+        tol=1e-3,
+        reg_covar=1e-6,
+        reg_relative=1e-9,
+        max_iter=100,
+        n_init=1,
+        init_params="kmeans",
+        annealing=1.0,
+        weights_init=None,
+        means_init=None,
+        precisions_init=None,
+        max_components=10,
+        max_degree=3,
+        criterion="bic",
+        random_state=None,
+        warm_start=False,
+        verbose=0,
+        devices=1,
+    ):
+        self.n_components = n_components
+        self.degree = degree
+        self.covariance_type = covariance_type
+        self.envelope = envelope
+        self.time_column = time_column
+        self.tol = tol
+        self.reg_covar = reg_covar
+        self.reg_relative = reg_relative
+        self.max_iter = max_iter
+        self.n_init = n_init
+        self.init_params = init_params
+        self.annealing = annealing
+        self.weights_init = weights_init
+        self.means_init = means_init
+        self.precisions_init = precisions_init
+        self.max_components = max_components
+        self.max_degree = max_degree
+        self.criterion = criterion
+        self.random_state = random_state
+        self.warm_start = warm_start
+        self.verbose = verbose
+        self.devices = devices
+
+    # --- fitting --------------------------------------------------------------------------------------------
+
+    def fit(self, X, y=None, sample_weight=None):
+        """Fit to rows of X (n, d); `sample_weight` (n,) counts repetitions: 2 is the point twice, 0 is not there.
+
+        **Raises:** ValueError on bad parameters, NaN or infinity, fewer points than components; warns
+        (ConvergenceWarning) where it did not converge, see `status_`.
+        """
+        self._fit(X, sample_weight)
+        return self
+
+    def fit_predict(self, X, y=None, sample_weight=None) -> Int[np.ndarray, "n"]:
+        """Fit, and the likeliest component of each row."""
+        scaled = self._fit(X, sample_weight)
+        with _precision(scaled.dtype):
+            return self._posteriors(scaled).argmax(1)
+
+    def _fit(self, X, sample_weight):
+        _check_parameters(self)
+        x, weights = self._checked(X, sample_weight)
+        with _precision(x.dtype):
+            run, model, scaled = self._runs(x, weights)
+        self._keep(run, model)
+        if run.status != EMStatus.CONVERGED:
+            warnings.warn(
+                f"EM ended as {run.status.name} after {run.num_steps} iterations. {_CURES[run.status]}",
+                ConvergenceWarning,
+                stacklevel=3,
+            )
+        return scaled
+
+    def _checked(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Rows with time last, and weights, both of the dtype that is fitted in."""
+        X = validate_data(self, X, dtype=[np.float64, np.float32], ensure_min_samples=2 if reset else 1, reset=reset)
+        if X.shape[1] < 2:
+            cure = "One column is time; give at least one of space."
+            raise invalid("X", expected="at least 2 columns", got=f"n_features = {X.shape[1]}", cure=cure)
+        weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
+        if not weights.sum() > 0:
+            raise invalid("sample_weight", expected="a positive sum", got="0", cure="0 takes a row out.")
+        least = 1 if self.n_components == "auto" or not reset else self.n_components
+        if (weights > 0).sum() < least:
+            raise invalid(
+                "n_components",
+                expected=f"at most the number of points (n_samples = {int((weights > 0).sum())})",
+                got=self.n_components,
+                cure='Fewer components, or n_components="auto".',
+            )
+        return _time_last(X, self._column(X.shape[1])), weights
+
+    def _column(self, num_columns: int) -> int:
+        column = self.time_column
+        if not isinstance(column, Integral) or not -num_columns <= column < num_columns:
+            raise invalid(
+                "time_column", expected=f"a column of {num_columns}", got=repr(column), cure="-1 is the last."
+            )
+        return int(column) % num_columns
+
+    def _runs(self, x, weights) -> tuple[Run, Model, np.ndarray]:
+        mean, variance = variances_of(x, weights)
+        envelope = _envelope(self.envelope)
+        total = float(weights.sum(dtype=np.float64))
+        warm = self._warm_start(x.shape[1])
+        if warm is None:
+            scaling = scaling_of(mean, variance, envelope, self.covariance_type)
+            num, degree = self._sizes(int((weights > 0).sum()))
+        else:
+            scaling, (num, degree) = self._scaling, warm
+        scaled = scaling.apply(x)
+        floor = (self.reg_covar + self.reg_relative * variance) / scaling.scale**2
+        degrees = used_degrees(degree if warm is None else self.degrees_, num)
+        model = Model(degrees, jnp.asarray(floor, x.dtype), self.covariance_type)
+        starts = self._starts(scaled, weights, scaling, model, degree, warm is not None)
+        points = points_of(scaled, weights, num * len(starts.time_loc), self.devices)
+        auto = "auto" in (self.n_components, self.degree) and warm is None
+        run = best(
+            expectation_maximisation(
+                starts,
+                points,
+                envelope,
+                model,
+                total=total,
+                least_mass=0.0 if self.n_components == "auto" else 0.5 * total / np.count_nonzero(weights),
+                tol=self.tol,
+                max_steps=self.max_iter,
+                annealing=self.annealing,
+                observe=_printed if self.verbose else None,
+            )
+        )
+        if auto and run.status != EMStatus.NOT_FINITE:
+            run, model = self._pruned(run, points, envelope, model, total)
+        self._scaling, self._envelope, self._floor = scaling, envelope, floor
+        vars(self).pop("_online", None)  # a new fit begins anew
+        return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model, scaled
+
+    def _pruned(self, run: Run, points: Points, envelope, model: Model, total: float) -> tuple[Run, Model]:
+        params, model = pruned(
+            run.params,
+            points,
+            envelope,
+            model,
+            penalty=np.log(total) if self.criterion == "bic" else 2.0,
+            components=self.n_components == "auto",
+            powers=self.degree == "auto",
+            total=total,
+            tol=self.tol,
+            max_steps=self.max_iter,
+        )
+        params, model = compressed(params, model)
+        starts = jax.tree.map(lambda z: z[None], params)
+        options = {"total": total, "tol": self.tol, "max_steps": self.max_iter}
+        last = expectation_maximisation(starts, points, envelope, model, **options)[0]
+        return last._replace(num_steps=run.num_steps + last.num_steps, history=run.history + last.history), model
+
+    def _sizes(self, num_points: int) -> tuple[int, int]:
+        degree = self.max_degree if self.degree == "auto" else self.degree
+        if self.n_components != "auto":
+            return self.n_components, degree
+        return max(1, min(self.max_components, num_points // _POINTS_PER_COMPONENT)), degree
+
+    def _warm_start(self, num_columns: int) -> tuple[int, int] | None:
+        if not self.warm_start or not hasattr(self, "_params") or self._params.tril.shape[-1] + 1 != num_columns:
+            return None
+        return len(self.weights_), self._params.degree
+
+    def _starts(self, scaled, weights, scaling: Scaling, model: Model, degree: int, warm: bool) -> Parameters:
+        """Starts, a leading axis of `n_init`."""
+        if warm:
+            return jax.tree.map(lambda z: jnp.asarray(z, scaled.dtype)[None], self._params)
+        rng = check_random_state(self.random_state)
+        made = []
+        for _ in range(self.n_init):
+            one = start(self.init_params, scaled, weights, model, degree, rng)
+            made.append(self._with_given(one, scaling, degree))
+        return jax.tree.map(lambda *z: jnp.stack(z), *made)
+
+    def _with_given(self, params: Parameters, scaling: Scaling, degree: int) -> Parameters:
+        """A start with `weights_init`, `means_init` and `precisions_init` in place of what they say."""
+        given = (self.weights_init, self.means_init, self.precisions_init)
+        if all(z is None for z in given):
+            return params
+        num, dtype = len(params.time_loc), params.curve.dtype
+        mixture = to_mixture(params, scaling, Constant())
+        means, covariances = (np.asarray(z, np.float64) for z in mixture.components.moments())
+        weights = np.exp(np.asarray(params.log_weights, np.float64))
+        dim = means.shape[1]
+        order = _order(self._column(dim), dim)
+        if self.weights_init is not None:
+            weights = _shaped("weights_init", self.weights_init, (num,))
+            if not ((weights >= 0).all() and np.isclose(weights.sum(), 1)):
+                raise invalid(
+                    "weights_init", expected="shares with sum 1", got=weights.tolist(), cure="Divide by the sum."
+                )
+        if self.means_init is not None:
+            means = _shaped("means_init", self.means_init, (num, dim))[:, order]
+        if self.precisions_init is not None:
+            covariances = _covariances(self.precisions_init, self.covariance_type, num, dim)[:, order][:, :, order]
+        scale = scaling.scale
+        return from_joint(
+            weights, (means - scaling.shift) / scale, covariances / (scale[:, None] * scale), degree, dtype
+        )
+
+    def _keep(self, run: Run, model: Model) -> None:
+        """The fitted attributes, in NumPy."""
+        params = Parameters(*(np.asarray(z) for z in run.params))
+        self._params = params
+        with _precision(params.curve.dtype):
+            mixture = to_mixture(params, self._scaling, self._envelope)
+            means, covariances = mixture.components.moments()
+            back = np.argsort(_order(self._column(means.shape[-1]), means.shape[-1]))
+            self.means_ = np.asarray(means)[:, back]
+            self.covariances_ = np.asarray(covariances)[:, back][:, :, back]
+            components = mixture.components
+            self.locs_, tril = np.asarray(components.loc), np.asarray(components.scale_tril)
+            self.time_means_, self.time_scales_ = np.asarray(components.time_loc), np.asarray(components.time_scale)
+            self.fold_coefficients_ = np.asarray(components.fold.coefficients)
+        self.space_covariances_ = tril @ tril.swapaxes(-1, -2)
+        self.weights_ = np.exp(params.log_weights) / np.exp(params.log_weights).sum()
+        self.degrees_ = np.asarray(model.used)
+        self.status_, self.converged_ = run.status, run.status == EMStatus.CONVERGED
+        self.n_iter_, self.lower_bound_ = run.num_steps, run.log_likelihood
+        self.lower_bounds_ = [value - self._scaling.log_volume for value in run.history]
+
+    def partial_fit(self, X, y=None, sample_weight=None):
+        """Online EM: learn from one batch after another, for data larger than memory.
+
+        The first batch is fitted by `fit` (so let it be no less than some hundred points per component), and sets the
+        floors; each later one takes one step, weighed in by its share of all weight so far, or by
+        (number of batches)^-0.7 if that is more: older batches are forgotten slowly, as they were seen with poorer
+        components. `n_iter_` counts batches; `lower_bound_` is that of the last batch before its step.
+
+        **Source:** Cappé and Moulines 2009. **Raises:** as `fit`; ValueError for an envelope other than "constant",
+        whose sums do not outlive a step of time.
+        """
+        if not hasattr(self, "_online"):
+            if not isinstance(_envelope(self.envelope), Constant):
+                cure = "Use fit, or gradient_fit.fit_gradient with batch_size."
+                raise invalid("envelope", expected='"constant" for partial_fit', got=repr(self.envelope), cure=cure)
+            return self._first_batch(X, sample_weight)
+        _check_parameters(self)
+        x, weights = self._checked(X, sample_weight, reset=False)
+        sums, seen, batches, model = self._online
+        with _precision(self._params.curve.dtype):
+            scaled = self._scaling.apply(x.astype(self._params.curve.dtype))
+            points = points_of(scaled, weights.astype(scaled.dtype), len(self.weights_), self.devices)
+            total, batches = float(weights.sum(dtype=np.float64)), batches + 1
+            share = max(total / (seen + total), batches**-FORGETTING)
+            params = self._arrays(scaled.dtype)
+            value = float(batch_sums(params, points).log_likelihood) / total
+            params, sums = online_step(params, sums, points, model, jnp.asarray(share, scaled.dtype))
+        status = EMStatus.NOT_CONVERGED if np.isfinite(value) else EMStatus.NOT_FINITE
+        if status == EMStatus.NOT_FINITE:
+            raise invalid("X", expected="a batch within reach of the components", got="none", cure="Shuffle the data.")
+        history = [*self._history, value]
+        self._keep(Run(params, value - self._scaling.log_volume, history, batches, status, 0), model)
+        self._online, self._history = (sums, seen + total, batches, model), history
+        return self
+
+    def _first_batch(self, X, sample_weight):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            scaled = self.fit(X, sample_weight=sample_weight)._scaled(X)
+        with _precision(scaled.dtype):
+            weights = _check_sample_weight(sample_weight, scaled, dtype=scaled.dtype)
+            points = points_of(scaled, weights, len(self.weights_), self.devices)
+            sums = batch_sums(self._arrays(scaled.dtype), points)
+            model = Model(jnp.asarray(self.degrees_), jnp.asarray(self._floor, scaled.dtype), self.covariance_type)
+        self._online = (sums, float(weights.sum(dtype=np.float64)), 1, model)
+        self._history = [self.lower_bound_ + self._scaling.log_volume]
+        self.n_iter_ = 1
+        return self
+
+    # --- what is known of points ------------------------------------------------------------------------------
+
+    def score_samples(self, X) -> Float[np.ndarray, "n"]:
+        """log p(x) of each row, in the units of X."""
+        y = self._scaled(X)
+        with _precision(y.dtype):
+            points = points_of(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
+            value = np.asarray(_scores(self._arrays(y.dtype), self._envelope, points))[: len(y)]
+        return value - y.dtype.type(self._scaling.log_volume)
+
+    def score(self, X, y=None) -> float:
+        """The mean of `score_samples`."""
+        return float(self.score_samples(X).mean())
+
+    def predict(self, X) -> Int[np.ndarray, "n"]:
+        """The likeliest component of each row."""
+        return self.predict_proba(X).argmax(1)
+
+    def predict_proba(self, X) -> Float[np.ndarray, "n k"]:
+        """P(component | x) of each row."""
+        y = self._scaled(X)
+        with _precision(y.dtype):
+            return self._posteriors(y)
+
+    def _posteriors(self, y):
+        points = points_of(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
+        return np.asarray(_responsibilities(self._arrays(y.dtype), self._envelope, points))[: len(y)]
+
+    def bic(self, X) -> float:
+        """-2 log-likelihood + parameters log n: smaller is better."""
+        return -2 * self.score(X) * len(X) + self._n_parameters() * float(np.log(len(X)))
+
+    def aic(self, X) -> float:
+        """-2 log-likelihood + 2 parameters: smaller is better."""
+        return -2 * self.score(X) * len(X) + 2 * self._n_parameters()
+
+    def _n_parameters(self) -> int:
+        check_is_fitted(self)
+        return num_parameters(self.weights_, self.degrees_, self.locs_.shape[1], self.covariance_type)
+
+    # --- the mixture --------------------------------------------------------------------------------------------
+
+    def to_mixture(self) -> FoldedMixture:
+        """The fitted `FoldedMixture`, **time last**; in float32 unless JAX has float64 enabled."""
+        check_is_fitted(self)
+        params = Parameters(*(jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)) for z in self._params))
+        return to_mixture(params, self._scaling, self._envelope)
+
+    def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, "n"]]:
+        """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
+        if not whole(n_samples, 1):
+            raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
+        check_is_fitted(self)
+        seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
+        with _precision(self._params.curve.dtype):
+            x, component = self.to_mixture().sample(jax.random.key(seed), (n_samples,), return_component=True)
+            x, component = np.asarray(x), np.asarray(component)
+        return x[:, np.argsort(_order(self._column(x.shape[1]), x.shape[1]))], component
+
+    def condition(self, columns, values):
+        """The mixture of the other columns where these have these values, by `FoldedMixture.condition`.
+
+        **Example:** `fitted.condition(-1, 0.5)  # space at time 0.5`
+        """
+        check_is_fitted(self)
+        num = self.n_features_in_
+        order = list(_order(self._column(num), num))
+        columns = np.atleast_1d(np.asarray(columns))
+        if columns.ndim != 1 or columns.dtype.kind not in "iu" or ((columns < -num) | (columns >= num)).any():
+            raise invalid("columns", expected=f"columns of {num}", got=columns.tolist(), cure="They are those of X.")
+        return self.to_mixture().condition([order.index(int(c) % num) for c in columns], np.atleast_1d(values))
+
+    def _scaled(self, X) -> np.ndarray:
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        return self._scaling.apply(_time_last(X, self._column(X.shape[1])))
+
+    def _arrays(self, dtype) -> Parameters:
+        return Parameters(*(jnp.asarray(z, dtype) for z in self._params))
+
+
+# --- compiled -------------------------------------------------------------------------------------------------
+
+_scores = eqx.filter_jit(scores)
+
+
+@eqx.filter_jit
+def _responsibilities(params: Parameters, envelope: AbstractEnvelope, points: Points):
+    def of_chunk(x):
+        log_density = pairs_of(params, envelope, x).log_density
+        total = log_likelihoods(log_density)[:, None]
+        reached = jnp.isfinite(total)  # out of all reach, the weights are what is known
+        shares = jnp.exp(log_density - jnp.where(reached, total, 0))
+        return jnp.where(reached, shares, jnp.exp(params.log_weights)[None])
+
+    shares = lax.map(of_chunk, points.x.reshape(-1, *points.x.shape[2:]))
+    return shares.reshape(-1, shares.shape[-1])
+
+
+# --- columns, checks --------------------------------------------------------------------------------------------
+
+
+def _precision(dtype):
+    """Where float64 data are computed, float64 is enabled; the user's own setting is left as it is."""
+    return jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext()
+
+
+def _order(column: int, num_columns: int) -> Int[np.ndarray, "d"]:
+    """The columns of X with time last."""
+    return np.append(np.delete(np.arange(num_columns), column), column)
+
+
+def _time_last(X: np.ndarray, column: int) -> np.ndarray:
+    return X if column == X.shape[1] - 1 else X[:, _order(column, X.shape[1])]
+
+
+def _envelope(envelope) -> AbstractEnvelope:
+    return _ENVELOPES[envelope]() if isinstance(envelope, str) else envelope
+
+
+def _shaped(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+    value = np.asarray(value, np.float64)
+    if value.shape != shape:
+        raise invalid(name, expected=f"shape {shape}", got=f"shape {value.shape}", cure="One entry per component.")
+    return value
+
+
+def _covariances(precisions, kind: str, num: int, dim: int) -> np.ndarray:
+    """Covariances (k, d, d) from precisions in the shape that scikit-learn has for each kind."""
+    shape = {"full": (num, dim, dim), "tied": (dim, dim), "diag": (num, dim), "spherical": (num,)}[kind]
+    precisions = _shaped("precisions_init", precisions, shape)
+    eye = np.eye(dim)
+    if kind == "spherical":
+        precisions = precisions[:, None, None] * eye
+    if kind == "diag":
+        precisions = precisions[:, :, None] * eye
+    precisions = np.broadcast_to(precisions, (num, dim, dim))
+    if not (np.linalg.eigvalsh(precisions) > 0).all():
+        raise invalid("precisions_init", expected="positive definite", got="others", cure="Invert covariances.")
+    return np.linalg.inv(precisions)
+
+
+def _check_parameters(self) -> None:
+    whole_or_auto = {"n_components": 1, "degree": 0}
+    for name, least in whole_or_auto.items():
+        value = getattr(self, name)
+        if value != "auto" and not whole(value, least):
+            raise invalid(name, expected=f'a whole number >= {least} or "auto"', got=repr(value))
+    for name, least in {"max_components": 1, "max_degree": 0, "max_iter": 1, "n_init": 1, "devices": 1}.items():
+        if not whole(getattr(self, name), least):
+            raise invalid(name, expected=f"a whole number >= {least}", got=repr(getattr(self, name)))
+    for name in ("tol", "reg_covar", "reg_relative"):
+        if not within(getattr(self, name), "[0, inf)"):
+            raise invalid(name, expected="a number >= 0", got=repr(getattr(self, name)))
+    if not within(self.annealing, "(0, 1]"):
+        raise invalid("annealing", expected="a number in (0, 1]", got=repr(self.annealing), cure="1 is none.")
+    one_of("covariance_type", self.covariance_type, _COVARIANCES)
+    one_of("init_params", self.init_params, tuple(STARTS))
+    one_of("criterion", self.criterion, ("bic", "aic"))
+    if isinstance(self.envelope, str):
+        one_of("envelope", self.envelope, tuple(_ENVELOPES))
+    elif not isinstance(self.envelope, AbstractEnvelope):
+        raise invalid("envelope", expected="an envelope or its name", got=repr(self.envelope), cure="as_envelope(f).")
+    if self.devices > len(jax.devices()):
+        raise invalid("devices", expected=f"at most {len(jax.devices())}", got=self.devices, cure="See jax.devices().")
+    if self.n_components == "auto" and any(
+        z is not None for z in (self.weights_init, self.means_init, self.precisions_init)
+    ):
+        raise invalid("n_components", expected="a number where starts are given", got='"auto"', cure="Give it.")
+
+
+def _printed(number: int, values: np.ndarray) -> None:
+    print(f"iteration {number}: mean log-likelihood {np.array2string(values, precision=6)} (scaled data)")

@@ -1,0 +1,299 @@
+"""The estimator: scikit-learn's own checks, its GaussianMixture as oracle, known mixtures, and hard data."""
+
+import subprocess
+import sys
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn")
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.mixture import GaussianMixture
+from sklearn.utils import estimator_checks
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.estimator import EMStatus, FoldedGaussianMixture
+
+K, N = 3, 300
+#: Three crossing curves, s = sum_j c_j t^j.
+CURVES = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, -1.0, 0.0, 0.0], [0.5, 3.0, -9.0, 6.0]])
+
+
+def _blobs(seed=0, n=N):
+    rng = np.random.default_rng(seed)
+    means, factors = rng.normal(size=(K, 3)) * 3, rng.normal(size=(K, 3, 3))
+    labels = np.arange(n) % K
+    return means[labels] + np.einsum("nij,nj->ni", factors[labels], rng.normal(size=(n, 3)))
+
+
+def _tracks(n=N, seed=0, noise=0.03):
+    rng = np.random.default_rng(seed)
+    labels, t = np.arange(n) % 3, rng.normal(0.5, 0.25, n)
+    s = (CURVES[labels] * t[:, None] ** np.arange(4)).sum(1) + rng.normal(size=n) * noise
+    return np.stack([s, t], 1), labels
+
+
+def _quiet(estimator, *args, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return estimator.fit(*args, **options)
+
+
+def _same_partition(one, other) -> float:
+    """Share of points on which two labelings agree, up to names."""
+    table = np.array([[np.sum((one == i) & (other == j)) for j in range(K)] for i in range(K)])
+    return max(sum(table[i, p[i]] for i in range(K)) for p in _permutations()) / len(one)
+
+
+def _permutations():
+    from itertools import permutations
+
+    return permutations(range(K))
+
+
+# --- scikit-learn -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", [FoldedGaussianMixture(2, degree=1), FoldedGaussianMixture()])
+def test_passes_scikit_learns_checks(estimator):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        results = estimator_checks.check_estimator(estimator, on_fail=None)
+    failed = [r for r in results if r["status"] not in ("passed", "skipped")]
+    assert not failed, failed
+
+
+@pytest.mark.parametrize(
+    "check",
+    ["check_no_attributes_set_in_init", "check_parameters_default_constructible", "check_get_params_invariance",
+     "check_estimators_unfitted", "check_fit2d_1sample", "check_fit2d_1feature"],
+)  # fmt: skip
+def test_passes_quick_checks(check):
+    estimator = FoldedGaussianMixture(1, degree=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        getattr(estimator_checks, check)("FoldedGaussianMixture", estimator)
+
+
+@pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0)])
+def test_linear_folds_are_scikit_learns_mixture(kind, degree):
+    """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""
+    x = _blobs() + np.array([100.0, -5.0, 3.0])
+    precisions = {"full": np.tile(np.eye(3) * 0.1, (K, 1, 1)), "diag": np.full((K, 3), 0.1)}[kind]
+    same = {
+        "covariance_type": kind,
+        "reg_covar": 0,
+        "tol": 0,
+        "max_iter": 30,
+        "means_init": x[:K],
+        "weights_init": np.full(K, 1 / K),
+        "precisions_init": precisions,
+    }
+    theirs = _quiet(GaussianMixture(K, **same), x)
+    ours = _quiet(FoldedGaussianMixture(K, degree=degree, reg_relative=0, **same), x)
+    close = {"rtol": 1e-6, "atol": 1e-8}
+    covariances = theirs.covariances_ if kind == "full" else theirs.covariances_[:, :, None] * np.eye(3)
+    np.testing.assert_allclose(ours.weights_, theirs.weights_, **close)
+    np.testing.assert_allclose(ours.means_, theirs.means_, **close)
+    np.testing.assert_allclose(ours.covariances_, covariances, **close)
+    np.testing.assert_allclose(ours.lower_bound_, theirs.lower_bound_, rtol=1e-9)
+    np.testing.assert_allclose(ours.score_samples(x), theirs.score_samples(x), **close)
+    np.testing.assert_allclose(ours.predict_proba(x), theirs.predict_proba(x), rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose([ours.bic(x), ours.aic(x)], [theirs.bic(x), theirs.aic(x)], rtol=1e-8)
+    assert (ours.n_iter_, ours.converged_) == (theirs.n_iter_, theirs.converged_)
+
+
+def test_to_mixture_samples_conditions_in_the_users_columns():
+    """Time may be any column; what is fitted is the same."""
+    x = _blobs()
+    last = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0), x)
+    first = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, time_column=0), x[:, [2, 0, 1]])
+    np.testing.assert_allclose(first.means_, last.means_[:, [2, 0, 1]], rtol=1e-6)
+    np.testing.assert_allclose(first.covariances_, last.covariances_[:, [2, 0, 1]][:, :, [2, 0, 1]], rtol=1e-6)
+    np.testing.assert_allclose(first.score_samples(x[:, [2, 0, 1]]), last.score_samples(x), rtol=1e-6)
+    np.testing.assert_allclose(
+        last.to_mixture().log_prob(jnp.asarray(x, jnp.float32)), last.score_samples(x), atol=1e-4
+    )
+    draws, component = first.sample(2000)
+    assert draws.shape == (2000, 3)
+    assert component.shape == (2000,)
+    error = draws.std(0) / np.sqrt(2000)
+    assert (np.abs(draws.mean(0) - x[:, [2, 0, 1]].mean(0)) < 5 * error).all()
+    here = first.condition(0, 0.3)
+    np.testing.assert_allclose(here.mean, last.to_mixture().condition_time(0.3).mean, rtol=1e-4)
+
+
+# --- weights ------------------------------------------------------------------------------------------------
+
+
+def test_weights_count_repetitions():
+    x, rng = _blobs(), np.random.default_rng(1)
+    weights = rng.integers(0, 3, N)
+    options = {"degree": 1, "random_state": 0, "max_iter": 20, "tol": 0}
+    weighted = _quiet(FoldedGaussianMixture(K, **options), x, sample_weight=weights)
+    repeated = _quiet(FoldedGaussianMixture(K, **options), np.repeat(x, weights, axis=0))
+    unweighted = _quiet(FoldedGaussianMixture(K, **options), x)
+    for name in ("weights_", "means_", "covariances_", "lower_bound_"):
+        np.testing.assert_allclose(getattr(weighted, name), getattr(repeated, name), rtol=1e-7, atol=1e-9)
+    assert not np.allclose(weighted.means_, unweighted.means_, rtol=1e-3)  # power
+
+
+def test_batches_lead_where_all_points_do():
+    x = _blobs(n=6000)[np.random.default_rng(1).permutation(6000)]
+    options = {"degree": 1, "random_state": 0, "n_init": 5, "tol": 1e-5, "max_iter": 300}
+    whole, online = FoldedGaussianMixture(K, **options).fit(x), FoldedGaussianMixture(K, **options)
+    scores = [online.partial_fit(batch).score(x) for batch in np.split(x, 12)]
+    assert online.n_iter_ == 12
+    assert abs(scores[-1] - whole.score(x)) < 0.005
+    assert scores[-1] > scores[0] + 0.005  # it did learn
+    with pytest.raises(ValueError, match="envelope"):
+        FoldedGaussianMixture(K, envelope="time_likelihood").partial_fit(x)
+
+
+# --- recovery -----------------------------------------------------------------------------------------------
+
+
+def test_crossing_tracks_are_found():
+    x, labels = _tracks()
+    fitted = FoldedGaussianMixture(K, degree=3, init_params="trajectories", n_init=4, random_state=0).fit(x)
+    assert fitted.converged_
+    assert _same_partition(fitted.predict(x), labels) > 0.75  # they cross where most points are
+    t = np.linspace(0.2, 0.8, 5)
+    u = fitted.time_means_[:, None] - t
+    powers = u[:, :, None] ** np.arange(1, 4)
+    centre = fitted.locs_[:, :1] + np.einsum("ktj,kj->kt", powers, fitted.fold_coefficients_[:, :, 0])
+    truth = CURVES @ (t[None] ** np.arange(4)[:, None])
+    nearest = np.abs(centre[:, None] - truth[None]).max(-1)
+    assert (nearest.min(0) < 0.03).all()  # 0.03 is the noise of one point
+    assert sorted(nearest.argmin(1)) == [0, 1, 2]
+    np.testing.assert_allclose(np.sqrt(fitted.space_covariances_.ravel()), 0.03, rtol=0.3)
+
+
+@pytest.mark.slow
+def test_auto_finds_components_and_powers():
+    x, _ = _tracks(1500)
+    fitted = _quiet(FoldedGaussianMixture(random_state=0, init_params="trajectories", max_components=6), x)
+    assert len(fitted.weights_) == 3
+    assert sorted(fitted.degrees_) == [1, 1, 3]
+    full = _quiet(FoldedGaussianMixture(6, degree=3, random_state=0, init_params="trajectories"), x)
+    assert fitted.bic(x) < full.bic(x)
+
+
+@pytest.mark.slow
+def test_recovers_a_folded_mixture_with_an_envelope():
+    """Draws from a known mixture whose spread shrinks away from its time; up to labels."""
+    from foldgauss import FoldedGaussian, PolynomialFold
+    from foldgauss.mixture import FoldedMixture
+
+    envelope = TimeLikelihood(1.0, 1e-2)
+    truth = FoldedMixture(
+        FoldedGaussian(
+            [[0.0, 0.0], [6.0, 0.0], [0.0, 6.0]],
+            scale=[[0.5, 0.4], [0.3, 0.6], [0.4, 0.4]],
+            time_loc=[0.0, 1.0, 2.0],
+            time_scale=[0.5, 0.7, 0.6],
+            fold=PolynomialFold(jnp.array([[[1.0, 0.0]], [[0.0, 1.0]], [[1.0, -1.0]]])),
+            envelope=envelope,
+        ),
+        weights=[0.5, 0.3, 0.2],
+    )
+    x = np.asarray(truth.sample(jax.random.key(0), (3000,)))
+    fitted = FoldedGaussianMixture(K, degree=1, envelope=envelope, tol=1e-5, max_iter=300, random_state=0).fit(x)
+    order = np.argsort(fitted.time_means_)
+    np.testing.assert_allclose(fitted.weights_[order], [0.5, 0.3, 0.2], atol=0.03)
+    np.testing.assert_allclose(fitted.time_means_[order], [0.0, 1.0, 2.0], atol=0.1)
+    np.testing.assert_allclose(fitted.time_scales_[order], [0.5, 0.7, 0.6], rtol=0.1)
+    np.testing.assert_allclose(fitted.locs_[order], [[0, 0], [6, 0], [0, 6]], atol=0.1)
+    np.testing.assert_allclose(fitted.fold_coefficients_[order, 0], [[1, 0], [0, 1], [1, -1]], atol=0.15)
+    assert fitted.score(x) > float(truth.log_prob(jnp.asarray(x)).mean())  # a maximum is above the truth
+
+
+def test_float32_far_from_zero():
+    x = _blobs(n=2000)
+    near = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, max_iter=30, tol=0), x)
+    far = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, max_iter=30, tol=0), (x + 1e4).astype(np.float32))
+    order, other = (np.argsort(f.means_[:, 0]) for f in (near, far))
+    assert far.covariances_.dtype == np.float32
+    variances = [np.diagonal(f.covariances_[o], axis1=1, axis2=2) for f, o in ((near, order), (far, other))]
+    np.testing.assert_allclose(*variances, rtol=0.01)
+
+
+# --- hard data, wrong words ---------------------------------------------------------------------------------
+
+
+def test_hard_data_end_in_numbers():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(N, 3))
+    constant = np.concatenate([x[:, :1], np.full((N, 1), 7.0), x[:, 2:]], 1)
+    still = np.concatenate([x[:, :2], np.full((N, 1), 7.0)], 1)
+    duplicates = np.repeat(x[:2], N // 2, axis=0)  # two places, three components
+    for data in (constant, still, duplicates):
+        fitted = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, max_iter=20), data)
+        assert np.isfinite(fitted.score_samples(data)).all()
+        assert np.isfinite(fitted.covariances_).all()
+        assert fitted.status_ in EMStatus
+
+
+@pytest.mark.parametrize(
+    ("match", "data", "options"),
+    [
+        ("NaN", np.array([[0.0, np.nan], [1, 2], [3, 4]]), {}),
+        ("infinity", np.array([[0.0, np.inf], [1, 2], [3, 4]]), {}),
+        ("minimum of 2", np.zeros((0, 3)), {}),
+        ("n_samples = 1|minimum of 2", np.zeros((1, 3)), {}),
+        ("n_components", np.zeros((2, 3)), {"n_components": 3}),
+        ("degree", np.zeros((5, 3)), {"degree": -1}),
+        ("covariance_type", np.zeros((5, 3)), {"covariance_type": "banded"}),
+        ("init_params", np.zeros((5, 3)), {"init_params": "magic"}),
+        ("envelope", np.zeros((5, 3)), {"envelope": 3}),
+        ("time_column", np.zeros((5, 3)), {"time_column": 3}),
+        ("annealing", np.zeros((5, 3)), {"annealing": 0.0}),
+        ("devices", np.zeros((5, 3)), {"devices": 1000}),
+        ("means_init", np.zeros((5, 3)), {"n_components": 1, "means_init": np.zeros((2, 3))}),
+    ],
+)
+def test_wrong_words_are_named(match, data, options):
+    with pytest.raises(ValueError, match=match):
+        FoldedGaussianMixture(**({"n_components": 1, "degree": 1} | options)).fit(data)
+
+
+def test_unfitted_says_so():
+    for call in ("to_mixture", "sample"):
+        with pytest.raises(NotFittedError):
+            getattr(FoldedGaussianMixture(), call)()
+
+
+def test_no_convergence_is_told():
+    with pytest.warns(ConvergenceWarning, match="NOT_CONVERGED"):
+        fitted = FoldedGaussianMixture(K, degree=1, max_iter=2, tol=0, random_state=0).fit(_blobs())
+    assert not fitted.converged_
+    assert fitted.status_ == EMStatus.NOT_CONVERGED
+
+
+# --- devices ------------------------------------------------------------------------------------------------
+
+_SHARDED = """
+import numpy as np, warnings
+warnings.simplefilter("ignore")
+from foldgauss.estimator import FoldedGaussianMixture
+x = np.random.default_rng(0).normal(size=(1001, 3)) * [1, 2, 3]
+options = {"degree": 2, "envelope": "time_likelihood", "max_iter": 10, "tol": 0, "random_state": 0}
+fits = [FoldedGaussianMixture(3, devices=k, **options).fit(x) for k in (1, 4)]
+for name in ("weights_", "means_", "covariances_", "lower_bounds_"):
+    np.testing.assert_allclose(*(getattr(f, name) for f in fits), rtol=1e-7, atol=1e-9)
+"""
+
+
+@pytest.mark.slow
+def test_same_on_one_and_on_four_devices():
+    import os
+
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", _SHARDED], env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,96 @@
+"""Choosing size and degree, and fits by gradient."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn")
+from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikelihood
+from foldgauss._em import EMStatus
+from foldgauss.estimator import FoldedGaussianMixture
+from foldgauss.gradient_fit import fit_gradient
+from foldgauss.mixture import FoldedMixture
+from foldgauss.selection import _parts, select_mixture
+
+
+def _two_parabolas(n=300, seed=0):
+    rng = np.random.default_rng(seed)
+    t, label = rng.normal(size=n), np.arange(n) % 2
+    return np.stack([np.where(label, 4 + t**2, -t * t) + 0.1 * rng.normal(size=n), t], 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", ["bic", "aic", "cv"])
+def test_size_and_degree_are_found(criterion):
+    estimator = FoldedGaussianMixture(n_init=2, random_state=0)
+    choice = select_mixture(estimator, _two_parabolas(), n_components=[1, 2], degrees=[1, 2], criterion=criterion)
+    assert (choice.estimator.n_components, choice.estimator.degree) == (2, 2)
+    assert choice.scores.shape == (2, 2)
+    assert choice.scores.min() == choice.scores[1, 1]
+
+
+def test_groups_stay_whole():
+    groups = np.repeat(np.arange(10), 7)
+    parts = _parts(70, 5, groups)
+    assert all(len(set(parts[groups == g])) == 1 for g in range(10))
+    assert (np.bincount(parts) == 14).all()
+
+
+@pytest.mark.parametrize(
+    ("match", "options"),
+    [
+        ("criterion", {"criterion": "best"}),
+        ("n_components", {"n_components": []}),
+        ("degrees", {"degrees": [-1]}),
+        ("folds", {"criterion": "cv", "folds": 1000}),
+        ("groups", {"criterion": "cv", "groups": np.zeros(3)}),
+    ],
+)
+def test_wrong_words_are_named(match, options):
+    with pytest.raises(ValueError, match=match):
+        select_mixture(FoldedGaussianMixture(), _two_parabolas(), **({"n_components": [1], "degrees": [1]} | options))
+
+
+def _start(fold=None):
+    fold = PolynomialFold(jnp.zeros((2, 2, 1))) if fold is None else fold
+    options = {"scale": [[1.0], [1.0]], "time_loc": [0.1, -0.1], "time_scale": [1.0, 1.0]}
+    components = FoldedGaussian([[-1.0], [5.0]], **options, fold=fold, envelope=TimeLikelihood(0.0))
+    return FoldedMixture(components, weights=[0.5, 0.5])
+
+
+@pytest.mark.slow
+def test_gradients_end_where_em_does():
+    x = _two_parabolas()
+    em = FoldedGaussianMixture(2, degree=2, random_state=0, tol=1e-6, max_iter=200).fit(x)
+    result = fit_gradient(_start(), x, steps=600)
+    assert result.status == EMStatus.NOT_CONVERGED
+    assert result.log_likelihoods[-1] > result.log_likelihoods[0] + 1
+    np.testing.assert_allclose(result.log_likelihoods[-1], em.score(x), atol=0.01)
+
+
+@pytest.mark.slow
+def test_gradients_train_a_fold_of_ones_own():
+    def bend(coefficient, u):
+        return coefficient * u**2
+
+    fold = CallableFold(jax.tree_util.Partial(bend, jnp.zeros(1)))
+    x = _two_parabolas()
+    x = x[np.arange(len(x)) % 2 == 0]  # s = -t^2 alone
+    one = FoldedGaussian(
+        [[-1.0]], scale=[[1.0]], time_loc=[0.0], time_scale=[1.0], fold=fold, envelope=TimeLikelihood(0.0)
+    )
+    result = fit_gradient(FoldedMixture(one, weights=[1.0]), x, steps=400)
+    assert abs(float(jax.tree.leaves(result.mixture.components.fold)[0].ravel()[0]) + 1) < 0.05
+
+
+@pytest.mark.slow
+def test_gradients_never_end_in_nan():
+    x = _two_parabolas()
+    x[3] = np.nan
+    result = fit_gradient(_start(), x, steps=5)
+    assert result.status == EMStatus.NOT_FINITE
+    assert np.isfinite(result.mixture.components.loc).all()
+    weights = np.ones(len(x))
+    weights[3] = 0  # is not there
+    assert fit_gradient(_start(), x, steps=5, sample_weight=weights).status == EMStatus.NOT_CONVERGED
