@@ -19,7 +19,7 @@ from foldgauss.envelope import Constant
 
 __all__ = ["FORGETTING", "batch_sums", "online_step", "seen_from"]
 
-#: The share of a batch is at least (number of batches)^-FORGETTING: between 1/2 and 1 it converges.
+#: A batch counts for its share of all weight so far to this power: between 1/2 and 1 it converges.
 FORGETTING = 0.7
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._cholesky import cholesky, log_det
+from foldgauss._cholesky import cholesky, inverse_lower, log_det
 from foldgauss._components import Parameters, log_likelihoods, pairs_of, to_powers
 from foldgauss._em import best, expectation_maximisation, log_likelihood
 from foldgauss._regression import hermite_to_powers
@@ -151,9 +151,12 @@ def _losses(params: Parameters, points: Points, envelope, model: Model) -> Float
     sums = accumulate(params, envelope, points)
     mass = jnp.where(sums.mass > 0, sums.mass, 1)
 
+    whitening = inverse_lower(params.tril)
+    floor = jnp.einsum("kab,b,kcb->kac", whitening, model.floor[:-1], whitening)
+
     def half_log_det(used):
         scatter = residual_scatter(sums, params, Model(used, model.floor, model.covariance))
-        return 0.5 * log_det(cholesky(scatter / mass[:, None, None]))
+        return 0.5 * log_det(cholesky(scatter / mass[:, None, None] + floor))  # as the covariance is made of it
 
     lower = jnp.maximum(model.used - 1, 0)
     loss = mass * (half_log_det(lower) - half_log_det(model.used))

@@ -147,7 +147,7 @@ def _grown_curves(y, weights, num, degree, rng):
     reach = np.ptp(t) or 1.0
     nearest = np.sort(_distances(y, y[home]), axis=0)[min(len(y) - 1, max(8, len(y) // 50))]
     near = weights[:, None] * np.exp(-0.5 * _distances(y, y[home]) / np.maximum(nearest, 1e-12))
-    width = np.sqrt(nearest)
+    width = np.maximum(np.sqrt(nearest), 1e-3)
     ridge = 1e-3 * np.diag(np.arange(degree + 1) ** 2.0)  # curves are straight until points say that they bend
     for step in range(_GROWTH_STEPS + 1):
         used = min(degree, 1 + step // 2)

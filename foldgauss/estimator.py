@@ -157,8 +157,9 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     def _fit(self, X, sample_weight):
         _check_parameters(self)
         x, weights = self._checked(X, sample_weight)
+        present = weights > 0  # rows without weight may hold anything
         with _precision(x.dtype):
-            run, model, scaled = self._runs(x, weights)
+            run, model = self._runs(x[present], weights[present])
         self._keep(run, model)
         if run.status != EMStatus.CONVERGED:
             warnings.warn(
@@ -166,7 +167,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 ConvergenceWarning,
                 stacklevel=3,
             )
-        return scaled
+        return self._scaling.apply(x)
 
     def _checked(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, both of the dtype that is fitted in."""
@@ -189,20 +190,23 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def _column(self, num_columns: int) -> int:
         column = self.time_column
-        if not isinstance(column, Integral) or not -num_columns <= column < num_columns:
+        if not isinstance(column, Integral) or isinstance(column, bool) or not -num_columns <= column < num_columns:
             raise invalid(
                 "time_column", expected=f"a column of {num_columns}", got=repr(column), cure="-1 is the last."
             )
         return int(column) % num_columns
 
-    def _runs(self, x, weights) -> tuple[Run, Model, np.ndarray]:
+    def _runs(self, x, weights) -> tuple[Run, Model]:
+        auto = "auto" in (self.n_components, self.degree)
+        if auto and weights.sum(dtype=np.float64) < len(weights):  # shares: what pays is decided by numbers of points
+            weights = weights * x.dtype.type(len(weights) / weights.sum(dtype=np.float64))
         mean, variance = variances_of(x, weights)
         envelope = _envelope(self.envelope)
         total = float(weights.sum(dtype=np.float64))
         warm = self._warm_start(x.shape[1])
         if warm is None:
             scaling = scaling_of(mean, variance, envelope, self.covariance_type)
-            num, degree = self._sizes(int((weights > 0).sum()))
+            num, degree = self._sizes(len(weights))
         else:
             scaling, (num, degree) = self._scaling, warm
         scaled = scaling.apply(x)
@@ -211,7 +215,6 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         model = Model(degrees, jnp.asarray(floor, x.dtype), self.covariance_type)
         starts = self._starts(scaled, weights, scaling, model, degree, warm is not None)
         points = points_of(scaled, weights, num * len(starts.time_loc), self.devices)
-        auto = "auto" in (self.n_components, self.degree) and warm is None
         run = best(
             expectation_maximisation(
                 starts,
@@ -219,18 +222,19 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 envelope,
                 model,
                 total=total,
-                least_mass=0.0 if self.n_components == "auto" else 0.5 * total / np.count_nonzero(weights),
+                least_mass=0.0 if self.n_components == "auto" else 0.5 * total / len(weights),
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,
                 observe=_printed if self.verbose else None,
             )
         )
-        if auto and run.status != EMStatus.NOT_FINITE:
+        if auto and warm is None and run.status != EMStatus.NOT_FINITE:
             run, model = self._pruned(run, points, envelope, model, total)
         self._scaling, self._envelope, self._floor = scaling, envelope, floor
         vars(self).pop("_online", None)  # a new fit begins anew
-        return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model, scaled
+        self._fitted_with = self.covariance_type, self._column(x.shape[1])
+        return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model
 
     def _pruned(self, run: Run, points: Points, envelope, model: Model, total: float) -> tuple[Run, Model]:
         params, model = pruned(
@@ -258,9 +262,12 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return max(1, min(self.max_components, num_points // _POINTS_PER_COMPONENT)), degree
 
     def _warm_start(self, num_columns: int) -> tuple[int, int] | None:
+        """The sizes to go on with; None where there are none, or what they stand for was changed."""
         if not self.warm_start or not hasattr(self, "_params") or self._params.tril.shape[-1] + 1 != num_columns:
             return None
-        return len(self.weights_), self._params.degree
+        same = self._fitted_with == (self.covariance_type, self._column(num_columns))
+        same &= self.n_components in ("auto", len(self.weights_)) and self.degree in ("auto", self._params.degree)
+        return (len(self.weights_), self._params.degree) if same else None
 
     def _starts(self, scaled, weights, scaling: Scaling, model: Model, degree: int, warm: bool) -> Parameters:
         """Starts, a leading axis of `n_init`."""
@@ -270,7 +277,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         made = []
         for _ in range(self.n_init):
             one = start(self.init_params, scaled, weights, model, degree, rng)
-            made.append(self._with_given(one, scaling, degree))
+            made.append(_of_kind(self._with_given(one, scaling, degree), self.covariance_type))
         return jax.tree.map(lambda *z: jnp.stack(z), *made)
 
     def _with_given(self, params: Parameters, scaling: Scaling, degree: int) -> Parameters:
@@ -323,10 +330,10 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     def partial_fit(self, X, y=None, sample_weight=None):
         """Online EM: learn from one batch after another, for data larger than memory.
 
-        The first batch is fitted by `fit` (so let it be no less than some hundred points per component), and sets the
-        floors; each later one takes one step, weighed in by its share of all weight so far, or by
-        (number of batches)^-0.7 if that is more: older batches are forgotten slowly, as they were seen with poorer
-        components. `n_iter_` counts batches; `lower_bound_` is that of the last batch before its step.
+        The first batch is fitted by `fit` (so let it be no less than some hundred points per component), sets the
+        floors, and takes the place of any fit before; each later one takes one step, weighed in by its share of all
+        weight so far to the power 0.7: older batches are forgotten slowly, as they were seen with poorer components.
+        `n_iter_` counts batches; `lower_bound_` is that of the last batch before its step.
 
         **Source:** Cappé and Moulines 2009. **Raises:** as `fit`; ValueError for an envelope other than "constant",
         whose sums do not outlive a step of time.
@@ -343,7 +350,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             scaled = self._scaling.apply(x.astype(self._params.curve.dtype))
             points = points_of(scaled, weights.astype(scaled.dtype), len(self.weights_), self.devices)
             total, batches = float(weights.sum(dtype=np.float64)), batches + 1
-            share = max(total / (seen + total), batches**-FORGETTING)
+            share = (total / (seen + total)) ** FORGETTING
             params = self._arrays(scaled.dtype)
             value = float(batch_sums(params, points).log_likelihood) / total
             params, sums = online_step(params, sums, points, model, jnp.asarray(share, scaled.dtype))
@@ -359,6 +366,12 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
             scaled = self.fit(X, sample_weight=sample_weight)._scaled(X)
+        if self.status_ in (EMStatus.NOT_FINITE, EMStatus.SINGULAR):
+            warnings.warn(
+                f"The first batch ended as {self.status_.name}. {_CURES[self.status_]}",
+                ConvergenceWarning,
+                stacklevel=3,
+            )
         with _precision(scaled.dtype):
             weights = _check_sample_weight(sample_weight, scaled, dtype=scaled.dtype)
             points = points_of(scaled, weights, len(self.weights_), self.devices)
@@ -429,7 +442,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return x[:, np.argsort(_order(self._column(x.shape[1]), x.shape[1]))], component
 
     def condition(self, columns, values):
-        """The mixture of the other columns where these have these values, by `FoldedMixture.condition`.
+        """The mixture of the other columns, **time last**, where these have these values: `FoldedMixture.condition`.
 
         **Example:** `fitted.condition(-1, 0.5)  # space at time 0.5`
         """
@@ -439,7 +452,12 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         columns = np.atleast_1d(np.asarray(columns))
         if columns.ndim != 1 or columns.dtype.kind not in "iu" or ((columns < -num) | (columns >= num)).any():
             raise invalid("columns", expected=f"columns of {num}", got=columns.tolist(), cure="They are those of X.")
-        return self.to_mixture().condition([order.index(int(c) % num) for c in columns], np.atleast_1d(values))
+        values = np.atleast_1d(np.asarray(values, np.float64))
+        if not np.isfinite(values).all():
+            raise invalid("values", expected="finite numbers", got=values.tolist())
+        with _precision(self._params.curve.dtype):  # the times of data far from zero do not fit into float32
+            made = self.to_mixture().condition([order.index(int(c) % num) for c in columns], values)
+        return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), made)
 
     def _scaled(self, X) -> np.ndarray:
         check_is_fitted(self)
@@ -489,8 +507,26 @@ def _envelope(envelope) -> AbstractEnvelope:
     return _ENVELOPES[envelope]() if isinstance(envelope, str) else envelope
 
 
+def _of_kind(params: Parameters, kind: str) -> Parameters:
+    """A start whose covariances are of the kind that is fitted: EM's steps keep it, and rely on it."""
+    tril = np.asarray(params.tril, np.float64)
+    covariances, eye = tril @ tril.swapaxes(-1, -2), np.eye(tril.shape[-1])
+    if kind == "full" or not np.isfinite(covariances).all():
+        return params
+    if kind == "tied":
+        shares = np.exp(np.asarray(params.log_weights, np.float64))
+        covariances = np.broadcast_to(np.einsum("k,kab->ab", shares / shares.sum(), covariances), covariances.shape)
+    if kind == "diag":
+        covariances = covariances * eye
+    if kind == "spherical":
+        covariances = np.trace(covariances, axis1=1, axis2=2)[:, None, None] / len(eye) * eye
+    return params._replace(tril=jnp.asarray(np.linalg.cholesky(covariances), params.tril.dtype))
+
+
 def _shaped(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     value = np.asarray(value, np.float64)
+    if not np.isfinite(value).all():
+        raise invalid(name, expected="finite numbers", got="NaN or infinity")
     if value.shape != shape:
         raise invalid(name, expected=f"shape {shape}", got=f"shape {value.shape}", cure="One entry per component.")
     return value
@@ -506,8 +542,11 @@ def _covariances(precisions, kind: str, num: int, dim: int) -> np.ndarray:
     if kind == "diag":
         precisions = precisions[:, :, None] * eye
     precisions = np.broadcast_to(precisions, (num, dim, dim))
-    if not (np.linalg.eigvalsh(precisions) > 0).all():
-        raise invalid("precisions_init", expected="positive definite", got="others", cure="Invert covariances.")
+    symmetric = np.allclose(precisions, precisions.swapaxes(-1, -2))
+    if not (symmetric and (np.linalg.eigvalsh(precisions) > 0).all()):
+        raise invalid(
+            "precisions_init", expected="symmetric and positive definite", got="others", cure="Invert covariances."
+        )
     return np.linalg.inv(precisions)
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, ArrayLike, Float, Key, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from foldgauss._checks import invalid, whole
 from foldgauss._em import EMStatus
@@ -78,6 +78,8 @@ def fit_gradient(
         raise invalid(
             "x", expected=f"shape (n, {mixture.event_shape[0]})", got=f"shape {x.shape}", cure="Time is last."
         )
+    if not len(x):
+        raise invalid("x", expected="at least one point", got="none")
     weights = jnp.ones(len(x), dtype) if sample_weight is None else jnp.asarray(sample_weight, dtype)
     if weights.shape != x.shape[:1] or not bool((weights >= 0).all()) or not bool(weights.sum() > 0):
         raise invalid("sample_weight", expected=f"{len(x)} numbers >= 0, not all 0", got=f"shape {weights.shape}")
@@ -87,18 +89,22 @@ def fit_gradient(
     key = jax.random.key(0) if key is None else key
     start = jax.tree.map(lambda z: z, mixture)
     raw = _raw_of(start)
-    state, values = optimiser.init(raw), []
-    for number in range(steps):
+    state, values, good = optimiser.init(raw), [], start
+    for number in range(steps + 1):  # once more, since a step tells of the parameters it begins with
         step_key = jax.random.fold_in(key, number)
-        new, new_state, value = _step(raw, state, start, x, weights, step_key, optimiser, batch_size)
-        if not np.isfinite(value):
-            return GradientFit(_mixture_of(raw, start), np.array(values), EMStatus.NOT_FINITE)
-        values.append(float(value))
-        finite = all(bool(jnp.isfinite(z).all()) for z in jax.tree.leaves(new._replace(logits=jnp.zeros(1))))
+        new, state, value, here, finite = _step(raw, state, start, x, weights, step_key, optimiser, batch_size)
         if not finite:
-            return GradientFit(_mixture_of(raw, start), np.array(values), EMStatus.NOT_FINITE)
-        raw, state = new, new_state
-    return GradientFit(_mixture_of(raw, start), np.array(values), EMStatus.NOT_CONVERGED)
+            return GradientFit(good, np.array(values), EMStatus.NOT_FINITE)
+        raw, good = new, here
+        if number < steps:
+            values.append(float(value))
+    return GradientFit(good, np.array(values), EMStatus.NOT_CONVERGED)
+
+
+def _is_finite(mixture: FoldedMixture) -> Bool[Array, ""]:
+    """Whether all numbers are, but for logits of -inf."""
+    leaves = jax.tree.leaves(eqx.filter(mixture.components, eqx.is_inexact_array))
+    return jnp.stack([jnp.isfinite(z).all() for z in leaves]).all() & ~jnp.isnan(mixture.logits).any()
 
 
 @eqx.filter_jit
@@ -115,7 +121,9 @@ def _step(raw, state, start, x, weights, key, optimiser, batch_size):
     value, gradient = jax.value_and_grad(loss)(raw)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # the optimiser is not ours
         updates, state = optimiser.update(gradient, state, raw)
-        return optax.apply_updates(raw, updates), state, -value
+        new = optax.apply_updates(raw, updates)
+    here = _mixture_of(raw, start)
+    return new, state, -value, here, jnp.isfinite(value) & _is_finite(here)
 
 
 def _raw_of(mixture: FoldedMixture) -> _Raw:

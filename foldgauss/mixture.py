@@ -552,9 +552,9 @@ def _log_evidence(components, rest, indices: tuple[int, ...], values: Array) -> 
 
 
 def _mixed(weights: Array, values: Array) -> Array:
-    """sum_k w_k values_k over the last dimension; what has no weight may be anything."""
+    """sum_k w_k values_k over the last dimension; what has no weight may be anything, a weight of NaN gives NaN."""
     (weights,) = align([(weights, 0)], values.ndim)
-    return jnp.where(weights > 0, weights * values, 0).sum(-1)
+    return jnp.where(weights == 0, 0, weights * values).sum(-1)
 
 
 @eqx.filter_jit
@@ -580,7 +580,7 @@ def _icdf(posterior: TimePosterior, q: Array) -> Array:
     steps = jnp.finfo(q.dtype).nmant + 8
     inner = jnp.isfinite(low) & jnp.isfinite(high)
     found = lax.fori_loop(0, steps, halve, (jnp.where(inner, low, 0), jnp.where(inner, high, 0)))[1]
-    return lax.stop_gradient(jnp.where(inner, found, low))
+    return lax.stop_gradient(jnp.where(jnp.isnan(weights).any(-1), jnp.nan, jnp.where(inner, found, low)))
 
 
 # --- draws ---------------------------------------------------------------------------------------------------
@@ -645,10 +645,10 @@ def _moments(mixture: AbstractMixture) -> tuple[Array, Array]:
 
 
 def _averaged(weights: Array, x: Array) -> Array:
-    """sum_k w_k x_k over x (*batch, k, ...); what has no weight may be anything."""
+    """sum_k w_k x_k over x (*batch, k, ...); what has no weight may be anything, a weight of NaN gives NaN."""
     rank = weights.ndim
     weights = lax.expand_dims(weights, range(rank, x.ndim))
-    return jnp.where(weights > 0, weights * x, 0).sum(rank - 1)
+    return jnp.where(weights == 0, 0, weights * x).sum(rank - 1)
 
 
 def _component_moments(components) -> tuple[Array, Array]:

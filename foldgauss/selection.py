@@ -58,16 +58,21 @@ def select_mixture(
         raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
     X = np.asarray(X)
     parts = _parts(len(X), folds, groups) if criterion == "cv" else None
-    scores = np.full((len(sizes), len(degrees)), np.inf)
+    least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
+    if max(sizes) > least:
+        got, cure = max(sizes), "Fewer components."
+        raise invalid("n_components", expected=f"at most {least}, the points of a fit", got=got, cure=cure)
+    scores, chosen = np.full((len(sizes), len(degrees)), np.inf), None
     for i, size in enumerate(sizes):
         for j, degree in enumerate(degrees):
             one = clone(estimator).set_params(n_components=int(size), degree=degree)
             scores[i, j] = _held_out(one, X, parts) if criterion == "cv" else _penalised(one, X, criterion)
+            if scores[i, j] < np.inf and scores[i, j] == scores.min():
+                chosen = one
     if not np.isfinite(scores).any():
         raise invalid("X", expected="points that some mixture fits", got="none", cure="Raise reg_covar.")
-    i, j = np.unravel_index(np.argmin(scores), scores.shape)
-    chosen = clone(estimator).set_params(n_components=int(sizes[i]), degree=degrees[j])
-    return MixtureChoice(chosen.fit(X), scores, sizes, degrees)
+    # By "bic" and "aic" it is fitted already, and another fit might end elsewhere.
+    return MixtureChoice(chosen.fit(X) if criterion == "cv" else chosen, scores, sizes, degrees)
 
 
 def _penalised(estimator, X, criterion: str) -> float:

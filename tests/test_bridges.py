@@ -122,6 +122,7 @@ def test_numpyro_distribution_is_the_same_distribution(numpyro):
     assert again.support(x).all()
 
 
+@pytest.mark.slow
 def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
     from numpyro import distributions
     from numpyro.infer import MCMC, NUTS

@@ -229,6 +229,7 @@ def test_space_marginal_is_the_law_of_the_samples():
     np.testing.assert_allclose(marginal.variance, dist.variance[:1])
 
 
+@pytest.mark.slow
 def test_density_is_the_slope_of_the_distribution_function():
     nodes, weights = np.polynomial.legendre.leggauss(60)
     for dist in (_dist(2).marginal([1]), _dist(2).condition([0], [0.3]).marginal([0])):
@@ -324,7 +325,7 @@ def _parabola(s, scale, power, dtype):
 _ACCURACY = {np.float64: 2e-13, np.float32: 2e-5}
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
 def test_mass_on_a_curve_narrower_than_numbers_lie_apart(dtype):
     s = np.array([-0.15, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 50.0])
     scales, powers = np.array([0.3, 1e-4, 1e-7, 1e-12]), np.array([1.0, 1.0, 2.0, 1.0])

@@ -297,3 +297,79 @@ def test_same_on_one_and_on_four_devices():
         [sys.executable, "-c", _SHARDED], env=environment, capture_output=True, text=True, timeout=240
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("kind", ["tied", "spherical"])
+def test_starts_are_of_the_kind_that_is_fitted(kind):
+    """Given means make a covariance for each component; those of a fit are tied, or round, all the same."""
+    x, labels = _tracks()
+    means = np.stack([x[labels == k].mean(0) for k in range(3)])
+    fitted = _quiet(FoldedGaussianMixture(3, degree=2, covariance_type=kind, means_init=means), x)
+    given = fitted.space_covariances_
+    if kind == "tied":
+        np.testing.assert_allclose(given, np.broadcast_to(given[:1], given.shape), rtol=1e-9)
+    np.testing.assert_allclose(given, given * np.eye(given.shape[-1]), atol=1e-12)
+
+
+def test_weights_that_are_shares_prune_as_well():
+    rng = np.random.default_rng(0)
+    t = rng.normal(size=300)
+    x = np.stack([2 * t + 0.1 * rng.normal(size=300), t], 1)
+    auto = FoldedGaussianMixture(max_components=4, random_state=0)
+    plain, shares = _quiet(auto, x), None
+    kept = plain.degrees_.tolist()
+    shares = _quiet(FoldedGaussianMixture(max_components=4, random_state=0), x, sample_weight=np.full(300, 1 / 300))
+    assert kept == shares.degrees_.tolist() == [1]
+
+
+def test_degrees_of_a_constant_column_and_of_exact_data():
+    rng = np.random.default_rng(0)
+    t = rng.normal(size=300)
+    for column in (np.full(300, 3.0), 2 * t):
+        x = np.stack([2 * t + 0.1 * rng.normal(size=300), column, t], 1)
+        assert _quiet(FoldedGaussianMixture(1, random_state=0), x).degrees_.tolist() == [1]
+
+
+def test_a_row_without_weight_may_hold_any_number():
+    x, _ = _tracks()
+    whole = _quiet(FoldedGaussianMixture(3, degree=1, random_state=0), x)
+    more = np.concatenate([x, [[1e200, -1e200]]])
+    weighed = _quiet(FoldedGaussianMixture(3, degree=1, random_state=0), more, sample_weight=[*np.ones(len(x)), 0])
+    assert weighed.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
+
+
+def test_a_small_batch_counts_for_little():
+    x = _blobs()
+    online = FoldedGaussianMixture(1, degree=1).partial_fit(x)
+    before = online.means_.copy()
+    moved = np.abs(online.partial_fit(x.max(0)[None] + 5).means_ - before).max()
+    assert 0 < moved < 0.5
+
+
+def test_conditions_far_from_zero_are_taken_in_the_precision_of_the_fit():
+    rng = np.random.default_rng(0)
+    t = rng.uniform(-1000, 1000, 400)
+    x = np.stack([np.sin(t / 400) + 0.01 * rng.normal(size=400), 1.7e9 + t], 1)
+    fitted = _quiet(FoldedGaussianMixture(1, degree=5), x)
+    near = [float(fitted.condition(-1, 1.7e9 + dt).mean[0]) for dt in (0, 20, 40)]
+    np.testing.assert_allclose(near, np.sin(np.array([0, 20, 40]) / 400), atol=0.03)
+    assert near[0] < near[1] < near[2]
+    with pytest.raises(ValueError, match="values: expected finite"):
+        fitted.condition(-1, np.nan)
+
+
+def test_a_warm_start_from_other_sizes_is_cold():
+    x = _blobs()
+    fitted = _quiet(FoldedGaussianMixture(2, degree=1, warm_start=True, random_state=0), x)
+    again = _quiet(fitted.set_params(n_components=3, degree=2), x)
+    assert again.means_.shape[0] == 3
+    assert again.fold_coefficients_.shape[1] == 2
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"means_init": np.full((3, 3), np.nan)}, {"precisions_init": np.full((3, 3, 3), np.nan)}, {"time_column": True}],
+)
+def test_starts_and_columns_that_cannot_be(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        FoldedGaussianMixture(3, degree=1, **options).fit(_blobs())

@@ -575,3 +575,15 @@ def test_as_scipy_object():
     np.testing.assert_allclose(frozen.logpdf(x), _mixture().log_prob(x), rtol=1e-6)
     assert frozen.cov.shape == (3, 3)
     assert frozen.marginal([0, 2]).dim == 2
+
+
+def test_nan_asked_is_nan_answered():
+    mixture = FoldedMixture(
+        FoldedGaussian(jnp.zeros((2, 2)), scale=jnp.ones((2, 2)), time_loc=[0.3, 0.7], time_scale=[0.2, 0.1]),
+        weights=[0.4, 0.6],
+    )
+    assert jnp.isnan(mixture.expected_space(jnp.nan)).all()
+    assert jnp.isnan(mixture.space_covariance(jnp.nan)).all()
+    when = mixture.time_given_space(jnp.array([0.1, jnp.nan]))
+    for value in (when.mean, when.cdf(0.5), when.icdf(0.5)):
+        assert jnp.isnan(value)

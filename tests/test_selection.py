@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 pytest.importorskip("sklearn")
@@ -94,3 +95,21 @@ def test_gradients_never_end_in_nan():
     weights = np.ones(len(x))
     weights[3] = 0  # is not there
     assert fit_gradient(_start(), x, steps=5, sample_weight=weights).status == EMStatus.NOT_CONVERGED
+
+
+@pytest.mark.slow
+def test_gradients_that_run_away_leave_the_last_good_mixture():
+    """Steps far too long: what is returned has a finite likelihood nevertheless."""
+    x = _two_parabolas()
+    for rate in (3.0, 30.0):
+        result = fit_gradient(_start(), x, steps=20, optimiser=optax.sgd(rate))
+        assert np.isfinite(result.mixture.log_prob(x).mean())
+        assert np.isfinite(result.mixture.components.time_scale).all()
+
+
+def test_the_choice_is_the_fit_that_was_scored():
+    x = _two_parabolas()
+    choice = select_mixture(FoldedGaussianMixture(max_iter=3), x, n_components=[2], degrees=[1])
+    assert choice.estimator.bic(x) == pytest.approx(choice.scores.min())
+    with pytest.raises(ValueError, match="n_components: expected at most"):
+        select_mixture(FoldedGaussianMixture(), x[:4], n_components=[5], degrees=[0])

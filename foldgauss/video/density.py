@@ -40,6 +40,8 @@ def density_image(
         raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Use marginal, or jax.vmap.")
     components, dtype = mixture.components, mixture.components.loc.dtype
     t = jnp.asarray(t, dtype)
+    if t.ndim:
+        raise invalid("t", expected="one number", got=f"shape {t.shape}", cure="Use jax.vmap for several times.")
     at = components.condition_time(t)
     log_det = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1) + 2 * at.log_scale
     log_peak = mixture.log_weights + components.time_marginal.log_prob(t) - log_det - _LOG_2PI
