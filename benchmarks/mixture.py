@@ -195,8 +195,9 @@ def main(arguments: list[str] | None = None) -> None:
     figures = {}
     for num in options.points:
         figures |= _shown(num, options.components, *_measured(num, options.components, options.rounds))
-    for name in [name for name in figures if name.endswith(f" {options.points[-1]}") and "_over_" in name]:
-        figures[name.rpartition(" ")[0]] = figures[name]  # the figures' plain names: at the most points
+    for num in sorted(options.points):  # the figures' plain names: at the most points that each was measured at
+        for name in [name for name in figures if name.endswith(f" {num}") and "_over_" in name]:
+            figures[name.rpartition(" ")[0]] = figures[name]
     if not options.skip_bending:
         figures |= _bends()
     _common.finish(options.json, figures, _common.machine(), points=options.points, components=options.components)
