@@ -237,17 +237,19 @@ def running_psnr(state: FitState) -> float:
 
 
 class _Outlook:
-    """How long a fit will still take, by the pace of the steps since it began or went on."""
+    """How long a fit will still take, by the pace of the steps since it began or went on, but for the first few."""
 
     def __init__(self, state: FitState, config: FitConfig, levels: list[Level]):
-        self.config, self.levels, self.seconds = config, levels, state.seconds
-        self.work = work_done(levels, _progress(state, config))
+        self.config, self.levels, self.first = config, levels, state.step + WARM_UP
+        self.seconds, self.work = math.nan, math.inf
 
     def seconds_left(self, state: FitState, progress: float) -> float:
         """At most what is left of the minutes, where there are any."""
         most = math.inf if self.config.minutes is None else max(60 * self.config.minutes - state.seconds, 0.0)
         work = work_done(self.levels, progress)
-        known = work > self.work and (state.plan or progress == 1)
+        if state.step <= self.first or not state.plan:
+            self.seconds, self.work = state.seconds, work
+        known = work > self.work
         return min((state.seconds - self.seconds) * (1 - work) / (work - self.work), most) if known else most
 
 
