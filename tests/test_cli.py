@@ -15,6 +15,7 @@ import pytest
 from commands import run
 
 from foldgauss import cli
+from foldgauss.cli import _shared, drawing, fitting
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
 from foldgauss.io.model_file import read_header
 
@@ -66,6 +67,28 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "400" in told
     assert "power 2" in told
+
+
+def test_other_rates_speeds_and_times(work, tmp_path, capsys):
+    """The clip has 6 frames, 12 a second; which frame is which is told by the model's own pictures."""
+    model = load_video_model(work / "model.safetensors")
+    own = list(model.frames())
+
+    def shown(name, *options):
+        assert run("render", work / "model.safetensors", "--out", tmp_path / name, *options) == 0
+        pictures = read_video(tmp_path / name).frames
+        return [next((k for k in range(6) if np.array_equal(own[k], picture)), None) for picture in pictures]
+
+    assert shown("same") == [0, 1, 2, 3, 4, 5]
+    assert shown("slow", "--speed", 0.5) == [0, None, 1, None, 2, None, 3, None, 4, None, 5]
+    assert shown("back", "--speed", -1) == [5, 4, 3, 2, 1, 0]
+    assert shown("rate", "--fps", 24) == [0, None, 1, None, 2, None, 3, None, 4, None, 5]
+    assert shown("held", "--remap", f"0=0,{1 / 12}={1 / 12},{3 / 12}={1 / 12},{4 / 12}={2 / 12}") == [0, 1, 1, 1, 2]
+    assert shown("ends", "--times", "1:0:2") == [5, 0]
+    capsys.readouterr()
+    assert run("render", work / "model.safetensors", "--out", tmp_path / "v.mp4", "--upsample", 4, "--fps", 12) == 0
+    assert "21 frames at 12 frames a second" in capsys.readouterr().out
+    assert read_video(tmp_path / "v.mp4").fps == pytest.approx(12)
 
 
 def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
@@ -185,6 +208,17 @@ def broken_inputs(tmp_path, work):
         "degree beyond": (["fit", clip, "--out", out, "--degree", "99"], 2, "degree"),
         "picture beyond memory": (["render", model, "--out", tmp_path / "v.mp4", "--size", "90000x90000"], 2, "memory"),
         "out is the clip": (["fit", clip, "--out", clip, "--overwrite"], 2, "another file"),
+        "two ways": (
+            ["render", model, "--out", tmp_path / "f", "--upsample", "2", "--speed", "2"],
+            2,
+            "--upsample and",
+        ),
+        "no rate": (["render", model, "--out", tmp_path / "f", "--fps", "0"], 2, "--fps"),
+        "no speed": (["render", model, "--out", tmp_path / "f", "--speed", "0"], 2, "--speed"),
+        "times beyond": (["render", model, "--out", tmp_path / "f", "--times", "0,1.5"], 2, "--times"),
+        "times misspelt": (["render", model, "--out", tmp_path / "f", "--times", "0:1"], 2, "--times"),
+        "remap misspelt": (["render", model, "--out", tmp_path / "f", "--remap", "0,1"], 2, "--remap"),
+        "remap back": (["render", model, "--out", tmp_path / "f", "--remap", "0=0,2=1,1=1"], 2, "--remap"),
         "upsample beyond": (["render", model, "--out", tmp_path / "f", "--upsample", "1000000000"], 2, "at most"),
         "no such folder for json": (["evaluate", model, clip, "--json", tmp_path / "no" / "f.json"], 1, "folder"),
         "mixed sizes": (["fit", mixed, "--out", out], 1, "40x50|50x40"),
@@ -266,7 +300,7 @@ def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
     def missing(name):
         raise FileNotFoundError('Try: pip install "foldgauss[samples]"')
 
-    monkeypatch.setattr(cli, "sample_clip", missing)
+    monkeypatch.setattr(fitting, "sample_clip", missing)
     assert run("demo", "--out", tmp_path / "demo") == 2
     assert "foldgauss[samples]" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
@@ -274,7 +308,7 @@ def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
 
 def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
     """The real clip, fewer steps."""
-    monkeypatch.setattr(cli, "DEMO_CONFIG", cli.FitConfig(num_gaussians=5000, steps=40))
+    monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=5000, steps=40))
     assert run("demo", "--out", tmp_path) == 0
     names = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
@@ -286,8 +320,8 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
 
 
 def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "DEMO_CONFIG", cli.FitConfig(num_gaussians=500, steps=3))
-    monkeypatch.setattr(cli, "DEMO_FRAMES", (0, 4))
+    monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(fitting, "DEMO_FRAMES", (0, 4))
     (tmp_path / "model.safetensors").write_bytes(b"an earlier demo's")
     (tmp_path / "notes.txt").write_text("mine")
     assert run("demo", "--out", tmp_path) == 2
@@ -312,7 +346,7 @@ def interrupted(monkeypatch):
     """Make the fit send its own process a signal after step 40."""
 
     def arm(number):
-        steps = cli.fit_steps
+        steps = fitting.fit_steps
 
         def stepping(*arguments):
             for state, info in steps(*arguments):
@@ -320,8 +354,8 @@ def interrupted(monkeypatch):
                     os.kill(os.getpid(), number)
                 yield state, info
 
-        monkeypatch.setattr(cli, "fit_steps", stepping)
-        return lambda: monkeypatch.setattr(cli, "fit_steps", steps)
+        monkeypatch.setattr(fitting, "fit_steps", stepping)
+        return lambda: monkeypatch.setattr(fitting, "fit_steps", steps)
 
     return arm
 
@@ -348,7 +382,7 @@ def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
     assert target.read_bytes() == whole.read_bytes()
 
 
-KEEPING_EVERY_STEP = "from foldgauss import cli; cli.CHECKPOINT_SECONDS = 0.0; cli.main()"
+KEEPING_EVERY_STEP = "from foldgauss.cli import fitting, main; fitting.CHECKPOINT_SECONDS = 0.0; main()"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="SIGKILL is POSIX's; CI runs it on Linux")
@@ -379,8 +413,8 @@ def _step_of(checkpoint):
 
 def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypatch, capsys):
     target = tmp_path / "m.safetensors"
-    monkeypatch.setattr(cli, "CHECKPOINT_SECONDS", 0.0)
-    kept, save = [], cli.save_checkpoint
+    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    kept, save = [], fitting.save_checkpoint
 
     def keep(path, state, **options):
         if state.step == 5:
@@ -388,7 +422,7 @@ def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypat
         kept.append(state.step)
         save(path, state, **options)
 
-    monkeypatch.setattr(cli, "save_checkpoint", keep)
+    monkeypatch.setattr(fitting, "save_checkpoint", keep)
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 0
     assert kept == [step for step in range(1, 31) if step != 5]
     assert "No space left" in capsys.readouterr().err
@@ -398,11 +432,11 @@ def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypat
 def test_a_fit_kept_at_its_last_step_is_finished(work, tmp_path, monkeypatch):
     """Killed between the last step and the saving of the model."""
     target = tmp_path / "m.safetensors"
-    monkeypatch.setattr(cli, "CHECKPOINT_SECONDS", 0.0)
-    save = cli.save_video_model
-    monkeypatch.setattr(cli, "save_video_model", lambda *a, **k: (_ for _ in ()).throw(OSError("killed")))
+    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    save = fitting.save_video_model
+    monkeypatch.setattr(fitting, "save_video_model", lambda *a, **k: (_ for _ in ()).throw(OSError("killed")))
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 1
-    monkeypatch.setattr(cli, "save_video_model", save)
+    monkeypatch.setattr(fitting, "save_video_model", save)
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--resume") == 0
     assert load_video_model(target).num_frames == 6
 
@@ -412,29 +446,29 @@ def test_the_model_is_saved_before_it_is_evaluated(work, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     target = tmp_path / "m.safetensors"
-    monkeypatch.setattr(cli, "evaluate", stopped)
+    monkeypatch.setattr(_shared, "evaluate", stopped)
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK) != 0
     assert load_video_model(target).num_frames == 6
 
 
 def test_presets(work, tmp_path, monkeypatch):
     """What is given on the command line is taken from there, all else from the preset."""
-    seen, steps = [], cli.fit_steps
+    seen, steps = [], fitting.fit_steps
 
     def stepping(frames, config, state):
         seen.append(config)
         return steps(frames, config, state)
 
-    monkeypatch.setattr(cli, "fit_steps", stepping)
+    monkeypatch.setattr(fitting, "fit_steps", stepping)
     model = tmp_path / "m.safetensors"
     common = ["fit", work / "clip.mp4", "--out", model, "--gaussians", "300", "--overwrite"]
     assert run(*common, "--preset", "paper", "--steps", "60", "--degree", "2", "--max-gaussians", "310") == 0
-    assert seen[-1] == cli.FitConfig.preset("paper", num_gaussians=300, max_gaussians=310, steps=60, degree=2)
+    assert seen[-1] == fitting.FitConfig.preset("paper", num_gaussians=300, max_gaussians=310, steps=60, degree=2)
     assert load_video_model(model).splats.num_gaussians <= 310
     assert run(*common, "--preset", "draft", "--steps", "9", "--batch-size", "2", "--power", "1", "--seed", "4") == 0
-    assert seen[-1] == cli.FitConfig.preset("draft", num_gaussians=300, steps=9, batch_size=2, power=1.0, seed=4)
+    assert seen[-1] == fitting.FitConfig.preset("draft", num_gaussians=300, steps=9, batch_size=2, power=1.0, seed=4)
     assert run(*common, "--steps", "9") == 0
-    assert seen[-1] == cli.FitConfig(num_gaussians=300, steps=9)
+    assert seen[-1] == fitting.FitConfig(num_gaussians=300, steps=9)
     assert run(*common, "--steps", "9", "--max-gaussians", "200") == 0
     assert load_video_model(model).splats.num_gaussians == 200
 
@@ -462,7 +496,7 @@ def test_an_unforeseen_error_is_one_line(work, tmp_path, monkeypatch, capsys):
     def broken(*arguments, **options):
         raise RuntimeError("surprise\nand more")
 
-    monkeypatch.setattr(cli, "load_video_model", broken)
+    monkeypatch.setattr(drawing, "load_video_model", broken)
     assert run("info", work / "model.safetensors") == 1
     message = capsys.readouterr().err
     assert "RuntimeError: surprise and more" in message
@@ -503,7 +537,7 @@ def test_overwrite_forgets_a_stopped_fit(work, tmp_path, interrupted, monkeypatc
     assert run("fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "80") == 1
     disarm()
     assert kept.exists()
-    steps = cli.fit_steps
+    steps = fitting.fit_steps
 
     def killed(after):
         def stepping(*given):
@@ -513,7 +547,7 @@ def test_overwrite_forgets_a_stopped_fit(work, tmp_path, interrupted, monkeypatc
         return stepping
 
     for after in (0, 1):  # only a first step takes the place of what was kept
-        monkeypatch.setattr(cli, "fit_steps", killed(after))
+        monkeypatch.setattr(fitting, "fit_steps", killed(after))
         assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--overwrite") == 1
         assert kept.exists() == (after == 0)
 

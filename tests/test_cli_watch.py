@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from commands import run
 
-from foldgauss import _progress, cli
+from foldgauss import _progress
+from foldgauss.cli import fitting
 from foldgauss.io import read_video, write_video
 from foldgauss.io.history import read_history
 
@@ -51,22 +52,22 @@ def test_history_of_a_resumed_fit_has_each_step_once(clip, tmp_path, monkeypatch
     """Kept at step 8, killed at step 12 with half a line written."""
     target, path = tmp_path / "m.safetensors", tmp_path / "m.jsonl"
     arguments = ["fit", clip, "--out", target, *QUICK, "--history", path]
-    steps = cli.fit_steps
+    steps = fitting.fit_steps
 
     def killed(*given):
         for state, info in steps(*given):
-            monkeypatch.setattr(cli, "CHECKPOINT_SECONDS", -1.0 if info.step == 8 else 1e9)
+            monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", -1.0 if info.step == 8 else 1e9)
             if info.step == 13:
                 raise OSError("killed")
             yield state, info
 
-    monkeypatch.setattr(cli, "fit_steps", killed)
+    monkeypatch.setattr(fitting, "fit_steps", killed)
     assert run(*arguments) == 1
     first = read_history(path)
     assert [info.step for info in first] == list(range(1, 13))
     with open(path, "a") as file:
         file.write('{"step": 13, "pro')
-    monkeypatch.setattr(cli, "fit_steps", steps)
+    monkeypatch.setattr(fitting, "fit_steps", steps)
     assert run(*arguments, "--resume") == 0
     history = read_history(path)
     assert [info.step for info in history] == list(range(1, 21))
@@ -86,14 +87,14 @@ def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypa
 
 
 def test_a_full_disk_ends_the_history_and_not_the_fit(clip, tmp_path, monkeypatch, capsys):
-    target, write = tmp_path / "m.safetensors", cli.HistoryFile.__call__
+    target, write = tmp_path / "m.safetensors", fitting.HistoryFile.__call__
 
     def full(self, state, info):
         if info.step >= 5:
             raise OSError(28, "No space left on device")
         write(self, state, info)
 
-    monkeypatch.setattr(cli.HistoryFile, "__call__", full)
+    monkeypatch.setattr(fitting.HistoryFile, "__call__", full)
     assert run("fit", clip, "--out", target, *QUICK, "--history", tmp_path / "h.jsonl") == 0
     assert target.exists()
     assert len(read_history(tmp_path / "h.jsonl")) == 4
@@ -179,7 +180,7 @@ def test_the_clock_rings_first_soon_and_then_now_and_then(monkeypatch):
 
 
 def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
-    steps = cli.fit_steps
+    steps = fitting.fit_steps
 
     def stepping(*given):
         for state, info in steps(*given):
@@ -187,7 +188,7 @@ def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
                 signal.raise_signal(signal.SIGINT)
             yield state, info
 
-    monkeypatch.setattr(cli, "fit_steps", stepping)
+    monkeypatch.setattr(fitting, "fit_steps", stepping)
     path = tmp_path / "h.jsonl"
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", path, "--quiet") == 1
     assert [info.step for info in read_history(path)] == list(range(1, 8))
@@ -201,7 +202,7 @@ def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monke
         raise AssertionError("went on")
         yield
 
-    monkeypatch.setattr(cli, "fit_steps", starting)
+    monkeypatch.setattr(fitting, "fit_steps", starting)
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 1
     assert f"stopped by {number.name} before the first step" in capsys.readouterr().err
     assert list(tmp_path.glob("m.*")) == []

@@ -3,7 +3,7 @@
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
-from foldgauss.video.frame_times import FrameTimes, interpolated_times
+from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
@@ -24,6 +24,9 @@ __all__ = [
     "fit",
     "fit_steps",
     "interpolated_times",
+    "played_positions",
     "psnr",
+    "remapped_positions",
     "ssim",
+    "times_at",
 ]

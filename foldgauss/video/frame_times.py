@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._checks import invalid
 from foldgauss.video.shots import is_cut
@@ -50,8 +50,59 @@ def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
     """
     if upsample < 1:
         raise invalid("upsample", expected="a whole number >= 1", got=upsample)
-    times = np.asarray(times)
-    position = np.arange((len(times) - 1) * upsample + 1) / upsample
-    interval = np.minimum(position.astype(int), len(times) - 2)
-    position = np.where(np.asarray(is_cut(times))[interval], np.floor(position + 0.5), position)
-    return np.interp(position, np.arange(len(times)), times).astype(times.dtype)
+    return times_at(times, np.arange((len(times) - 1) * upsample + 1) / upsample)
+
+
+def times_at(
+    times: Float[np.ndarray, "num_frames"], positions: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch"]:
+    """The times of continuous frame positions: 2.5 is half way from frame 2 to frame 3.
+
+    Positions are held within the clip. At a cut nothing lies between: the nearer frame's time. Shapes: as `positions`.
+    """
+    times, positions = np.asarray(times), np.clip(np.asarray(positions, np.float64), 0, len(times) - 1)
+    interval = np.minimum(positions.astype(int), len(times) - 2)
+    positions = np.where(np.asarray(is_cut(times))[interval], np.floor(positions + 0.5), positions)
+    return np.interp(positions, np.arange(len(times)), times).astype(times.dtype)
+
+
+def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Float[np.ndarray, "shown"]:
+    """Frame positions that are shown one after another, from the first frame to the last; backwards for speed < 0.
+
+    `rate` is that of the pictures over that of the frames, `speed` how fast time goes by: 0.25 is slow motion. The last
+    frame is shown only where the step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
+    """
+    _check_rate(rate)
+    if not (np.isfinite(speed) and speed != 0):
+        raise invalid("speed", expected="a number other than 0", got=speed, cure="0.25 is slow motion, -1 backwards.")
+    step = abs(speed) / rate
+    positions = np.arange(int(np.floor((num_frames - 1) / step + 1e-9)) + 1) * step
+    return positions if speed > 0 else num_frames - 1 - positions
+
+
+def remapped_positions(
+    remap: Float[ArrayLike, "points 2"], fps: float, rate: float = 1.0
+) -> Float[np.ndarray, "shown"]:
+    """Frame positions that are shown when the clip's time is a piecewise linear function of the pictures' time.
+
+    `remap` has rows (second shown, second of the clip), the first column rising from 0; `fps` is the clip's, `rate` as
+    in `played_positions`. Raises ValueError for anything else.
+    Example: `remapped_positions([[0, 0], [1, 1], [3, 1], [4, 2]], fps=25)` holds second 1 for two seconds.
+    """
+    _check_rate(rate)
+    points = np.asarray(remap, np.float64)
+    if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 2 or not np.isfinite(points).all():
+        expected = "at least two rows (second shown, second of the clip)"
+        raise invalid("remap", expected=expected, got=f"shape {points.shape}" if np.isfinite(points).all() else remap)
+    shown, of_clip = points.T
+    if shown[0] != 0 or (np.diff(shown) <= 0).any():
+        raise invalid("remap", expected="seconds shown that rise from 0", got=shown.tolist())
+    if of_clip.min() < 0:
+        raise invalid("remap", expected="seconds of the clip >= 0", got=of_clip.tolist())
+    seconds = np.arange(int(np.floor(shown[-1] * fps * rate + 1e-9)) + 1) / (fps * rate)
+    return np.interp(seconds, shown, of_clip) * fps
+
+
+def _check_rate(rate: float) -> None:
+    if not (np.isfinite(rate) and rate > 0):
+        raise invalid("rate", expected="a number > 0", got=rate)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foldgauss.video import FrameTimes, interpolated_times
+from foldgauss.video import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.shots import is_cut, out_of_cuts, time_logits
 
 
@@ -69,3 +69,30 @@ def test_bad_input():
         FrameTimes.uniform(1)
     with pytest.raises(ValueError, match="upsample"):
         interpolated_times(np.array([0.0, 1.0]), 0)
+
+
+def test_positions_become_times():
+    times = np.array([0.0, 0.2, 1.0], np.float32)
+    np.testing.assert_allclose(times_at(times, np.array([0.5, 1.5, -3.0, 9.0])), [0.1, 0.6, 0, 1], atol=1e-7)
+    cut = np.asarray(FrameTimes(time_logits(8, [3])).times())
+    np.testing.assert_array_equal(times_at(cut, np.array([2.4, 2.6])), cut[[2, 3]])
+
+
+def test_playing_at_another_rate_or_speed():
+    np.testing.assert_allclose(played_positions(4, 2.0), np.arange(7) / 2)
+    np.testing.assert_allclose(played_positions(4, 1.0, speed=0.5), np.arange(7) / 2)
+    np.testing.assert_allclose(played_positions(4, 1.0, speed=-1.5), [3, 1.5, 0])
+    assert len(played_positions(251, 60 / 25)) == 601  # the last frame is not lost to rounding
+    for wrong in (0.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="speed: expected"):
+            played_positions(4, 1.0, speed=wrong)
+        with pytest.raises(ValueError, match="rate: expected"):
+            played_positions(4, wrong)
+
+
+def test_remapped_time():
+    held = remapped_positions([[0, 0], [1, 1], [3, 1], [4, 0.5]], fps=2)
+    np.testing.assert_allclose(held, [0, 1, 2, 2, 2, 2, 2, 1.5, 1])
+    for wrong in ([[0, 0]], [[0, 0], [0, 1]], [[1, 0], [2, 1]], [[0, 0], [1, -1]], [[0, 0], [1, np.nan]], [0, 1]):
+        with pytest.raises(ValueError, match="remap: expected"):
+            remapped_positions(wrong, fps=2)

@@ -1,0 +1,62 @@
+"""The command `foldgauss`: arguments and exit codes. The work is done on the floors below."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from foldgauss import __version__
+from foldgauss.cli import drawing, fitting  # noqa: F401 - each adds its commands to `app`
+from foldgauss.cli._shared import WrongUse, app, as_option, err, out
+from foldgauss.cli.fitting import Stopped
+
+WRONG_USE, FAILURE = 2, 1
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"foldgauss {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit."""
+    del debug, version  # read by `main`, before typer runs, and by the callback
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command and exit: 0 fine, 2 wrong use, 1 failure; one-line errors unless --debug."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments  # taken out, so that it may stand anywhere
+    try:
+        app([argument for argument in arguments if argument != "--debug"], standalone_mode=True)
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        option = as_option(text)
+        if _names_an_option(text) and option.partition(":")[0] in arguments:
+            text = option
+        if not isinstance(error, ValueError | OSError | MemoryError | Stopped | KeyboardInterrupt):
+            text = f"{type(error).__name__}: {text[:300]} (--debug shows where)"
+        err.print(f"error: {text}", style="red", soft_wrap=True)
+        sys.exit(_exit_code(error))
+
+
+def _exit_code(error: BaseException) -> int:
+    """Wrong use: an argument that cannot be right. Failure: a file that cannot be read or written."""
+    wrong = isinstance(error, WrongUse | FileNotFoundError) or _names_an_option(str(error))
+    return WRONG_USE if wrong else FAILURE
+
+
+def _names_an_option(text: str) -> bool:
+    """Whether an error of the floors below is about what the user gave by an option of the same name."""
+    commands = typer.main.get_command(app).commands.values()
+    options = {option for command in commands for part in command.params for option in part.opts}
+    return ":" in text and as_option(text).partition(":")[0] in options

@@ -1,0 +1,177 @@
+"""What the commands share: consoles, options, arguments and how results are shown."""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from foldgauss.io._atomic import atomic_path
+from foldgauss.io.video_file import Clip, memory_limit
+from foldgauss.video.metrics import Evaluation, evaluate
+from foldgauss.video.model import VideoModel
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+# No markup: names of files may hold brackets.
+out = Console(markup=False, highlight=False)
+err = Console(stderr=True, markup=False, highlight=False)
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
+Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
+Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B.")]
+
+
+class WrongUse(ValueError):
+    """The command was called with arguments that cannot be right."""
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    height, cross, width = text.lower().partition("x")
+    if not (cross and height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
+        raise WrongUse(f"--size: expected HxW with both at least 1, as 160x320, got {text!r}.")
+    return int(height), int(width)
+
+
+def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    if not colon or any(part and not part.isdecimal() for part in (first, last)):
+        raise WrongUse(f"--frames: expected A:B with whole numbers >= 0, as 0:24, got {text!r}.")
+    return (int(first) if first else None), (int(last) if last else None)
+
+
+def parse_color(text: str) -> tuple[float, float, float]:
+    digits = text.removeprefix("#")
+    if not re.fullmatch("[0-9a-fA-F]{6}", digits):
+        raise WrongUse(f"--background: expected six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}.")
+    return tuple(byte / 255 for byte in bytes.fromhex(digits))
+
+
+def refuse_huge(size: tuple[int, int] | None) -> None:
+    """A picture is held in floats, some copies of it."""
+    if size is not None and 64 * size[0] * size[1] > memory_limit():
+        raise WrongUse(f"--size: expected a picture that fits in memory, got {size[0]}x{size[1]}. Take a smaller one.")
+
+
+def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
+    if path.exists() and not overwrite:
+        raise WrongUse(f"{option}: {path} exists. Choose another path, or add --overwrite.")
+
+
+@contextmanager
+def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], None]]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, disable=not (shown and err.is_terminal)) as progress:
+        task = progress.add_task(title, total=total)
+        yield lambda: progress.advance(task)
+
+
+def counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
+    for item in items:
+        yield item
+        advance()
+
+
+def evaluate_with_progress(
+    model: VideoModel,
+    frames: np.ndarray,
+    keep: Callable[[np.ndarray], None] = lambda picture: None,
+    *,
+    shown: bool = True,
+) -> Evaluation:
+    """Scores of every frame; `keep` is handed the pictures they were read off."""
+    with progress_bar("Evaluating", model.num_frames, shown) as advance:
+
+        def on_frame(picture: np.ndarray) -> None:
+            keep(picture)
+            advance()
+
+        return evaluate(model, frames, on_frame)
+
+
+def figures_of(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
+    return {
+        "mean_psnr": round(scores.mean_psnr, 3),
+        "mean_ssim": round(scores.mean_ssim, 4),
+        "lowest_psnr": round(min(scores.psnr), 3),
+        "num_frames": model.num_frames,
+        "height": model.size[0],
+        "width": model.size[1],
+        "num_gaussians": model.splats.num_gaussians,
+        "degree": model.splats.degree,
+    }
+
+
+def scores_of(scores: Evaluation) -> dict[str, Any]:
+    return {"mean_psnr": round(scores.mean_psnr, 3), "mean_ssim": round(scores.mean_ssim, 4)}
+
+
+def fingerprint(clip: Clip) -> dict[str, Any]:
+    """What a resumed fit must find again: the frames themselves, whatever they are called now."""
+    digest = hashlib.blake2b(clip.frames, digest_size=16).hexdigest()
+    return {"num_frames": clip.num_frames, "size": list(clip.size), "frames_digest": digest}
+
+
+_LABELS = {
+    "mean_psnr": ("mean PSNR", "{:.2f} dB"),
+    "mean_psnr_on_white": ("mean PSNR over white", "{:.2f} dB"),
+    "mean_ssim": ("mean SSIM", "{:.4f}"),
+    "lowest_psnr": ("lowest PSNR of a frame", "{:.2f} dB"),
+    "num_frames": ("frames", "{:,}"),
+    "height": ("height", "{:,} px"),
+    "width": ("width", "{:,} px"),
+    "num_gaussians": ("Gaussians", "{:,}"),
+    "degree": ("degree of the folds", "{}"),
+    "fit_seconds": ("time spent fitting", "{:.1f} s"),
+    "steps": ("steps", "{:,}"),
+    "stopped_by": ("stopped by", "{}"),
+    "file_bytes": ("model file", "{:,} bytes"),
+    "bits_per_pixel": ("bits per pixel", "{:.3f}"),
+}
+
+
+def print_figures(title: str, figures: dict[str, Any]) -> None:
+    table = Table(title=title, show_header=False)
+    for name, value in figures.items():
+        label, form = _LABELS[name]
+        table.add_row(label, form.format(value))
+    out.print(table)
+
+
+def print_frames(scores: Evaluation) -> None:
+    table = Table("frame", "PSNR (dB)", "SSIM")
+    for k, (psnr, ssim) in enumerate(zip(scores.psnr, scores.ssim, strict=True)):
+        table.add_row(str(k), f"{psnr:.2f}", f"{ssim:.4f}")
+    out.print(table)
+
+
+def short(value: Any) -> str:
+    text = json.dumps(value) if isinstance(value, list | dict) else str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def write_json(path: Path, figures: dict[str, Any]) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def as_option(text: str) -> str:
+    """An error about a setting, as one about its option: num_gaussians is --gaussians."""
+    name, colon, rest = text.partition(":")
+    return f"--{name.replace('num_gaussians', 'gaussians').replace('_', '-')}{colon}{rest}"

@@ -1,0 +1,228 @@
+"""The commands that show a model: `render`, `evaluate` and `info`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from foldgauss._checks import invalid
+from foldgauss.cli._shared import (
+    Frames,
+    Overwrite,
+    Size,
+    WrongUse,
+    app,
+    counted,
+    err,
+    evaluate_with_progress,
+    figures_of,
+    fingerprint,
+    out,
+    parse_color,
+    parse_frames,
+    parse_size,
+    print_figures,
+    print_frames,
+    progress_bar,
+    refuse_existing,
+    refuse_huge,
+    short,
+    write_json,
+)
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.model_file import read_header
+from foldgauss.io.video_file import MAX_FPS, VIDEO_SUFFIXES, Clip, read_video, write_video
+from foldgauss.io.video_model import load_video_model
+from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
+from foldgauss.video.metrics import evaluate
+
+MAX_UPSAMPLE = MAX_SHOWN = 100_000  # above, a clip of seconds plays for days
+MIN_SPEED = 1e-4
+
+
+@app.command()
+def render(
+    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    out_path: Annotated[Path, typer.Option("--out", help="FILE.mp4, FILE.webm, or a folder for PNG frames.")],
+    size: Size = None,
+    upsample: Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames a second [default: the clip's; with --upsample K, K times that].")
+    ] = None,
+    speed: Annotated[
+        float | None, typer.Option(help="How fast time goes by: 0.25 is slow motion, -1 backwards.")
+    ] = None,
+    remap: Annotated[
+        str | None,
+        typer.Option(metavar="S=C,S=C,..", help="Second C of the clip at second S: 0=0,1=1,3=1,4=2 holds second 1."),
+    ] = None,
+    times: Annotated[
+        str | None, typer.Option(metavar="T,T,..|A:B:N", help="These times of the model, in [0, 1]; or N from A to B.")
+    ] = None,
+    background: Annotated[
+        str, typer.Option(metavar="RRGGBB", help="Colour behind a model of a clip with alpha, as ffffff.")
+    ] = "000000",
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw a model as a video, in between its frames too."""
+    course = _Course(upsample, fps, speed, _parse_remap(remap), _parse_times(times))
+    picture_size, behind = parse_size(size), parse_color(background)
+    if out_path.suffix and not out_path.is_dir():
+        if out_path.suffix.lower() not in VIDEO_SUFFIXES:
+            wanted = " or ".join(VIDEO_SUFFIXES)
+            raise WrongUse(str(invalid("--out", expected=f"{wanted}, or a folder without extension", got=out_path)))
+        refuse_existing(out_path, overwrite)
+        check_writable(out_path)
+    refuse_huge(picture_size)
+    model = load_video_model(model_path)
+    shown, rate = course.times(np.asarray(model.frame_times.times()), model.fps), course.rate(model.fps)
+    if out_path.suffix and rate > MAX_FPS:
+        cure = f"Take at most {int(MAX_FPS / model.fps)} times the clip's rate, give --fps, or write to a folder."
+        raise WrongUse(str(invalid("--upsample", expected=f"up to {MAX_FPS:g} frames a second", got=rate, cure=cure)))
+    with progress_bar("Rendering", len(shown)) as advance:
+        pictures = counted(model.frames(shown, picture_size, background=behind), advance)
+        path = write_video(out_path, pictures, min(rate, MAX_FPS), overwrite=overwrite)
+    out.print(f"{path}: {len(shown)} frames at {rate:g} frames a second", soft_wrap=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Course:
+    """Which times are shown, and how fast: the options of `render`, at most one of the last four but `fps`."""
+
+    upsample: int | None
+    fps: float | None
+    speed: float | None
+    remap: list[tuple[float, float]] | None
+    chosen: np.ndarray | None
+
+    def __post_init__(self) -> None:
+        ways = {"upsample": self.upsample, "speed": self.speed, "remap": self.remap, "times": self.chosen}
+        given = [f"--{name}" for name, value in ways.items() if value is not None]
+        if len(given) > 1:
+            raise WrongUse(str(invalid(given[0], expected="one way to choose times", got=" and ".join(given))))
+        if self.upsample is not None and not 1 <= self.upsample <= MAX_UPSAMPLE:
+            expected = f"a whole number from 1 to {MAX_UPSAMPLE:,}"
+            raise WrongUse(str(invalid("--upsample", expected=expected, got=self.upsample)))
+        if self.fps is not None and not 0 < self.fps <= MAX_FPS:
+            raise WrongUse(str(invalid("--fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=self.fps)))
+        if self.speed is not None and not MIN_SPEED <= abs(self.speed) <= 1 / MIN_SPEED:
+            expected = f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0"
+            raise WrongUse(str(invalid("--speed", expected=expected, got=self.speed)))
+
+    def rate(self, fps: float) -> float:
+        """Frames a second of what is shown, given the clip's."""
+        return fps * (self.upsample or 1) if self.fps is None else self.fps
+
+    def times(self, frame_times: np.ndarray, fps: float) -> np.ndarray:
+        """The model times that are shown, in their order."""
+        if self.chosen is not None:
+            return self.chosen
+        if self.upsample is not None:
+            return interpolated_times(frame_times, self.upsample)
+        rate = self.rate(fps) / fps
+        if self.remap is not None:
+            if self.remap[-1][0] * fps * rate > MAX_SHOWN:
+                raise WrongUse(f"--remap: expected at most {MAX_SHOWN:,} pictures, got {self.remap[-1][0]:g} seconds.")
+            return times_at(frame_times, remapped_positions(self.remap, fps, rate))
+        return times_at(frame_times, played_positions(len(frame_times), rate, speed=self.speed or 1.0))
+
+
+@app.command(name="evaluate")
+def evaluate_command(
+    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+    frames: Frames = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare a model with its clip: PSNR and SSIM per frame, size of the file, bits per pixel."""
+    if json_path is not None:
+        refuse_existing(json_path, overwrite, "--json")
+        check_writable(json_path)
+    model = load_video_model(model_path)
+    about = read_header(model_path)["metadata"]
+    kept = about.get("frames")
+    wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
+    clip = read_video(video, frames=wanted, size=model.size)
+    if clip.num_frames != model.num_frames:
+        raise WrongUse(
+            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
+            "Name the frames it was fitted to."
+        )
+    _say_other_frames(about, clip)
+    scores = evaluate_with_progress(model, clip.frames)
+    num_bytes = model_path.stat().st_size
+    figures = figures_of(model, scores) | {"file_bytes": num_bytes}
+    if clip.has_alpha:
+        figures["mean_psnr_on_white"] = round(evaluate(model, clip.frames, background=(1.0, 1.0, 1.0)).mean_psnr, 3)
+    figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
+    if json_path is not None:
+        write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
+    print_frames(scores)
+    print_figures(str(model_path), figures)
+
+
+@app.command()
+def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]) -> None:
+    """Say what a model file holds."""
+    model = load_video_model(model_path)
+    about = read_header(model_path)["metadata"]
+    envelope = model.splats.envelope
+    times = np.asarray(model.frame_times.times())
+    figures = {
+        "frames": f"{model.num_frames} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second",
+        "Gaussians": f"{model.splats.num_gaussians:,}",
+        "fold": f"polynomial of degree {model.splats.degree}",
+        "envelope": f"time likelihood, power {float(envelope.power):g} (paper's text 1, its code 2)",
+        "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
+        "numbers stored": f"{model.num_floats:,}",
+        "file": f"{model_path.stat().st_size:,} bytes",
+    }
+    table = Table(title=str(model_path), show_header=False)
+    for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
+        table.add_row(name, value)
+    out.print(table)
+
+
+def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
+    """Any clip of the right size may be compared with a model, but not unawares."""
+    digest = about.get("frames_digest")  # files from before it was kept have none
+    if digest is not None and digest != fingerprint(clip)["frames_digest"]:
+        err.print(
+            f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
+            "another clip or range, or the same one decoded by another version of OpenCV.",
+            soft_wrap=True,
+        )
+
+
+def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:
+    if text is None:
+        return None
+    pairs = [part.partition("=") for part in text.split(",")]
+    try:
+        points = [(float(shown), float(of_clip)) for shown, _, of_clip in pairs]
+        remapped_positions(points, fps=1e-3)
+    except ValueError as error:
+        expected = "seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2"
+        raise WrongUse(str(invalid("--remap", expected=expected, got=text))) from error
+    return points
+
+
+def _parse_times(text: str | None) -> np.ndarray | None:
+    if text is None:
+        return None
+    expected = "numbers in [0, 1] as 0,0.5,1, or first:last:count as 0:1:50"
+    try:
+        if text.count(":") == 2:
+            first, last, count = text.split(":")
+            times = np.linspace(float(first), float(last), min(int(count), MAX_SHOWN + 1))
+        else:
+            times = np.array([float(part) for part in text.split(",")])
+    except ValueError as error:
+        raise WrongUse(str(invalid("--times", expected=expected, got=text))) from error
+    if not (0 < len(times) <= MAX_SHOWN and ((times >= 0) & (times <= 1)).all()):
+        raise WrongUse(str(invalid("--times", expected=expected, got=text)))
+    return times

@@ -1,0 +1,384 @@
+"""The commands that fit: `demo` and `fit`."""
+
+import dataclasses
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from foldgauss._checks import invalid
+from foldgauss._progress import Manner, Observer, previewing, print_json, watching
+from foldgauss._threads import num_threads
+from foldgauss.cli._shared import (
+    Frames,
+    Overwrite,
+    Size,
+    WrongUse,
+    app,
+    as_option,
+    err,
+    evaluate_with_progress,
+    figures_of,
+    fingerprint,
+    out,
+    parse_frames,
+    parse_size,
+    print_figures,
+    refuse_existing,
+    scores_of,
+    write_json,
+)
+from foldgauss.datasets import sample_clip
+from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io.history import HistoryFile, read_history, write_curves
+from foldgauss.io.pictures import comparison
+from foldgauss.io.video_file import VIDEO_SUFFIXES, Clip, read_video, write_image, write_video
+from foldgauss.io.video_model import load_checkpoint, save_checkpoint, save_video_model
+from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
+
+#: A running fit is kept on disk this often, in seconds.
+CHECKPOINT_SECONDS = 30.0
+DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
+DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
+DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
+
+#: What a user may take `fit --out` for: the clip as a picture, not the model.
+_OTHER_SUFFIXES = {*VIDEO_SUFFIXES, ".mov", ".avi", ".mkv", ".gif", ".png", ".jpg", ".jpeg", ".json", ".jsonl"}
+
+
+class Stopped(Exception):
+    """The user asked a fit to stop; the message says how to go on."""
+
+
+@app.command()
+def demo(
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
+) -> None:
+    """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out.
+
+    A later demo replaces the files of an earlier one; a folder with other files in it is left alone.
+    """
+    _refuse_foreign(out_dir)
+    clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
+    _make_folder(out_dir)
+    out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
+    with watching(_manner(), err) as observe:
+        state, info = _run_fit(clip.frames, DEMO_CONFIG, observe)
+    model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
+    pictures: list[np.ndarray] = []
+    scores = evaluate_with_progress(model, clip.frames, pictures.append)
+    figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+    path = save_video_model(
+        out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG) | scores_of(scores)
+    )
+    figures["file_bytes"] = path.stat().st_size
+    write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
+    shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
+    captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
+    picture = comparison([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
+    write_image(out_dir / "comparison.png", picture)
+    write_json(out_dir / "metrics.json", figures | {"psnr": scores.psnr, "ssim": scores.ssim})
+    print_figures("Demo", figures)
+    for name, what in (
+        ("comparison.png", "original, reconstruction and error side by side"),
+        ("reconstruction.mp4", "plays in any browser (VP9)"),
+        ("model.safetensors", "the model: try `foldgauss render` on it with --upsample 4"),
+        ("metrics.json", "the figures above, and by frame"),
+    ):
+        out.print(f"  {out_dir / name}  {what}", soft_wrap=True)
+
+
+@app.command()
+def fit(
+    video: Annotated[Path, typer.Argument(help="Video file, or folder of images in natural order.")],
+    out_path: Annotated[
+        Path | None, typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name].")
+    ] = None,
+    preset: Annotated[
+        str, typer.Option(help=f"Recipe that other options change: {', '.join(PRESETS)} (slow: the published one).")
+    ] = "standard",
+    size: Size = None,
+    frames: Frames = None,
+    gaussians: Annotated[
+        int | None,
+        typer.Option(help="Number of Gaussians at the start [default: by the preset, or the frame's size]."),
+    ] = None,
+    max_gaussians: Annotated[int | None, typer.Option(help="Largest number of Gaussians, grown or not.")] = None,
+    max_size_mb: Annotated[
+        float | None,
+        typer.Option("--max-size-mb", help="Largest model file, in 10^6 bytes; limits the Gaussians."),
+    ] = None,
+    degree: Annotated[
+        int | None, typer.Option(help="Degree of the fold polynomial [default: 3; draft: 2; paper: 7].")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips; draft: 800; paper: 30000].")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(help="Time to fit for.")] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option("--target-psnr", help="Stop once the mean PSNR of the frames is this, in dB.")
+    ] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
+    power: Annotated[
+        float | None,
+        typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 2]."),
+    ] = None,
+    compositing: Annotated[
+        str | None, typer.Option(help="Blend of the Gaussians: over (front to back) or sum [default: over].")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
+    overwrite: Overwrite = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
+    history: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.jsonl", help="Write every step's figures here as it is done; FILE.png: the curves."),
+    ] = None,
+    preview: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Keep a picture of the running fit here, new every 10 s.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings and errors.")] = False,
+    log_json: Annotated[bool, typer.Option("--log-json", help="Tell progress and figures as lines of JSON.")] = False,
+) -> None:
+    """Fit a model to a clip, until the first of the given budgets binds.
+
+    A stopped fit is kept and goes on with --resume.
+    """
+    changes = {
+        "num_gaussians": gaussians,
+        "max_gaussians": max_gaussians,
+        "degree": degree,
+        "steps": steps,
+        "minutes": minutes,
+        "target_psnr": target_psnr,
+        "max_size_mb": max_size_mb,
+        "batch_size": batch_size,
+        "power": power,
+        "compositing": compositing,
+        "seed": seed,
+    }
+    try:
+        config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
+    except ValueError as error:
+        raise WrongUse(as_option(str(error))) from error
+    target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
+    kept = target.with_name(f"{target.name}.checkpoint")
+    if target.exists() and video.exists() and target.samefile(video):
+        raise WrongUse(f"--out: expected another file than the clip, got {target}.")
+    if out_path is not None and out_path.suffix.lower() in _OTHER_SUFFIXES:
+        raise WrongUse(
+            f"--out: expected a name for the model, as {out_path.with_suffix('.safetensors')}, got {out_path}."
+        )
+    manner = _manner(quiet, log_json)
+    refuse_existing(target, overwrite)
+    curves = _check_records(target, video, history, preview, overwrite or resume)
+    if kept.exists() and not (resume or overwrite):
+        raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
+    if resume and not kept.exists():
+        raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
+    check_writable(target)
+    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
+    _say_clip(clip, config, manner)
+    source = fingerprint(clip)
+    state = load_checkpoint(kept, config=config, source=source) if resume else None
+
+    def keep(state: FitState) -> None:
+        save_checkpoint(kept, state, config=config, source=source)
+
+    def begin() -> None:
+        if overwrite and not resume:
+            kept.unlink(missing_ok=True)  # or a --resume after this fit would go on with the one before
+
+    recorded = None
+    if history is not None:
+        recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
+    previews = None if preview is None else previewing(preview, clip, config)
+    with watching(manner, err, history=recorded, preview=previews) as observe:
+        state, info = _run_fit(clip.frames, config, observe, state, keep, begin)
+    model = to_model(state, config, clip.size, clip.fps)
+    about = _provenance(clip, config) | {"frames": parse_frames(frames)}
+    save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
+    kept.unlink(missing_ok=True)
+    if history is not None:
+        _draw_curves(curves, history)
+    scores = evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
+    save_video_model(target, model, metadata=about | scores_of(scores))
+    figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+    figures |= {"stopped_by": info.stopped_by, "file_bytes": target.stat().st_size}
+    if manner == "json":
+        with suppress(OSError):  # nobody listens any more, but the model is there
+            print_json("done", {"model": str(target)} | figures)
+    elif manner != "quiet":
+        print_figures(str(target), figures)
+
+
+def _manner(quiet: bool = False, log_json: bool = False) -> Manner:
+    """How a fit is shown: as asked, else a bar on a terminal and lines in a log."""
+    if quiet and log_json:
+        raise WrongUse("--quiet: expected one of --quiet and --log-json, got both. Leave one out.")
+    if quiet or log_json:
+        return "quiet" if quiet else "json"
+    return "bar" if err.is_terminal else "lines"
+
+
+def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
+    """Refuse places for the history, its curves and the preview that cannot be right; returns that of the curves."""
+    curves = Path() if history is None else history.with_suffix(".png")
+    asked = {"--history": (history, ".jsonl"), "--preview": (preview, ".png")}
+    for option, (path, suffix) in asked.items():
+        if path is not None and path.suffix != suffix:
+            raise WrongUse(str(invalid(option, expected=f"a name ending in {suffix}", got=path)))
+    places = [("--history", history), ("--history", None if history is None else curves), ("--preview", preview)]
+    taken = {target.resolve(), video.resolve()}
+    for option, path in places:
+        if path is None:
+            continue
+        if video.is_dir() and path.resolve().parent == video.resolve():
+            raise WrongUse(
+                f"{option}: expected a place outside the clip's folder, got {path}: it would be a frame there."
+            )
+        if path.resolve() in taken:
+            raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
+        taken.add(path.resolve())
+        refuse_existing(path, overwrite, option)
+        check_writable(path)
+    return curves
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """A demo replaces its own files only, so nothing else may be among them."""
+    try:
+        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
+    except OSError:  # missing, or no folder: making it says so
+        return
+    foreign = sorted(names - DEMO_FILES)
+    if foreign:
+        raise WrongUse(
+            f"--out: expected a new folder or one that a demo wrote, got {folder} with {foreign[0]!r} in it. "
+            "Choose another folder."
+        )
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
+    check_writable(path / "model.safetensors")
+
+
+def _run_fit(
+    frames: np.ndarray,
+    config: FitConfig,
+    observe: Observer,
+    resumed: FitState | None = None,
+    keep: Callable[[FitState], object] | None = None,
+    begin: Callable[[], object] = lambda: None,
+) -> tuple[FitState, FitInfo]:
+    """Run the fit; `observe` sees each step, `keep` is called now and then, and before leaving on a signal.
+
+    `begin` is called once there is a first step, and so something in place of what was there before.
+    """
+    with _signals() as asked:
+        kept_at = time.monotonic()
+        for state, info in fit_steps(frames, config, resumed):
+            if not asked.stepping:
+                asked.stepping = True
+                begin()
+            observe(state, info)  # first: what is kept at a step is in the history
+            if keep is not None and time.monotonic() - kept_at > CHECKPOINT_SECONDS:
+                _keep_if_possible(keep, state)
+                kept_at = time.monotonic()
+            if asked.name and info.progress < 1:
+                raise _stopped(asked.name, state, info, keep)
+    return state, info
+
+
+def _keep_if_possible(keep: Callable[[FitState], object], state: FitState) -> None:
+    """A full disk now is no reason to lose the fit: say so, and go on."""
+    try:
+        keep(state)
+    except OSError as error:
+        err.print(f"warning: the fit could not be kept at step {state.step}: {error}", soft_wrap=True)
+
+
+def _stopped(name: str, state: FitState, info: FitInfo, keep: Callable[[FitState], object] | None) -> Stopped:
+    """Keep the fit and say how to go on."""
+    if keep is None:
+        return Stopped(f"stopped by {name} after step {info.step}; nothing was kept.")
+    keep(state)
+    return Stopped(f"stopped by {name} after step {info.step}; add --resume to go on from there.")
+
+
+@dataclasses.dataclass
+class _Asked:
+    """The signal that asked a fit to stop; and whether it had taken a step by then, which must not be cut in half."""
+
+    name: str = ""
+    stepping: bool = False
+
+
+@contextmanager
+def _signals() -> Iterator[_Asked]:
+    """Note SIGINT and SIGTERM, for the end of a step; before the first step they stop at once, as a second SIGINT."""
+    asked, before = _Asked(), {}
+
+    def note(number, frame) -> None:
+        asked.name = asked.name or signal.Signals(number).name
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if not asked.stepping:
+            raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, note)
+    try:
+        yield asked
+    except KeyboardInterrupt as error:
+        if asked.stepping:
+            raise
+        raise Stopped(f"stopped by {asked.name} before the first step.") from error
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _draw_curves(path: Path, history: Path) -> None:
+    """The fit is done by now: what goes wrong with its curves is told, no more."""
+    try:
+        write_curves(path, read_history(history))
+    except (ImportError, OSError, ValueError) as error:
+        err.print(f"warning: no curves in {path}: {error}", soft_wrap=True)
+
+
+def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
+    height, width = clip.size
+    if clip.num_declared > clip.num_frames:
+        err.print(
+            f"warning: only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; those are used.",
+            soft_wrap=True,
+        )
+    num = chosen_num_gaussians(config, clip.num_frames, height, width)
+    steps = planned_steps(config, clip.num_frames)
+    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
+    plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
+    if manner == "json":
+        about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
+        print_json("start", about | {"num_gaussians": num, "degree": config.degree, "threads": num_threads()})
+    if manner in ("json", "quiet"):
+        return
+    growing = "" if config.growth is None else " at the start"
+    out.print(
+        f"{clip.source}: {clip.num_frames} frames of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
+        f"{num:,} Gaussians of degree {config.degree}{growing}, "
+        f"{plan}, {num_threads()} threads",
+        soft_wrap=True,
+    )
+
+
+def _provenance(clip: Clip, config: FitConfig) -> dict[str, Any]:
+    return {"clip": Path(clip.source).name, "seed": config.seed, "frames_digest": fingerprint(clip)["frames_digest"]}
