@@ -1,0 +1,138 @@
+"""Frames never seen: fit every second frame, draw those in between, and compare with what is usual.
+
+    python -m benchmarks.interpolation [--json FILE] [--clip bunny|bikes|carphone|PATH ...] [--size HxW]
+                                       [--frames A:B] [--gaussians N] [--steps N | --minutes M] [--seed S]
+                                       [--set NAME=VALUE ...] [--sheet FILE]
+
+Without options: *bunny* and *bikes* at 160x320, 40,000 Gaussians, 2 minutes each. Frames 0, 2, 4, ... are fitted, and
+frames 1, 3, 5, ... drawn half way between the learned times of their neighbours. Beside them, of the same neighbours:
+
+- their mean, and their mean after warping each half way by OpenCV's DIS flow between the two;
+- both again, of the model's own pictures of the neighbours: then all start from the same quality.
+
+PSNR of 8-bit pictures, mean over the frames; "without cuts" leaves out frames between two shots, which nothing can
+know. `--sheet` draws the held-out frames on which ours and the best rival differ most.
+"""
+
+import argparse
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks import _common, fit_clip
+from benchmarks._common import console
+from foldgauss.datasets import sample_clip
+from foldgauss.io.pictures import comparison
+from foldgauss.io.video_file import Clip, read_video, write_image
+from foldgauss.video import interpolated_times
+from foldgauss.video.config import FitConfig
+from foldgauss.video.fit import fit
+from foldgauss.video.metrics import psnr
+from foldgauss.video.shots import is_cut
+
+CLIPS, SIZE, GAUSSIANS, MINUTES = ("bunny", "bikes"), (160, 320), 40_000, 2.0
+SHOWN = 4
+
+
+def mean_of_two(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Linear blending, half way; uint8 (height, width, 3)."""
+    return ((one.astype(np.uint16) + other + 1) // 2).astype(np.uint8)
+
+
+def warped_half_way(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Each picture moved half of its flow to the other, then their mean."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (one, other)]
+    rows, columns = one.shape[:2]
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+    moved = []
+    for picture, pair in ((one, grey), (other, grey[::-1])):
+        flow = search.calc(*pair, None)
+        moved.append(cv2.remap(picture, grid - flow / 2, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    return mean_of_two(*moved)
+
+
+def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None) -> dict[str, float]:
+    """Figures of one clip, which are also shown."""
+    seen, held_out = clip.frames[::2], clip.frames[1:-1:2] if len(clip.frames) % 2 else clip.frames[1::2][:-1]
+    model = fit(np.ascontiguousarray(seen), config, fps=clip.fps / 2).model
+    times = np.asarray(model.frame_times.times())
+    own = list(model.frames())
+    between = list(model.frames(interpolated_times(times, 2)[1::2]))
+    whole = ~np.asarray(is_cut(times))
+    pictures = {"folded Gaussians": between}
+    for whose, frames in (("frames", seen), ("own pictures", own)):
+        pairs = list(itertools.pairwise(frames))
+        pictures[f"blending, {whose}"] = [mean_of_two(*pair) for pair in pairs]
+        pictures[f"DIS warping, {whose}"] = [warped_half_way(*pair) for pair in pairs]
+    scores = {
+        way: np.array([psnr(target, made) for target, made in zip(held_out, every, strict=True)])
+        for way, every in pictures.items()
+    }
+    training = float(np.mean([psnr(target, made) for target, made in zip(seen, own, strict=True)]))
+    ours = scores["folded Gaussians"]
+    _show(scores, training, whole, f"{name}: {len(seen)} frames of {clip.size[0]}x{clip.size[1]} fitted")
+    if sheet is not None:
+        _draw(sheet.with_stem(f"{sheet.stem}-{name}"), held_out, pictures, scores, whole)
+    names = {"blending, frames": "blend", "DIS warping, frames": "warp"}
+    names |= {"blending, own pictures": "own_blend", "DIS warping, own pictures": "own_warp"}
+    figures = {f"held_out_{name}": ours.mean(), f"training_{name}": training}
+    figures |= {f"{short}_{name}": scores[way].mean() for way, short in names.items()}
+    figures[f"loss_{name}"] = training - ours.mean()
+    figures[f"held_out_whole_{name}"] = ours[whole].mean()
+    figures[f"warp_whole_{name}"] = scores["DIS warping, frames"][whole].mean()
+    return figures
+
+
+def _show(scores: dict[str, np.ndarray], training: float, whole: np.ndarray, title: str) -> None:
+    table = _common.table(title, "held-out frames", "PSNR, dB", "without cuts", "worst")
+    for way, values in scores.items():
+        kept = values[whole]
+        table.add_row(way, f"{values.mean():.2f}", f"{kept.mean():.2f}", f"{kept.min():.2f}")
+    table.add_section()
+    table.add_row("the frames fitted, by the model", f"{training:.2f}", "", "")
+    console.print(table)
+
+
+def _draw(path: Path, held_out, pictures, scores, whole) -> None:
+    ours, rival = "folded Gaussians", "DIS warping, frames"
+    gain = np.where(whole, scores[ours] - scores[rival], 0)
+    order = np.argsort(gain)
+    shown = [*order[: SHOWN // 2], *order[-(SHOWN // 2) :]]
+    for way, where in ((ours, path), (rival, path.with_stem(f"{path.stem}-warped"))):
+        captions = [f"frame {2 * k + 1}, {scores[way][k]:.1f} dB" for k in shown]
+        write_image(where, comparison([held_out[k] for k in shown], [pictures[way][k] for k in shown], captions))
+
+
+def main(arguments: list[str] | None = None) -> None:
+    options = _common.parse(_parser(), arguments)
+    budget = {"steps": options.steps} if options.steps is not None else {"minutes": options.minutes or MINUTES}
+    config = FitConfig(num_gaussians=options.gaussians, seed=options.seed, **budget | dict(options.set or ()))
+    figures = {}
+    for name in options.clip or CLIPS:
+        path = sample_clip(name) if name in fit_clip.SAMPLES else Path(name)
+        clip = read_video(path, frames=options.frames, size=options.size)
+        figures |= measure(clip, config, Path(name).stem, options.sheet)
+    setting = {"size": options.size, "gaussians": options.gaussians, "seed": options.seed} | budget
+    _common.finish(options.json, figures, _common.machine(), setting=setting | {"set": dict(options.set or ())})
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _common.parser(__doc__)
+    parser.add_argument("--clip", action="append", help="a sample clip or a path; may be given again [bunny, bikes]")
+    parser.add_argument("--size", type=_common.size, metavar="HxW", default=SIZE, help="[160x320]")
+    parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="frames A <= i < B [all]")
+    parser.add_argument("--gaussians", type=_common.whole, default=GAUSSIANS, help=f"[{GAUSSIANS}]")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=_common.whole, help="how long, in steps")
+    length.add_argument("--minutes", type=float, help=f"how long, in minutes [{MINUTES:g}]")
+    parser.add_argument("--seed", type=int, default=0, help="[0]")
+    parser.add_argument("--set", action="append", type=fit_clip._setting, metavar="NAME=VALUE", help="of FitConfig")
+    parser.add_argument("--sheet", type=Path, metavar="FILE", help="pictures of held-out frames go here (PNG)")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
