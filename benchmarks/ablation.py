@@ -4,9 +4,9 @@
                                   [--idea NAME ...]
 
 Every idea is switched off alone, everything else as in `FitConfig()`; fits of one clip and seed run one after another,
-the default among them, so that a slow minute of the machine hits neighbours alike. With `--steps`
-the machine's pace does not matter, which is fair to ideas that do not change what a step costs. PSNR is the mean over
-all frames of 8-bit pictures. *Bunny* is at 160x320 with 40,000 Gaussians, *bikes* at its own 272x640 with the default's number.
+the default among them, so that a slow minute of the machine hits neighbours alike. With `--steps` the machine's pace
+does not matter, which is fair to ideas that do not change what a step costs. PSNR is the mean over all frames of 8-bit
+pictures. *Bunny* is at 160x320 with 40,000 Gaussians, *bikes* at its own 272x640 with the default's number.
 """
 
 import dataclasses
