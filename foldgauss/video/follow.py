@@ -35,7 +35,7 @@ class Traits(NamedTuple):
     """The Gaussians seen in a frame, and what they are told apart by.
 
     Colours and motions are those *seen* where the Gaussian is: the picture's, averaged by its weights. Its own may be
-    anything where many Gaussians overlap.
+    anything where many Gaussians overlap. Where the motion seen is not one, the Gaussian stands at a border.
     """
 
     light: Light
@@ -43,8 +43,14 @@ class Traits(NamedTuple):
     index: Int[np.ndarray, "num"]  # of all
     position: Float32[np.ndarray, "num 2"]  # px
     motion: Float32[np.ndarray, "num 2"]  # px per frame
+    spread: Float32[np.ndarray, "num"]  # of the motion seen: its standard deviation, px per frame
+    own_motion: Float32[np.ndarray, "num 2"]  # px per frame
     color: Float32[np.ndarray, "num 3"]  # CIELAB
     total: Float32[np.ndarray, "num"]  # px
+
+    def those(self, keep: Bool[np.ndarray, "num"]) -> "Traits":
+        """Some of them."""
+        return Traits(self.light, *(leaf[keep] for leaf in self[1:]))
 
 
 def traits(stage: Stage, k: int) -> Traits:
@@ -53,10 +59,14 @@ def traits(stage: Stage, k: int) -> Traits:
     which = np.flatnonzero(light.total > 0)
     total = light.total[which]
     everyone = light.drawn(np.ones((len(light.alive), 1)))
-    flow = light.drawn(_motion(stage, k, light)) / np.maximum(everyone, 1e-6)
-    motion = light.gathered(flow)[which] / total[:, None]
-    color = light.gathered(light.picture)[which] / total[:, None]
-    return Traits(light, which, light.alive[which], light.splats.mean[which], motion, lab(color), total)
+    own_motion = _motion(stage, k, light)
+    flow = light.drawn(own_motion) / np.maximum(everyone, 1e-6)
+    *motion, square = (light.gathered(np.stack([*flow, (flow * flow).sum(0)]))[which] / total[:, None]).T
+    motion = np.stack(motion, -1)
+    spread = np.sqrt(np.maximum(square - (motion * motion).sum(1), 0))
+    color = lab(light.gathered(light.picture)[which] / total[:, None])
+    position, own_motion = light.splats.mean[which], own_motion[which]
+    return Traits(light, which, light.alive[which], position, motion, spread, own_motion, color, total)
 
 
 def _motion(stage: Stage, k: int, light: Light) -> Float32[np.ndarray, "num_alive 2"]:
@@ -168,11 +178,12 @@ def grown(stage: Stage, pixel: tuple[int, int], k: int, tolerance: float) -> Boo
     parts = ((one.index, one.color, one.total) for one in seen)
     color, alike = weighted_mean(stage.num_gaussians, parts)
     alike[alike] = difference(color[alike], wanted) <= tolerance
-    candidates = alike[here.alive]
-    seed = here.alive[np.argmax(np.where(candidates, weight, 0) if (weight[candidates] > 0).any() else weight)]
+    of_color = np.where(alike[here.alive], weight, 0)
+    seed = here.alive[np.argmax(of_color if of_color.any() else weight)]
     alike[seed] = True
-    _, part = connected_components(_links(stage, seen, alike), directed=False)
-    return alike & (part == part[seed])
+    pairs = _pairs(stage, seen, alike)
+    inside = _connected(stage.num_gaussians, pairs, seed)
+    return inside | _joining(stage.num_gaussians, pairs, inside)
 
 
 def _sampled(stage: Stage, k: int) -> list[int]:
@@ -183,29 +194,68 @@ def _sampled(stage: Stage, k: int) -> list[int]:
     return list(range(own[0] + (k - own[0]) % step, own[-1] + 1, step))
 
 
-def _links(stage: Stage, seen: list[Traits], among: Bool[np.ndarray, "num_gaussians"]) -> coo_array:
-    """The graph of neighbours that move alike in most of the frames in which they touch."""
-    num = stage.num_gaussians
-    pairs = [_touching(one, among, MOTION * max(stage.size)) for one in seen]
-    one, other, alike = (np.concatenate([pair[n] for pair in pairs]) for n in range(3))
-    votes = coo_array((np.where(alike, 1.0, -1.0), (one, other)), shape=(num, num)).tocsr()
-    votes.data[votes.data <= 0] = 0
+class _Pairs(NamedTuple):
+    """Neighbours that touch in a frame, frame after frame, both ways round, by number."""
+
+    one: Int[np.ndarray, "num"]
+    other: Int[np.ndarray, "num"]
+    firm: Bool[np.ndarray, "num"]  # neither stands at a border
+    alike: Bool[np.ndarray, "num"]  # they move alike, as seen
+    gap: Float32[np.ndarray, "num"]  # of one's *own* motion and the other's, px per frame; NaN if that is at a border
+
+
+def _connected(num: int, pairs: _Pairs, seed: int) -> Bool[np.ndarray, "num_gaussians"]:
+    """Whom a chain of links leads to: firm pairs that move alike in most of the frames in which they touch.
+
+    Chains do not go through those at borders: there the motion seen changes little by little, from one to the other.
+    """
+    one, other = pairs.one[pairs.firm], pairs.other[pairs.firm]
+    votes = coo_array((np.where(pairs.alike[pairs.firm], 1.0, -1.0), (one, other)), shape=(num, num)).tocsr()
+    votes.data[votes.data < 0] = 0
     votes.eliminate_zeros()
-    return votes
+    _, part = connected_components(votes, directed=False)
+    return part == part[seed]
 
 
-def _touching(seen: Traits, among: Bool[np.ndarray, "num_gaussians"], motion: float) -> tuple[np.ndarray, ...]:
-    """(one, other, whether they move alike) of the neighbours in a frame, by number, the smaller first."""
-    own = np.flatnonzero(among[seen.index])
-    if len(own) < 2:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
-    index, position, velocity = seen.index[own], seen.position[own], seen.motion[own]
-    radius = np.abs(np.linalg.det(seen.light.splats.factor[seen.which[own]])) ** 0.5
-    num = min(NEIGHBOURS + 1, len(own))
-    distance, other = cKDTree(position).query(position, list(range(1, num + 1)))
-    one = np.broadcast_to(np.arange(len(own))[:, None], other.shape)
+def _joining(num: int, pairs: _Pairs, inside: Bool[np.ndarray, "num_gaussians"]) -> Bool[np.ndarray, "num_gaussians"]:
+    """Those at borders in all frames whose own motion is more like that of their neighbours inside than outside."""
+    free = np.ones(num, bool)
+    free[pairs.one[pairs.firm]] = False
+    gaps = []
+    for side in (inside, ~inside):
+        which = side[pairs.other] & ~np.isnan(pairs.gap)
+        count = np.bincount(pairs.one[which], minlength=num)
+        total = np.bincount(pairs.one[which], pairs.gap[which], minlength=num)
+        gaps.append(np.divide(total, count, out=np.full(num, np.inf), where=count > 0))
+    return free & (gaps[0] < gaps[1])
+
+
+def _pairs(stage: Stage, seen: list[Traits], among: Bool[np.ndarray, "num_gaussians"]) -> _Pairs:
+    """All pairs among some, in each frame those seen clearly: of one that is hidden one sees what is in front."""
+    best = np.zeros(stage.num_gaussians)
+    for one in seen:
+        best[one.index] = np.maximum(best[one.index], one.total)
+    clear = (one.those(among[one.index] & (one.total >= CLEAR * best[one.index])) for one in seen)
+    found = [_touching(one, MOTION * max(stage.size)) for one in clear if len(one.index)]
+    return _Pairs(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _touching(seen: Traits, motion: float) -> _Pairs:
+    """The pairs of one frame."""
+    num = min(NEIGHBOURS + 1, len(seen.index))  # with oneself
+    radius = np.abs(np.linalg.det(seen.light.splats.factor[seen.which])) ** 0.5
+    distance, other = cKDTree(seen.position).query(seen.position, list(range(1, num + 1)))
+    one = np.broadcast_to(np.arange(len(other))[:, None], other.shape)
     near = (distance <= REACH * (radius[one] + radius[other]) + 1) & (one != other)
     one, other = one[near], other[near]
-    speed = np.hypot(*np.maximum(np.abs(velocity[one]), np.abs(velocity[other])).T)
-    alike = np.hypot(*(velocity[one] - velocity[other]).T) <= motion + MOTION_SHARE * speed
-    return np.minimum(index[one], index[other]), np.maximum(index[one], index[other]), alike
+    firm = seen.spread <= motion + MOTION_SHARE * np.hypot(*seen.motion.T)
+    alike = _move_alike(seen.motion[one], seen.motion[other], motion)
+    gap = np.where(firm[other], np.hypot(*(seen.own_motion[one] - seen.motion[other]).T), np.nan)
+    return _Pairs(seen.index[one], seen.index[other], firm[one] & firm[other], alike, gap)
+
+
+def _move_alike(
+    one: Float[np.ndarray, "num 2"], other: Float[np.ndarray, "num 2"], motion: float
+) -> Bool[np.ndarray, "num"]:
+    speed = np.maximum(np.hypot(*one.T), np.hypot(*other.T))
+    return np.hypot(*(one - other).T) <= motion + MOTION_SHARE * speed

@@ -187,22 +187,20 @@ def weighted_mean(
     return np.divide(value, total, out=value, where=there[:, None]), there
 
 
-def drawn_share(
-    model: VideoModel, mask: Bool[np.ndarray, "num_gaussians"], t: float
-) -> Float32[np.ndarray, "height width"]:
+def drawn_share(stage: Stage, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Float32[np.ndarray, "height width"]:
     """The share of a set of Gaussians in each pixel at time t: sum of their weights over that of all; 0 where none."""
-    light = Stage(model).at(t)
+    light = stage.at(t)
     chosen = mask[light.alive]
     own, everyone = light.drawn(np.stack([chosen, np.ones_like(chosen)], 1))
     return np.divide(own, everyone, out=np.zeros_like(own), where=everyone > 0)
 
 
-def reached(model: VideoModel, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
+def reached(stage: Stage, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
     """The pixels at time t that a set of Gaussians reaches: where the alpha of one is not cut off, seen or hidden."""
-    light = Stage(model).at(t)
-    chosen = mask[light.alive]
-    splats = light.splats
+    splats = stage.at(t).splats
+    chosen = mask[splats.alive]
     leaves = splats.mean[chosen], splats.factor[chosen], splats.opacity[chosen]
     bright = np.ones((int(chosen.sum()), 3), np.float32)
     # Added up: nothing hides behind anything then.
-    return cpu.forward(*leaves, bright, _DARK, model.size, compositing="sum", options=model.options).image[0] > 0
+    drawn = cpu.forward(*leaves, bright, _DARK, stage.size, compositing="sum", options=stage.model.options)
+    return drawn.image[0] > 0

@@ -340,7 +340,7 @@ def matte(model: VideoModel, selection: Selection, t: float) -> Float32[np.ndarr
 
     **Example:** `matte(model, selection, 0.5) > 0.5`. **Raises:** ValueError for a selection of another model.
     """
-    return drawn_share(model, _of(model, selection), t)
+    return drawn_share(*_known(model, selection), t)
 
 
 def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndarray, "height width"]:
@@ -348,11 +348,13 @@ def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndar
 
     Reached is where a Gaussian's alpha is not cut off (`RenderOptions.alpha_cutoff`). Else as `matte`.
     """
-    return reached(model, _of(model, selection), t)
+    return reached(*_known(model, selection), t)
 
 
-def _of(model: VideoModel, selection: Selection) -> Bool[np.ndarray, "num_gaussians"]:
-    return (Selection.none(model) | selection).mask
+def _known(model: VideoModel, selection: Selection) -> tuple[Stage, Bool[np.ndarray, "num_gaussians"]]:
+    """The model, ready to be asked, and the mask of a selection that fits it."""
+    stage = Stage(model)
+    return stage, (Selection.none(model) | selection).mask
 
 
 def _inside(model: VideoModel, region: Region, threshold: float, follow: bool) -> Selection:
