@@ -2,7 +2,9 @@
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.history import HistoryFile, read_history, write_curves
+from foldgauss.io.masks import read_masks
 from foldgauss.io.model_file import ModelFileError
+from foldgauss.io.selections import load_selection, save_selection
 from foldgauss.io.video_file import Clip, VideoError, read_video, write_image, write_video
 from foldgauss.io.video_model import load_video_model, save_video_model
 
@@ -12,9 +14,12 @@ __all__ = [
     "ModelFileError",
     "OutputError",
     "VideoError",
+    "load_selection",
     "load_video_model",
     "read_history",
+    "read_masks",
     "read_video",
+    "save_selection",
     "save_video_model",
     "write_curves",
     "write_image",

@@ -11,6 +11,8 @@ from foldgauss._checks import invalid
 #: Kinds of image whose stored numbers are the labels: palette ("P"), grey ("L") and black and white ("1").
 _NUMBERED = ("P", "L", "1")
 _WHITE = 255
+#: The label of pixels that may be anything.
+VOID = 255
 
 
 def read_labels(paths: Sequence[Path]) -> np.ndarray:

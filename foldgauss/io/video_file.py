@@ -345,13 +345,13 @@ def _fit_to(size: tuple[int, int] | None, crop: tuple[int, int] | None = None) -
                 cure="Take fewer frames or a smaller size.",
             )
         if size is not None and image.shape[:2] != size:
-            image = _resized(image[_centre_crop(image.shape[:2], size)], size)
+            image = _resized(image[aspect_window(image.shape[:2], size)], size)
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGRA2RGBA)
 
     return prepare
 
 
-def _centre_crop(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, slice]:
+def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, slice]:
     """The largest centred window of `have` with the aspect of `want`, to whole pixels."""
     height, width = have
     if width * want[0] > height * want[1]:

@@ -7,6 +7,19 @@ from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_p
 from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
+from foldgauss.video.select import (
+    Selection,
+    by_box,
+    by_click,
+    by_color,
+    by_mask,
+    by_polygon,
+    by_time,
+    contribution,
+    influence,
+    matte,
+    select,
+)
 
 __all__ = [
     "Evaluation",
@@ -18,15 +31,26 @@ __all__ = [
     "FrameTimes",
     "Growth",
     "LearningRates",
+    "Selection",
     "VideoModel",
+    "by_box",
+    "by_click",
+    "by_color",
+    "by_mask",
+    "by_polygon",
+    "by_time",
+    "contribution",
     "density_image",
     "evaluate",
     "fit",
     "fit_steps",
+    "influence",
     "interpolated_times",
+    "matte",
     "played_positions",
     "psnr",
     "remapped_positions",
+    "select",
     "ssim",
     "times_at",
 ]

@@ -117,8 +117,8 @@ def test_frame_range_is_half_open(clip_file, frames, first, count):
         ((1, 5000), (5000, 16), (0, 1, 2499, 2500)),
     ],
 )
-def test_centre_crop(have, want, window):
-    rows, columns = video_file._centre_crop(have, want)
+def testaspect_window(have, want, window):
+    rows, columns = video_file.aspect_window(have, want)
     assert (rows.start, rows.stop, columns.start, columns.stop) == window
 
 

@@ -1,0 +1,206 @@
+"""Who adds what to the picture: the weights w_i(p) = alpha_i(p) times the light that reaches Gaussian i at pixel p.
+
+A picture is A c: linear in the colours, with A the weights. So the renderer's two passes give both ways through A:
+forward, what any three numbers of each Gaussian look like; backward, the sums over pixels of any picture times the
+weights. Three channels always, since the kernels for three are those that the fit and playback have compiled.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.special import expit
+
+from foldgauss._checks import invalid
+from foldgauss.render import cpu
+from foldgauss.video.conditioning import Conditioned, Shape, condition, update_windows
+from foldgauss.video.model import VideoModel
+from foldgauss.video.packing import pack
+from foldgauss.video.regions import Region
+from foldgauss.video.shots import out_of_cuts
+
+_DARK = np.zeros(3, np.float32)
+
+
+class Stage:
+    """A model ready to be asked, at any time and its own size, what its Gaussians add to the picture.
+
+    **Raises:** ValueError for what is no `VideoModel`, for numbers that are not finite, and for several envelopes.
+    """
+
+    def __init__(self, model: VideoModel):
+        if not isinstance(model, VideoModel):
+            cure = "Select in each layer's own model, before layers and edits are put together."
+            raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+        self.model, self.size = model, model.size
+        self.rows = pack(model.splats)
+        broken = int((~np.isfinite(self.rows)).any(-1).sum())
+        if broken:
+            raise invalid("model", expected="finite numbers", got=f"{broken:,} Gaussians that have none")
+        power, floor = (_the_one(model.splats.envelope, name) for name in ("power", "floor"))
+        self.shape = Shape(model.splats.degree, power, floor, self.size, aspect=self.size[0] / self.size[1])
+        self.window = np.empty((len(self.rows), 2), np.float32)
+        update_windows(self.rows, np.arange(len(self.rows)), self.window)
+        self.times = np.asarray(model.frame_times.times())
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.rows)
+
+    def frame(self, k: int) -> "Light":
+        """The light of frame k."""
+        return self.at(float(self.times[k]))
+
+    def at(self, t: float) -> "Light":
+        """The light at time t; between two shots the nearer one's, as pictures are drawn."""
+        return Light(self, condition(self.rows, self.window, float(out_of_cuts(t, self.times)), self.shape))
+
+    def position(self, indices: Int[np.ndarray, "num"], t: float) -> Float32[np.ndarray, "num 2"]:
+        """Centres of the named Gaussians, in pixels, at any time, alive or not."""
+        ever = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
+        return condition(self.rows[indices], ever, t, self.shape).mean
+
+    def own_place(self, indices: Int[np.ndarray, "num"]) -> Float[np.ndarray, "num 2"]:
+        """Centres of the named Gaussians at their own times, in pixels: there the fold is 0."""
+        height, width = self.size
+        return np.asarray(self.model.splats.loc, np.float64)[indices] * max(self.size) + [width / 2, height / 2]
+
+    @functools.cached_property
+    def own_times(self) -> Float[np.ndarray, "num_gaussians"]:
+        """m_t of every Gaussian."""
+        return expit(np.asarray(self.model.splats.time_loc_logit, np.float64))
+
+    def nearest_frame(self, indices: Int[np.ndarray, "num"]) -> Int[np.ndarray, "num"]:
+        """The frame next to each named Gaussian's own time."""
+        return np.searchsorted((self.times[1:] + self.times[:-1]) / 2, self.own_times[indices])
+
+
+def _the_one(envelope, name: str) -> float:
+    """The number that all Gaussians share."""
+    values = np.unique(np.asarray(getattr(envelope, name)))
+    if values.size != 1:
+        got = f"{values.size} different ones"
+        raise invalid(f"model.splats.envelope.{name}", expected="one number for all Gaussians", got=got)
+    return float(values[0])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Light:
+    """One time of a model: the Gaussians alive, and the weights by which they make the picture."""
+
+    stage: Stage
+    splats: Conditioned
+
+    @property
+    def alive(self) -> Int[np.ndarray, "num_alive"]:
+        """Numbers of the Gaussians alive, in array order."""
+        return self.splats.alive
+
+    @functools.cached_property
+    def _trace(self) -> cpu.Trace:
+        return self._forward(self.splats.color)
+
+    @property
+    def picture(self) -> Float32[np.ndarray, "3 height width"]:
+        """What is seen, over black."""
+        return self._trace.image
+
+    @functools.cached_property
+    def total(self) -> Float32[np.ndarray, "num_alive"]:
+        """Sum over pixels of the weights, in pixels."""
+        return self.gathered(np.ones((1, *self.stage.size), np.float32))[:, 0]
+
+    def drawn(self, values: Float[np.ndarray, "num_alive channels"]) -> Float32[np.ndarray, "channels height width"]:
+        """A v: the picture of up to three numbers per Gaussian, as if they were its colours."""
+        return self._forward(_three(values, 1)).image[: values.shape[1]]
+
+    def gathered(self, planes: Float[np.ndarray, "channels height width"]) -> Float32[np.ndarray, "num_alive channels"]:
+        """A^T y: sums over pixels of up to three pictures times the weights."""
+        return cpu.backward(self._trace, _three(planes, 0))[3][:, : len(planes)]
+
+    def _forward(self, color: Float32[np.ndarray, "num_alive 3"]) -> cpu.Trace:
+        splats, model = self.splats, self.stage.model
+        leaves = splats.mean, splats.factor, splats.opacity, color, _DARK
+        return cpu.forward(*leaves, self.stage.size, compositing=model.compositing, options=model.options)
+
+
+def _three(values: np.ndarray, axis: int) -> np.ndarray:
+    """float32, filled up with zeros to three along the axis."""
+    pad = [(0, 0)] * values.ndim
+    pad[axis] = (0, 3 - values.shape[axis])
+    return np.ascontiguousarray(np.pad(values.astype(np.float32), pad))
+
+
+def contributions(
+    stage: Stage, region: Region
+) -> tuple[Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"]]:
+    """What each Gaussian adds over the frames of a region: inside it, in all, and in its best frame; px, float64."""
+    inside, total, best = np.zeros((3, stage.num_gaussians))
+    everywhere = np.ones(stage.size, np.float32)
+    for k in region.frames:
+        light = stage.frame(k)
+        own_inside, own = light.gathered(np.stack([region.at(k), everywhere])).T
+        inside[light.alive] += own_inside
+        total[light.alive] += own
+        best[light.alive] = np.maximum(best[light.alive], own)
+    return inside, total, best
+
+
+def best_frames(
+    stage: Stage, frames: Iterable[int], best: Float[np.ndarray, "num_gaussians"]
+) -> Float[np.ndarray, "num_gaussians"]:
+    """What each Gaussian adds in its best frame, of `frames` too, if that is more than `best`."""
+    best = best.copy()
+    for k in frames:
+        light = stage.frame(k)
+        best[light.alive] = np.maximum(best[light.alive], light.total)
+    return best
+
+
+def seen_colors(
+    stage: Stage,
+) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, "num_gaussians"]]:
+    """The picture's colour where each Gaussian is seen, the mean over all frames; and which are seen at all."""
+
+    def parts():
+        for k in range(len(stage.times)):
+            light = stage.frame(k)
+            seen = light.total > 0
+            total = light.total[seen]
+            yield light.alive[seen], light.gathered(light.picture)[seen] / total[:, None], total
+
+    return weighted_mean(stage.num_gaussians, parts())
+
+
+def weighted_mean(
+    num: int, parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> tuple[Float[np.ndarray, "num 3"], Bool[np.ndarray, "num"]]:
+    """Means of (index, value, weight) of several frames; and which of `num` there were any of."""
+    value, total = np.zeros((num, 3)), np.zeros((num, 1))
+    for index, own, weight in parts:
+        value[index] += weight[:, None] * own
+        total[index] += weight[:, None]
+    there = total[:, 0] > 0
+    return np.divide(value, total, out=value, where=there[:, None]), there
+
+
+def drawn_share(stage: Stage, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Float32[np.ndarray, "height width"]:
+    """The share of a set of Gaussians in each pixel at time t: sum of their weights over that of all; 0 where none."""
+    light = stage.at(t)
+    chosen = mask[light.alive]
+    own, everyone = light.drawn(np.stack([chosen, np.ones_like(chosen)], 1))
+    return np.divide(own, everyone, out=np.zeros_like(own), where=everyone > 0)
+
+
+def reached(stage: Stage, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
+    """The pixels at time t that a set of Gaussians reaches: where the alpha of one is not cut off, seen or hidden."""
+    splats = stage.at(t).splats
+    chosen = mask[splats.alive]
+    leaves = splats.mean[chosen], splats.factor[chosen], splats.opacity[chosen]
+    bright = np.ones((int(chosen.sum()), 3), np.float32)
+    # Added up: nothing hides behind anything then.
+    drawn = cpu.forward(*leaves, bright, _DARK, stage.size, compositing="sum", options=stage.model.options)
+    return drawn.image[0] > 0

@@ -1,0 +1,83 @@
+"""Masks of an object from images, folders and videos."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from foldgauss.io import read_masks, write_image, write_video
+
+SIZE = (40, 60)
+
+
+def labels(k):
+    """Object 1 walks to the right, object 2 stands, a corner is void."""
+    found = np.zeros(SIZE, np.uint8)
+    found[10:20, 10 + k : 20 + k] = 1
+    found[25:35, 40:50] = 2
+    found[:2, :2] = 255
+    return found
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for k in range(12):
+        image = Image.fromarray(labels(k)).convert("L")
+        image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0] + [0] * 759)
+        image.save(tmp_path / f"mask{k}.png")
+    return tmp_path
+
+
+def test_a_folder_in_natural_order(folder):
+    np.testing.assert_array_equal(read_masks(folder, label=1), [labels(k) == 1 for k in range(12)])
+    np.testing.assert_array_equal(read_masks(folder, label=2, frames=(9, None)), [labels(k) == 2 for k in (9, 10, 11)])
+    every = read_masks(folder, frames=(None, 2))
+    assert every.dtype == bool
+    np.testing.assert_array_equal(every, [(labels(k) == 1) | (labels(k) == 2) for k in range(2)])  # but void
+
+
+def test_one_image(folder):
+    np.testing.assert_array_equal(read_masks(folder / "mask3.png", label=1), labels(3) == 1)
+    Image.fromarray(np.where(labels(3) == 1, np.uint8(255), np.uint8(0))).save(folder / "white.png")
+    np.testing.assert_array_equal(read_masks(folder / "white.png"), labels(3) == 1)
+
+
+def test_a_video_is_cut_at_a_level(tmp_path):
+    frames = [np.repeat(np.where(labels(k) == 1, 200, 30).astype(np.uint8)[..., None], 3, -1) for k in range(4)]
+    path = write_video(tmp_path / "mask.mp4", frames, 25)
+    found = read_masks(path, frames=(1, 4))
+    truth = np.array([labels(k) == 1 for k in (1, 2, 3)])
+    assert found.shape == truth.shape
+    assert (found != truth).mean() < 0.01  # compressed
+    assert not read_masks(path, level=0.95).any()
+
+
+def test_cut_as_frames_are(folder):
+    whole = read_masks(folder, label=2)
+    np.testing.assert_array_equal(read_masks(folder, label=2, size=(40, 40)), whole[:, :, 10:50])
+    np.testing.assert_array_equal(read_masks(folder, label=2, size=(10, 30)), whole[:, 10:30])
+
+
+def test_refused(folder, tmp_path):
+    def fails(match, *arguments, error=ValueError, **options):
+        with pytest.raises(error, match=match) as caught:
+            read_masks(*arguments, **options)
+        assert "\n" not in str(caught.value)
+
+    fails("missing", folder / "none", error=FileNotFoundError)
+    fails(r"label: expected one of \[1, 2\] .*, got 3", folder, label=3)
+    for label in (0, 255, 1.5, True):
+        fails("label: expected an object's number, 1 to 254", folder, label=label)
+    fails("frames: expected a range in 12 images, got stop 13", folder, frames=(0, 13))
+    fails("path: expected a folder with images", folder, frames=(5, 5))
+    fails("frames: expected a folder or a video", folder / "mask0.png", frames=(0, 1))
+    fails("size: expected", folder, size=(0, 5))
+    (folder / "empty").mkdir()
+    fails("path: expected a folder with images", folder / "empty")
+    write_image(folder / "colours.png", np.zeros((*SIZE, 3), np.uint8))
+    fails("number per pixel.*'RGB'", folder / "colours.png")
+    video = write_video(tmp_path / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
+    fails("label: expected images with labels, got the video", video, label=1)
+    for level in (0, 1.5, None):
+        fails("level: expected a share of white", video, level=level)
+    (folder / "text.mp4").write_text("none")
+    fails("does not open as a video", folder / "text.mp4")

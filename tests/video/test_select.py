@@ -1,0 +1,470 @@
+"""Selections: the right Gaussians, by what they add to the picture."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import BACKGROUND, BOX, COLOR, DISC, NUM_FRAMES, SPEED, START, named_model, square, textured_clip
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.video import (
+    FitConfig,
+    FrameTimes,
+    Selection,
+    by_box,
+    by_click,
+    by_color,
+    by_mask,
+    by_polygon,
+    by_time,
+    contribution,
+    fit,
+    influence,
+    matte,
+    select,
+)
+from foldgauss.video.light import Stage
+from foldgauss.video.playback import Playback
+
+MODEL, LABEL = named_model()
+HEIGHT, WIDTH = MODEL.size
+TIMES = np.linspace(0, 1, MODEL.num_frames)
+
+
+def truth(name):
+    return Selection(name == LABEL)
+
+
+def object_masks(name):
+    """(num_frames, height, width): where an object of the named model is, but for what hides it."""
+    masks = np.stack([square(MODEL, name, k) for k in range(MODEL.num_frames)])
+    return masks if name == DISC else masks & ~object_masks(DISC)
+
+
+def errors(found, wanted, model=MODEL):
+    """The worst frame's shares of what the object, and of what all others add, that were missed and wrongly taken."""
+    stage, worst = Stage(model), np.zeros(2)
+    for t in np.linspace(0, 1, 2 * model.num_frames - 1):  # between frames, too
+        light = stage.at(t)
+        own, chosen = wanted.mask[light.alive], found.mask[light.alive]
+        shares = (
+            light.total[own & ~chosen].sum() / light.total[own].sum(),
+            (light.total[~own & chosen].sum() / light.total[~own].sum()),
+        )
+        worst = np.maximum(worst, shares)
+    return worst
+
+
+def without(model, selection):
+    """The model with the selected Gaussians deleted."""
+    keep = ~selection.mask
+    splats = jax.tree.map(lambda leaf: leaf[keep] if np.ndim(leaf) else leaf, model.splats)
+    return dataclasses.replace(model, splats=splats)
+
+
+# ----------------------------------------------------------------------------------------------------- sets
+
+bits = st.lists(st.booleans(), min_size=6, max_size=6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(bits, bits)
+def test_sets_are_sets(one, other):
+    a, b = Selection(np.array(one)), Selection(np.array(other))
+    sets = {"a": {k for k in range(6) if one[k]}, "b": {k for k in range(6) if other[k]}}
+    for found, wanted in (
+        (a | b, sets["a"] | sets["b"]),
+        (a & b, sets["a"] & sets["b"]),
+        (a - b, sets["a"] - sets["b"]),
+        (a ^ b, sets["a"] ^ sets["b"]),
+        (~a, set(range(6)) - sets["a"]),
+    ):
+        assert set(found.indices.tolist()) == wanted
+        assert len(found) == len(wanted)
+        assert all((k in found) == (k in wanted) for k in range(6))
+    assert (a == b) == (sets["a"] == sets["b"])
+
+
+def test_a_selection_does_not_change():
+    mask = np.zeros(5, bool)
+    one = Selection(mask)
+    mask[2] = True
+    assert len(one) == 0
+    with pytest.raises(ValueError, match="read-only"):
+        one.mask[0] = True
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        one.mask = mask
+    assert repr(Selection(mask)) == "Selection(1 of 5)"
+
+
+def test_all_none_and_numbers():
+    assert len(Selection.all(MODEL)) == len(LABEL) == Selection.none(MODEL).num_gaussians
+    assert Selection.of(MODEL, [3, 1, 3]).indices.tolist() == [1, 3]
+    assert Selection.of(MODEL, []) == Selection.none(MODEL) == ~Selection.all(MODEL)
+
+
+def test_bad_sets():
+    for mask in (np.zeros(3), np.zeros((3, 1), bool), [1, 0]):
+        with pytest.raises(ValueError, match=r"^mask: expected bool \(num_gaussians,\)"):
+            Selection(mask)
+    for indices in ([-1], [len(LABEL)], [0.5], [[1]], [True]):
+        with pytest.raises(ValueError, match=r"^indices: expected whole numbers"):
+            Selection.of(MODEL, indices)
+    with pytest.raises(ValueError, match=r"^selection: expected a selection of 3 Gaussians, got one of 4"):
+        Selection(np.zeros(3, bool)) | Selection(np.zeros(4, bool))
+    with pytest.raises(TypeError, match="expected a Selection, got ndarray"):
+        Selection(np.zeros(3, bool)) & np.zeros(3, bool)
+    assert Selection(np.zeros(3, bool)) != "none"
+
+
+# --------------------------------------------------------------------------------------------- contribution
+
+
+def weights(model, k):
+    """The definition, pixel by pixel: (num_gaussians, height, width), float64."""
+    stage, options = Stage(model), model.options
+    splats = stage.frame(k).splats
+    y, x = np.mgrid[: model.size[0], : model.size[1]] + 0.5
+    found, light = np.zeros((stage.num_gaussians, *model.size)), np.ones(model.size)
+    for i, mean, factor, opacity in zip(splats.alive, splats.mean, splats.factor, splats.opacity, strict=True):
+        precision = np.linalg.inv(factor.astype(float) @ factor.T + options.low_pass * np.eye(2))
+        offset = np.stack([x - mean[0], y - mean[1]], -1)
+        alpha = opacity * np.exp(-0.5 * np.einsum("hwi,ij,hwj->hw", offset, precision, offset))
+        alpha = np.where(alpha >= options.alpha_cutoff, np.minimum(alpha, options.alpha_ceiling), 0)
+        if model.compositing == "over":
+            alpha[light <= options.transmittance_stop] = 0
+            found[i], light = light * alpha, light * (1 - alpha)
+        else:
+            found[i] = alpha
+    return found
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_contribution_is_its_definition(compositing):
+    model, _ = named_model(num_frames=5, size=(24, 36), compositing=compositing, each=60)
+    rng = np.random.default_rng(0)
+    masks = {1: rng.random((24, 36)) < 0.3, 4: rng.random((24, 36))}
+    inside, total = contribution(model, masks)
+    by_frame = {k: weights(model, k) for k in masks}
+    np.testing.assert_allclose(inside, sum((by_frame[k] * masks[k]).sum((1, 2)) for k in masks), rtol=2e-3, atol=5e-3)
+    np.testing.assert_allclose(total, sum(by_frame[k].sum((1, 2)) for k in masks), rtol=2e-3, atol=5e-3)
+    own = Selection(rng.random(len(total)) < 0.5)
+    share = by_frame[1][own.mask].sum(0) / by_frame[1].sum(0)
+    np.testing.assert_allclose(matte(model, own, 0.25), share, atol=2e-3)
+
+
+def test_mattes_of_parts_come_to_one():
+    parts = [matte(MODEL, truth(name), 0.37) for name in (DISC, BOX, BACKGROUND)]
+    np.testing.assert_allclose(sum(parts), 1, atol=1e-5)
+    assert all(part.min() >= 0 for part in parts)
+    assert parts[0].max() > 0.99
+    assert not matte(MODEL, Selection.none(MODEL), 0.37).any()
+
+
+@pytest.mark.parametrize("t", [0.0, 0.5, 0.77])
+def test_nothing_changes_beyond_the_influence(t):
+    selection = truth(DISC)
+    reached = influence(MODEL, selection, t)
+    before, after = (Playback(model).frame(t).astype(int) for model in (MODEL, without(MODEL, selection)))
+    changed = (before != after).any(-1)
+    assert not changed[~reached].any()
+    assert 0.05 < changed.mean() <= reached.mean() < 0.2
+    assert not matte(MODEL, selection, t)[~reached].any()
+    assert not influence(MODEL, Selection.none(MODEL), t).any()
+
+
+# ----------------------------------------------------------------------------------------------------- masks
+
+
+@pytest.mark.parametrize("name", [DISC, BOX])
+def test_masks_of_all_frames_give_exactly_the_object(name):
+    assert by_mask(MODEL, object_masks(name)) == truth(name)
+    scaled = object_masks(name).repeat(3, 1).repeat(3, 2)
+    assert by_mask(MODEL, scaled) == truth(name)
+    assert by_mask(MODEL, object_masks(name).astype(np.float32)) == truth(name)
+
+
+@pytest.mark.parametrize("name", [DISC, BOX])
+@pytest.mark.parametrize("k", [0, 6, 11])
+def test_one_mask_brings_the_object_through_all_frames(name, k):
+    missed, wrong = errors(by_mask(MODEL, object_masks(name)[k], frame=k), truth(name))
+    assert missed < 0.05
+    assert wrong < 0.02
+    alone = errors(by_mask(MODEL, object_masks(name)[k], frame=k, follow=False), truth(name))[0]
+    if k != 6:  # where many are not alive yet, or no more
+        assert alone > 0.2
+
+
+def test_sums_are_selected_too():
+    model, label = named_model(compositing="sum")
+    missed, _ = errors(by_mask(model, np.stack([square(model, DISC, k) for k in range(12)])), Selection(label == DISC))
+    assert missed < 0.05
+
+
+def test_ways_to_name_frames_are_one():
+    masks = object_masks(DISC)
+    for found in (
+        by_mask(MODEL, {5: masks[5], 4: masks[4]}, follow=False),
+        by_mask(MODEL, masks[4:6], frames=(4, 6), follow=False),
+    ):
+        assert found == by_mask(MODEL, [masks[4], masks[5]], frames=(4, 6), follow=False)
+    still = by_mask(MODEL, np.stack([masks[4]] * 12))
+    assert still == by_mask(MODEL, masks[4], frames=(0, 12))
+    assert by_mask(MODEL, masks[4:5], frame=4) == by_mask(MODEL, masks[4], frame=4)
+
+
+def test_more_of_a_gaussian_has_to_be_inside_for_a_higher_threshold():
+    half = np.zeros((12, *MODEL.size), bool)
+    half[:, :, : WIDTH // 2] = True
+    few, more, most = (by_mask(MODEL, half, threshold=share) for share in (1.0, 0.5, 0.05))
+    assert few - more == more - most == Selection.none(MODEL)
+    assert len(few) < len(more) < len(most) < len(LABEL)
+    inside, total = contribution(MODEL, half)
+    seen = total > 0
+    np.testing.assert_array_equal(more.mask[seen], inside[seen] >= 0.5 * total[seen])
+
+
+def test_those_between_frames_go_by_their_place():
+    """Alive for less than a frame, between two: no picture of a frame shows them."""
+    between = np.flatnonzero(np.abs((MODEL.splats.gaussians().time_loc * 11) % 1 - 0.5) < 0.1)
+    change = np.asarray(MODEL.splats.log_time_scale).copy()
+    change[between] = np.log(0.02 / 11)
+    model = eqx.tree_at(lambda m: m.splats.log_time_scale, MODEL, change)
+    assert contribution(model, np.ones(MODEL.size, bool), frames=(0, 12))[1][between].max() == 0
+    found = by_mask(model, object_masks(DISC))
+    hidden = between[LABEL[between] != BACKGROUND]
+    assert len(hidden) > 40
+    assert (found.mask[hidden] == (LABEL[hidden] == DISC)).mean() > 0.98  # some stand in the disc's rim
+    one = by_mask(model, object_masks(DISC)[0], frame=0)  # followed: by their neighbours' place
+    assert (one.mask[hidden] == (LABEL[hidden] == DISC)).mean() > 0.9
+    alone = by_mask(model, object_masks(DISC)[0], frame=0, follow=False)
+    early = MODEL.splats.gaussians().time_loc[hidden] < 0.5 / 11
+    np.testing.assert_array_equal(alone.mask[hidden], (LABEL[hidden] == DISC) & early)
+
+
+def test_nothing_is_followed_across_a_cut():
+    logits = np.zeros(11, np.float32)
+    logits[5] = np.log(25.0)
+    model = dataclasses.replace(MODEL, frame_times=FrameTimes(logits))
+    t = np.asarray(model.frame_times.times())
+    assert t[6] - t[5] > 0.6
+    k = 2
+    where = matte(model, truth(DISC), float(t[k])) > 0.5
+    found = by_mask(model, where, frame=k)
+    before = by_time(model, frames=(0, 6), alive=True)
+    assert len(found & truth(DISC)) > 0
+    assert not len(found - before)
+    assert len(truth(DISC) - before) > 10
+
+
+@pytest.mark.parametrize(
+    ("mask", "options", "match"),
+    [
+        (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask with something in it"),
+        ({}, {}, "^mask: expected a mask with something in it"),
+        (np.ones((48, 48), bool), {"frame": 0}, "^mask: expected the aspect of the model's 48x72, got 48x48"),
+        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* Of labels"),
+        (np.full((48, 72), 1.5), {"frame": 0}, r"shares in \[0, 1\]"),
+        (np.full((48, 72), np.nan), {"frame": 0}, r"shares in \[0, 1\]"),
+        (np.ones((48, 72), bool), {}, "frame=k"),
+        (np.ones((5, 48, 72), bool), {}, "^mask: expected one of shape .*, or 12 of them"),
+        (np.ones(5, bool), {"frame": 0}, "^mask: expected one of shape"),
+        (np.ones((0, 0), bool), {"frame": 0}, "^mask: expected bool"),
+        (np.ones((48, 72), bool), {"frame": 12}, r"^frame: expected a frame's number in \[0, 12\)"),
+        (np.ones((48, 72), bool), {"frame": -1}, "^frame"),
+        (np.ones((48, 72), bool), {"frame": True}, "^frame"),
+        (np.ones((48, 72), bool), {"frame": 1, "frames": (0, 2)}, "^frame, frames: expected one of the two"),
+        (np.ones((48, 72), bool), {"frames": (3, 3)}, "^frames"),
+        (np.ones((48, 72), bool), {"frames": (0, 13)}, "^frames"),
+        (np.ones((48, 72), bool), {"frames": 3}, "^frames.*frame=k"),
+        ({0: np.ones((48, 72), bool)}, {"frame": 0}, "frames named once"),
+        ({0: np.ones((2, 48, 72), bool)}, {}, "^mask: expected bool"),
+        ({99: np.ones((48, 72), bool)}, {}, "^frame"),
+        (np.ones((48, 72), bool), {"frame": 0, "threshold": 0}, "^threshold"),
+        (np.ones((48, 72), bool), {"frame": 0, "threshold": "half"}, "^threshold"),
+    ],
+)
+def test_bad_masks(mask, options, match):
+    with pytest.raises(ValueError, match=match) as caught:
+        by_mask(MODEL, mask, **options)
+    assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------- boxes, colours, times
+
+
+def test_boxes_and_polygons_are_masks():
+    mask = np.zeros(MODEL.size, bool)
+    mask[10:30, 5:25] = True
+    wanted = by_mask(MODEL, mask, frame=3)
+    assert by_box(MODEL, (5, 10, 25, 30), frame=3) == wanted
+    assert by_box(MODEL, (4.6, 9.6, 25.4, 30.4), frame=3) == wanted  # by centres
+    assert by_polygon(MODEL, [(5, 10), (25, 10), (25, 30), (5, 30)], frame=3) == wanted
+    assert by_box(MODEL, (5, 10, 25, 30)) == by_mask(MODEL, mask, frames=(0, 12))
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    triangle = (x > 10) & (y > 5) & (x - 10 + 2 * (y - 5) < 50)
+    assert by_polygon(MODEL, [(10, 5), (60, 5), (10, 30)], frame=3) == by_mask(MODEL, triangle, frame=3)
+    for box in ((5, 10, 5, 30), (25, 10, 5, 30), (0, 0, np.nan, 3), (1, 2, 3), "box"):
+        with pytest.raises(ValueError, match=r"^box"):
+            by_box(MODEL, box)
+    with pytest.raises(ValueError, match=r"^box: expected pixels of a 48x72 frame in it, got none"):
+        by_box(MODEL, (80, 0, 90, 10))
+    for polygon in ([(0, 0), (1, 1)], [(0, 0, 0)] * 3, [(0, 0), (1, np.inf), (3, 3)], 7):
+        with pytest.raises(ValueError, match=r"^polygon"):
+            by_polygon(MODEL, polygon)
+
+
+@pytest.mark.parametrize("name", [DISC, BOX, BACKGROUND])
+def test_colors(name):
+    assert by_color(MODEL, COLOR[name], tolerance=12, seen=False) == truth(name)
+    missed, wrong = errors(by_color(MODEL, COLOR[name], tolerance=20), truth(name))
+    assert max(missed, wrong) < 0.03
+    assert len(by_color(MODEL, COLOR[name], tolerance=0)) == 0
+
+
+def test_the_color_seen_is_that_of_the_picture():
+    """Two of opposite tints, one on the other, look grey."""
+    color = np.asarray(MODEL.splats.color_dc).copy()
+    disc = truth(DISC).indices
+    color[disc[::2]], color[disc[1::2]] = (2.0, -2.0, 0.0), (-2.0, 2.0, 0.0)
+    model = eqx.tree_at(lambda m: m.splats.color_dc, MODEL, color)
+    olive = (0.5, 0.5, 0.5)
+    assert not len(by_color(model, olive, tolerance=15, seen=False) & truth(DISC))
+    assert len(by_color(model, olive, tolerance=15) & truth(DISC)) > 0.1 * len(disc)
+
+
+def test_bad_colors():
+    for color in ((0.5, 0.5), (2, 0, 0), (np.nan, 0, 0), "red", (200, 10, 10)):
+        with pytest.raises(ValueError, match=r"^color: expected red, green and blue in \[0, 1\]"):
+            by_color(MODEL, color)
+    for tolerance in (-1, np.nan, "5"):
+        with pytest.raises(ValueError, match=r"^tolerance"):
+            by_color(MODEL, (0, 0, 0), tolerance=tolerance)
+
+
+def test_times():
+    own, spread = (np.asarray(leaf) for leaf in (MODEL.splats.gaussians().time_loc, MODEL.splats.log_time_scale))
+    np.testing.assert_array_equal(by_time(MODEL, (0.2, 0.6)).mask, (own >= 0.2) & (own <= 0.6))
+    reach = 3.0348 * np.exp(spread)
+    alive = (own - reach < 0.1) & (own + reach > 0.05)
+    np.testing.assert_array_equal(by_time(MODEL, (0.05, 0.1), alive=True).mask, alive)
+    np.testing.assert_array_equal(by_time(MODEL, frames=(3, 6)).mask, (own >= 2.5 / 11) & (own <= 5.5 / 11))
+    np.testing.assert_array_equal(by_time(MODEL, frame=0).mask, own <= 0.5 / 11)
+    assert by_time(MODEL, frame=4, alive=True) == by_time(MODEL, (TIMES[4], TIMES[4]), alive=True)
+    assert by_time(MODEL, frames=(0, 12)) == Selection.all(MODEL)
+    for times in ((0.5, 0.2), (-0.1, 0.5), (0, 1.1), (0, np.nan), 0.5):
+        with pytest.raises(ValueError, match=r"^times: expected"):
+            by_time(MODEL, times)
+    for options in ({}, {"times": (0, 1), "frame": 1}):
+        with pytest.raises(ValueError, match=r"^times, frames, frame: expected one"):
+            by_time(MODEL, **options)
+
+
+# ----------------------------------------------------------------------------------------------------- clicks
+
+
+def centre(name, k):
+    return tuple(np.array([WIDTH, HEIGHT]) / 2 + WIDTH * (START[name] + TIMES[k] * SPEED[name]))
+
+
+@pytest.mark.parametrize("name", [DISC, BOX])
+@pytest.mark.parametrize("k", [0, 6, 10])
+def test_a_click_grows_to_the_object(name, k):
+    missed, wrong = errors(by_click(MODEL, centre(name, k), frame=k, tolerance=25), truth(name))
+    assert missed < 0.05
+    assert wrong < 0.02
+
+
+def test_a_click_ends_where_another_motion_begins():
+    """Disc and wall of one colour."""
+    color = np.broadcast_to(np.float32([0.5, 0.2, 0.1]), (len(LABEL), 3))
+    model = eqx.tree_at(lambda m: m.splats.color_dc, MODEL, color)
+    found = by_click(model, centre(DISC, 6), frame=6)
+    missed, wrong = errors(found, truth(DISC))
+    assert missed < 0.05
+    assert wrong < 0.05
+
+
+def test_bad_clicks():
+    for click in ((-1, 5), (72, 5), (5, 48), (np.nan, 1), (1,), "here"):
+        with pytest.raises(ValueError, match=r"^click: expected \(x, y\)"):
+            by_click(MODEL, click, frame=0)
+    with pytest.raises(ValueError, match=r"^click: expected a place where something is drawn"):
+        by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0)
+
+
+# ----------------------------------------------------------------------------------------------------- the door
+
+
+def test_criteria_are_intersected():
+    box = (5, 5, 40, 40)
+    both = by_box(MODEL, box, frame=0) & by_color(MODEL, COLOR[DISC], tolerance=25)
+    assert 0 < len(both) < len(by_box(MODEL, box, frame=0))
+    assert select(MODEL, box=box, frame=0, color=COLOR[DISC], tolerance=25) == both
+    assert select(MODEL, box=box, frame=0, color=COLOR[DISC], tolerance=25, times=(0, 0.3)) == both & by_time(
+        MODEL, (0, 0.3)
+    )
+    assert select(MODEL, frames=(2, 5), alive=True) == by_time(MODEL, frames=(2, 5), alive=True)
+    assert select(MODEL, mask=object_masks(DISC)) == truth(DISC)
+    assert select(MODEL, click=centre(DISC, 6), frame=6) == by_click(MODEL, centre(DISC, 6), frame=6)
+    assert select(MODEL, polygon=[(0, 0), (9, 0), (9, 9)], frame=0, follow=False) == by_polygon(
+        MODEL, [(0, 0), (9, 0), (9, 9)], frame=0, follow=False
+    )
+
+
+def test_bad_criteria():
+    for options, match in (
+        ({}, "^select: expected at least one criterion"),
+        ({"tolerance": 5.0, "frame": 1}, "^tolerance: expected color or click"),
+        ({"click": (5, 5)}, "^frame: expected the frame that was clicked in"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            select(MODEL, **options)
+
+
+def test_bad_models():
+    broken = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))
+    with pytest.raises(ValueError, match=r"^model: expected finite numbers"):
+        by_color(broken, (0, 0, 0))
+    many = TimeLikelihood(np.linspace(1, 2, len(LABEL), dtype=np.float32), 0.3)
+    mixed = eqx.tree_at(lambda m: m.splats.envelope, MODEL, many)
+    with pytest.raises(ValueError, match=r"^model\.splats\.envelope\.power: expected one number"):
+        by_color(mixed, (0, 0, 0))
+    with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got FoldedSplats"):
+        matte(MODEL.splats, truth(DISC), 0.5)
+    with pytest.raises(ValueError, match=r"^selection"):
+        matte(MODEL, Selection(np.zeros(3, bool)), 0.5)
+
+
+# ------------------------------------------------------------------------------------------------- a real fit
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    frames, labels = textured_clip()
+    return fit(frames, FitConfig(num_gaussians=3000, steps=600)).model, labels
+
+
+def overlap(model, selection, masks):
+    """Intersection over union of true masks and the pixels that are mostly the selection's; mean over frames."""
+    times, found = np.asarray(model.frame_times.times()), []
+    for t, mask in zip(times, masks, strict=True):
+        mostly = matte(model, selection, float(t)) > 0.5
+        found.append((mostly & mask).sum() / (mostly | mask).sum())
+    return np.mean(found)
+
+
+@pytest.mark.parametrize("name", [DISC, BOX])
+def test_a_fitted_object_is_selected(fitted, name):
+    model, labels = fitted
+    masks = labels == name
+    assert overlap(model, by_mask(model, masks), masks) > 0.97
+    assert overlap(model, by_mask(model, {0: masks[0], NUM_FRAMES - 1: masks[-1]}), masks) > 0.93
+    y, x = np.argwhere(masks[4]).mean(0)
+    assert overlap(model, by_click(model, (x, y), frame=4), masks) > 0.95
+    other = by_mask(model, labels == 3 - name)
+    assert overlap(model, other, masks) < 0.05  # the measure can fail
