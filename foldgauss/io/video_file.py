@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._checks import invalid
-from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, not_writable
+from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_replaceable
 
 # FFmpeg writes to stderr about every damaged packet; our errors say it in one line. OpenCV reads this
 # variable when it first opens a video, so it stands before the import. -8 is AV_LOG_QUIET.
@@ -199,7 +199,7 @@ def image_paths(folder: Path) -> list[Path]:
         for entry in folder.iterdir()
         if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
     )
-    return sorted(images, key=lambda entry: _natural(entry.name))
+    return sorted(images, key=lambda entry: natural_order(entry.name))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -406,7 +406,7 @@ def _stacked(frames: list[np.ndarray]) -> np.ndarray:
     return stacked
 
 
-def _natural(name: str) -> tuple:
+def natural_order(name: str) -> tuple:
     """Sort key: runs of digits compare as numbers; the name itself breaks ties (1.png, 01.png)."""
     parts = re.split(r"([0-9]+)", name.lower())
     return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
@@ -460,7 +460,7 @@ def write_frames(folder: PathLike, frames: Iterable[np.ndarray], *, overwrite: b
     Raises `VideoError` for no frames or frames of other kinds, `OutputError` where the folder is refused.
     """
     folder = Path(folder)
-    _check_replaceable(folder, overwrite)
+    check_replaceable(folder, overwrite, pattern=r"[0-9]{5,}\.png")
     with atomic_folder(folder) as temporary:
         for number, frame in enumerate(_checked_frames(frames)):
             (temporary / f"{number:05d}.png").write_bytes(_png(frame))
@@ -542,29 +542,6 @@ def _relabel_as_webm(path: Path) -> None:
 
 def _png(frame: np.ndarray) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1].tobytes()
-
-
-def _check_replaceable(folder: Path, overwrite: bool) -> None:
-    """Raise `OutputError` unless `folder` is missing, empty, or frames that `overwrite` gives up."""
-    if not os.path.exists(folder):
-        return
-    if not folder.is_dir():
-        raise OutputError(f"path: expected a folder for PNG frames, got the file {str(folder)!r}. Choose another name.")
-    try:
-        names = [entry.name for entry in folder.iterdir()]
-    except OSError as error:
-        raise not_writable(folder, error) from error
-    foreign = [name for name in names if not re.fullmatch(r"[0-9]{5,}\.png", name)]
-    if foreign:
-        raise OutputError(
-            f"path: expected an empty folder or one of numbered frames, got {str(folder)!r} with "
-            f"{min(foreign)!r} in it. Choose another folder."
-        )
-    if names and not overwrite:
-        raise OutputError(
-            f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} frames. "
-            "Choose another folder, or allow overwriting."
-        )
 
 
 # ----------------------------------------------------------------------------------------------- checks
