@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -33,6 +34,7 @@ _FILES = r"frame_[0-9]{4,}\.(obj|ply)|pseudomesh\.json"
 _TURN = np.array([1.0, -1.0, -1.0])
 #: No sine of the angle between two edges is smaller than that in a face that float32 tells from a line.
 _COLLINEAR = COLLINEAR * float(np.finfo(np.float32).eps)
+_LARGEST = 1e38  # of a coordinate: float32 holds the difference of two such
 _AXES_SLANT = 1e-6  # cosine up to which two columns of a factor are its axes: rounding of float32
 
 
@@ -72,7 +74,7 @@ class Pseudomesh:
         check_size(size)
         faces, aspect = self.triangles[number], self.size[0] / self.size[1]
         if faces.origin[:, 2].any() or faces.edges[..., 2].any():
-            return project(faces.to_gaussians(), Camera.front(aspect), size, order="array")
+            return jax.tree.map(np.asarray, project(faces.to_gaussians(), Camera.front(aspect), size, order="array"))
         unit = pixels_per_unit(size, aspect=aspect)
         centre = np.array([size[1] / 2, size[0] / 2], np.float32)
         mean, factor = faces.origin[:, :2] * np.float32(unit) + centre, _flat_factor(faces.edges) * np.float32(unit)
@@ -88,7 +90,7 @@ class Pseudomesh:
         """The picture of a frame over `background`. Raises ValueError for a size or a background that is none."""
         size = self.size if size is None else tuple(size)
         splats, behind = self.splats(number, size), checked_background(background, self.compositing)
-        leaves = (np.asarray(leaf, np.float32) for leaf in (splats.mean, splats.factor, splats.opacity, splats.color))
+        leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
         drawn = {"compositing": self.compositing, "options": self.options}
         return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
 
@@ -333,7 +335,7 @@ def _parsed_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ..
         place = tuple(float(word) for word in words[:3])
     except ValueError:
         place = ()
-    if len(place) < 3 or not all(abs(x) < np.finfo(np.float32).max for x in place):
+    if len(place) < 3 or not all(abs(x) <= _LARGEST for x in place):
         got, cure = repr(" ".join(words)[:60]), "The file is damaged, or the tool wrote NaN."
         raise format_error(f"{path}, line {number}", expected="a vertex x y z", got=got, cure=cure)
     return place
