@@ -115,6 +115,10 @@ def test_scaled_and_mirrored_faces(folder, model):
     edited(folder / "frame_0001.obj", lambda faces: faces[:, :1] + 2 * (faces - faces[:, :1]))
     after = read_pseudomesh(folder).splats(1)
     np.testing.assert_allclose(after.factor, 2 * before.factor, rtol=1e-4, atol=1e-4)
+    along = lambda faces: faces + np.array([0, 0, 0.5])[:, None] * (faces[:, 1:2] - faces[:, :1])  # noqa: E731
+    edited(folder / "frame_0001.obj", along)  # v2 along the first edge: what is at right angles to it stays
+    slanted = read_pseudomesh(folder).splats(1)
+    np.testing.assert_allclose(slanted.factor, after.factor, rtol=1e-4, atol=1e-3)
     edited(folder / "frame_0001.obj", lambda faces: faces * np.array([-1, 1, 1]))
     mirrored = read_pseudomesh(folder).splats(1)
     np.testing.assert_allclose(mirrored.mean[:, 0], 80 - before.mean[:, 0], atol=1e-4)

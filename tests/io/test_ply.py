@@ -255,7 +255,7 @@ def test_size_and_rate_must_be_known(tmp_path):
 def test_a_frame_in_space_is_the_frame(tmp_path, size, axes):
     """Written, read, sorted by depth and seen by the front camera: the model's own picture, in the model's order."""
     model = random_model(size=size)
-    path = write_3dgs_ply(tmp_path / "f.ply", model, 0.5, axes=axes)
+    path = write_3dgs_ply(tmp_path / "f.ply", model, 0.5, axes=axes, depth_step=2e-3)  # so deep that size tells
     gaussians = read_3dgs_ply(path, axes=axes)
     splats = Playback(model).splats(0.5)
     assert len(gaussians.opacity) == len(splats.opacity) > 20
