@@ -62,3 +62,14 @@ def test_rendering():
     for other in ("added", "sharp", "soft", "aside", "from_above"):
         assert np.isfinite(names[other]).all()
         assert np.abs(names[other] - image).max() > 0.05
+
+
+@pytest.mark.slow
+def test_formats(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = _run("formats.md")
+    np.testing.assert_allclose(names["again"].splats.loc, names["model"].splats.loc, atol=1e-6)
+    assert len(names["gaussians"].mean) > 10
+    assert names["vertices"].shape[1:] == (3, 3)
+    made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply"}
+    assert {path.name for path in tmp_path.iterdir()} == made

@@ -1,27 +1,53 @@
-"""Files: clips in and out, model files, pictures. Every output appears whole or not at all."""
+"""Files: clips in and out, model files, other programs' formats, pictures. Every output appears whole or not at all."""
 
 from foldgauss.io._atomic import OutputError
+from foldgauss.io._ply import FormatError
+from foldgauss.io.exchange import export, import_model
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.masks import read_masks
+from foldgauss.io.mesh import Pseudomesh, read_pseudomesh, write_pseudomesh
 from foldgauss.io.model_file import ModelFileError
+from foldgauss.io.ply import (
+    frame_gaussians,
+    read_3dgs_ply,
+    read_vegas_ply,
+    write_3dgs_frames,
+    write_3dgs_ply,
+    write_gaussians_ply,
+    write_vegas_ply,
+)
 from foldgauss.io.selections import load_selection, save_selection
-from foldgauss.io.video_file import Clip, VideoError, read_video, write_image, write_video
+from foldgauss.io.video_file import Clip, VideoError, read_video, write_frames, write_image, write_video
 from foldgauss.io.video_model import load_video_model, save_video_model
 
 __all__ = [
     "Clip",
+    "FormatError",
     "HistoryFile",
     "ModelFileError",
     "OutputError",
+    "Pseudomesh",
     "VideoError",
+    "export",
+    "frame_gaussians",
+    "import_model",
     "load_selection",
     "load_video_model",
+    "read_3dgs_ply",
     "read_history",
     "read_masks",
+    "read_pseudomesh",
+    "read_vegas_ply",
     "read_video",
     "save_selection",
     "save_video_model",
+    "write_3dgs_frames",
+    "write_3dgs_ply",
     "write_curves",
+    "write_frames",
+    "write_gaussians_ply",
     "write_image",
+    "write_pseudomesh",
+    "write_vegas_ply",
     "write_video",
 ]

@@ -1,6 +1,7 @@
 """Files that appear whole or not at all."""
 
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -111,3 +112,29 @@ def atomic_folder(folder: str | os.PathLike) -> Iterator[Path]:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str = "frames") -> None:
+    """Raise `OutputError` unless `folder` is missing, empty, or holds `what` alone, which `overwrite` gives up.
+
+    Names that match `pattern` are such: what this package did not write it does not delete.
+    """
+    if not os.path.exists(folder):
+        return
+    if not folder.is_dir():
+        raise OutputError(f"path: expected a folder for {what}, got the file {str(folder)!r}. Choose another name.")
+    try:
+        names = [entry.name for entry in folder.iterdir()]
+    except OSError as error:
+        raise not_writable(folder, error) from error
+    foreign = [name for name in names if not re.fullmatch(pattern, name)]
+    if foreign:
+        raise OutputError(
+            f"path: expected an empty folder or one of numbered {what}, got {str(folder)!r} with "
+            f"{min(foreign)!r} in it. Choose another folder."
+        )
+    if names and not overwrite:
+        raise OutputError(
+            f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} {what}. "
+            "Choose another folder, or allow overwriting."
+        )

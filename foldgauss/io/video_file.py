@@ -11,16 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._checks import invalid
-from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, not_writable
+from foldgauss._checks import invalid, one_of
+from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_replaceable, not_writable
 
 # FFmpeg writes to stderr about every damaged packet; our errors say it in one line. OpenCV reads this
 # variable when it first opens a video, so it stands before the import. -8 is AV_LOG_QUIET.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
+from PIL import Image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".webm")  # what `write_video` makes; reading takes whatever OpenCV decodes
+ANIMATION_SUFFIXES = (".gif", ".webp")
+IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both exact
+MAX_GIF_FPS = 50.0  # frames of less than 2 hundredths of a second are shown for 10 by browsers
+WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
 MIN_SIZE = 16  # px; below this there is less than one tile and one SSIM window (11 taps) of picture
 MAX_FPS = 1000.0  # a container's time stamps are milliseconds
@@ -199,7 +204,7 @@ def image_paths(folder: Path) -> list[Path]:
         for entry in folder.iterdir()
         if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
     )
-    return sorted(images, key=lambda entry: _natural(entry.name))
+    return sorted(images, key=lambda entry: natural_order(entry.name))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -406,7 +411,7 @@ def _stacked(frames: list[np.ndarray]) -> np.ndarray:
     return stacked
 
 
-def _natural(name: str) -> tuple:
+def natural_order(name: str) -> tuple:
     """Sort key: runs of digits compare as numbers; the name itself breaks ties (1.png, 01.png)."""
     parts = re.split(r"([0-9]+)", name.lower())
     return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
@@ -415,29 +420,44 @@ def _natural(name: str) -> tuple:
 # ---------------------------------------------------------------------------------------------- writing
 
 
-def write_video(path: PathLike, frames: Iterable[np.ndarray], fps: float, *, overwrite: bool = False) -> Path:
+def write_video(
+    path: PathLike,
+    frames: Iterable[np.ndarray],
+    fps: float,
+    *,
+    overwrite: bool = False,
+    image_format: str = "png",
+) -> Path:
     """Write frames, uint8 RGB of shape (height, width, 3), and return the path; nothing half-written stays.
 
     `.mp4` and `.webm` are VP9 (profile 0, 4:2:0), which browsers play: OpenCV's wheel has no H.264 encoder.
     4:2:0 halves the colour resolution. Bunny comes back at 35 dB at 160x320, the limit of 4:2:0 there, and
-    at 40 dB at 640x1280 (OpenCV hands no quality setting to the encoder); a folder of PNGs is exact. An odd
+    at 40 dB at 640x1280 (OpenCV hands no quality setting to the encoder); a folder of images is exact. An odd
     height or width, which OpenCV would cut, gets its last row or column repeated once.
 
-    A path without extension, or an existing folder, goes to `write_frames`, with `overwrite`; an existing
-    *file* is replaced. `fps` is in (0, 1000].
+    `.gif` and `.webp` are animations that play again and again. A GIF has a palette of 256 colours for each frame,
+    and times in hundredths of a second: frames last a whole number of them each, of two lengths where need be, so
+    that the whole keeps its pace. Browsers slow down what is faster than 50 frames a second, which is refused. An
+    animated WebP has 4:2:0 at quality 90. Both are held in memory until the last frame.
+
+    A path without extension, or an existing folder, goes to `write_frames`, with `overwrite` and `image_format`; an
+    existing *file* is replaced. `fps` is in (0, 1000].
 
     Raises `VideoError` for another extension, no frames, or frames of other kinds; `OutputError` where the
     path cannot be written.
     """
     path = Path(path)
     _check_fps(fps)
+    one_of("image_format", image_format, IMAGE_FORMATS)
     if path.is_dir() or not path.suffix:
-        return write_frames(path, frames, overwrite=overwrite)
+        return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     suffix = path.suffix.lower()
+    if suffix in ANIMATION_SUFFIXES:
+        return _write_animation(path, suffix, frames, float(fps))
     if suffix not in VIDEO_SUFFIXES:
         raise _error(
             "path",
-            expected="a name ending in .mp4 or .webm, or a folder (no extension) for PNG frames",
+            expected="a name ending in .mp4, .webm, .gif or .webp, or a folder (no extension) for images",
             got=repr(path.name),
             cure="Rename the output.",
         )
@@ -451,19 +471,24 @@ def write_video(path: PathLike, frames: Iterable[np.ndarray], fps: float, *, ove
     return path
 
 
-def write_frames(folder: PathLike, frames: Iterable[np.ndarray], *, overwrite: bool = False) -> Path:
+def write_frames(
+    folder: PathLike, frames: Iterable[np.ndarray], *, overwrite: bool = False, image_format: str = "png"
+) -> Path:
     """Write frames, uint8 RGB of shape (height, width, 3), as 00000.png, 00001.png, ...; returns the folder.
 
-    The folder appears whole or not at all. One that holds files is refused unless `overwrite`, and even
-    then if it holds anything but such numbered frames: what this package did not write it does not delete.
+    With `image_format="webp"` as 00000.webp and so on: as exact as PNG, and smaller. The folder appears whole or not
+    at all. One that holds files is refused unless `overwrite`, and even then if it holds anything but such numbered
+    frames: what this package did not write it does not delete.
 
-    Raises `VideoError` for no frames or frames of other kinds, `OutputError` where the folder is refused.
+    Raises `VideoError` for no frames or frames of other kinds, `OutputError` where the folder is refused, ValueError
+    for an unknown `image_format`.
     """
-    folder = Path(folder)
-    _check_replaceable(folder, overwrite)
+    one_of("image_format", image_format, IMAGE_FORMATS)
+    folder, encode = Path(folder), _png if image_format == "png" else _webp
+    check_replaceable(folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)")
     with atomic_folder(folder) as temporary:
         for number, frame in enumerate(_checked_frames(frames)):
-            (temporary / f"{number:05d}.png").write_bytes(_png(frame))
+            (temporary / f"{number:05d}.{image_format}").write_bytes(encode(frame))
     return folder
 
 
@@ -479,6 +504,40 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
+
+
+def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float) -> Path:
+    """Write an animated GIF or WebP that repeats without end."""
+    if suffix == ".gif" and fps > MAX_GIF_FPS:
+        raise _error(
+            "fps",
+            expected=f"at most {MAX_GIF_FPS:g} for a GIF",
+            got=f"{fps:g}",
+            cure="Take fewer frames, or a .webp or .webm.",
+        )
+    with atomic_path(path) as temporary:
+        pictures = [_as_picture(frame, suffix) for frame in _checked_frames(frames)]
+        first, *rest = pictures
+        shared = {"save_all": True, "append_images": rest, "loop": 0}
+        try:
+            if suffix == ".gif":
+                first.save(temporary, "GIF", duration=_gif_durations(len(pictures), fps), optimize=False, **shared)
+            else:
+                first.save(temporary, "WEBP", duration=1000 / fps, quality=WEBP_QUALITY, **shared)
+        except OSError as error:
+            raise not_writable(path, error) from error
+    return path
+
+
+def _as_picture(frame: np.ndarray, suffix: str) -> Image.Image:
+    picture = Image.fromarray(frame)
+    return picture.quantize(256) if suffix == ".gif" else picture
+
+
+def _gif_durations(num_frames: int, fps: float) -> list[int]:
+    """Milliseconds of each frame, whole hundredths of a second, whose sums stay within a half of the true times."""
+    ends = np.rint(100 * np.arange(num_frames + 1) / fps).astype(int)
+    return [10 * int(lasts) for lasts in np.diff(ends)]
 
 
 def _encode(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
@@ -540,31 +599,13 @@ def _relabel_as_webm(path: Path) -> None:
         file.write(b"webm\0\0\0\0")
 
 
+def _webp(frame: np.ndarray) -> bytes:
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 101]  # above 100: lossless
+    return cv2.imencode(".webp", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
+
+
 def _png(frame: np.ndarray) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1].tobytes()
-
-
-def _check_replaceable(folder: Path, overwrite: bool) -> None:
-    """Raise `OutputError` unless `folder` is missing, empty, or frames that `overwrite` gives up."""
-    if not os.path.exists(folder):
-        return
-    if not folder.is_dir():
-        raise OutputError(f"path: expected a folder for PNG frames, got the file {str(folder)!r}. Choose another name.")
-    try:
-        names = [entry.name for entry in folder.iterdir()]
-    except OSError as error:
-        raise not_writable(folder, error) from error
-    foreign = [name for name in names if not re.fullmatch(r"[0-9]{5,}\.png", name)]
-    if foreign:
-        raise OutputError(
-            f"path: expected an empty folder or one of numbered frames, got {str(folder)!r} with "
-            f"{min(foreign)!r} in it. Choose another folder."
-        )
-    if names and not overwrite:
-        raise OutputError(
-            f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} frames. "
-            "Choose another folder, or allow overwriting."
-        )
 
 
 # ----------------------------------------------------------------------------------------------- checks

@@ -8,6 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from foldgauss.datasets import sample_clip
 from foldgauss.io import video_file
@@ -448,6 +449,58 @@ def test_folder_of_frames_is_exact(tmp_path):
     np.testing.assert_array_equal(read_video(folder).frames, frames)
 
 
+def test_folder_of_webp_is_exact(tmp_path):
+    frames = _moving(3, 33, 35)
+    folder = write_video(tmp_path / "out", frames, 25, image_format="webp")
+    assert sorted(entry.name for entry in folder.iterdir()) == ["00000.webp", "00001.webp", "00002.webp"]
+    np.testing.assert_array_equal(read_video(folder).frames, frames)
+    write_frames(folder, frames[:2], overwrite=True)
+    assert sorted(entry.name for entry in folder.iterdir()) == ["00000.png", "00001.png"]
+    for write in (
+        lambda: write_frames(folder, frames, image_format="bmp"),
+        lambda: write_video("a", frames, 25, image_format=""),
+    ):
+        with pytest.raises(ValueError, match="image_format"):
+            write()
+
+
+@pytest.mark.parametrize(("name", "quality"), [("out.gif", 31), ("out.webp", 33)])
+@pytest.mark.parametrize("fps", [12.5, 29.97, 50])
+def test_animations_keep_their_pace(tmp_path, name, quality, fps):
+    frames = _moving(9, 33, 35)
+    path = write_video(tmp_path / name, iter(frames), fps)
+    with Image.open(path) as image:
+        assert (image.n_frames, image.info["loop"]) == (9, 0)
+        durations, pictures = [], []
+        for number in range(9):
+            image.seek(number)
+            pictures.append(np.asarray(image.convert("RGB")))
+            durations.append(image.info["duration"])
+    assert _psnr(np.stack(pictures), frames) > quality
+    assert sum(durations) == pytest.approx(9000 / fps, abs=5)
+    assert max(durations) - min(durations) <= 10
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_gif_is_read_as_it_was_written(tmp_path):
+    clip = read_video(write_video(tmp_path / "out.gif", _moving(9), 20))
+    assert (clip.num_frames, clip.fps, clip.frames.shape[3]) == (9, 20, 3)
+    assert _psnr(clip.frames, _moving(9)) > 31
+
+
+def test_a_gif_too_fast_is_refused(tmp_path):
+    with pytest.raises(VideoError) as caught:
+        write_video(tmp_path / "out.gif", _moving(), 60)
+    _one_line(caught, "fps", "50")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["one.gif", "one.webp"])
+def test_an_animation_of_one_frame(tmp_path, name):
+    with Image.open(write_video(tmp_path / name, _moving(1), 25)) as image:
+        assert image.size == (64, 48)
+
+
 def test_existing_frames_need_overwrite(tmp_path):
     folder = write_frames(tmp_path / "out.frames", _moving(5))
     before = sorted(folder.iterdir())
@@ -478,7 +531,7 @@ def _failing():
     raise RuntimeError("the renderer failed")
 
 
-@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out"])
+@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out.gif", "out"])
 def test_failure_leaves_what_was_there(tmp_path, name):
     old = write_video(tmp_path / name, _moving(2), 25)
     for entry in (old, *old.glob("*")):
@@ -491,7 +544,7 @@ def test_failure_leaves_what_was_there(tmp_path, name):
 
 
 def test_failure_leaves_nothing_new(tmp_path):
-    for name in ("out.mp4", "out.webm", "out"):
+    for name in ("out.mp4", "out.webm", "out.gif", "out.webp", "out"):
         with pytest.raises(RuntimeError):
             write_video(tmp_path / name, _failing(), 25)
     assert list(tmp_path.iterdir()) == []
@@ -507,7 +560,7 @@ _BAD_FRAMES = {
 
 
 @pytest.mark.parametrize("frames", _BAD_FRAMES.values(), ids=_BAD_FRAMES)
-@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out"])
+@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out.gif", "out.webp", "out"])
 def test_bad_frames(tmp_path, name, frames):
     with pytest.raises(VideoError) as caught:
         write_video(tmp_path / name, frames, 25)
@@ -515,7 +568,7 @@ def test_bad_frames(tmp_path, name, frames):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["out.avi", "out.gif", "out.mp4.tmp"])
+@pytest.mark.parametrize("name", ["out.avi", "out.png", "out.mp4.tmp"])
 def test_other_extensions_list_the_choices(tmp_path, name):
     with pytest.raises(VideoError) as caught:
         write_video(tmp_path / name, _moving(), 25)
@@ -533,7 +586,7 @@ def test_output_that_cannot_be_written(tmp_path, name):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out", "out.png"])
+@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out.gif", "out", "out.png"])
 def test_a_full_disk_is_noticed(tmp_path, name):
     """OpenCV says nothing when its writes fail; a limit on file size stands in for the full disk."""
     program = """

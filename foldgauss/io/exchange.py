@@ -1,0 +1,99 @@
+"""The roads in and out by the name of a format: what `foldgauss export` and `foldgauss import` do."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from foldgauss._checks import invalid, one_of
+from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io._ply import format_error
+from foldgauss.io.mesh import write_pseudomesh
+from foldgauss.io.ply import (
+    AXES,
+    DEPTH_STEP,
+    read_vegas_ply,
+    write_3dgs_frames,
+    write_3dgs_ply,
+    write_vegas_ply,
+)
+from foldgauss.video.model import VideoModel
+
+#: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame.
+FORMATS = ("ply", "ply3dgs", "obj")
+
+
+def export(
+    model: VideoModel,
+    format: str,
+    out: str | os.PathLike,
+    *,
+    times: Sequence[float] | None = None,
+    depth_step: float | None = None,
+    axes: str | None = None,
+    sh_degree: int | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a model for other programs; returns the path of the file or the folder.
+
+    - `ply`: one file, the published VeGaS video (`write_vegas_ply`)
+    - `ply3dgs`: a folder with a 3DGS scene of each frame (`write_3dgs_frames`); or one file, where `out` ends in .ply
+      and `times` is one (`write_3dgs_ply`)
+    - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
+
+    `times` in [0, 1] (default: the model's frame times) for the formats of frames; `depth_step`, `axes` and `sh_degree`
+    for `ply3dgs`. What exists is refused unless `overwrite`.
+
+    **Raises:** ValueError for an unknown format, an option that the format does not know, and as the function;
+    `OutputError` where the output cannot be written or exists.
+
+    **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
+    """
+    one_of("format", format, FORMATS)
+    out, options = Path(out), {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
+    given = {name: value for name, value in options.items() if value is not None}
+    unknown = list(given) if format != "ply3dgs" else []
+    unknown += ["times"] if format == "ply" and times is not None else []
+    if unknown:
+        got = f"it for {format!r}"
+        raise invalid(unknown[0], expected="an option of this format", got=got, cure="Leave it out.")
+    if format == "ply":
+        _check_new(out, overwrite)
+        return write_vegas_ply(out, model)
+    if format == "obj":
+        return write_pseudomesh(out, model, times, overwrite=overwrite)
+    given = {"depth_step": DEPTH_STEP, "axes": AXES[0], "sh_degree": 3} | given
+    if out.suffix.lower() != ".ply" or out.is_dir():
+        return write_3dgs_frames(out, model, times, overwrite=overwrite, **given)
+    if times is None or np.size(times) != 1:
+        got = "all frames" if times is None else str(np.size(times))
+        cure = "Give one time, or a folder (a name without .ply)."
+        raise invalid("times", expected="one for a single file", got=got, cure=cure)
+    _check_new(out, overwrite)
+    return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **given)
+
+
+def _check_new(path: Path, overwrite: bool) -> None:
+    check_writable(path)
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"path: expected a new file, got {str(path)!r}, which exists. Choose another path, or allow overwriting."
+        )
+
+
+def import_model(
+    path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
+) -> VideoModel:
+    """The model in a file of another program: a published VeGaS video. See `read_vegas_ply` for `size` and `fps`.
+
+    **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Still scenes of 3DGS
+    and pseudomeshes hold none: `read_3dgs_ply` and `read_pseudomesh` read them as what they are.
+
+    **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
+    """
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() == ".obj":
+        cure = "Draw frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
+        raise format_error(path, expected="a .ply file with a video", got="a folder or a mesh", cure=cure)
+    return read_vegas_ply(path, size=size, fps=fps)

@@ -1,0 +1,99 @@
+"""Export and import by the name of a format."""
+
+import numpy as np
+import pytest
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import (
+    FormatError,
+    OutputError,
+    export,
+    import_model,
+    read_pseudomesh,
+    write_3dgs_frames,
+    write_3dgs_ply,
+    write_pseudomesh,
+    write_vegas_ply,
+)
+from foldgauss.render import RenderOptions
+from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video.packing import pack, unpack
+
+
+@pytest.fixture(scope="module")
+def model():
+    rows = np.random.default_rng(0).normal(size=(30, 15)).astype(np.float32)
+    splats = unpack(rows, 2, TimeLikelihood(np.float32(2), np.float32(0)))
+    return VideoModel(splats, FrameTimes.uniform(3), (40, 64), 24.0, RenderOptions())
+
+
+def files(path):
+    return {entry.name: entry.read_bytes() for entry in path.iterdir()} if path.is_dir() else path.read_bytes()
+
+
+def test_a_video_goes_out_and_comes_back(tmp_path, model):
+    path = export(model, "ply", tmp_path / "v.ply")
+    assert files(path) == files(write_vegas_ply(tmp_path / "w.ply", model))
+    again = import_model(path)
+    np.testing.assert_allclose(pack(again.splats), pack(model.splats), rtol=1e-6, atol=1e-6)
+    assert import_model(path, size=(20, 32), fps=12).fps == 12
+
+
+@pytest.mark.parametrize("options", [{}, {"times": [0.2, 0.7], "axes": "y-up", "sh_degree": 0, "depth_step": 0.0}])
+def test_frames_for_viewers(tmp_path, model, options):
+    path = export(model, "ply3dgs", tmp_path / "frames", **options)
+    assert files(path) == files(write_3dgs_frames(tmp_path / "again", model, **options))
+
+
+def test_one_frame_for_viewers(tmp_path, model):
+    path = export(model, "ply3dgs", tmp_path / "one.ply", times=[0.4], sh_degree=0)
+    assert files(path) == files(write_3dgs_ply(tmp_path / "again.ply", model, 0.4, sh_degree=0))
+    for times in (None, [0.1, 0.2]):
+        with pytest.raises(ValueError, match="times"):
+            export(model, "ply3dgs", tmp_path / "two.ply", times=times)
+    assert not (tmp_path / "two.ply").exists()
+
+
+def test_frames_for_mesh_tools(tmp_path, model):
+    path = export(model, "obj", tmp_path / "mesh", times=[0.5])
+    assert files(path) == files(write_pseudomesh(tmp_path / "again", model, [0.5]))
+    assert read_pseudomesh(path).num_frames == 1
+
+
+@pytest.mark.parametrize(
+    ("format", "options", "text"),
+    [
+        ("gltf", {}, "format"),
+        ("ply", {"times": [0.5]}, "times"),
+        ("ply", {"sh_degree": 0}, "sh_degree"),
+        ("obj", {"axes": "y-up"}, "axes"),
+        ("obj", {"depth_step": 0.0}, "depth_step"),
+        ("ply3dgs", {"axes": "up"}, "axes"),
+    ],
+)
+def test_wrong_options(tmp_path, model, format, options, text):
+    with pytest.raises(ValueError, match=text):
+        export(model, format, tmp_path / "out", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("format", "name", "options"), [("ply", "v.ply", {}), ("ply3dgs", "f.ply", {"times": [0]}), ("ply3dgs", "f", {})]
+)
+def test_existing_outputs(tmp_path, model, format, name, options):
+    path = export(model, format, tmp_path / name, **options)
+    before = files(path)
+    with pytest.raises(OutputError, match="overwriting"):
+        export(model, format, path, **options)
+    assert files(path) == before
+    assert export(model, format, path, overwrite=True, **options) == path
+
+
+def test_what_is_no_video(tmp_path, model):
+    write_3dgs_ply(tmp_path / "f.ply", model, 0.5)
+    with pytest.raises(FormatError, match="read_3dgs_ply"):
+        import_model(tmp_path / "f.ply", size=(40, 64))
+    with pytest.raises(FormatError, match="read_pseudomesh"):
+        import_model(write_pseudomesh(tmp_path / "mesh", model))
+    with pytest.raises(FileNotFoundError, match="missing"):
+        import_model(tmp_path / "none.ply")

@@ -1,0 +1,545 @@
+"""PLY files: the published VeGaS video with its picture, 3DGS scenes that viewers open, and damage that is refused."""
+
+import math
+import struct
+import warnings
+
+import equinox as eqx
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.lib import recfunctions
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import ply as ply_file
+from foldgauss.io._atomic import OutputError
+from foldgauss.io._ply import FormatError, read_ply, write_ply
+from foldgauss.io.ply import (
+    frame_gaussians,
+    read_3dgs_ply,
+    read_vegas_ply,
+    write_3dgs_frames,
+    write_3dgs_ply,
+    write_gaussians_ply,
+    write_vegas_ply,
+)
+from foldgauss.render import Gaussians3D, RenderOptions, Splats2D, cpu
+from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video.packing import pack, unpack
+from foldgauss.video.playback import Playback
+
+NUM, DEGREE, FRAMES = 60, 3, 5
+HALF_WIDTH = math.tan(0.6911112 / 2)  # of the published frame, at distance 1
+
+
+def vegas_columns(seed=0, num=NUM, degree=DEGREE):
+    """Raw columns of a published video: smooth Gaussians over the frame, none so thin that a cutoff hits it."""
+    rng = np.random.default_rng(seed)
+    columns = {"x": rng.uniform(-0.4, 0.4, num), "y": rng.normal(size=num), "z": rng.uniform(-0.3, 0.3, num)}
+    columns |= {name: np.zeros(num) for name in ("nx", "ny", "nz")}
+    columns |= {f"f_dc_{c}": rng.uniform(-2.5, 1.5, num) for c in range(3)}
+    columns |= {"opacity": rng.normal(0, 2, num)}
+    columns |= {f"scale_{k}": np.log(rng.uniform(0.02, 0.15, num)) for k in range(3)}
+    columns |= {"rot_0": rng.normal(0, 2, num), "m_0": rng.normal(0, 1.5, num)}
+    columns |= {"sigma_0": np.log(rng.uniform(0.15, 0.8, num))}
+    columns |= {f"w1_{k}": rng.normal(0, 0.2, num) for k in range(2 * degree)}
+    return {name: column.astype(np.float32) for name, column in columns.items()}
+
+
+def time_weights(seed=0):
+    return np.random.default_rng(seed).normal(0, 0.5, FRAMES - 1).astype(np.float32)
+
+
+def write_raw(path, columns, weights=None, *, layout="binary_little_endian", code="f", between=""):
+    """A PLY file by hand, in any of the three layouts."""
+    kind = {"f": "float", "d": "double"}[code]
+    elements = [("vertex", columns)]
+    if weights is not None:
+        elements.append(("time", {f"time_func_{k}": [weight] for k, weight in enumerate(weights)}))
+    header, body = f"ply\nformat {layout} 1.0\ncomment by hand\n{between}", b""
+    for name, rows in elements:
+        table = np.stack([np.asarray(row, float) for row in rows.values()], axis=1)
+        header += f"element {name} {len(table)}\n" + "".join(f"property {kind} {row}\n" for row in rows)
+        if layout == "ascii":
+            body += "".join(" ".join(map(repr, row)) + "\n" for row in table.tolist()).encode()
+        else:
+            order = "<" if "little" in layout else ">"
+            body += struct.pack(f"{order}{table.size}{code}", *table.ravel())
+    path.write_bytes(header.encode() + b"end_header\n" + body)
+    return path
+
+
+def published_picture(columns, t, size):
+    """The picture as the published formulas give it, in their own geometry: camera at (0, -1, 0), plane y = 0.
+
+    In float64 NumPy, with nothing of this package.
+    """
+    c = {name: column.astype(float) for name, column in columns.items()}
+    height, width = size
+    sigmoid = lambda x: 1 / (1 + np.exp(-x))  # noqa: E731
+    u = sigmoid(c["m_0"]) - t
+    degree = sum(name.startswith("w1_") for name in c) // 2
+    x = c["x"] + sum(c[f"w1_{2 * j}"] * u ** (j + 1) for j in range(degree))
+    z = c["z"] + sum(c[f"w1_{2 * j + 1}"] * u ** (j + 1) for j in range(degree))
+    shrink = np.exp(-((u / np.exp(c["sigma_0"])) ** 2) / 2)
+    first, second = np.exp(c["scale_0"]) * shrink, np.exp(c["scale_2"]) * shrink
+    angle = 2 * np.pi * sigmoid(c["rot_0"])
+    focal = width / (2 * HALF_WIDTH)
+    rows, columns_ = np.mgrid[0:height, 0:width] + 0.5
+    light, image = np.ones(size), np.zeros((*size, 3))
+    for i in np.flatnonzero((shrink > 0.01) & (first > 1e-4) & (second > 1e-4)):
+        turn = np.array([[np.cos(angle[i]), 0, np.sin(angle[i])], [0, 1, 0], [-np.sin(angle[i]), 0, np.cos(angle[i])]])
+        space = turn @ np.diag([first[i], 1e-8, second[i]]) ** 2 @ turn.T
+        right, down, depth = x[i], -z[i], 1.0  # in the camera's axes: +x, -z, +y
+        view = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        jacobian = focal / depth * np.array([[1, 0, -right / depth], [0, 1, -down / depth]])
+        covariance = jacobian @ view @ space @ view.T @ jacobian.T + 0.3 * np.eye(2)
+        offset = np.stack([columns_ - (width / 2 + focal * right), rows - (height / 2 + focal * down)], -1)
+        distance = np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(covariance), offset)
+        alpha = np.minimum(0.99, sigmoid(c["opacity"][i]) * np.exp(-distance / 2))
+        alpha[alpha < 1 / 255] = 0
+        color = np.maximum([0.5 + 0.2820948 * c[f"f_dc_{k}"][i] for k in range(3)], 0)
+        image += (light * alpha)[..., None] * color
+        light *= 1 - alpha
+    return image
+
+
+def drawn(splats, size, model):
+    """Float picture by the CPU engine."""
+    leaves = (np.asarray(leaf, np.float32) for leaf in (splats.mean, splats.factor, splats.opacity, splats.color))
+    return cpu.forward(*leaves, np.zeros(3, np.float32), size, options=model.options).image.transpose(1, 2, 0)
+
+
+def one_line(caught, *texts):
+    message = str(caught.value)
+    assert "\n" not in message
+    for text in texts:
+        assert text in message, message
+
+
+def random_model(seed=0, size=(48, 80), degree=DEGREE, num=NUM, power=2.0, floor=0.0):
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(num, 11 + 2 * degree)).astype(np.float32)
+    splats = unpack(rows, degree, TimeLikelihood(np.float32(power), np.float32(floor)))
+    splats = eqx.tree_at(lambda s: s.log_scale, splats, rng.uniform(-4, -2, (num, 2)).astype(np.float32))
+    splats = eqx.tree_at(lambda s: s.loc, splats, rng.uniform(-0.5, 0.5, (num, 2)).astype(np.float32))
+    return VideoModel(splats, FrameTimes(time_weights(seed)), size, 29.97, RenderOptions(low_pass=0.1))
+
+
+# ------------------------------------------------------------------------------------------------ VeGaS
+
+
+@pytest.mark.parametrize("size", [(40, 64), (64, 40)])
+def test_a_published_video_gives_the_published_picture(tmp_path, size):
+    columns, weights = vegas_columns(), time_weights()
+    model = read_vegas_ply(write_raw(tmp_path / "v.ply", columns, weights), size=size, fps=24)
+    assert (model.num_frames, model.fps, model.size) == (FRAMES, 24.0, size)
+    share = np.exp(weights.astype(float)) / np.exp(weights.astype(float)).sum()
+    times = np.asarray(model.frame_times.times())
+    np.testing.assert_allclose(times, [share[:k].sum() for k in range(FRAMES)], atol=1e-6)
+    for t in times:
+        expected = published_picture(columns, float(t), size)
+        assert expected.std() > 0.05
+        np.testing.assert_allclose(drawn(Playback(model).splats(t), size, model), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("wrong", ["rot_0", "z", "w1_1", "m_0", "scale_0"])
+def test_the_reference_would_tell(tmp_path, wrong):
+    """A sign or a pair mistaken in any of these is a picture that differs by more than the tolerance."""
+    columns, size = vegas_columns(), (40, 64)
+    model = read_vegas_ply(write_raw(tmp_path / "v.ply", columns, time_weights()), size=size)
+    changed = columns | {wrong: columns["scale_2"] if wrong == "scale_0" else -columns[wrong]}
+    expected = published_picture(changed, 0.4, size)
+    assert np.abs(drawn(Playback(model).splats(0.4), size, model) - expected).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("layout", "code"), [("ascii", "f"), ("binary_big_endian", "f"), ("binary_little_endian", "d")]
+)
+def test_all_layouts_hold_the_same(tmp_path, layout, code):
+    columns, weights = vegas_columns(), time_weights()
+    plain = read_vegas_ply(write_raw(tmp_path / "a.ply", columns, weights), size=(40, 64))
+    other = read_vegas_ply(write_raw(tmp_path / "b.ply", columns, weights, layout=layout, code=code), size=(40, 64))
+    np.testing.assert_array_equal(pack(plain.splats), pack(other.splats))
+    np.testing.assert_array_equal(plain.frame_times.logits, other.frame_times.logits)
+
+
+def test_other_elements_and_lists_are_skipped(tmp_path):
+    columns, weights = vegas_columns(), time_weights()
+    plain = write_raw(tmp_path / "a.ply", columns, weights).read_bytes()
+    head, body = plain.split(b"end_header\n", 1)
+    faces = b"element face 2\nproperty uchar flag\nproperty list uchar int vertex_indices\n"
+    start = head.index(b"element vertex")
+    rows = struct.pack("<BB3iBB4i", 7, 3, 0, 1, 2, 9, 4, 0, 1, 2, 3)
+    (tmp_path / "b.ply").write_bytes(head[:start] + faces + head[start:] + b"end_header\n" + rows + body)
+    model = read_vegas_ply(tmp_path / "b.ply", size=(40, 64))
+    np.testing.assert_array_equal(pack(model.splats), pack(read_vegas_ply(tmp_path / "a.ply", size=(40, 64)).splats))
+    text = write_raw(tmp_path / "c.ply", columns, weights, layout="ascii").read_bytes()
+    head, body = text.split(b"end_header\n", 1)
+    faced = head[: head.index(b"element vertex")] + faces + head[head.index(b"element vertex") :]
+    (tmp_path / "d.ply").write_bytes(faced + b"end_header\n7 3 0 1 2\n9 4 0 1 2 3\n" + body)
+    again = read_vegas_ply(tmp_path / "d.ply", size=(40, 64))
+    np.testing.assert_array_equal(pack(model.splats), pack(again.splats))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 7])
+@pytest.mark.parametrize("size", [(48, 80), (80, 48)])
+def test_leaves_come_back_to_rounding(tmp_path, degree, size):
+    model = random_model(degree=degree, size=size)
+    again = read_vegas_ply(write_vegas_ply(tmp_path / "v.ply", model))
+    assert (again.size, again.fps, again.options, again.compositing) == (size, 29.97, model.options, "over")
+    np.testing.assert_allclose(pack(again.splats), pack(model.splats), rtol=3e-7, atol=5e-7)
+    np.testing.assert_array_equal(again.frame_times.logits, model.frame_times.logits)
+    assert float(again.splats.envelope.power) == 2
+
+
+def test_columns_come_back_to_rounding(tmp_path):
+    columns, weights = vegas_columns(), time_weights()
+    model = read_vegas_ply(write_raw(tmp_path / "a.ply", columns, weights), size=(40, 64))
+    ply = read_ply(write_vegas_ply(tmp_path / "b.ply", model), ("vertex", "time"))
+    assert list(ply.names("vertex")) == list(columns)
+    assert list(ply.names("time")) == [f"time_func_{k}" for k in range(FRAMES - 1)]
+    for name in set(columns) - {"y", "scale_1"}:  # which the published renderer does not look at
+        np.testing.assert_allclose(ply.elements["vertex"][name], columns[name], rtol=3e-7, atol=5e-7, err_msg=name)
+    np.testing.assert_array_equal(ply.columns("time", ply.names("time"))[0].astype(np.float32), weights)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"power": 1.0}, "--power 2"),
+        ({"floor": 0.01}, "floor"),
+    ],
+)
+def test_what_the_published_code_cannot_draw_is_refused(tmp_path, change, text):
+    with pytest.raises(ValueError, match="expected") as caught:
+        write_vegas_ply(tmp_path / "v.ply", random_model(**change))
+    one_line(caught, text)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sums_and_diverged_models_are_refused(tmp_path):
+    model = random_model()
+    summed = VideoModel(model.splats, model.frame_times, model.size, 25.0, model.options, "sum")
+    for write in (write_vegas_ply, lambda path, model: write_3dgs_ply(path, model, 0.5)):
+        with pytest.raises(ValueError, match="sum"):
+            write(tmp_path / "v.ply", summed)
+    broken = eqx.tree_at(lambda m: m.splats.loc, model, np.full((NUM, 2), np.nan, np.float32))
+    with pytest.raises(ValueError, match="finite"):
+        write_vegas_ply(tmp_path / "v.ply", broken)
+    with pytest.raises(ValueError, match="VideoModel"):
+        write_vegas_ply(tmp_path / "v.ply", model.splats)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_size_and_rate_must_be_known(tmp_path):
+    path = write_raw(tmp_path / "v.ply", vegas_columns(), time_weights())
+    with pytest.raises(FormatError) as caught:
+        read_vegas_ply(path)
+    one_line(caught, "size=(480, 854)")
+    assert read_vegas_ply(path, size=(40, 64)).fps == 25
+    for wrong in ({"size": (0, 4)}, {"size": 7}, {"size": (4, 4), "fps": 0}, {"size": (4, 4), "fps": math.nan}):
+        with pytest.raises(ValueError, match=r"expected|got"):
+            read_vegas_ply(path, **wrong)
+    own = write_vegas_ply(tmp_path / "own.ply", random_model())
+    assert read_vegas_ply(own, fps=10, size=(20, 30)).size == (20, 30)
+    assert read_vegas_ply(own, fps=10).fps == 10
+
+
+# ------------------------------------------------------------------------------------------------- 3DGS
+
+
+@pytest.mark.parametrize("size", [(48, 80), (80, 48)])
+@pytest.mark.parametrize("axes", ["y-down", "y-up"])
+def test_a_frame_in_space_is_the_frame(tmp_path, size, axes):
+    """Written, read, sorted by depth and seen by the front camera: the model's own picture, in the model's order."""
+    model = random_model(size=size)
+    path = write_3dgs_ply(tmp_path / "f.ply", model, 0.5, axes=axes, depth_step=2e-3)  # so deep that size tells
+    gaussians = read_3dgs_ply(path, axes=axes)
+    splats = Playback(model).splats(0.5)
+    assert len(gaussians.opacity) == len(splats.opacity) > 20
+    by_chance = np.random.default_rng(0).permutation(len(splats.opacity))
+    nearest_first = by_chance[np.argsort(gaussians.mean[by_chance, 2])]
+    seen = from_the_front(gaussians, nearest_first, size)
+    np.testing.assert_allclose(drawn(seen, size, model), drawn(splats, size, model), atol=2e-4)
+    wrong = from_the_front(gaussians, by_chance, size)
+    assert np.abs(drawn(wrong, size, model) - drawn(splats, size, model)).max() > 0.05  # the order matters here
+
+
+def from_the_front(gaussians, order, size):
+    """Flat Gaussians through a pinhole before the plane, in an order; by hand."""
+    height, width = size
+    distance = min(1, width / height) / (2 * HALF_WIDTH)
+    focal = width / (2 * HALF_WIDTH)
+    mean, factor = gaussians.mean[order], gaussians.factor[order, :2, :2]
+    enlarged = focal / (distance + mean[:, 2])
+    places = mean[:, :2] * enlarged[:, None] + np.array([width / 2, height / 2])
+    return Splats2D(places, factor * enlarged[:, None, None], gaussians.opacity[order], gaussians.color[order])
+
+
+def test_depths_keep_the_order_in_float32():
+    """As many as a large model has: in space, and as distances from the front camera."""
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(30_000, 11)).astype(np.float32)
+    rows[:, 9:] = 0  # all alive
+    splats = unpack(rows, 0, TimeLikelihood(np.float32(2), np.float32(0)))
+    splats = eqx.tree_at(lambda s: (s.time_loc_logit, s.log_time_scale), splats, (0 * rows[:, 0], 0 * rows[:, 0]))
+    model = VideoModel(splats, FrameTimes.uniform(3), (160, 320), 25.0, RenderOptions())
+    depth = np.asarray(frame_gaussians(model, 0.5).mean)[:, 2]
+    assert len(depth) == 30_000
+    assert depth[0] == 0
+    assert (np.diff(depth) > 0).all()
+    distance = np.float32(0.5 / HALF_WIDTH)
+    assert (np.diff(depth + distance) > 0).all()
+    assert depth[-1] < 0.02
+    assert not np.asarray(frame_gaussians(model, 0.5, depth_step=0).mean)[:, 2].any()
+
+
+def test_layout_is_what_viewers_expect(tmp_path):
+    model = random_model()
+    raw = write_3dgs_ply(tmp_path / "f.ply", model, 0.5).read_bytes()
+    head, body = raw.split(b"end_header\n", 1)
+    num = len(Playback(model).splats(0.5).opacity)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(45))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {num}", *(f"property float {n}" for n in names)]
+    assert head.decode().splitlines() == lines
+    table = np.frombuffer(body, "<f4").reshape(num, 62)
+    assert not table[:, 3:6].any()
+    assert not table[:, 9:54].any()
+    np.testing.assert_allclose(np.linalg.norm(table[:, 58:], axis=1), 1, rtol=1e-6)
+    splats = Playback(model).splats(0.5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-table[:, 54])), splats.opacity, rtol=1e-5)
+    np.testing.assert_allclose(np.maximum(0.5 + 0.28209479 * table[:, 6:9], 0), splats.color, atol=1e-6)
+    small = write_3dgs_ply(tmp_path / "g.ply", model, 0.5, sh_degree=0)
+    assert small.stat().st_size < 0.31 * len(raw)
+    np.testing.assert_array_equal(read_3dgs_ply(small).mean, read_3dgs_ply(tmp_path / "f.ply").mean)
+
+
+def test_gaussians_in_space_come_back(tmp_path):
+    """Any of them, not flat ones alone: needles, mirrored factors, opacity 0 and 1."""
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(50, 3, 3)) * np.exp(rng.normal(-3, 2, (50, 1, 3)))
+    factor[:10] *= np.array([-1, 1, 1])
+    opacity = np.concatenate([[0, 1], rng.uniform(0, 1, 48)])
+    gaussians = Gaussians3D(rng.normal(size=(50, 3)), factor, opacity, rng.uniform(0, 2, (50, 3)))
+    again = read_3dgs_ply(write_gaussians_ply(tmp_path / "g.ply", gaussians))
+    np.testing.assert_allclose(again.mean, gaussians.mean, rtol=1e-6)
+    for one, other in zip(again.factor.astype(float), factor, strict=True):
+        np.testing.assert_allclose(one @ one.T, other @ other.T, atol=3e-6 * np.abs(other @ other.T).max())
+    np.testing.assert_allclose(again.opacity, opacity, atol=1e-6)
+    np.testing.assert_allclose(again.color, gaussians.color, atol=1e-6)
+
+
+def test_frames_go_to_a_folder(tmp_path):
+    model = random_model()
+    folder = write_3dgs_frames(tmp_path / "out", model)
+    assert [path.name for path in sorted(folder.iterdir())] == [f"frame_{k:04d}.ply" for k in range(FRAMES)]
+    t = float(model.frame_times.times()[2])
+    one = write_3dgs_ply(tmp_path / "one.ply", model, t)
+    assert (folder / "frame_0002.ply").read_bytes() == one.read_bytes()
+    with pytest.raises(OutputError, match="overwriting"):
+        write_3dgs_frames(folder, model)
+    write_3dgs_frames(folder, model, [0.5], overwrite=True)
+    assert len(list(folder.iterdir())) == 1
+    (folder / "precious.txt").touch()
+    with pytest.raises(OutputError, match="precious"):
+        write_3dgs_frames(folder, model, overwrite=True)
+    for times in ([], [1.5], [math.nan], 0.5):
+        with pytest.raises(ValueError, match="times"):
+            write_3dgs_frames(tmp_path / "other", model, times)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"depth_step": -1}, {"depth_step": math.nan}, {"axes": "z-up"}, {"sh_degree": 4}, {"t": 1.5}]
+)
+def test_wrong_arguments(tmp_path, arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        write_3dgs_ply(tmp_path / "f.ply", random_model(), **({"t": 0.5} | arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_gaussians_cannot_be_written(tmp_path):
+    good = frame_gaussians(random_model(), 0.5)
+    grey = eqx.tree_at(lambda g: g.color, good, good.color[:, :1])
+    broken = eqx.tree_at(lambda g: g.mean, good, good.mean * np.float32(np.nan))
+    for gaussians, text in ((grey, "channels"), (broken, "finite")):
+        with pytest.raises(ValueError, match=text):
+            write_gaussians_ply(tmp_path / "g.ply", gaussians)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_time_with_nothing_to_see(tmp_path):
+    model = eqx.tree_at(lambda m: m.splats.log_time_scale, random_model(), np.full(NUM, -20, np.float32))
+    gaussians = read_3dgs_ply(write_3dgs_ply(tmp_path / "f.ply", model, 0.0))
+    assert gaussians.mean.shape == (0, 3)
+    assert gaussians.factor.shape == (0, 3, 3)
+
+
+# ----------------------------------------------------------------------------------------------- damage
+
+
+def _header(*lines, layout="binary_little_endian"):
+    return "\n".join(["ply", f"format {layout} 1.0", *lines, "end_header", ""]).encode()
+
+
+DAMAGED = {
+    "empty": (b"", "empty"),
+    "another file": (b"\x89PNG\r\n", "PNG"),
+    "no end": (b"ply\nformat ascii 1.0\n", "end_header"),
+    "a long header": (b"ply\n" + b"comment\n" * 600_000, "end_header"),
+    "no format": (b"ply\nelement vertex 1\nproperty float x\nend_header\n", "format"),
+    "another format": (b"ply\nformat binary_middle_endian 1.0\nend_header\n", "line 2"),
+    "property first": (_header("property float x"), "line 3"),
+    "unknown type": (_header("element vertex 1", "property half x"), "line 4"),
+    "a negative count": (_header("element vertex -1"), "line 3"),
+    "no number": (_header("element vertex many"), "line 3"),
+    "a count that lies": (_header("element vertex 999999999999", "property float x"), "breaks off"),
+    "a count that lies in text": (_header("element vertex 99999999999", "property int x", layout="ascii"), "breaks"),
+    "more digits": (_header("element vertex " + "9" * 5000, "property float x"), "line 3"),
+    "twice": (_header("element vertex 1", "property float x", "property float x"), "'x' twice"),
+    "two elements": (_header("element vertex 1", "property float x", "element vertex 1"), "'vertex' twice"),
+    "no properties": (_header("element vertex 5"), "none"),
+    "a list": (_header("element vertex 1", "property list uchar float x") + b"\0", "list"),
+    "a list of floats long": (_header("element vertex 1", "property list float float x"), "line 4"),
+    "a mesh": (_header("element vertex 1", "property float x") + bytes(4), "m_0"),
+    "no vertices": (_header("element face 1", "property float x") + bytes(4), "no element 'vertex'"),
+    "lists that lie": (_header("element face 1", "property list int int x", "element vertex 1", "property int x")
+                       + struct.pack("<i", 2**31 - 1), "breaks off"),
+    "lists of negative length": (_header("element face 1", "property list int int x", "element vertex 1",
+                                         "property int x") + struct.pack("<i", -1), "-1"),
+    "words": (_header("element vertex 1", "property float x", layout="ascii") + b"north", "'north' in x of vertex 0"),
+    "a long word": (_header("element vertex 1", "property float x", layout="ascii") + b"1" * 10**6, "1000000"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_damaged_files(tmp_path, kind):
+    data, text = DAMAGED[kind]
+    (tmp_path / "v.ply").write_bytes(data)
+    with pytest.raises(FormatError) as caught:
+        read_vegas_ply(tmp_path / "v.ply", size=(40, 64))
+    one_line(caught, text, "v.ply")
+    with pytest.raises(FormatError):
+        read_3dgs_ply(tmp_path / "v.ply")
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"x": np.full(NUM, np.nan)}, "nan in x of vertex 0"),
+        ({"w1_3": np.where(np.arange(NUM) == 7, np.inf, 0)}, "inf in w1_3 of vertex 7"),
+        ({"m_0": None}, "m_0"),
+        ({"scale_2": None}, "scale_2"),
+        ({"w1_5": None}, "even number"),
+        ({"w1_2": None, "w1_9": np.zeros(NUM)}, "w1_2"),
+        ({"f_rest_0": np.ones(NUM)}, "degree 0"),
+        ({"scale_0": np.full(NUM, 1e38), "x": np.full(NUM, 3e38)}, "float32"),
+    ],
+)
+def test_wrong_columns(tmp_path, change, text):
+    columns = {name: column for name, column in (vegas_columns() | change).items() if column is not None}
+    with pytest.raises(FormatError) as caught:
+        read_vegas_ply(write_raw(tmp_path / "v.ply", columns, time_weights(), code="d"), size=(40, 64))
+    one_line(caught, text)
+
+
+def test_frame_weights_are_needed(tmp_path):
+    columns, size = vegas_columns(), (40, 64)
+    with pytest.raises(FormatError, match="element 'time'"):
+        read_vegas_ply(write_raw(tmp_path / "v.ply", columns), size=size)
+    gone = {name: column[:0] for name, column in columns.items()}
+    with pytest.raises(FormatError, match="Gaussians"):
+        read_vegas_ply(write_raw(tmp_path / "v.ply", gone, time_weights()), size=size)
+    tables = {"vertex": columns, "time": {"time_func_0": time_weights()}}
+    column = read_vegas_ply(write_ply(tmp_path / "c.ply", tables), size=size)
+    np.testing.assert_array_equal(column.frame_times.logits, time_weights())
+    for rows in ({"time_func_0": [1, 2], "time_func_1": [1, 2]}, {"time_func_1": [1], "time_func_2": [2]}, {"a": []}):
+        with pytest.raises(FormatError, match="time"):
+            read_vegas_ply(write_ply(tmp_path / "d.ply", {"vertex": columns, "time": rows}), size=size)
+
+
+@pytest.mark.parametrize(
+    "note", ['{"size": [1, "a"]}', "[1]", "{", '{"options": 3}', '{"size": [4, 4], "options": {"low_pass": -1}}',
+             '{"size": [4, 4], "options": {"colour": 1}}', '{"size": [4, 4], "fps": "many"}', "[" * 100_000]
+)  # fmt: skip
+def test_notes_that_are_none(tmp_path, note):
+    tables = {"vertex": vegas_columns(), "time": {f"time_func_{k}": [0.0] for k in range(3)}}
+    with pytest.raises(FormatError) as caught:
+        read_vegas_ply(write_ply(tmp_path / "v.ply", tables, comments=["foldgauss " + note]))
+    one_line(caught, "v.ply")
+
+
+def test_3dgs_files_that_are_none(tmp_path):
+    with pytest.raises(FormatError, match="read_vegas_ply"):
+        read_3dgs_ply(write_raw(tmp_path / "v.ply", vegas_columns(), time_weights()))
+    path = write_3dgs_ply(tmp_path / "f.ply", random_model(), 0.5, sh_degree=0)
+    with pytest.raises(FormatError, match="read_3dgs_ply"):
+        read_vegas_ply(path)
+    rows = read_ply(path, ["vertex"]).elements["vertex"]
+    columns = {name: np.array(rows[name]) for name in rows.dtype.names}
+    for name, value, text in (("rot", 0, "vertex 1"), ("scale_1", 1e3, "float32"), ("y", np.nan, "y of vertex 1")):
+        changed = {own: np.array(column) for own, column in columns.items()}
+        for own in (own for own in changed if own.startswith(name)):
+            changed[own][1] = value
+        with pytest.raises(FormatError, match=text):
+            read_3dgs_ply(write_ply(tmp_path / "g.ply", {"vertex": changed}))
+    with pytest.raises(ValueError, match="axes"):
+        read_3dgs_ply(path, axes="up")
+
+
+def test_missing_paths(tmp_path):
+    for read in (read_vegas_ply, read_3dgs_ply):
+        with pytest.raises(FileNotFoundError, match="missing"):
+            read(tmp_path / "none.ply")
+        with pytest.raises(FormatError):
+            read(tmp_path)
+    with pytest.raises(OutputError, match="folder"):
+        write_vegas_ply(tmp_path / "none" / "v.ply", random_model())
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    """Small files of every kind, to be damaged."""
+    folder, model = tmp_path_factory.mktemp("ply"), random_model(num=4, degree=1)
+    text = write_raw(folder / "text.ply", vegas_columns(num=3, degree=1), time_weights(), layout="ascii")
+    files = [write_vegas_ply(folder / "v.ply", model), write_3dgs_ply(folder / "f.ply", model, 0.5, sh_degree=0), text]
+    return folder / "damaged.ply", [path.read_bytes() for path in files]
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_random_damage_raises_one_kind_of_error(samples, data):
+    path, files = samples
+    raw = bytearray(files[data.draw(st.integers(0, len(files) - 1))])
+    for place in data.draw(st.lists(st.integers(0, len(raw) - 1), max_size=4)):
+        raw[place] = data.draw(st.integers(0, 255))
+    path.write_bytes(raw[: data.draw(st.integers(0, len(raw)) | st.just(len(raw)))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        errors = [refusal(read, path) for read in (_sized, read_vegas_ply, read_3dgs_ply)]
+    assert not any("\n" in error for error in errors)
+
+
+def _sized(path):
+    return read_vegas_ply(path, size=(4, 4))
+
+
+def refusal(read, path):
+    """The message of the one error that may come, or nothing."""
+    try:
+        read(path)
+    except FormatError as error:
+        return str(error)
+    return ""
+
+
+def test_structured_rows_are_plain_numbers(tmp_path):
+    """What `read_ply` gives is what stands there, whatever the byte order."""
+    columns = {"a": [1.0, 2.5], "b": [-3.0, 1e-30]}
+    rows = read_ply(write_raw(tmp_path / "x.ply", columns, layout="binary_big_endian"), ["vertex"]).elements["vertex"]
+    expected = np.stack([np.float32(column) for column in columns.values()], axis=1)
+    np.testing.assert_array_equal(recfunctions.structured_to_unstructured(rows), expected)
+    assert ply_file.is_vegas(read_ply(tmp_path / "x.ply", ["vertex"])) is False
