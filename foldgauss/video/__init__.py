@@ -2,13 +2,21 @@
 
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
+from foldgauss.video.edit import Edit, edit
+from foldgauss.video.edited import EditedVideo, Layer, layers
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
 from foldgauss.video.frame_times import FrameTimes, interpolated_times
 from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
+from foldgauss.video.overlays import SelectedGaussians
+from foldgauss.video.select import Selection, select
+from foldgauss.video.timing import Clock, Span
 
 __all__ = [
+    "Clock",
+    "Edit",
+    "EditedVideo",
     "Evaluation",
     "FitConfig",
     "FitInfo",
@@ -17,13 +25,20 @@ __all__ = [
     "FoldedSplats",
     "FrameTimes",
     "Growth",
+    "Layer",
     "LearningRates",
+    "SelectedGaussians",
+    "Selection",
+    "Span",
     "VideoModel",
     "density_image",
+    "edit",
     "evaluate",
     "fit",
     "fit_steps",
     "interpolated_times",
+    "layers",
     "psnr",
+    "select",
     "ssim",
 ]
