@@ -47,7 +47,8 @@ class When(TypedDict, total=False):
 def edit(model: VideoModel | EditedVideo) -> "Edit":
     """The start of a chain of edits, everything selected. Raises ValueError for what is no video."""
     video = as_edited(model)
-    return Edit(video, Selection(np.ones(video.num_gaussians, bool)))
+    counts = tuple(layer.num_gaussians for layer in video.layers)
+    return Edit(video, Selection(np.ones(sum(counts), bool)), counts, tuple(map(np.arange, counts)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,6 +76,9 @@ class Edit:
 
     _video: EditedVideo
     selection: Selection
+    # By layer: how many Gaussians the chain was begun with, and which of those each one is now, or is a copy of.
+    _begun_with: tuple[int, ...]
+    _sources: tuple[Int[np.ndarray, "num"], ...]
 
     def video(self) -> VideoModel | EditedVideo:
         """What has been made: a folded model if all edits could be baked, else an edited video."""
@@ -97,7 +101,8 @@ class Edit:
         `selection`: a `Selection`, a mask bool (num_gaussians,) or a function of `video()` that gives one of the two.
         Else `criteria` as `foldgauss.video.select.select` takes them (`mask=`, `box=`, `color=`, ...), asked of each
         layer's model, or of layer number `layer` alone, as it is without overlays: edits that could be baked are seen,
-        others not. Masks count the Gaussians of all layers, front layer first, or of `layer`.
+        others not. Masks count the Gaussians of all layers, front layer first, or of `layer`: those that there are now,
+        or those that the chain was begun with, whose copies then go along.
         """
         if selection is not None and criteria:
             got = f"{type(selection).__name__} and {', '.join(criteria)}"
@@ -109,22 +114,33 @@ class Edit:
         if criteria:
             chosen = [select(layers[k].model, **criteria).mask for k in numbers]
         else:
-            chosen = self._given(selection, [layers[k].num_gaussians for k in numbers])
+            chosen = self._given(selection, numbers)
         masks = [np.zeros(one.num_gaussians, bool) for one in layers]
         for k, mask in zip(numbers, chosen, strict=True):
             masks[k] = mask
         return dataclasses.replace(self, selection=Selection(np.concatenate(masks)))
 
-    def _given(self, selection: object, counts: list[int]) -> list[Mask]:
-        if callable(selection):
-            selection = selection(self.video())
-        mask = selection.mask if isinstance(selection, Selection) else selection
-        mask = np.ones(sum(counts), bool) if mask is None else np.asarray(mask)
-        if mask.dtype != bool or mask.shape != (sum(counts),):
-            cure = "Copies and deletions change the number: select in what they made, edit(...).video()."
+    def _given(self, selection: object, numbers: Sequence[int]) -> list[Mask]:
+        """A mask by layers, of those that there are now."""
+        sources = [self._sources[k] for k in numbers]
+        counts, before = [len(source) for source in sources], [self._begun_with[k] for k in numbers]
+        if selection is None:
+            return [np.ones(count, bool) for count in counts]
+        if callable(selection):  # it is asked now, so it answers for now
+            selection, before = selection(self.video()), counts
+            sources = [np.arange(count) for count in counts]
+        mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
+        if mask.dtype != bool or mask.shape not in ((sum(counts),), (sum(before),)):
             expected = f"a Selection or mask of {sum(counts):,} Gaussians"
-            raise invalid("selection", expected=expected, got=f"{mask.dtype} {mask.shape}", cure=cure)
-        return np.split(mask, np.cumsum(counts)[:-1])
+            got, cure = f"{mask.dtype} {mask.shape}", "Is it another model's?"
+            raise invalid("selection", expected=expected, got=got, cure=cure)
+        if len(mask) != sum(before):
+            return _split(mask, counts)
+        moved = any(not np.array_equal(source, np.arange(count)) for source, count in zip(sources, before, strict=True))
+        if moved and sum(counts) == sum(before):
+            cure = "As many were copied as deleted: end the chain with .video(), and begin anew with that."
+            raise invalid("selection", expected="a mask that can mean but one thing", got="one of two", cure=cure)
+        return [part[source] for part, source in zip(_split(mask, before), sources, strict=True)]
 
     # ------------------------------------------------------------------------------------- where, in the plane
 
@@ -215,23 +231,25 @@ class Edit:
     def _copied(self, num: int) -> tuple["Edit", list[Mask]]:
         """With `num` copies behind each selected Gaussian, all selected; and masks of each copy."""
         self._check_selected()
-        made, chosen, numbers = [], [], []
+        made, chosen, copies, sources = [], [], [], []
         for layer, mask in zip(self._video.layers, self._parts(), strict=True):
             counts = np.where(mask, num + 1, 1)
             source = np.repeat(np.arange(len(mask)), counts)
             copy = np.arange(len(source)) - np.repeat(np.cumsum(counts) - counts, counts)  # 0: the original
             made.append(_gathered(layer, source, mask, copy))
             chosen.append(mask[source])
-            numbers.append(copy)
-        copy = np.concatenate(numbers)
-        return self._with(tuple(made), Selection(np.concatenate(chosen))), [copy == k for k in range(1, num + 1)]
+            copies.append(copy)
+            sources.append(source)
+        copy = np.concatenate(copies)
+        copied = self._with(made, Selection(np.concatenate(chosen)), sources)
+        return copied, [copy == k for k in range(1, num + 1)]
 
     def vanish(self, **when: Unpack[When]) -> "Edit":
         """Gone. Baked without a span: the Gaussians are deleted, and nothing is selected any more."""
         if self._span(when) is not None:
             return self.opacity(0.0, **when)
         self._check_selected()
-        kept, made = [], []
+        made, sources = [], []
         for layer, mask in zip(self._video.layers, self._parts(), strict=True):
             delete = mask.any() and not mask.all() and _can_lose(layer, mask)
             source = np.flatnonzero(~mask) if delete else np.arange(len(mask))
@@ -240,8 +258,8 @@ class Edit:
             elif mask.any():
                 layer = _with_overlay(layer, Opacity(mask, None, 0.0))
             made.append(layer)
-            kept.append(np.zeros(len(source), bool))
-        return self._with(tuple(made), Selection(np.concatenate(kept)))
+            sources.append(source)
+        return self._with(made, Selection(np.zeros(sum(map(len, sources)), bool)), sources)
 
     def opacity(self, factor: float, **when: Unpack[When]) -> "Edit":
         """Opacity times `factor` >= 0, held at 1. Baked without a span, where it stays below 1; 0 is `vanish`."""
@@ -380,8 +398,8 @@ class Edit:
     ) -> "Edit":
         """Turn the flat selection in space about (x, y) (None: its own centre), then move it in depth; an overlay.
 
-        `depth` > 0 is away from the viewer, < 0 nearer; what covers what follows, see `EditedVideo`. `rotate`: an axis
-        (x right, y down, z away) times an angle in radians.
+        `depth` > 0 is away from the viewer, so behind all that stays in the plane, < 0 nearer, see `EditedVideo`.
+        `rotate`: an axis (x right, y down, z away) times an angle in radians.
 
         **Source:** MiraGe; VeGaS eq:mirage.
         """
@@ -428,7 +446,7 @@ class Edit:
             free = span is None and not any((np.asarray(other.mask) & mask).any() for other in before)
             baked = bake(layer.model.splats, mask) if bake is not None and free else None
             made.append(_with_overlay(layer, edit) if baked is None else _with_splats(layer, baked))
-        return self._with(tuple(made), self.selection)
+        return self._with(made, self.selection)
 
     def _check_selected(self) -> None:
         if not len(self.selection):
@@ -440,20 +458,30 @@ class Edit:
             _with_overlay(layer, make(mask, span)) if mask.any() else layer
             for layer, mask in zip(self._video.layers, self._parts(), strict=True)
         ]
-        return self._with(tuple(made), self.selection)
+        return self._with(made, self.selection)
 
-    def _with(self, layers: tuple[Layer, ...], selection: Selection) -> "Edit":
-        return Edit(dataclasses.replace(self._video, layers=layers), selection)
+    def _with(
+        self, layers: list[Layer], selection: Selection, sources: list[Int[np.ndarray, "num"]] | None = None
+    ) -> "Edit":
+        """With other layers, whose Gaussians are those `sources` of now, by layer."""
+        made = {"_video": dataclasses.replace(self._video, layers=tuple(layers)), "selection": selection}
+        if sources is not None:
+            made["_sources"] = tuple(old[new] for old, new in zip(self._sources, sources, strict=True))
+        return dataclasses.replace(self, **made)
 
     def _parts(self) -> list[Mask]:
         """The selection by layers."""
-        return np.split(self.selection.mask, np.cumsum([layer.num_gaussians for layer in self._video.layers])[:-1])
+        return _split(self.selection.mask, [layer.num_gaussians for layer in self._video.layers])
 
     def _span(self, when: When) -> Span | None:
         return span_of(self._frame_times(), **when)
 
     def _frame_times(self) -> Float[np.ndarray, "num_frames"]:
         return np.asarray(self._video.frame_times.times(), np.float64)
+
+
+def _split(mask: Mask, counts: Sequence[int]) -> list[Mask]:
+    return np.split(mask, np.cumsum(counts)[:-1])
 
 
 def _gathered(

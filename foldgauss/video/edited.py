@@ -51,9 +51,9 @@ class EditedVideo(eqx.Module):
     size and rate are the video's. `camera`: who looks at it, a `Camera` or a function of t (which cannot be saved);
     None is the front one, for which flat Gaussians are the picture as it was fitted.
 
-    Gaussians cover one another in array order, front layer first. Once some are placed in space, all are sorted by their
-    distance from the camera across the plane of the frame, |z - z_camera|, array order where it is equal: so any number
-    of parallel planes cover one another as they should from wherever they are seen, and each plane keeps its order.
+    Gaussians cover one another in array order, front layer first. Once some are placed in space, all are sorted by
+    their distance from the camera across the plane of the frame, |z - z_camera|, array order where it is equal: so any
+    number of parallel planes cover one another as they should wherever they are seen from, and each keeps its order.
 
     **Units:** times are in [0, 1], of the video. **Example:** `edit(model).select(mask).move((0.1, 0)).video()`.
 
@@ -200,8 +200,9 @@ class EditedStage:
 
     def __init__(self, video: EditedVideo, size: tuple[int, int]):
         height, width = video.size
-        self._size, self._aspect, self._camera = tuple(size), height / width, video.camera
-        self._layers = [_LayerStage(layer, self._size, self._aspect) for layer in video.layers]
+        self._size, self._camera = tuple(size), video.camera
+        self._layers = [_LayerStage(layer, self._size, height / width) for layer in video.layers]
+        self._front = partial(Camera.front, height / width)
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
@@ -210,25 +211,28 @@ class EditedStage:
         if self._camera is not None:
             for moment in moments:
                 moment.lift_all()
+        if not any(moment.in_space for moment in moments):
+            return _together(moments)
         camera = self._camera_at(t)
         for moment in moments:
             moment.project(camera, self._size)
-        parts = [(moment.mean, moment.factor, moment.opacity, moment.color) for moment in moments]
-        leaves = parts[0] if len(parts) == 1 else tuple(map(np.concatenate, zip(*parts, strict=True)))
-        if all(moment.depth is None for moment in moments):
-            return Splats2D(*leaves)
-        depth = np.concatenate([moment.depths() for moment in moments])
+        depth = np.concatenate([moment.depth for moment in moments])
         nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
-        return Splats2D(*(leaf[nearest_first] for leaf in leaves))
+        return jax.tree.map(lambda leaf: leaf[nearest_first], _together(moments))
 
     def _camera_at(self, t: float) -> Camera:
         camera = self._camera
-        if camera is None:
-            return Camera.front(self._aspect)
-        seen = camera if isinstance(camera, Camera) else camera(t)
+        if camera is None or isinstance(camera, Camera):
+            return self._front() if camera is None else camera
+        seen = camera(t)
         if not isinstance(seen, Camera):
             raise invalid("camera(t)", expected="a Camera", got=type(seen).__name__)
         return seen
+
+
+def _together(moments: list["_Moment"]) -> Splats2D:
+    parts = [(moment.mean, moment.factor, moment.opacity, moment.color) for moment in moments]
+    return Splats2D(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))))
 
 
 class _LayerStage:
@@ -287,7 +291,6 @@ class _Moment:
         height, width = size
         self._unit, self._middle = done.unit, np.float32([width / 2, height / 2])
         self._solid_mean = self._solid_factor = self._lifted = None  # of all, once one is in space
-        self.depth = None
 
     def edit(self, mask: Bool[np.ndarray, "num"], change: Callable[[SelectedGaussians], SelectedGaussians]) -> None:
         """Change the masked ones; all others keep their bits."""
@@ -311,19 +314,25 @@ class _Moment:
         self._lifted[:] = True
 
     def project(self, camera: Camera, size: tuple[int, int]) -> None:
-        """Bring those in space back to pixels, as the camera sees them, and note their depths."""
-        if self._lifted is None:
+        """Bring those in space back to pixels, as the camera sees them."""
+        if not self.in_space:
             return
         which = np.flatnonzero(self._lifted)
         seen = _project(camera, size, self._solid_mean[which], self._solid_factor[which], self.opacity[which])
         self.mean[which], self.factor[which], self.opacity[which] = seen
-        self.depth = self._solid_mean[:, 2]
 
-    def depths(self) -> Float[np.ndarray, "num"]:
-        return np.zeros(len(self.index), np.float32) if self.depth is None else self.depth
+    @property
+    def in_space(self) -> bool:
+        """Whether one of them is."""
+        return self._lifted is not None
+
+    @property
+    def depth(self) -> Float[np.ndarray, "num"]:
+        """z of each; 0 in the plane of the frame."""
+        return self._solid_mean[:, 2] if self.in_space else np.zeros(len(self.index), np.float32)
 
     def _take(self, chosen: np.ndarray) -> SelectedGaussians:
-        if self._lifted is None:
+        if not self.in_space:
             mean, factor = self._in_model_space(chosen)
         else:
             mean, factor = self._solid_mean[chosen], self._solid_factor[chosen]
@@ -338,7 +347,7 @@ class _Moment:
                 getattr(self, name)[chosen] = getattr(after, name)
         if after.mean is before.mean and after.factor is before.factor:
             return
-        if self._lifted is None and after.mean.shape[1] == 2:
+        if not self.in_space and after.mean.shape[1] == 2:
             self.mean[chosen] = after.mean * self._unit + self._middle
             self.factor[chosen] = after.factor * self._unit
             return
@@ -347,7 +356,7 @@ class _Moment:
         self._solid_mean[chosen], self._solid_factor[chosen], self._lifted[chosen] = after.mean, after.factor, True
 
     def _make_space(self) -> None:
-        if self._lifted is None:
+        if not self.in_space:
             num = len(self.index)
             self._solid_mean, self._solid_factor = np.zeros((num, 3), np.float32), np.zeros((num, 3, 2), np.float32)
             self._solid_mean[:, :2], self._solid_factor[:, :2] = self._in_model_space(slice(None))
