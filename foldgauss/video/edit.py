@@ -77,8 +77,8 @@ class Edit:
     _video: EditedVideo
     selection: Selection
     # By layer: how many Gaussians the chain was begun with, and which of those each one is now, or is a copy of.
-    _begun_with: tuple[int, ...]
-    _sources: tuple[Int[np.ndarray, "num"], ...]
+    _begun_with: tuple[int, ...] = dataclasses.field(repr=False)
+    _sources: tuple[Int[np.ndarray, "num"], ...] = dataclasses.field(repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
         """What has been made: a folded model if all edits could be baked, else an edited video."""
@@ -153,7 +153,7 @@ class Edit:
 
         `about`: the point (x, y) that stays; baked then, without a span. None: the selection's own centre at each time.
         """
-        given = checked_numbers("factor", np.atleast_1d(np.asarray(factor)))
+        given = _listed("factor", factor)
         if len(given) not in (1, 2) or min(given) <= 0:
             cure = "Mirror with transform(), delete with vanish()."
             raise invalid("factor", expected="one or two numbers > 0", got=factor, cure=cure)
@@ -179,10 +179,7 @@ class Edit:
         `about`: c, (x, y); baked then, without a span. None: the selection's own centre at each time. Eased, A goes by
         its rotation and its symmetric part, see `Affine`.
         """
-        rows = np.asarray(matrix)
-        if rows.shape != (2, 2):
-            raise invalid("matrix", expected="shape (2, 2)", got=f"shape {rows.shape}")
-        rows = np.array([checked_numbers("matrix", row) for row in rows])
+        rows = _square("matrix", matrix, 2)
         if not abs(np.linalg.det(rows)) > 1e-12 * np.abs(rows).max() ** 2:
             raise invalid("matrix", expected="a matrix that has an inverse", got=rows.tolist(), cure="See vanish().")
         return self._map(*_polar(rows), offset, about, when)
@@ -212,6 +209,8 @@ class Edit:
         Each copy is scaled and turned about `about` (None: its own centre), then shifted, and comes later by its delay
         (see `retime`): one number for all or one for each. A copy has the depth of what it is a copy of: it stands
         directly behind it. Over a span copies are there only within; eased, they come out of the original and fade in.
+
+        Copies have the edits of their originals, each about its own centre, even if the edit was of a wider selection.
         """
         shifts = [checked_numbers("offsets", offset, 2) for offset in _rows("offsets", offsets)]
         named = (("delays", delays), ("scale", scale), ("angle", angle))
@@ -342,7 +341,8 @@ class Edit:
             raise invalid("clock", expected="a Clock", got=type(clock).__name__)
         identity = clock is None and (shift, stretch) == (0, 1) and outside == "continue"
         bake = partial(baking.retimed, shift=float(shift), stretch=float(stretch), about=float(about))
-        bakes = clock is None and outside == "continue"
+        # Between shots a clock shows the nearer one, which no leaves say.
+        bakes = clock is None and outside == "continue" and not any(layer.has_cuts for layer in self._video.layers)
         make = partial(Retimed, clock=line if clock is None else clock)
         return self._apply(make, when, bake if bakes else None, skip=identity)
 
@@ -441,11 +441,11 @@ class Edit:
             if not mask.any():
                 made.append(layer)
                 continue
-            edit = make(mask, span)
-            before = layer.clocks if isinstance(edit, Retimed) else layer.overlays
+            made_so = make(mask, span)
+            before = layer.clocks if isinstance(made_so, Retimed) else layer.overlays
             free = span is None and not any((np.asarray(other.mask) & mask).any() for other in before)
             baked = bake(layer.model.splats, mask) if bake is not None and free else None
-            made.append(_with_overlay(layer, edit) if baked is None else _with_splats(layer, baked))
+            made.append(_with_overlay(layer, made_so) if baked is None else _with_splats(layer, baked))
         return self._with(made, self.selection)
 
     def _check_selected(self) -> None:
@@ -531,10 +531,7 @@ def _polar(matrix: Float[np.ndarray, "2 2"]) -> tuple[float, tuple[tuple[float, 
 
 
 def _recolor(gain, offset, matrix, hue: float | None) -> Callable[..., Recolor]:
-    rows = np.eye(3) if matrix is None else np.asarray(matrix)
-    if rows.shape != (3, 3):
-        raise invalid("matrix", expected="shape (3, 3)", got=f"shape {rows.shape}")
-    rows = np.array([checked_numbers("matrix", row) for row in rows])
+    rows = np.eye(3) if matrix is None else _square("matrix", matrix, 3)
     gains = _one_each("gain", 1.0 if gain is None else gain, 3)
     shift = _one_each("offset", 0.0 if offset is None else offset, 3)
     table = tuple(map(tuple, (np.array(gains)[:, None] * rows).tolist()))
@@ -551,9 +548,21 @@ def _rows(parameter: str, values: object) -> list:
     return rows
 
 
+def _listed(parameter: str, values: ArrayLike) -> tuple[float, ...]:
+    """Numbers, or one number alone, as a tuple."""
+    return checked_numbers(parameter, [values] if np.ndim(values) == 0 else values)
+
+
+def _square(parameter: str, values: ArrayLike, side: int) -> Float[np.ndarray, "side side"]:
+    rows = [checked_numbers(parameter, row, side) for row in _rows(parameter, values)]
+    if len(rows) != side:
+        raise invalid(parameter, expected=f"shape ({side}, {side})", got=f"{len(rows)} rows")
+    return np.array(rows)
+
+
 def _one_each(parameter: str, values: ArrayLike, num: int) -> tuple[float, ...]:
     """`num` numbers: as given, or one for all."""
-    given = checked_numbers(parameter, np.atleast_1d(np.asarray(values)))
+    given = _listed(parameter, values)
     if len(given) not in (1, num):
         raise invalid(parameter, expected=f"one number or {num}", got=f"{len(given)}")
     return given if len(given) == num else given * num

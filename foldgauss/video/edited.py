@@ -1,6 +1,5 @@
 """Edited videos: models in layers, with edits that no folded model holds, drawn as one."""
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -11,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from foldgauss._checks import invalid, whole
-from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, project
+from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.alpha import BLACK
-from foldgauss.video.conditioning import Conditioned
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import AbstractOverlay, Retimed, SelectedGaussians, acts, padded, room_for
@@ -42,6 +40,11 @@ class Layer(eqx.Module):
     @property
     def num_gaussians(self) -> int:
         return self.model.splats.num_gaussians
+
+    @property
+    def has_cuts(self) -> bool:
+        """Whether there are several shots, with nothing to see between them."""
+        return bool(np.asarray(is_cut(self.model.frame_times.times())).any())
 
 
 class EditedVideo(eqx.Module):
@@ -242,12 +245,12 @@ class _LayerStage:
         self._stage, self._layer = Stage(layer.model, size, aspect=aspect), layer
         self._masks = [np.asarray(overlay.mask) for overlay in layer.overlays]
         self._times = np.asarray(layer.model.frame_times.times())
-        self._has_cuts = bool(np.asarray(is_cut(self._times)).any())
+        self._has_cuts = layer.has_cuts
         self._groups = _by_clocks(layer)
 
     def at(self, t: float) -> "_Moment":
         """The layer's Gaussians at the video's time t, edited."""
-        moment = _Moment(self._conditioned(t), self._stage.shape.size)
+        moment = _Moment(*self._conditioned(t), self._stage.shape.size, self._stage.shape.aspect)
         for overlay, mask in zip(self._layer.overlays, self._masks, strict=True):
             progress = overlay.progress(t)
             if acts(overlay, progress):
@@ -255,15 +258,14 @@ class _LayerStage:
         moment.drop_unseen()
         return moment
 
-    def _conditioned(self, t: float) -> Conditioned:
+    def _conditioned(self, t: float) -> tuple[np.ndarray, ...]:
+        """Index, mean, factor, opacity and colour of those alive, each by its clock, in array order."""
         parts = [self._stage.at(self._own_time(clocks, t), members) for clocks, members in self._groups]
-        if len(parts) == 1:
-            return parts[0]
-        alive = np.concatenate([part.alive for part in parts])
-        order = np.argsort(alive, kind="stable")
-        names = ("mean", "factor", "opacity", "color", "kept")
-        leaves = {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names}
-        return dataclasses.replace(parts[0], alive=alive[order], **leaves)
+        leaves = [(part.alive, part.mean, part.factor, part.opacity, part.color) for part in parts]
+        if len(leaves) == 1:
+            return leaves[0]
+        order = np.argsort(np.concatenate([part.alive for part in parts]), kind="stable")
+        return tuple(np.take(np.concatenate(leaf), order, axis=0) for leaf in zip(*leaves, strict=True))
 
     def _own_time(self, clocks: tuple[Retimed, ...], t: float) -> float:
         for clock in reversed(clocks):  # the last edit is asked first: it retimes all that the others made
@@ -285,11 +287,11 @@ def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray,
 class _Moment:
     """A layer's Gaussians at one time, in pixels, on the way through the edits; those in space also in model space."""
 
-    def __init__(self, done: Conditioned, size: tuple[int, int]):
-        self.index, self.mean, self.factor = done.alive, done.mean, done.factor
-        self.opacity, self.color = done.opacity, done.color
+    def __init__(self, index, mean, factor, opacity, color, size: tuple[int, int], aspect: float):
+        self.index, self.mean, self.factor, self.opacity, self.color = index, mean, factor, opacity, color
         height, width = size
-        self._unit, self._middle = done.unit, np.float32([width / 2, height / 2])
+        self._unit = np.float32(pixels_per_unit(size, aspect=aspect))
+        self._middle = np.float32([width / 2, height / 2])
         self._solid_mean = self._solid_factor = self._lifted = None  # of all, once one is in space
 
     def edit(self, mask: Bool[np.ndarray, "num"], change: Callable[[SelectedGaussians], SelectedGaussians]) -> None:

@@ -55,11 +55,10 @@ class SelectedGaussians:
 
         By area too, since Gaussians far from their own time are small and must not pull: the centre then moves evenly.
         """
-        gram = np.swapaxes(self.factor, 1, 2).astype(np.float64) @ self.factor
-        weights = self.opacity * np.sqrt(np.maximum(np.linalg.det(gram), 0))
+        weights = self.opacity * _areas(self.factor)
         if not weights.sum() > 0:
-            weights = np.ones(len(self))
-        return weights @ self.mean / weights.sum()
+            weights = np.ones(len(self), np.float32)
+        return np.einsum("n,nd->d", weights, self.mean, dtype=np.float64) / weights.sum(dtype=np.float64)
 
     def in_space(self) -> "SelectedGaussians":
         """The same with dim 3: in the plane z = 0 where they were flat."""
@@ -68,6 +67,21 @@ class SelectedGaussians:
         mean = np.concatenate([self.mean, np.zeros_like(self.mean[:, :1])], 1)
         factor = np.concatenate([self.factor, np.zeros_like(self.factor[:, :1])], 1)
         return dataclasses.replace(self, mean=mean, factor=factor)
+
+
+def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, "num"]:
+    """Of the parallelograms that the two columns span, in the plane or in space."""
+    first, second = np.moveaxis(factor, (2, 1), (0, 1))
+    pairs = [(0, 1)] if len(first) == 2 else [(1, 2), (2, 0), (0, 1)]
+    crosses = [first[i] * second[j] - first[j] * second[i] for i, j in pairs]
+    return np.abs(crosses[0]) if len(crosses) == 1 else np.linalg.norm(crosses, axis=0)
+
+
+def _mapped(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray, "num dim 2"]) -> np.ndarray:
+    """A F for many F, as one product of matrices."""
+    columns = np.swapaxes(factor, 1, 2)
+    rows = columns.reshape(-1, len(matrix)) @ matrix.T.astype(np.float32)
+    return np.swapaxes(rows.reshape(columns.shape), 1, 2)
 
 
 class AbstractOverlay(eqx.Module):
@@ -136,15 +150,17 @@ class Affine(AbstractOverlay):
         return np.array([[cos, -sin], [sin, cos]]) @ (np.eye(2) + progress * (np.array(self.stretch) - np.eye(2)))
 
     def __call__(self, gaussians, t, progress):
-        mean, shift = gaussians.mean.astype(np.float64), progress * np.array(self.offset)
+        dim, shift = gaussians.mean.shape[1], progress * np.array(self.offset)
+        move = np.zeros(dim)
         if self.moves_only:
-            mean[:, :2] += shift
-            return dataclasses.replace(gaussians, mean=mean)
+            move[:2] = shift
+            return dataclasses.replace(gaussians, mean=gaussians.mean + move.astype(np.float32))
+        matrix = np.eye(dim)
+        matrix[:2, :2] = self.matrix(progress)
         centre = gaussians.centre[:2] if self.about is None else np.array(self.about)
-        matrix, factor = self.matrix(progress), gaussians.factor.astype(np.float64)
-        mean[:, :2] = (mean[:, :2] - centre) @ matrix.T + (centre + shift)
-        factor[:, :2] = matrix @ factor[:, :2]
-        return dataclasses.replace(gaussians, mean=mean, factor=factor)
+        move[:2] = centre - matrix[:2, :2] @ centre + shift
+        mean = gaussians.mean @ matrix.T.astype(np.float32) + move.astype(np.float32)
+        return dataclasses.replace(gaussians, mean=mean, factor=_mapped(matrix, gaussians.factor))
 
 
 class Opacity(AbstractOverlay):
@@ -236,13 +252,12 @@ class Place(AbstractOverlay):
 
     def __call__(self, gaussians, t, progress):
         gaussians = gaussians.in_space()
-        mean, factor = gaussians.mean.astype(np.float64), gaussians.factor
+        mean, factor, move = gaussians.mean, gaussians.factor, np.array([0, 0, progress * self.depth])
         if any(self.rotation):
             centre = gaussians.centre if self.about is None else np.array([*self.about, 0.0])
             turn = Rotation.from_rotvec(progress * np.array(self.rotation)).as_matrix()
-            mean, factor = (mean - centre) @ turn.T + centre, turn @ factor
-        mean[:, 2] += progress * self.depth
-        return dataclasses.replace(gaussians, mean=mean, factor=factor)
+            mean, factor, move = mean @ turn.T.astype(np.float32), _mapped(turn, factor), move + centre - turn @ centre
+        return dataclasses.replace(gaussians, mean=mean + move.astype(np.float32), factor=factor)
 
 
 class Function(AbstractOverlay):

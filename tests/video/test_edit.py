@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib
 
 import jax
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates, spline_filter
 
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.video import Clock, EditedVideo, Selection, VideoModel, edit
+from foldgauss.video import Clock, EditedVideo, Selection, VideoModel, edit, layers
 from foldgauss.video.playback import Playback
 from foldgauss.video.stage import Stage
 from tests.video.soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
@@ -513,6 +514,24 @@ def test_selections():
     assert chain.video() is MODEL
 
 
+def test_criteria_are_asked_of_each_layer(monkeypatch):
+    asked = []
+
+    def by_criteria(model, **criteria):
+        asked.append((model, criteria))
+        return Selection(OBJECT)
+
+    monkeypatch.setattr(importlib.import_module("foldgauss.video.edit"), "select", by_criteria)
+    moved = edit(MODEL).move((0.1, 0))
+    assert len(moved.select(box=(0, 0, 9, 9), frame=2).selection) == OBJECT.sum()
+    model, criteria = asked.pop()
+    assert model is moved.video()  # what could be baked is seen
+    assert criteria == {"box": (0, 0, 9, 9), "frame": 2}
+    chain = edit(layers(MODEL, MODEL))
+    assert len(chain.select(color=(1, 0, 0)).selection) == 2 * OBJECT.sum()
+    np.testing.assert_array_equal(chain.select(layer=1, color=(1, 0, 0)).selection.mask[:NUM], False)
+
+
 def test_selections_of_before_go_on():
     """A mask of what the chain was begun with means those, wherever they are now, and their copies."""
     some = np.arange(NUM) >= NUM - 5
@@ -548,7 +567,9 @@ WRONG = {
     "angle": (lambda: E.rotate(np.inf), "angle: expected a finite number"),
     "factor 0": (lambda: E.scale(0), "factor: expected one or two numbers > 0"),
     "three factors": (lambda: E.scale((1, 2, 3)), "factor: expected one or two"),
-    "matrix": (lambda: E.transform(np.eye(3)), "matrix: expected shape"),
+    "matrix": (lambda: E.transform(np.eye(3)), "matrix: expected 2 finite numbers"),
+    "matrix of one row": (lambda: E.transform([[1, 2]]), "matrix: expected shape"),
+    "ragged": (lambda: E.scale([(1, 2), 3]), "factor: expected finite numbers"),
     "flat matrix": (lambda: E.transform([[1, 2], [2, 4]]), "matrix: expected a matrix that has an inverse"),
     "opacity": (lambda: E.opacity(-1), "factor: expected a number >= 0"),
     "no copies": (lambda: E.multiply([]), "offsets: expected at least one"),
@@ -559,7 +580,7 @@ WRONG = {
     "no way": (lambda: E.recolor(), "color, hue, gain: expected one way"),
     "two ways": (lambda: E.recolor((1, 0, 0), hue=0.1), "color, hue, gain: expected one way"),
     "gains": (lambda: E.recolor(gain=(1, 2)), "gain: expected one number or 3"),
-    "colour matrix": (lambda: E.recolor(matrix=np.eye(2)), "matrix: expected shape"),
+    "colour matrix": (lambda: E.recolor(matrix=np.eye(2)), "matrix: expected 3 finite numbers"),
     "black object": (lambda: E.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object with some light"),
     "standing still": (lambda: E.retime(stretch=0), "stretch: expected a number but 0"),
     "two clocks": (lambda: E.retime(shift=1, clock=Clock.frozen(0)), "clock: expected a clock, or"),
