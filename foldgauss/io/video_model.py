@@ -2,6 +2,8 @@
 
 import dataclasses
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +14,30 @@ import numpy as np
 from foldgauss._checks import invalid, one_of
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
-from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
+from foldgauss.video.edited import EditedVideo, Layer
 from foldgauss.video.fit import TIME_ADAM, FitState
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Statistics
 from foldgauss.video.model import VideoModel
+from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
 
-VIDEO, CHECKPOINT = "video", "fit-checkpoint"
+VIDEO, EDITED, CHECKPOINT = "video", "edited-video", "fit-checkpoint"
 
 
-def save_video_model(path: str | os.PathLike, model: VideoModel, *, metadata: dict | None = None) -> Path:
-    """Write a fitted video; `metadata` is free: where it came from, how good it is. See `save_model`."""
+def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *, metadata: dict | None = None) -> Path:
+    """Write a fitted or an edited video; `metadata` is free: where it came from, how good it is. See `save_model`.
+
+    Raises `ModelFileError` for edits that hold code: `apply`, `apply_triangles`, a camera that is a function.
+    """
     return save_model(path, model, metadata=metadata)
 
 
-def load_video_model(path: str | os.PathLike) -> VideoModel:
-    """Read a fitted video. Raises `ModelFileError` also where the file holds something else of ours."""
-    return _load(path, VIDEO)
+def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
+    """Read a fitted or an edited video. Raises `ModelFileError` also where the file holds something else of ours."""
+    return _load(path, VIDEO, EDITED)
 
 
 def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
@@ -58,11 +65,11 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
     return jax.tree.map(np.array, state)  # the fit updates its arrays in place: they must be its own
 
 
-def _load(path: str | os.PathLike, kind: str) -> Any:
+def _load(path: str | os.PathLike, *kinds: str) -> Any:
     found = read_header(path)["kind"]
-    if found != kind:
+    if found not in kinds:
         raise ModelFileError(
-            f"path: expected a model of kind {kind!r}, got {found!r} in {str(path)!r}. "
+            f"path: expected a model of kind {' or '.join(map(repr, kinds))}, got {found!r} in {str(path)!r}. "
             "Give the file that `foldgauss fit` wrote to --out."
         )
     return load_model(path)
@@ -105,6 +112,51 @@ def _video_skeleton(header: dict) -> VideoModel:
     return jax.eval_shape(build)  # traced, not computed: nothing is allocated
 
 
+def _describe_edited(video: EditedVideo) -> dict:
+    try:
+        layers = [_describe_layer(layer) for layer in video.layers]
+    except ValueError as error:  # a function
+        raise ModelFileError(str(error)) from error
+    return {"layers": layers, "camera": _describe_camera(video.camera), "timeline": video.timeline}
+
+
+def _describe_layer(layer: Layer) -> dict:
+    return {
+        "model": _describe_video(layer.model),
+        "overlays": list(map(described, layer.overlays)),
+        "clocks": list(map(described, layer.clocks)),
+    }
+
+
+def _describe_camera(camera: Camera | Callable | None) -> dict | None:
+    if camera is None:
+        return None
+    if not isinstance(camera, Camera):
+        cure = "Write the pictures, or save with seen_from(None) and set the camera again."
+        error = invalid("camera", expected="a Camera, which can be written down", got="a function", cure=cure)
+        raise ModelFileError(str(error))
+    return {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
+
+
+def _edited_skeleton(header: dict) -> EditedVideo:
+    layers = tuple(_layer_skeleton(layer) for layer in header["layers"])
+    return EditedVideo(layers, _camera_skeleton(header["camera"]), timeline=header["timeline"])
+
+
+def _layer_skeleton(header: dict) -> Layer:
+    model = _video_skeleton(header["model"])
+    mask = jax.ShapeDtypeStruct((model.splats.num_gaussians,), np.bool_)
+    return Layer(model, *(tuple(restored(edit, mask) for edit in header[name]) for name in ("overlays", "clocks")))
+
+
+def _camera_skeleton(header: dict | None) -> Camera | None:
+    if header is None:
+        return None
+    one_of("camera's dtype", header["dtype"], ("float32", "float64"))
+    leaves = (jax.ShapeDtypeStruct(shape, np.dtype(header["dtype"])) for shape in ((3, 3), (3,), ()))
+    return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
+
+
 def _describe_checkpoint(state: FitState) -> dict:
     num, width = state.rows.shape
     return {
@@ -142,4 +194,5 @@ def _checkpoint_skeleton(header: dict) -> FitState:
 
 
 register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton)
+register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton)
 register_model(CHECKPOINT, FitState, to_header=_describe_checkpoint, from_header=_checkpoint_skeleton)

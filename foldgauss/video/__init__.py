@@ -2,11 +2,14 @@
 
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
+from foldgauss.video.edit import Edit, edit
+from foldgauss.video.edited import EditedVideo, Layer, layers
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
 from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
+from foldgauss.video.overlays import SelectedGaussians
 from foldgauss.video.select import (
     Selection,
     by_box,
@@ -20,8 +23,12 @@ from foldgauss.video.select import (
     matte,
     select,
 )
+from foldgauss.video.timing import Clock, Span
 
 __all__ = [
+    "Clock",
+    "Edit",
+    "EditedVideo",
     "Evaluation",
     "FitConfig",
     "FitInfo",
@@ -30,8 +37,11 @@ __all__ = [
     "FoldedSplats",
     "FrameTimes",
     "Growth",
+    "Layer",
     "LearningRates",
+    "SelectedGaussians",
     "Selection",
+    "Span",
     "VideoModel",
     "by_box",
     "by_click",
@@ -41,11 +51,13 @@ __all__ = [
     "by_time",
     "contribution",
     "density_image",
+    "edit",
     "evaluate",
     "fit",
     "fit_steps",
     "influence",
     "interpolated_times",
+    "layers",
     "matte",
     "played_positions",
     "psnr",

@@ -251,10 +251,13 @@ def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) ->
     )
 
 
-def condition(rows: np.ndarray, window: np.ndarray, t: float, shape: Shape) -> Conditioned:
-    """The Gaussians whose window holds t, conditioned on t and brought to pixels."""
+def condition(
+    rows: np.ndarray, window: np.ndarray, t: float, shape: Shape, members: np.ndarray | None = None
+) -> Conditioned:
+    """The Gaussians whose window holds t, of those with `members` (num,) if given, conditioned on t, in pixels."""
     t = np.float32(t)
-    alive = np.flatnonzero((window[:, 0] < t) & (t < window[:, 1]))
+    near = (window[:, 0] < t) & (t < window[:, 1])
+    alive = np.flatnonzero(near if members is None else near & members)
     num, (height, width) = len(alive), shape.size
     unit = np.float32(pixels_per_unit(shape.size, aspect=shape.aspect))
     mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)

@@ -1,0 +1,648 @@
+"""Edits: what a folded model holds is baked exactly, all else acts where and when it should, and nowhere else."""
+
+import dataclasses
+import functools
+import importlib
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates, spline_filter
+
+from foldgauss.render import RenderOptions, cpu
+from foldgauss.video import Clock, EditedVideo, Selection, VideoModel, edit, layers
+from foldgauss.video.playback import Playback
+from foldgauss.video.stage import Stage
+from tests.video.soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
+
+MODEL = soft_model()
+TIMES = np.asarray(MODEL.frame_times.times())
+ALWAYS = {"frames": (None, None)}  # as an overlay
+BETWEEN = (0.0, 0.31, float(TIMES[3]), 0.77, 1.0)
+
+
+def picture(video, t, size=None) -> np.ndarray:
+    return np.array(Playback(video, size).image(t))
+
+
+def apart(one, other, t) -> float:
+    return float(np.abs(picture(one, t) - picture(other, t)).max())
+
+
+def same_leaves(one, other) -> bool:
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in pairs)
+
+
+def alone(video, mask) -> np.ndarray:
+    """What the masked add to pictures: they white, all others black."""
+    return edit(video).select(~mask).recolor(gain=0).select(mask).recolor(gain=0, offset=1).video()
+
+
+# ------------------------------------------------------------------------------------------------- affine maps
+
+TURN = 0.6
+MAPS = {
+    "move": lambda e, **when: e.move((0.12, -0.05), **when),
+    "scale": lambda e, **when: e.scale(1.4, about=(0.05, 0.1), **when),
+    "scale two ways": lambda e, **when: e.scale((1.5, 0.7), about=(-0.1, 0.0), **when),
+    "rotate": lambda e, **when: e.rotate(TURN, about=(0.1, 0.05), **when),
+    "shear": lambda e, **when: e.transform([[1.1, 0.4], [-0.2, 0.8]], (0.02, 0.03), about=(0, 0), **when),
+    "mirror": lambda e, **when: e.transform([[-1, 0.1], [0, 1]], about=(-0.1, 0.0), **when),
+}
+MATRICES = {
+    "move": (np.eye(2), (0.0, 0.0), (0.12, -0.05)),
+    "scale": (1.4 * np.eye(2), (0.05, 0.1), (0, 0)),
+    "scale two ways": (np.diag([1.5, 0.7]), (-0.1, 0.0), (0, 0)),
+    "rotate": (np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]]), (0.1, 0.05), (0, 0)),
+    "shear": (np.array([[1.1, 0.4], [-0.2, 0.8]]), (0, 0), (0.02, 0.03)),
+    "mirror": (np.array([[-1, 0.1], [0, 1]]), (-0.1, 0.0), (0, 0)),
+}
+
+
+@pytest.mark.parametrize("when", [{}, ALWAYS], ids=["baked", "overlay"])
+@pytest.mark.parametrize("name", MAPS)
+def test_affine_edits_commute_with_rendering(name, when):
+    """The picture of the edited model is the edited picture: sampled where A^-1 takes each pixel."""
+    edited = MAPS[name](edit(MODEL), **when).video()
+    assert isinstance(edited, EditedVideo if when else VideoModel)
+    matrix, centre, offset = MATRICES[name]
+    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
+    point = (np.stack([x, y], -1) - np.array(SIZE[::-1]) / 2) / max(SIZE)
+    source = (point - centre - offset) @ np.linalg.inv(matrix).T + centre
+    at = (source * max(SIZE) + 1.5 * np.array(SIZE[::-1])) * FINER - 0.5
+    inside = ((at > 4) & (at < np.array(SIZE[::-1]) * 3 * FINER - 5)).all(-1)
+    assert inside.mean() > 0.95
+    for t in (0.31, float(TIMES[4])):
+        truth = [map_coordinates(c, [at[..., 1], at[..., 0]], prefilter=False) for c in splines_around(t)]
+        got = picture(edited, t)
+        assert np.abs(got - picture(MODEL, t)).max() > 0.05
+        np.testing.assert_allclose(got[:, inside], np.stack(truth)[:, inside], atol=1e-3)
+
+
+FINER = 4
+
+
+@functools.cache
+def splines_around(t):
+    """The picture with as much of what lies around it on each side, as splines over finer pixels."""
+    height, width = (FINER * n for n in SIZE)
+    splats = Stage(MODEL, (height, width)).splats(t)
+    leaves = (splats.mean + np.float32([width, height]), splats.factor, splats.opacity, splats.color)
+    image = cpu.forward(*leaves, np.zeros(3, np.float32), (3 * height, 3 * width), options=MODEL.options).image
+    return [spline_filter(channel) for channel in image]
+
+
+BAKED = MAPS | {
+    "opacity": lambda e, **when: e.opacity(0.4, **when),
+    "more opacity": lambda e, **when: e.opacity(1.1, **when),
+    "gain": lambda e, **when: e.recolor(gain=(0.5, 1.5, 1), offset=-0.1, **when),
+    "matrix": lambda e, **when: e.recolor(matrix=np.eye(3)[[1, 2, 0]], **when),
+    "color": lambda e, **when: e.recolor((0.9, 0.2, 0.1), **when),
+    "hue": lambda e, **when: e.recolor(hue=0.6, **when),
+    "vanish": lambda e, **when: e.vanish(**when),
+    "later": lambda e, **when: e.retime(shift=0.04, **when),
+    "slower": lambda e, **when: e.retime(stretch=1.2, about=0.5, **when),
+    "reverse": lambda e, **when: e.retime(stretch=-1, about=0.5, **when),
+    "multiply": lambda e, **when: e.multiply([(0.2, 0.1), (0.1, -0.1)], about=(0, 0), scale=(0.8, 1.2), **when),
+}
+
+
+@pytest.mark.parametrize(("power", "floor"), [(2.0, 0.0), (1.0, 0.1)])
+@pytest.mark.parametrize("name", BAKED)
+def test_what_is_baked_is_what_the_overlay_draws(name, power, floor):
+    model = soft_model(power=power, floor=floor)
+    chain = edit(model).select(OBJECT)
+    baked, laid_over = BAKED[name](chain).video(), BAKED[name](chain, **ALWAYS).video()
+    assert isinstance(baked, VideoModel)
+    assert isinstance(laid_over, EditedVideo)
+    assert max(apart(baked, model, t) for t in BETWEEN) > 0.02
+    for t in BETWEEN:
+        assert apart(baked, laid_over, t) < 1e-5
+
+
+@pytest.mark.parametrize("name", set(BAKED) - {"vanish", "multiply"})
+def test_what_is_not_selected_keeps_its_bits(name):
+    edited = BAKED[name](edit(MODEL).select(OBJECT)).video()
+    for one, other in zip(jax.tree.leaves(edited.splats), jax.tree.leaves(MODEL.splats), strict=True):
+        if np.ndim(one):
+            np.testing.assert_array_equal(one[~OBJECT], other[~OBJECT])
+            assert one.dtype == other.dtype
+
+
+NOTHING = {
+    "move": lambda e, **when: e.move((0, 0), **when),
+    "scale": lambda e, **when: e.scale(1, **when),
+    "rotate": lambda e, **when: e.rotate(0.0, about=(0.1, 0), **when),
+    "transform": lambda e, **when: e.transform(np.eye(2), **when),
+    "opacity": lambda e, **when: e.opacity(1, **when),
+    "recolor": lambda e, **when: e.recolor(gain=1, offset=0, **when),
+    "retime": lambda e, **when: e.retime(shift=0, stretch=1, **when),
+    "place": lambda e, **when: e.place(**when),
+    "camera": lambda e, **when: e.seen_from(None),
+}
+
+
+@pytest.mark.parametrize("when", [{}, {"frame": 2}, {"frames": (1, 5), "ease": 1}], ids=str)
+@pytest.mark.parametrize("name", NOTHING)
+def test_identity_edits_are_exact(name, when):
+    video = NOTHING[name](edit(MODEL).select(OBJECT), **when).video()
+    assert isinstance(video, VideoModel)
+    assert same_leaves(video, MODEL)
+
+
+def test_functions_that_change_nothing_are_exact():
+    chain = edit(MODEL)
+    for video in (chain.apply(lambda g, t: g).video(), chain.apply_triangles(lambda v, t: v).video()):
+        assert isinstance(video, EditedVideo)
+        assert apart(video, MODEL, 0.31) == 0
+        np.testing.assert_array_equal(list(video.frames()), list(MODEL.frames()))
+
+
+# ---------------------------------------------------------------------------------------------------- composition
+
+angles = st.floats(-7, 7)
+points = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+
+
+def splats(video, t=0.31):
+    return Stage(video, SIZE).splats(t)
+
+
+def assert_same_splats(one, other, tolerance=1e-4):
+    """In pixels; of covariances their square roots' size."""
+    a, b = splats(one), splats(other)
+    np.testing.assert_allclose(a.mean, b.mean, atol=tolerance * 64)
+    cov_a, cov_b = (np.float64(s.factor) @ np.float64(s.factor).swapaxes(1, 2) for s in (a, b))
+    size = np.trace(cov_b, axis1=1, axis2=2)[:, None, None]
+    np.testing.assert_allclose(cov_a / size, cov_b / size, atol=tolerance)
+    np.testing.assert_allclose(a.opacity, b.opacity, atol=1e-5)
+    np.testing.assert_allclose(a.color, b.color, atol=1e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(angle=angles, about=points)
+def test_a_turn_and_back(angle, about):
+    chain = edit(MODEL).select(OBJECT).rotate(angle, about=about).rotate(-angle, about=about)
+    assert_same_splats(chain.video(), MODEL)
+
+
+@settings(max_examples=25, deadline=None)
+@given(first=points, second=points)
+def test_shifts_add(first, second):
+    total = np.add(first, second)
+    assert_same_splats(edit(MODEL).move(first).move(second).video(), edit(MODEL).move(total).video())
+
+
+@settings(max_examples=25, deadline=None)
+@given(first=st.floats(0.2, 5), second=st.floats(0.2, 5), about=points, angle=angles)
+def test_scales_multiply_and_turns_commute_with_them(first, second, about, angle):
+    one = edit(MODEL).scale(first, about=about).rotate(angle, about=about).scale(second, about=about)
+    other = edit(MODEL).rotate(angle, about=about).scale(first * second, about=about)
+    assert_same_splats(one.video(), other.video())
+
+
+@settings(max_examples=25, deadline=None)
+@given(entries=st.tuples(*[st.floats(-2, 2)] * 4), about=points, offset=points)
+def test_a_map_and_its_inverse(entries, about, offset):
+    matrix = np.reshape(entries, (2, 2))
+    if abs(np.linalg.det(matrix)) < 0.1:
+        return
+    inverse = np.linalg.inv(matrix)
+    there = edit(MODEL).transform(matrix, offset, about=about)
+    back = there.transform(inverse, -inverse @ offset, about=about)
+    assert_same_splats(back.video(), MODEL, 1e-3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(shift=st.floats(-0.05, 0.05), stretch=st.floats(0.8, 1.1), about=st.floats(0.4, 0.6))
+def test_retiming_and_back(shift, stretch, about):
+    there = edit(MODEL).retime(shift=shift, stretch=stretch, about=about)
+    back = there.retime(shift=-shift / stretch, stretch=1 / stretch, about=about)
+    assert isinstance(back.video(), VideoModel)
+    assert_same_splats(back.video(), MODEL)
+
+
+@settings(max_examples=15, deadline=None)
+@given(matrix=st.sampled_from(["rotate", "shear", "mirror", "scale two ways"]), progress=st.floats(0, 1))
+def test_no_way_through_nothing(matrix, progress):
+    """On the way to a map that does not mirror nothing is flat."""
+    from foldgauss.video.edit import _polar
+    from foldgauss.video.overlays import Affine
+
+    target = MATRICES[matrix][0]
+    angle, stretch = _polar(np.asarray(target, float))
+    map_ = Affine(np.zeros(0, bool), None, angle, stretch, (0.0, 0.0), None)
+    np.testing.assert_allclose(map_.matrix(1.0), target, atol=1e-12)
+    np.testing.assert_array_equal(map_.matrix(0.0), np.eye(2))
+    if matrix != "mirror":
+        assert np.linalg.det(map_.matrix(progress)) > 0.3
+
+
+def test_edits_act_in_their_order():
+    """An affine edit after an overlay of the same Gaussians must not slip in under it."""
+    chain = edit(MODEL).select(OBJECT).scale(1.5)  # about its own centre: an overlay
+    later = chain.move((0.1, 0)).scale(0.5, about=(0, 0)).video()
+    assert isinstance(later, EditedVideo)
+    centre = lambda video: video.at(0.31).mean[OBJECT].mean(0)  # noqa: E731
+    middle = np.array(SIZE[::-1]) / 2
+    expected = 0.5 * (centre(chain.video()) + np.array([6.4, 0]) - middle) + middle
+    np.testing.assert_allclose(centre(later), expected, atol=1e-3)
+    other = edit(MODEL).select(OBJECT).scale(1.5).select(~OBJECT).move((0.1, 0)).video()
+    assert len(other.layers[0].overlays) == 1  # others of its Gaussians are free to be baked
+
+
+# --------------------------------------------------------------------------------------------------- spans of time
+
+
+ONE_FRAME = {
+    "recolor": lambda e: e.recolor((1, 0, 1), frame=3),
+    "move": lambda e: e.move((0.2, 0), frame=3),
+    "scale": lambda e: e.scale(2, frame=3),
+    "vanish": lambda e: e.vanish(frame=3),
+    "multiply": lambda e: e.multiply([(0, 0.05)], frame=3, originals=True),
+    "retime": lambda e: e.retime(shift=0.5, frame=3),
+    "place": lambda e: e.place(depth=-0.3, rotate=(0, 1, 0), frame=3),
+    "triangles": lambda e: e.apply_triangles(lambda v, t: v * np.float32(1.2), frame=3),
+}
+
+
+def quality(frame, clip, where) -> float:
+    return -10 * np.log10(np.mean((frame - clip)[where] ** 2))
+
+
+@pytest.mark.parametrize("name", ONE_FRAME)
+def test_a_single_frame_and_no_other(name):
+    """The edited frame differs where the selection reaches, by decibels, and nowhere else; no other frame does."""
+    model = soft_model(options=RenderOptions())
+    chain = ONE_FRAME[name](edit(model).select(OBJECT))
+    before, after = np.stack(list(model.frames())), np.stack(list(chain.video().frames()))
+    others = np.arange(NUM_FRAMES) != 3
+    np.testing.assert_array_equal(before[others], after[others])
+    object_before = picture(alone(model, OBJECT), TIMES[3])[0]
+    reached = (object_before > 0) | (picture(alone(chain.video(), chain.selection.mask), TIMES[3])[0] > 0)
+    assert 0.1 < reached.mean() < 0.9
+    np.testing.assert_array_equal(before[3][~reached], after[3][~reached])
+    clip = before[3] + np.random.default_rng(0).normal(0, 4, before[3].shape)  # what was fitted, say
+    assert abs(quality(before[3], clip, ~reached) - quality(after[3], clip, ~reached)) < 0.1
+    inside = object_before > 0.3
+    assert inside.sum() > 50
+    if name == "recolor":
+        assert quality(before[3], clip, inside) - quality(after[3], clip, inside) > 5
+    assert (before[3] != after[3])[inside].any()
+    # Half way to the neighbours it is seen, beyond it is not.
+    near, far = (np.interp(k, np.arange(NUM_FRAMES), TIMES) for k in (3.4, 3.6))
+    assert apart(chain.video(), model, near) > 0.01
+    assert apart(chain.video(), model, far) == 0
+
+
+def test_vanished_is_gone_and_nothing_else():
+    model = soft_model(options=RenderOptions())
+    gone = edit(model).select(OBJECT).vanish().video()
+    assert gone.splats.num_gaussians == NUM - OBJECT.sum()
+    faded = edit(model).select(OBJECT).vanish(frames=(2, None), ease=2).video()
+    for t in BETWEEN:
+        share = picture(alone(model, OBJECT), t)[0]
+        assert share.sum() > 50
+        np.testing.assert_array_equal(picture(gone, t)[:, share == 0], picture(model, t)[:, share == 0])
+    left = lambda t: picture(alone(faded, OBJECT), t)[0].sum() / picture(alone(model, OBJECT), t)[0].sum()  # noqa: E731
+    assert left(TIMES[1]) == 1
+    assert 0.4 < left(TIMES[2]) < 0.99
+    assert left(TIMES[5]) == 0
+    assert apart(faded, gone, TIMES[5]) == 0
+    assert apart(faded, model, TIMES[1]) == 0
+
+
+def test_easing_comes_and_goes():
+    """Where the object is, frame by frame: outside, half way in, there, half way out."""
+    where = lambda video, k: video.at(TIMES[k]).mean[OBJECT].mean(0)[0]  # noqa: E731
+    chain = edit(MODEL).select(OBJECT)
+    video = chain.move((0.1, 0), frames=(1, 6), ease=2).video()
+    still = edit(MODEL).apply(lambda g, t: g).video()
+    way = [(where(video, k) - where(still, k)) / 6.4 for k in range(NUM_FRAMES)]
+    np.testing.assert_allclose(way, [0, 0.25, 0.75, 1, 0.75, 0.25, 0], atol=1e-4)
+    smooth = chain.move((0.1, 0), frames=(1, None), ease=2, curve="smooth").video()
+    way = [(where(smooth, k) - where(still, k)) / 6.4 for k in range(NUM_FRAMES)]
+    np.testing.assert_allclose(way, [0, 0.15625, 0.84375, 1, 1, 1, 1], atol=1e-4)
+    by_times = chain.move((0.1, 0), times=(TIMES[2], TIMES[4])).video()
+    assert [where(by_times, k) != where(still, k) for k in range(NUM_FRAMES)] == [False, False, True, True] + [
+        False
+    ] * 3
+
+
+def test_a_turn_of_more_than_a_turn_is_one():
+    video = edit(MODEL).select(OBJECT).rotate(4 * np.pi, about=(0, 0), frames=(0, None), ease=0).video()
+    assert apart(video, MODEL, 0.5) < 1e-4
+    eased = edit(MODEL).select(OBJECT).rotate(2 * np.pi, about=(0, 0), frames=(1, 6), ease=2).video()
+    assert apart(eased, MODEL, TIMES[1]) > 0.1
+
+
+# ------------------------------------------------------------------------------------------- own centres, copies
+
+
+def test_about_its_own_centre_it_stays_where_it_is():
+    for make in (lambda e: e.scale(1.7), lambda e: e.rotate(1.0), lambda e: e.transform([[1, 0.5], [0, -1]])):
+        video = make(edit(MODEL).select(OBJECT)).video()
+        # Weighted by opacity and area, which an affine map scales alike.
+        np.testing.assert_allclose(own_centre(video), own_centre(MODEL), atol=1e-5)
+
+
+def own_centre(video):
+    found = []
+    edit(video).select(OBJECT).apply(lambda g, t: found.append(g.centre) or g).video().at(0.31)
+    return found[0]
+
+
+def test_copies_stand_behind_their_originals():
+    chain = edit(MODEL).select(OBJECT).multiply([(0.1, 0), (0.2, 0)])
+    video = chain.video()
+    assert video.splats.num_gaussians == NUM + 2 * OBJECT.sum()
+    assert len(chain.selection) == 2 * OBJECT.sum()
+    source = np.repeat(np.arange(NUM), np.where(OBJECT, 3, 1))
+    np.testing.assert_array_equal(video.splats.opacity_logit, MODEL.splats.opacity_logit[source])
+    shift = np.asarray(video.splats.loc)[:, 0] - MODEL.splats.loc[source, 0]
+    np.testing.assert_allclose(shift[:6], [0, 0.1, 0.2] * 2, atol=1e-6)
+    both = edit(MODEL).select(OBJECT).multiply([(0.1, 0)], originals=True)
+    assert len(both.selection) == 2 * OBJECT.sum()
+    assert not chain.selection.mask[~np.repeat(OBJECT, np.where(OBJECT, 3, 1))].any()
+
+
+def test_copies_have_their_own_edits_and_times():
+    """What was done to the original, about its own centre, is done to each copy about its own."""
+    grown = edit(MODEL).select(OBJECT).scale(1.5)
+    copies = grown.multiply([(0.2, 0.0), (0.0, 0.2)], delays=(0.0, 0.1), scale=(1, 0.5), angle=0.2)
+    each = [grown.scale(1).rotate(0.2).move((0.2, 0)), grown.scale(0.5).rotate(0.2).move((0, 0.2)).retime(shift=0.1)]
+    got = copies.video().at(0.5)
+    for k, one in enumerate(each):
+        copy = np.flatnonzero(np.repeat(OBJECT, np.where(OBJECT, 3, 1)))[k + 1 :: 3]
+        expected = one.video().at(0.5)
+        np.testing.assert_allclose(got.mean[copy], expected.mean[OBJECT], atol=1e-3)
+        np.testing.assert_allclose(got.factor[copy], expected.factor[OBJECT], atol=1e-3)
+
+
+def test_copies_over_a_span_are_there_only_within():
+    video = edit(MODEL).select(OBJECT).multiply([(0.2, 0)], frames=(2, 5), ease=1).video()
+    number = [len(video.at(t).opacity) for t in TIMES]
+    assert number == [NUM] * 2 + [NUM + OBJECT.sum()] * 3 + [NUM] * 2
+
+
+# ------------------------------------------------------------------------------------------------------------ clocks
+
+
+def test_clocks():
+    chain = edit(MODEL).select(OBJECT)
+    at = lambda video, t: video.at(t).mean[OBJECT]  # noqa: E731
+    frozen = chain.freeze(2).video()
+    assert isinstance(frozen, EditedVideo)
+    base = edit(MODEL).apply(lambda g, t: g).video()
+    for t in BETWEEN:
+        np.testing.assert_array_equal(at(frozen, t), at(base, float(TIMES[2])))
+        np.testing.assert_array_equal(frozen.at(t).mean[~OBJECT], base.at(t).mean[~OBJECT])
+    there_and_back = chain.retime(clock=Clock((0.0, 0.5, 1.0), (0.0, 1.0, 0.0))).video()
+    np.testing.assert_array_equal(at(there_and_back, 0.25), at(base, 0.5))
+    np.testing.assert_array_equal(at(there_and_back, 0.75), at(base, 0.5))
+    held = chain.retime(shift=0.5, outside="hold").video()
+    np.testing.assert_array_equal(at(held, 0.25), at(base, 0.0))
+    np.testing.assert_array_equal(at(held, 0.75), at(base, 0.25))
+    late = chain.retime(shift=0.5).video()
+    assert isinstance(late, EditedVideo)  # some m_t would be above 1
+    np.testing.assert_array_equal(at(late, 0.75), at(base, 0.25))
+    from_three_on = chain.retime(clock=Clock.frozen(0.0), frames=(3, None)).video()
+    np.testing.assert_array_equal(at(from_three_on, TIMES[4]), at(base, 0.0))
+    np.testing.assert_array_equal(at(from_three_on, TIMES[2]), at(base, TIMES[2]))
+
+
+def test_clocks_follow_one_another():
+    """A later retiming retimes what the earlier ones made: first reversed, then delayed."""
+    reverse = Clock((0.0, 1.0), (1.0, 0.0), outside="continue")
+    both = edit(MODEL).select(OBJECT).retime(clock=reverse).retime(shift=0.2).video()
+    base = edit(MODEL).apply(lambda g, t: g).video()
+    np.testing.assert_allclose(both.at(0.5).mean[OBJECT], base.at(0.7).mean[OBJECT], atol=1e-3)
+    assert len(both.layers[0].clocks) == 2  # the second was not baked in under the first
+    some = np.arange(NUM) < 20
+    crossed = edit(MODEL).select(OBJECT).freeze(0).select(some).retime(shift=0.2, outside="hold").video()
+    np.testing.assert_array_equal(crossed.at(0.5).mean[OBJECT], base.at(0.0).mean[OBJECT])
+    np.testing.assert_allclose(crossed.at(0.5).mean[some & ~OBJECT], base.at(0.3).mean[some & ~OBJECT], atol=1e-3)
+
+
+# ----------------------------------------------------------------------------------------------------------- colours
+
+
+def test_recolouring_keeps_the_shading():
+    light = np.array([0.2126, 0.7152, 0.0722])
+    base = edit(MODEL).apply(lambda g, t: g).video().at(0.5)
+    red = edit(MODEL).select(OBJECT).recolor((0.8, 0.1, 0.1)).video()
+    got = Playback(red).splats(0.5)
+    ratio = got.color[OBJECT] / np.array([0.8, 0.1, 0.1])
+    np.testing.assert_allclose(ratio, np.repeat(ratio[:, :1], 3, 1), rtol=1e-4)
+    np.testing.assert_allclose(got.opacity[OBJECT] @ ratio[:, 0] / got.opacity[OBJECT].sum(), 1, rtol=1e-4)
+    before = base.color[OBJECT] @ light
+    np.testing.assert_allclose(ratio[:, 0] / before, ratio[0, 0] / before[0], rtol=1e-3)
+    blue = Playback(edit(MODEL).select(OBJECT).recolor(hue=2 / 3).video()).splats(0.5).color[OBJECT]
+    assert (blue[:, 2] >= blue[:, :2].max(1) - 1e-5).all()
+    unclipped = (blue > 0).all(1)
+    assert unclipped.sum() > 3
+    np.testing.assert_allclose((blue @ light)[unclipped], before[unclipped], rtol=1e-4)
+
+
+# --------------------------------------------------------------------------------------------------------- functions
+
+
+def test_any_function_of_the_conditioned_gaussians():
+    seen = []
+
+    def wave(gaussians, t):
+        seen.append((gaussians.index, t))
+        shift = 0.1 * np.sin(2 * np.pi * t)
+        return dataclasses.replace(gaussians, mean=gaussians.mean + np.array([shift, 0.0]))
+
+    video = edit(MODEL).select(OBJECT).apply(wave).video()
+    moved = edit(MODEL).select(OBJECT).move((0.1, 0)).video()
+    assert apart(video, moved, 0.25) < 1e-5
+    np.testing.assert_array_equal(seen[0][0], np.flatnonzero(OBJECT))
+    assert seen[0][1] == 0.25
+    half = edit(MODEL).select(OBJECT).apply(wave, frames=(1, 6), ease=5 / 2).video()
+    quarter = float(np.interp(0.5 + 1.25, np.arange(NUM_FRAMES), TIMES))
+    expected = edit(MODEL).select(OBJECT).move((0.05 * np.sin(2 * np.pi * quarter), 0)).video()
+    assert apart(half, expected, quarter) < 1e-5
+
+
+def test_functions_of_triangles():
+    """A shift, a turn and a mirror of vertices are those edits."""
+    chain = edit(MODEL).select(OBJECT)
+
+    def through(matrix, vertices):
+        out = vertices.copy()
+        out[..., :2] = vertices[..., :2] @ matrix.T + [0.1, 0.05]
+        return out
+
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]) * 1.3
+    for matrix in (turn, turn @ np.diag([1, -1])):
+        expected = chain.transform(matrix, (0.1, 0.05), about=(0, 0)).video()
+        assert (
+            apart(chain.apply_triangles(lambda v, t, matrix=matrix: through(matrix, v)).video(), expected, 0.31) < 1e-3
+        )
+    half = chain.apply_triangles(lambda v, t: v + np.float32([0.2, 0, 0]), frames=(1, 6), ease=2).video()
+    expected = chain.move((0.05, 0)).video()
+    assert apart(half, expected, TIMES[1]) < 1e-3
+
+
+def test_triangles_there_and_back():
+    """V to Gaussians and back, forced by a change far below a pixel: the same picture."""
+    video = edit(MODEL).apply_triangles(lambda v, t: v + np.float32(1e-6)).video()
+    for t in BETWEEN:
+        assert 0 < apart(video, MODEL, t) < 1e-3
+
+
+# ------------------------------------------------------------------------------------------------------ who, and errors
+
+
+def test_selections():
+    chain = edit(MODEL)
+    assert len(chain.selection) == NUM
+    assert len(chain.select(OBJECT).selection) == OBJECT.sum()
+    assert len(chain.select(Selection(OBJECT)).select().selection) == NUM
+    asked = []
+    by_function = chain.select(lambda model: asked.append(model) or ~Selection(OBJECT))
+    np.testing.assert_array_equal(by_function.selection.mask, ~OBJECT)
+    assert asked[0] is MODEL
+    assert len(chain.select(OBJECT).vanish().selection) == 0
+    # The chain that was begun with is as it was.
+    assert len(chain.selection) == NUM
+    assert chain.video() is MODEL
+
+
+def test_criteria_are_asked_of_each_layer(monkeypatch):
+    asked = []
+
+    def by_criteria(model, **criteria):
+        asked.append((model, criteria))
+        return Selection(OBJECT)
+
+    monkeypatch.setattr(importlib.import_module("foldgauss.video.edit"), "select", by_criteria)
+    moved = edit(MODEL).move((0.1, 0))
+    assert len(moved.select(box=(0, 0, 9, 9), frame=2).selection) == OBJECT.sum()
+    model, criteria = asked.pop()
+    assert model is moved.video()  # what could be baked is seen
+    assert criteria == {"box": (0, 0, 9, 9), "frame": 2}
+    chain = edit(layers(MODEL, MODEL))
+    assert len(chain.select(color=(1, 0, 0)).selection) == 2 * OBJECT.sum()
+    np.testing.assert_array_equal(chain.select(layer=1, color=(1, 0, 0)).selection.mask[:NUM], False)
+
+
+def test_selections_of_before_go_on():
+    """A mask of what the chain was begun with means those, wherever they are now, and their copies."""
+    some = np.arange(NUM) >= NUM - 5
+    chain = edit(MODEL).select(OBJECT).multiply([(0.1, 0), (0.2, 0)]).select(some).vanish().select(OBJECT)
+    assert len(chain.selection) == 3 * OBJECT.sum()
+    np.testing.assert_array_equal(chain.selection.mask, np.repeat(OBJECT, np.where(OBJECT, 3, 1))[:-5])
+    assert len(chain.select(chain.selection).selection) == 3 * OBJECT.sum()  # nor is one of now mistaken
+    with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 59 .*another model's"):
+        chain.select(np.ones(58, bool))
+    with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 59"):
+        chain.select(lambda model: OBJECT)  # asked now
+    equal = edit(MODEL).select(some).multiply([(0.1, 0)]).select(np.arange(NUM) < 5).vanish()
+    with pytest.raises(ValueError, match=r"^selection: expected a mask that can mean but one thing"):
+        equal.select(OBJECT)
+    assert len(equal.select(lambda model: OBJECT).selection) == OBJECT.sum()
+    assert len(equal.select().selection) == NUM
+
+
+E = edit(MODEL)
+WRONG = {
+    "no video": (lambda: edit(MODEL.splats), "video: expected a VideoModel or an EditedVideo"),
+    "mask of others": (lambda: E.select(OBJECT[:-1]), "selection: expected a Selection or mask of 40"),
+    "mask of numbers": (lambda: E.select(np.ones(NUM)), "selection: .*float64"),
+    "both": (lambda: E.select(OBJECT, color=(1, 0, 0)), "selection: .*or criteria"),
+    "no layer": (lambda: E.select(layer=1), "layer: expected a whole number in"),
+    "nobody": (lambda: E.select(~(OBJECT | True)).move((0.1, 0)), "selection: expected at least one"),
+    "nobody to copy": (lambda: E.select(~(OBJECT | True)).multiply([(0.1, 0)]), "selection: expected at least one"),
+    "after vanishing": (lambda: E.select(OBJECT).vanish().vanish(), "selection: expected at least one"),
+    "offset": (lambda: E.move((1, 2, 3)), "offset: expected 2 finite numbers"),
+    "nan": (lambda: E.move((np.nan, 0)), "offset: expected 2 finite numbers"),
+    "text": (lambda: E.move("ab"), "offset: expected 2 finite"),
+    "about": (lambda: E.rotate(1, about=(0,)), "about: expected 2 finite"),
+    "angle": (lambda: E.rotate(np.inf), "angle: expected a finite number"),
+    "factor 0": (lambda: E.scale(0), "factor: expected one or two numbers > 0"),
+    "three factors": (lambda: E.scale((1, 2, 3)), "factor: expected one or two"),
+    "matrix": (lambda: E.transform(np.eye(3)), "matrix: expected 2 finite numbers"),
+    "matrix of one row": (lambda: E.transform([[1, 2]]), "matrix: expected shape"),
+    "ragged": (lambda: E.scale([(1, 2), 3]), "factor: expected finite numbers"),
+    "flat matrix": (lambda: E.transform([[1, 2], [2, 4]]), "matrix: expected a matrix that has an inverse"),
+    "opacity": (lambda: E.opacity(-1), "factor: expected a number >= 0"),
+    "no copies": (lambda: E.multiply([]), "offsets: expected at least one"),
+    "no list": (lambda: E.multiply(3), "offsets: expected at least one"),
+    "delays": (lambda: E.multiply([(0, 0)], delays=(1, 2)), "delays: expected one number or 1"),
+    "colour": (lambda: E.recolor((1, 2)), "color: expected 3 finite"),
+    "dark colour": (lambda: E.recolor((1, 2, -1)), "color: expected three numbers >= 0"),
+    "no way": (lambda: E.recolor(), "color, hue, gain: expected one way"),
+    "two ways": (lambda: E.recolor((1, 0, 0), hue=0.1), "color, hue, gain: expected one way"),
+    "gains": (lambda: E.recolor(gain=(1, 2)), "gain: expected one number or 3"),
+    "colour matrix": (lambda: E.recolor(matrix=np.eye(2)), "matrix: expected 3 finite numbers"),
+    "black object": (lambda: E.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object with some light"),
+    "standing still": (lambda: E.retime(stretch=0), "stretch: expected a number but 0"),
+    "two clocks": (lambda: E.retime(shift=1, clock=Clock.frozen(0)), "clock: expected a clock, or"),
+    "no clock": (lambda: E.retime(clock=lambda t: t), "clock: expected a Clock"),
+    "outside": (lambda: E.retime(shift=0.1, outside="loop"), "outside: expected one of"),
+    "frozen": (lambda: E.freeze(7), r"frame: expected a number in \[0, 6\]"),
+    "function": (lambda: E.apply(3), "function: expected a function"),
+    "depth": (lambda: E.place(depth=None), "depth: expected a finite number"),
+    "camera": (lambda: E.seen_from("left"), "camera: expected a Camera"),
+    "frame": (lambda: E.move((0, 0), frame=7), r"frame: expected a whole number in \[0, 6\]"),
+    "frames": (lambda: E.move((0, 0), frames=(3, 3)), "frames: expected .first, stop."),
+    "frames of one": (lambda: E.move((0, 0), frames=3), "frames: expected two of them"),
+    "times": (lambda: E.move((0, 0), times=(0.5, 0.2)), "times: expected .start, stop., rising"),
+    "two whens": (lambda: E.move((0, 0), frame=1, times=(0, 1)), "frame, frames, times: expected one"),
+    "ease alone": (lambda: E.move((0, 0), ease=2), "ease: expected a span"),
+    "long ease": (lambda: E.move((0, 0), frames=(2, 4), ease=2), "ease: expected no more than the span's 2 frames"),
+    "ease": (lambda: E.move((0, 0), frames=(2, 4), ease=-1), "ease: expected a number of frames"),
+    "curve": (lambda: E.move((0, 0), frame=2, curve="cubic"), "curve: expected one of"),
+    "clock knots": (lambda: Clock((0, 0), (0, 1)), "times: expected rising"),
+    "clock lengths": (lambda: Clock((0, 1), (0,)), "times, own_times: expected as many"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_malformed_arguments(name):
+    call, message = WRONG[name]
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()
+
+
+DRAWN_WRONG = {
+    "nothing back": (lambda g, t: None, "function: expected SelectedGaussians"),
+    "fewer": (lambda g, t: dataclasses.replace(g, mean=g.mean[1:]), "function's mean"),
+    "nan": (lambda g, t: dataclasses.replace(g, color=g.color * np.nan), "function's color"),
+    "opacity": (lambda g, t: dataclasses.replace(g, opacity=g.opacity + 1), "function: expected opacity in"),
+    "others": (lambda g, t: dataclasses.replace(g, index=g.index + 1), "function: expected the same Gaussians"),
+}
+
+
+@pytest.mark.parametrize("name", DRAWN_WRONG)
+def test_functions_that_return_nonsense(name):
+    function, message = DRAWN_WRONG[name]
+    with pytest.raises(ValueError, match=f"^{message}"):
+        edit(MODEL).apply(function).video().render(0.5)
+
+
+def test_functions_cannot_write_to_what_they_are_given():
+    def in_place(gaussians, t):
+        gaussians.mean[:] += 1
+        return gaussians
+
+    with pytest.raises(ValueError, match="read-only"):
+        edit(MODEL).apply(in_place).video().render(0.5)
+
+
+def test_broken_triangles():
+    flat = lambda v, t: np.repeat(v[:, :1], 3, 1)  # noqa: E731
+    for function, message in (
+        (flat, "vertices: expected faces whose three vertices span a plane, got 40 without area, the first at index 0"),
+        (lambda v, t: v * np.nan, "vertices: expected finite numbers"),
+        (lambda v, t: v[1:], r"vertices: expected numbers of shape \(40, 3, 3\)"),
+        (lambda v, t: None, "vertices: expected numbers of shape"),
+    ):
+        with pytest.raises(ValueError, match=f"^{message}"):
+            edit(MODEL).apply_triangles(function).video().render(0.5)
