@@ -550,7 +550,8 @@ def _rows(parameter: str, values: object) -> list:
 
 def _listed(parameter: str, values: ArrayLike) -> tuple[float, ...]:
     """Numbers, or one number alone, as a tuple."""
-    return checked_numbers(parameter, [values] if np.ndim(values) == 0 else values)
+    several = isinstance(values, (list, tuple)) or getattr(values, "ndim", 0) > 0
+    return checked_numbers(parameter, values if several else [values])
 
 
 def _square(parameter: str, values: ArrayLike, side: int) -> Float[np.ndarray, "side side"]:
