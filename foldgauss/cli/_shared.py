@@ -14,8 +14,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from foldgauss._checks import invalid
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.video_file import Clip, memory_limit
+from foldgauss.io.video_file import (
+    ANIMATION_SUFFIXES,
+    MAX_FPS,
+    MAX_GIF_FPS,
+    VIDEO_SUFFIXES,
+    Clip,
+    memory_limit,
+    write_video,
+)
+from foldgauss.video.alpha import BLACK
+from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 
@@ -23,6 +34,8 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 # No markup: names of files may hold brackets.
 out = Console(markup=False, highlight=False)
 err = Console(stderr=True, markup=False, highlight=False)
+
+MAX_SHOWN = 100_000  # above, a clip of seconds plays for days
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
@@ -89,7 +102,7 @@ def counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
 
 
 def evaluate_with_progress(
-    model: VideoModel,
+    model: VideoModel | EditedVideo,
     frames: np.ndarray,
     keep: Callable[[np.ndarray], None] = lambda picture: None,
     *,
@@ -105,7 +118,7 @@ def evaluate_with_progress(
         return evaluate(model, frames, on_frame)
 
 
-def figures_of(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
+def figures_of(model: VideoModel | EditedVideo, scores: Evaluation) -> dict[str, Any]:
     return {
         "mean_psnr": round(scores.mean_psnr, 3),
         "mean_ssim": round(scores.mean_ssim, 4),
@@ -113,8 +126,8 @@ def figures_of(model: VideoModel, scores: Evaluation) -> dict[str, Any]:
         "num_frames": model.num_frames,
         "height": model.size[0],
         "width": model.size[1],
-        "num_gaussians": model.splats.num_gaussians,
-        "degree": model.splats.degree,
+        "num_gaussians": model.num_gaussians,
+        "degree": model.degree,
     }
 
 
@@ -175,3 +188,51 @@ def as_option(text: str) -> str:
     """An error about a setting, as one about its option: num_gaussians is --gaussians."""
     name, colon, rest = text.partition(":")
     return f"--{name.replace('num_gaussians', 'gaussians').replace('_', '-')}{colon}{rest}"
+
+
+def check_picture_path(path: Path, *, others: str = "") -> None:
+    """Refuse a name that pictures cannot be written to."""
+    wanted = (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES)
+    if path.suffix and not path.is_dir() and path.suffix.lower() not in wanted:
+        expected = ", ".join((others, *wanted) if others else wanted) + ", or a folder without extension"
+        raise WrongUse(str(invalid("--out", expected=expected, got=path)))
+
+
+def draw(
+    model: VideoModel | EditedVideo,
+    path: Path,
+    times: np.ndarray,
+    rate: float,
+    *,
+    size: tuple[int, int] | None = None,
+    background: tuple[float, float, float] = BLACK,
+    image_format: str = "png",
+    overwrite: bool = False,
+) -> None:
+    """Write the pictures at `times` to `path`, `rate` a second, with a bar."""
+    most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
+    if path.suffix and not path.is_dir() and rate > most:
+        expected, cure = f"at most {most:g} frames a second", "Give a lower one, or write to a folder instead."
+        raise WrongUse(str(invalid("--fps", expected=expected, got=f"{rate:g}", cure=cure)))
+    with progress_bar("Rendering", len(times)) as advance:
+        pictures = counted(model.frames(times, size, background=background), advance)
+        kind = {"overwrite": overwrite, "image_format": image_format}
+        write_video(path, pictures, min(rate, MAX_FPS), **kind)
+    out.print(f"{path}: {len(times)} frames at {rate:g} frames a second", soft_wrap=True)
+
+
+def parse_times(text: str | None) -> np.ndarray | None:
+    if text is None:
+        return None
+    expected = "numbers in [0, 1] as 0,0.5,1, or first:last:count as 0:1:50"
+    try:
+        if text.count(":") == 2:
+            first, last, count = text.split(":")
+            times = np.linspace(float(first), float(last), min(int(count), MAX_SHOWN + 1))
+        else:
+            times = np.array([float(part) for part in text.split(",")])
+    except ValueError as error:
+        raise WrongUse(str(invalid("--times", expected=expected, got=text))) from error
+    if not (0 < len(times) <= MAX_SHOWN and ((times >= 0) & (times <= 1)).all()):
+        raise WrongUse(str(invalid("--times", expected=expected, got=text)))
+    return times

@@ -10,12 +10,14 @@ from rich.table import Table
 
 from foldgauss._checks import invalid
 from foldgauss.cli._shared import (
+    MAX_SHOWN,
     Frames,
     Overwrite,
     Size,
     WrongUse,
     app,
-    counted,
+    check_picture_path,
+    draw,
     err,
     evaluate_with_progress,
     figures_of,
@@ -24,9 +26,9 @@ from foldgauss.cli._shared import (
     parse_color,
     parse_frames,
     parse_size,
+    parse_times,
     print_figures,
     print_frames,
-    progress_bar,
     refuse_existing,
     refuse_huge,
     short,
@@ -34,19 +36,20 @@ from foldgauss.cli._shared import (
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.model_file import read_header
-from foldgauss.io.video_file import MAX_FPS, VIDEO_SUFFIXES, Clip, read_video, write_video
+from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, Clip, read_video
 from foldgauss.io.video_model import load_video_model
+from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.metrics import evaluate
 
-MAX_UPSAMPLE = MAX_SHOWN = 100_000  # above, a clip of seconds plays for days
+MAX_UPSAMPLE = MAX_SHOWN
 MIN_SPEED = 1e-4
 
 
 @app.command()
 def render(
     model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
-    out_path: Annotated[Path, typer.Option("--out", help="FILE.mp4, FILE.webm, or a folder for PNG frames.")],
+    out_path: Annotated[Path, typer.Option("--out", help="FILE.mp4, .webm, .gif or .webp, or a folder for images.")],
     size: Size = None,
     upsample: Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")] = None,
     fps: Annotated[
@@ -65,27 +68,27 @@ def render(
     background: Annotated[
         str, typer.Option(metavar="RRGGBB", help="Colour behind a model of a clip with alpha, as ffffff.")
     ] = "000000",
+    image_format: Annotated[
+        str | None, typer.Option("--format", help="Of the images in a folder: png or webp, both exact [default: png].")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Draw a model as a video, in between its frames too."""
-    course = _Course(upsample, fps, speed, _parse_remap(remap), _parse_times(times))
+    course = _Course(upsample, fps, speed, _parse_remap(remap), parse_times(times))
     picture_size, behind = parse_size(size), parse_color(background)
-    if out_path.suffix and not out_path.is_dir():
-        if out_path.suffix.lower() not in VIDEO_SUFFIXES:
-            wanted = " or ".join(VIDEO_SUFFIXES)
-            raise WrongUse(str(invalid("--out", expected=f"{wanted}, or a folder without extension", got=out_path)))
+    check_picture_path(out_path)
+    if image_format is not None and (out_path.suffix and not out_path.is_dir()):
+        raise WrongUse(str(invalid("--format", expected="a folder as --out", got=out_path)))
+    if image_format is not None and image_format not in IMAGE_FORMATS:
+        raise WrongUse(str(invalid("--format", expected="one of " + ", ".join(IMAGE_FORMATS), got=image_format)))
+    if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
     refuse_huge(picture_size)
     model = load_video_model(model_path)
     shown, rate = course.times(np.asarray(model.frame_times.times()), model.fps), course.rate(model.fps)
-    if out_path.suffix and rate > MAX_FPS:
-        cure = f"Take at most {int(MAX_FPS / model.fps)} times the clip's rate, give --fps, or write to a folder."
-        raise WrongUse(str(invalid("--upsample", expected=f"up to {MAX_FPS:g} frames a second", got=rate, cure=cure)))
-    with progress_bar("Rendering", len(shown)) as advance:
-        pictures = counted(model.frames(shown, picture_size, background=behind), advance)
-        path = write_video(out_path, pictures, min(rate, MAX_FPS), overwrite=overwrite)
-    out.print(f"{path}: {len(shown)} frames at {rate:g} frames a second", soft_wrap=True)
+    how = {"size": picture_size, "background": behind, "overwrite": overwrite}
+    draw(model, out_path, shown, rate, image_format=image_format or "png", **how)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,17 +173,21 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     """Say what a model file holds."""
     model = load_video_model(model_path)
     about = read_header(model_path)["metadata"]
-    envelope = model.splats.envelope
+    powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
     times = np.asarray(model.frame_times.times())
     figures = {
         "frames": f"{model.num_frames} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second",
-        "Gaussians": f"{model.splats.num_gaussians:,}",
-        "fold": f"polynomial of degree {model.splats.degree}",
-        "envelope": f"time likelihood, power {float(envelope.power):g} (paper's text 1, its code 2)",
+        "Gaussians": f"{model.num_gaussians:,}",
+        "fold": f"polynomial of degree {model.degree}",
+        "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
         "numbers stored": f"{model.num_floats:,}",
         "file": f"{model_path.stat().st_size:,} bytes",
     }
+    if isinstance(model, EditedVideo):
+        figures["edits"] = ", ".join(
+            f"{len(one.overlays) + len(one.clocks)} on {one.num_gaussians:,} Gaussians" for one in model.layers
+        )
     table = Table(title=str(model_path), show_header=False)
     for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
         table.add_row(name, value)
@@ -209,20 +216,3 @@ def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:
         expected = "seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2"
         raise WrongUse(str(invalid("--remap", expected=expected, got=text))) from error
     return points
-
-
-def _parse_times(text: str | None) -> np.ndarray | None:
-    if text is None:
-        return None
-    expected = "numbers in [0, 1] as 0,0.5,1, or first:last:count as 0:1:50"
-    try:
-        if text.count(":") == 2:
-            first, last, count = text.split(":")
-            times = np.linspace(float(first), float(last), min(int(count), MAX_SHOWN + 1))
-        else:
-            times = np.array([float(part) for part in text.split(",")])
-    except ValueError as error:
-        raise WrongUse(str(invalid("--times", expected=expected, got=text))) from error
-    if not (0 < len(times) <= MAX_SHOWN and ((times >= 0) & (times <= 1)).all()):
-        raise WrongUse(str(invalid("--times", expected=expected, got=text)))
-    return times

@@ -108,6 +108,11 @@ class EditedVideo(eqx.Module):
         return sum(layer.num_gaussians for layer in self.layers)
 
     @property
+    def degree(self) -> int:
+        """The highest of the folds'."""
+        return max(layer.model.splats.degree for layer in self.layers)
+
+    @property
     def num_floats(self) -> int:
         """Numbers stored, masks not counted."""
         return sum(layer.model.num_floats for layer in self.layers)

@@ -212,6 +212,15 @@ class VideoModel(eqx.Module):
         return self.frame_times.num_frames
 
     @property
+    def num_gaussians(self) -> int:
+        return self.splats.num_gaussians
+
+    @property
+    def degree(self) -> int:
+        """Of the folds."""
+        return self.splats.degree
+
+    @property
     def num_floats(self) -> int:
         """Numbers stored."""
         return sum(np.size(leaf) for leaf in jax.tree.leaves(self))
