@@ -219,7 +219,7 @@ def broken_inputs(tmp_path, work):
         "times misspelt": (["render", model, "--out", tmp_path / "f", "--times", "0:1"], 2, "--times"),
         "remap misspelt": (["render", model, "--out", tmp_path / "f", "--remap", "0,1"], 2, "--remap"),
         "remap back": (["render", model, "--out", tmp_path / "f", "--remap", "0=0,2=1,1=1"], 2, "--remap"),
-        "upsample beyond": (["render", model, "--out", tmp_path / "f", "--upsample", "1000000000"], 2, "at most"),
+        "upsample beyond": (["render", model, "--out", tmp_path / "f", "--upsample", "1000000000"], 2, "100,000"),
         "no such folder for json": (["evaluate", model, clip, "--json", tmp_path / "no" / "f.json"], 1, "folder"),
         "mixed sizes": (["fit", mixed, "--out", out], 1, "40x50|50x40"),
         "frames beyond": (["fit", clip, "--out", out, "--frames", "0:99"], 2, "frames"),
