@@ -18,11 +18,11 @@ import numpy as np
 from sklearn.mixture import GaussianMixture
 
 from benchmarks import _bending, _common
-from foldgauss._em import State, _steps, used_degrees
-from foldgauss._scaling import Scaling, to_mixture
-from foldgauss._starts import from_joint
-from foldgauss._statistics import points_of
-from foldgauss._updates import Model
+from foldgauss._em.loop import State, _steps, used_degrees
+from foldgauss._em.scaling import Scaling, to_mixture
+from foldgauss._em.starts import from_joint
+from foldgauss._em.statistics import points_of
+from foldgauss._em.updates import Model
 from foldgauss.envelope import Constant
 from foldgauss.estimator import FoldedGaussianMixture
 

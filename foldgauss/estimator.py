@@ -20,14 +20,14 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._checks import invalid, one_of, whole, within
-from foldgauss._components import Parameters, log_likelihoods, pairs_of
-from foldgauss._em import EMStatus, Run, best, expectation_maximisation, used_degrees
-from foldgauss._online import FORGETTING, batch_sums, online_step
-from foldgauss._prune import compressed, num_parameters, pruned
-from foldgauss._scaling import Scaling, scaling_of, to_mixture, variances_of
-from foldgauss._starts import STARTS, from_joint, start
-from foldgauss._statistics import Points, points_of, scores
-from foldgauss._updates import Model
+from foldgauss._em.components import Parameters, log_likelihoods, pairs_of
+from foldgauss._em.loop import EMStatus, Run, best, expectation_maximisation, used_degrees
+from foldgauss._em.online import FORGETTING, batch_sums, online_step
+from foldgauss._em.prune import compressed, num_parameters, pruned
+from foldgauss._em.scaling import Scaling, scaling_of, to_mixture, variances_of
+from foldgauss._em.starts import STARTS, from_joint, start
+from foldgauss._em.statistics import Points, points_of, scores
+from foldgauss._em.updates import Model
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.mixture import FoldedMixture
 

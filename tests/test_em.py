@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss import _components as components
-from foldgauss._em import EMStatus, best, expectation_maximisation, used_degrees
-from foldgauss._online import seen_from
-from foldgauss._scaling import Scaling, from_mixture, to_mixture
-from foldgauss._statistics import Times, accumulate, points_of, time_steps
-from foldgauss._updates import Model, newton_step, profile, updated
+from foldgauss._em import components
+from foldgauss._em.loop import EMStatus, best, expectation_maximisation, used_degrees
+from foldgauss._em.online import seen_from
+from foldgauss._em.scaling import Scaling, from_mixture, to_mixture
+from foldgauss._em.statistics import Times, accumulate, points_of, time_steps
+from foldgauss._em.updates import Model, newton_step, profile, updated
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 
 K, N, DEGREE = 3, 200, 2

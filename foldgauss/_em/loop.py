@@ -1,4 +1,4 @@
-"""Expectation maximisation: the loop. What a step does stands in `_statistics` and `_updates`.
+"""Expectation maximisation: the loop. What a step does stands in `statistics` and `updates`.
 
 **Source:** Dempster, Laird and Rubin 1977; generalised EM where the envelope hangs on time.
 """
@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._components import Parameters
-from foldgauss._statistics import Points, Times, accumulate, time_steps
-from foldgauss._updates import Model, newton_step, profile, updated
+from foldgauss._em.components import Parameters
+from foldgauss._em.statistics import Points, Times, accumulate, time_steps
+from foldgauss._em.updates import Model, newton_step, profile, updated
 from foldgauss.envelope import AbstractEnvelope, Constant
 
 __all__ = ["EMStatus", "Run", "State", "best", "expectation_maximisation", "log_likelihood", "step", "used_degrees"]

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._batch import cast
-from foldgauss._components import Pairs, Parameters, log_likelihoods, pairs_of
+from foldgauss._em.components import Pairs, Parameters, log_likelihoods, pairs_of
 from foldgauss._regression import hermite_columns
 from foldgauss.envelope import AbstractEnvelope, Constant
 

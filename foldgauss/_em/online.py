@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._cholesky import inverse_lower
-from foldgauss._components import Parameters, moved, to_powers
+from foldgauss._em.cholesky import inverse_lower
+from foldgauss._em.components import Parameters, moved, to_powers
+from foldgauss._em.statistics import Points, Statistics, accumulate
+from foldgauss._em.updates import Model, updated
 from foldgauss._regression import hermite_to_powers
-from foldgauss._statistics import Points, Statistics, accumulate
-from foldgauss._updates import Model, updated
 from foldgauss.envelope import Constant
 
 __all__ = ["FORGETTING", "batch_sums", "online_step", "seen_from"]

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from foldgauss._components import Parameters
-from foldgauss._statistics import Points, accumulate, points_of
-from foldgauss._updates import Model, updated
+from foldgauss._em.components import Parameters
+from foldgauss._em.statistics import Points, accumulate, points_of
+from foldgauss._em.updates import Model, updated
 from foldgauss.envelope import Constant
 
 __all__ = ["STARTS", "from_joint", "from_responsibilities", "start"]

@@ -12,12 +12,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._cholesky import cholesky, inverse_lower, log_det
-from foldgauss._components import Parameters, log_likelihoods, pairs_of, to_powers
-from foldgauss._em import best, expectation_maximisation, log_likelihood
+from foldgauss._em.cholesky import cholesky, inverse_lower, log_det
+from foldgauss._em.components import Parameters, log_likelihoods, pairs_of, to_powers
+from foldgauss._em.loop import best, expectation_maximisation, log_likelihood
+from foldgauss._em.statistics import Points, accumulate
+from foldgauss._em.updates import Model, residual_scatter
 from foldgauss._regression import hermite_to_powers
-from foldgauss._statistics import Points, accumulate
-from foldgauss._updates import Model, residual_scatter
 from foldgauss.envelope import AbstractEnvelope
 
 __all__ = ["compressed", "num_parameters", "pruned"]
