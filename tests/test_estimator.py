@@ -379,8 +379,10 @@ def test_a_row_without_weight_may_hold_any_number():
 
 
 def test_unequal_batches_lead_where_all_points_do():
-    x = _blobs(n=4000)[np.random.default_rng(1).permutation(4000)]
-    options = {"degree": 1, "random_state": 0, "tol": 1e-5, "max_iter": 300}
+    x = _blobs(n=4000)
+    means = np.stack([x[k::K].mean(0) for k in range(K)])
+    x = x[np.random.default_rng(1).permutation(4000)]
+    options = {"degree": 1, "tol": 1e-5, "max_iter": 300, "means_init": means}
     whole, online = FoldedGaussianMixture(K, **options).fit(x), FoldedGaussianMixture(K, **options)
     ends = np.cumsum([500, 250, 17, 400, 60, 512, 1, 300, 450, 200, 512, 500, 298])
     batches = np.split(x, ends)[:-1]
