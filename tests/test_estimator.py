@@ -380,9 +380,13 @@ def test_a_row_without_weight_may_hold_any_number():
 
 def test_unequal_batches_lead_where_all_points_do():
     x = _blobs(n=4000)
-    means = np.stack([x[k::K].mean(0) for k in range(K)])
+    groups = [x[k::K] for k in range(K)]
+    start = {
+        "means_init": np.stack([group.mean(0) for group in groups]),
+        "precisions_init": np.stack([np.linalg.inv(np.cov(group.T)) for group in groups]),
+    }
     x = x[np.random.default_rng(1).permutation(4000)]
-    options = {"degree": 1, "tol": 1e-5, "max_iter": 300, "means_init": means}
+    options = {"degree": 1, "tol": 1e-5, "max_iter": 300} | start
     whole, online = FoldedGaussianMixture(K, **options).fit(x), FoldedGaussianMixture(K, **options)
     ends = np.cumsum([500, 250, 17, 400, 60, 512, 1, 300, 450, 200, 512, 500, 298])
     batches = np.split(x, ends)[:-1]
