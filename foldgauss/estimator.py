@@ -223,7 +223,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 envelope,
                 model,
                 total=total,
-                least_mass=0.0 if self.n_components == "auto" else 0.5 * total / len(weights),
+                least_mass=0.5 * total / len(weights),
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,

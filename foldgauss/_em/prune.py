@@ -71,9 +71,10 @@ def pruned(
     found, moves = scored(params, model), True
     while moves:
         moves = False
-        while components and (less := _fewer(found, points, envelope, fitted)) is not None:
-            found, moves = less, True
+        # Powers first: a component is worth more beside others than its share of powers that nobody needs.
         while powers and (less := _lower(found, points, envelope, fitted, penalty)) is not None:
+            found, moves = less, True
+        while components and (less := _fewer(found, points, envelope, fitted)) is not None:
             found, moves = less, True
     return found.params, found.model
 

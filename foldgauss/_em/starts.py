@@ -131,7 +131,9 @@ def _trajectories(y, weights, num, degree, rng):
     near = np.exp(-0.5 * square / np.median(widths) ** 2) * mass[:, None]
     chosen, left = [], np.ones(len(part))
     for _ in range(num):
-        best = int(np.argmax(left @ near))
+        gain = left @ near
+        gain[chosen] = -1  # a curve taken twice would leave a component without points
+        best = int(np.argmax(gain))
         chosen.append(best)
         left = left * (1 - near[:, best] / mass)
     return _one_hot(_curve_distances(y, curves[chosen]).argmin(1), num)
