@@ -1,6 +1,6 @@
 """Mixtures beside scikit-learn's and gmmx's: log-densities, one iteration of EM, and what bending brings.
 
-    python -m benchmarks.mixture [--points N ...] [--components K] [--rounds N] [--skip-bending] [--json FILE]
+    python -m benchmarks.mixture [--points [N ...]] [--components K] [--rounds N] [--skip-bending] [--json FILE]
 
 d = 3, full covariances, a linear fold and a = 1: the model that all of them have. scikit-learn computes in float64,
 gmmx in float32; gmmx is measured where it imports (`pip install gmmx`). Ratios above 1 mean that foldgauss is faster;
@@ -192,7 +192,9 @@ def _bends() -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> None:
     made = _common.parser(__doc__)
-    made.add_argument("--points", type=_common.whole, nargs="+", default=[100_000, 1_000_000])
+    made.add_argument(
+        "--points", type=_common.whole, nargs="*", default=[100_000, 1_000_000], help="none: bending alone"
+    )
     made.add_argument("--components", type=_common.whole, default=64)
     made.add_argument("--rounds", type=_common.whole, default=3)
     made.add_argument("--skip-bending", action="store_true", help="speed alone")

@@ -44,6 +44,8 @@ _CURES = {
 }
 #: Of the points, this many for each component that "auto" starts with.
 _POINTS_PER_COMPONENT = 8
+#: Steps between floating-point times up to this share of a component's spread are no loss.
+_COARSEST = 0.01
 
 
 class FoldedGaussianMixture(DensityMixin, BaseEstimator):
@@ -427,10 +429,28 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     # --- the mixture --------------------------------------------------------------------------------------------
 
     def to_mixture(self) -> FoldedMixture:
-        """The fitted `FoldedMixture`, **time last**; in float32 unless JAX has float64 enabled."""
+        """The fitted `FoldedMixture`, **time last**; in float32 unless JAX has float64 enabled.
+
+        Warns where its times, far from zero, then lie too far apart for how fast its components move.
+        """
         check_is_fitted(self)
-        params = Parameters(*(jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)) for z in self._params))
+        dtype = jax.dtypes.canonicalize_dtype(self._params.curve.dtype)
+        if dtype != self._params.curve.dtype:
+            self._warn_of_coarse_times(dtype)
+        params = Parameters(*(jnp.asarray(z, dtype) for z in self._params))
         return to_mixture(params, self._scaling, self._envelope)
+
+    def _warn_of_coarse_times(self, dtype) -> None:
+        step = np.spacing((np.abs(self.time_means_) + 3 * self.time_scales_).astype(dtype)).astype(np.float64)
+        speed = np.abs(self.fold_coefficients_[:, :1]).sum(1) / np.sqrt(_diagonals(self.space_covariances_))
+        worst = float((step * np.maximum(1 / self.time_scales_, speed.max(1))).max())
+        if worst > _COARSEST:
+            warnings.warn(
+                f"In {np.dtype(dtype).name} times lie so far apart that a component moves or fades by {worst:.2g} of "
+                "its own spread from one to the next. Subtract an offset from the time column before the fit, or enable "
+                "float64: jax.config.update('jax_enable_x64', True).",
+                stacklevel=3,
+            )
 
     def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, "n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
@@ -523,6 +543,10 @@ def _of_kind(params: Parameters, kind: str) -> Parameters:
     if kind == "spherical":
         covariances = np.trace(covariances, axis1=1, axis2=2)[:, None, None] / len(eye) * eye
     return params._replace(tril=jnp.asarray(np.linalg.cholesky(covariances), params.tril.dtype))
+
+
+def _diagonals(matrices: Float[np.ndarray, "k d d"]) -> Float[np.ndarray, "k d"]:
+    return np.diagonal(matrices, axis1=-2, axis2=-1)
 
 
 def _shaped(name: str, value, shape: tuple[int, ...]) -> np.ndarray:

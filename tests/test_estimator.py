@@ -474,6 +474,20 @@ def test_conditions_far_from_zero_are_taken_in_the_precision_of_the_fit():
         fitted.condition(-1, np.nan)
 
 
+def test_times_too_coarse_for_float32_are_told():
+    rng = np.random.default_rng(0)
+    t = rng.normal(size=300)
+    x = np.stack([2 * t + 0.1 * rng.normal(size=300), t], 1)
+    fitted = _quiet(FoldedGaussianMixture(1, degree=1), x + np.array([0, 1e3]))  # a millionth of a tenth
+    fitted.to_mixture()  # warnings are errors
+    far = _quiet(FoldedGaussianMixture(1, degree=1), x + np.array([0, 1e6]))
+    with pytest.warns(UserWarning, match=r"float32 times.*Subtract an offset"):
+        far.to_mixture()
+    with jax.enable_x64(True):
+        assert far.to_mixture().components.loc.dtype == jnp.float64
+    far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
+
+
 def test_a_warm_start_from_other_sizes_is_cold():
     x = _blobs()
     fitted = _quiet(FoldedGaussianMixture(2, degree=1, warm_start=True, random_state=0), x)
