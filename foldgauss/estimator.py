@@ -447,8 +447,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         if worst > _COARSEST:
             warnings.warn(
                 f"In {np.dtype(dtype).name} times lie so far apart that a component moves or fades by {worst:.2g} of "
-                "its own spread from one to the next. Subtract an offset from the time column before the fit, or enable "
-                "float64: jax.config.update('jax_enable_x64', True).",
+                "its own spread from one to the next. Subtract an offset from the time column before the fit, or "
+                "enable float64: jax.config.update('jax_enable_x64', True).",
                 stacklevel=3,
             )
 
