@@ -96,13 +96,13 @@ def feature_tracks(seed: int = 0) -> Split:
 
 def curves(times: str) -> tuple[dict[str, Side], np.ndarray]:
     """On crossing curves; and the held-out points' groups."""
-    ours = {"n_components": [3, 4, 6, 8, 10, 12], "degree": [1, 2, 3]}
+    ours = {"n_components": [3, 4, 6, 8, 11], "degree": [1, 3]}
     return _compared(crossing(times), range(6, 31, 3), ours, max_components=12)
 
 
 def tracks(seed: int = 0) -> tuple[dict[str, Side], np.ndarray]:
     """On feature tracks, where points of one track hang together, so that BIC sees more points than there are."""
-    ours = {"n_components": [10, 20, 30, 40], "degree": [0, 1, 2, 3]}
+    ours = {"n_components": [20, 30, 40], "degree": [0, 1, 2, 3]}
     return _compared(feature_tracks(seed), [10, 15, 20, 25, 30, 35, 40, 50, 60], ours, max_components=30)
 
 
