@@ -1,11 +1,11 @@
-"""Data that bend over time, and two mixtures of the best BIC each: scikit-learn's and ours."""
+"""Data that bend over time, and two mixtures, scikit-learn's and ours, each chosen by the same rule."""
 
 import warnings
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from sklearn.mixture import GaussianMixture
+from sklearn.model_selection import GridSearchCV, GroupKFold
 
 from foldgauss import datasets
 from foldgauss.estimator import FoldedGaussianMixture
@@ -20,107 +20,117 @@ CURVES = np.array(
     ]
 )
 NOISE = 0.03
-#: Width of the frames that features are followed on; the frames of *bikes* (one shot), and that they are found in.
-WIDTH, FRAMES, HOME, FEATURES = 320, (85, 135), 110, 1000
-#: Numbers of components, and parts of the cross-validation.
-SIZES, PARTS = [3, 5, 10, 15, 20], 3
+#: The shot of *bikes* whose camera turns forth and back, so that tracks bend most; the frame that corners are found in,
+#: how many at most, their least quality and distance (pixels).
+FRAMES, HOME, CORNERS, QUALITY, DISTANCE = (30, 76), 53, 40_000, 3e-4, 2.0
+#: Tracks of at least so many frames are kept, and read once in so many frames.
+LONG, EVERY = 31, 4
+#: Parts of the cross-validation.
+PARTS = 3
 
 
 class Split(NamedTuple):
+    """Points (n, 3), and to which track each belongs: no track is torn apart, neither here nor in cross-validation."""
+
     train: np.ndarray
     test: np.ndarray
-    groups: np.ndarray  # of the points in train
+    groups: np.ndarray
+    test_groups: np.ndarray
 
 
 class Side(NamedTuple):
-    """A chosen mixture: its components, free parameters, and mean log-density of points held out."""
+    """A chosen mixture: its components, free parameters, and log-densities of points held out."""
 
     components: int
     parameters: int
-    held_out: float
+    log_densities: np.ndarray
+
+    @property
+    def held_out(self) -> float:
+        return float(self.log_densities.mean())
+
+    def over(self, other: "Side", groups: np.ndarray) -> tuple[float, float]:
+        """The difference of `held_out` to another's, and its standard error, a group being one draw."""
+        difference = self.log_densities - other.log_densities
+        sums = np.bincount(np.unique(groups, return_inverse=True)[1], difference - difference.mean())
+        return float(difference.mean()), float(np.sqrt((sums**2).sum()) / len(difference))
 
 
 def crossing(times: str, num: int = 3000, seed: int = 0) -> Split:
-    """Points on three crossing cubic curves, with noise, at normal or at uniform times."""
+    """Points on three crossing cubic curves, with noise, at normal or at uniform times: every point by itself."""
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 3, num)
     t = {"normal": rng.normal(0.5, 0.25, num), "uniform": rng.uniform(0, 1, num)}[times]
     s = np.einsum("ndj,nj->nd", CURVES[labels], t[:, None] ** np.arange(4)) + rng.normal(size=(num, 2)) * NOISE
-    x = np.concatenate([s, t[:, None]], 1)
-    return Split(x[: num // 2], x[num // 2 :], labels[: num // 2])
+    x, half = np.concatenate([s, t[:, None]], 1), num // 2
+    return Split(x[:half], x[half:], np.arange(half), np.arange(half, num))
 
 
 def feature_tracks(seed: int = 0) -> Split:
     """Corners of a frame of *bikes*, followed by optical flow; half of the tracks is held out. In frame widths, and in
-    spans of the frames followed."""
+    spans of the shot.
+
+    Tracks are read at random times, by straight lines between frames: frames' own times are few, and a component that
+    sits at one of them has a density as high as its floor allows.
+    """
     import cv2
 
-    clip = datasets.bikes(frames=FRAMES)
-    frames = np.asarray(clip.frames)
-    height = round(WIDTH * frames.shape[1] / frames.shape[2])
-    frames = np.stack([cv2.resize(f, (WIDTH, height), interpolation=cv2.INTER_AREA) for f in frames])
-    home = HOME - FRAMES[0]
-    reach = FRAMES[1] - HOME
+    frames = np.asarray(datasets.bikes(frames=FRAMES).frames)
+    home, width = HOME - FRAMES[0], frames.shape[2]
     grey = cv2.cvtColor(frames[home], cv2.COLOR_RGB2GRAY)
-    corners = cv2.goodFeaturesToTrack(grey, FEATURES, 0.01, 4).reshape(-1, 2) + np.float32(0.5)
+    corners = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, DISTANCE).reshape(-1, 2) + np.float32(0.5)
+    reach = min(home, len(frames) - 1 - home)
     tracks = Motion.of(frames).follow(np.full(len(corners), home), corners, longest=reach)
-    position = (corners[:, None] + tracks.shift) / WIDTH
-    t = np.broadcast_to(np.arange(-reach, reach + 1) / (2 * reach), tracks.known.shape)
-    points = np.concatenate([position, t[..., None]], -1).astype(np.float64)
-    train = np.random.default_rng(seed).permutation(len(corners)) < len(corners) // 2
-    chosen = lambda which: points[which][tracks.known[which]]  # noqa: E731
-    names = np.broadcast_to(np.arange(len(corners))[:, None], tracks.known.shape)
-    return Split(chosen(train), chosen(~train), names[train][tracks.known[train]])
+    rng = np.random.default_rng(seed)
+    points, groups = [], []
+    for k in np.flatnonzero(tracks.known.sum(1) >= LONG):
+        known = np.flatnonzero(tracks.known[k])
+        at = rng.uniform(known[0], known[-1], len(known) // EVERY)
+        where = (corners[k] + tracks.shift[k, known]) / width
+        points.append(np.stack([*(np.interp(at, known, where[:, j]) for j in (0, 1)), (at - reach) / (2 * reach)], -1))
+        groups.append(np.full(len(at), k))
+    points, groups = np.concatenate(points).astype(np.float64), np.concatenate(groups)
+    train = (rng.permutation(len(corners)) < len(corners) // 2)[groups]
+    return Split(points[train], points[~train], groups[train], groups[~train])
 
 
-def _scikit_learns(num: int) -> GaussianMixture:
-    return GaussianMixture(num, n_init=2, random_state=0, max_iter=200)
+def curves(times: str) -> tuple[dict[str, Side], np.ndarray]:
+    """On crossing curves; and the held-out points' groups."""
+    ours = {"n_components": [3, 4, 6, 8, 11], "degree": [1, 3]}
+    return _compared(crossing(times), range(6, 31, 3), ours, max_components=12)
 
 
-def _ours(num: int, degree: int | str, init_params: str) -> FoldedGaussianMixture:
-    options = {"n_init": 2, "random_state": 0, "max_iter": 200, "init_params": init_params}
-    return FoldedGaussianMixture(num, degree=degree, **options)
+def tracks(seed: int = 0) -> tuple[dict[str, Side], np.ndarray]:
+    """On feature tracks, where points of one track hang together, so that BIC sees more points than there are."""
+    ours = {"n_components": [20, 30, 40], "degree": [0, 1, 2, 3]}
+    return _compared(feature_tracks(seed), [10, 15, 20, 25, 30, 35, 40, 50, 60], ours, max_components=30)
 
 
-def curves(times: str) -> dict[str, Side]:
-    """On crossing curves: both by BIC."""
-    split = crossing(times)
-    return {
-        "scikit-learn, BIC": _by_bic(_scikit_learns, split, range(6, 31, 3)),
-        "foldgauss, BIC": _by_bic(lambda num: _ours(num, "auto", "trajectories"), split, range(2, 7)),
-    }
-
-
-def tracks() -> dict[str, Side]:
-    """On feature tracks, where points of one track hang together, so that BIC sees more points than there are: by BIC,
-    and by cross-validation that keeps tracks whole."""
-    split = feature_tracks()
-    return {
-        "scikit-learn, BIC": _by_bic(_scikit_learns, split, [20, 40, 80, 120]),
-        "scikit-learn, CV": _by_cv(lambda choice: _scikit_learns(*choice), split, [(num,) for num in SIZES]),
-        "foldgauss, CV": _by_cv(lambda choice: _ours(*choice, "kmeans"), split, list(product(SIZES, (1, 2, 3)))),
-    }
-
-
-def _by_bic(make, split: Split, sizes) -> Side:
+def _compared(split: Split, sizes, ours: dict, max_components: int) -> tuple[dict[str, Side], np.ndarray]:
+    options = {"n_init": 4, "random_state": 0, "max_iter": 200}
+    theirs = GaussianMixture(**options)
+    heated = {"annealing": 0.1} | options
+    auto = FoldedGaussianMixture(max_components=max_components, **heated)
+    grown = FoldedGaussianMixture(**heated)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        fitted = [make(num).fit(split.train) for num in sizes]
-    return _side(min(fitted, key=lambda model: model.bic(split.train)), split)
+        warnings.simplefilter("ignore")  # of runs that stop at max_iter
+        fitted = {
+            "scikit-learn, BIC": _by_bic([GaussianMixture(size, **options) for size in sizes], split),
+            "foldgauss, BIC (auto)": auto.fit(split.train),
+            "scikit-learn, CV": _by_cv(theirs, {"n_components": list(sizes)}, split),
+            "foldgauss, CV": _by_cv(grown, ours, split),
+        }
+        sides = {
+            who: Side(len(model.weights_), model._n_parameters(), model.score_samples(split.test))
+            for who, model in fitted.items()
+        }
+    return sides, split.test_groups
 
 
-def _by_cv(make, split: Split, choices) -> Side:
-    names = np.unique(split.groups)
-    part = np.random.default_rng(0).permutation(len(names)) % PARTS
-    held = part[np.searchsorted(names, split.groups)]
-    scores = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for choice in choices:
-            fits = [make(choice).fit(split.train[held != k]) for k in range(PARTS)]
-            scores.append(sum(fit.score_samples(split.train[held == k]).sum() for k, fit in enumerate(fits)))
-        return _side(make(choices[int(np.argmax(scores))]).fit(split.train), split)
+def _by_bic(models, split: Split):
+    return min((model.fit(split.train) for model in models), key=lambda model: model.bic(split.train))
 
 
-def _side(model, split: Split) -> Side:
-    return Side(len(model.weights_), model._n_parameters(), model.score(split.test))
+def _by_cv(model, grid: dict, split: Split):
+    parts = GroupKFold(PARTS, shuffle=True, random_state=0)
+    return GridSearchCV(model, grid, cv=parts).fit(split.train, groups=split.groups).best_estimator_

@@ -16,12 +16,33 @@ from jaxtyping import Array, Float
 from foldgauss._batch import expand, parts_of
 from foldgauss._triangular import UNROLLED_SIZE, solve_lower
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import QuickTimeLikelihood, TimeLikelihood, Unfloored
+from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.gaussian import Gaussian
 
 __all__ = ["chunked", "components_first", "pair_log_prob"]
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
+
+
+class _QuickTimeLikelihood(AbstractEnvelope):
+    """`TimeLikelihood` to an *absolute* error of rounding in log a, by fewer and plainer functions."""
+
+    power: Float[Array, "*#batch"]
+    floor: Float[Array, "*#batch"] | None  # None is 0
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (0,) if self.floor is None else (0, 0)
+
+    def log_a(self, t, *, time_loc, time_scale):
+        largest = float(jnp.finfo(t.dtype).max) * 1e-3  # inf - inf and 0 * inf are kept out
+        tau = (t - time_loc) / time_scale
+        decay = -jnp.minimum(0.5 * self.power * jnp.minimum(tau * tau, largest), largest)
+        if self.floor is None:
+            return decay
+        decay, log_floor = jnp.log1p(-self.floor) + decay, jnp.log(self.floor)
+        share = jnp.exp(-jnp.abs(decay - log_floor))  # of the smaller term in the greater, at most 1
+        return jnp.maximum(decay, log_floor) + jnp.log(1 + share)
 
 
 def components_first(components: FoldedGaussian | Gaussian, rank: int) -> FoldedGaussian | Gaussian:
@@ -48,10 +69,12 @@ def _pairs(structure, rows: Array, *leaves: Array) -> Array:
     if isinstance(dist, Gaussian) or not isinstance(dist.envelope, TimeLikelihood):
         return _values(dist, rows)
     power, floor = dist.envelope.power, dist.envelope.floor
-    having = lambda envelope: _values(eqx.tree_at(lambda dist: dist.envelope, dist, envelope), rows)  # noqa: E731
+
+    def having(floor):
+        return _values(eqx.tree_at(lambda dist: dist.envelope, dist, _QuickTimeLikelihood(power, floor)), rows)
+
     # Without a floor log a is no logarithm at all: half of the time.
-    unfloored, floored = (lambda: having(Unfloored(power))), (lambda: having(QuickTimeLikelihood(power, floor)))
-    return lax.cond((floor == 0).all(), unfloored, floored)
+    return lax.cond((floor == 0).all(), lambda: having(None), lambda: having(floor))
 
 
 def _values(dist: FoldedGaussian | Gaussian, rows: Array) -> Array:

@@ -112,46 +112,6 @@ class TimeLikelihood(AbstractEnvelope):
         return _log_floored(0.5 * power * tau * tau, floor)
 
 
-class Unfloored(AbstractEnvelope):
-    """`TimeLikelihood` with floor 0, for values only: log a = -power tau^2 / 2."""
-
-    power: Float[Array, "*#batch"]
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (0,)
-
-    @property
-    def is_closed(self) -> bool:
-        return True
-
-    def log_a(self, t, *, time_loc, time_scale):
-        largest = float(jnp.finfo(t.dtype).max) * 1e-3  # inf - inf and 0 * inf are kept out
-        tau = (t - time_loc) / time_scale
-        return -jnp.minimum(0.5 * self.power * jnp.minimum(tau * tau, largest), largest)
-
-
-class QuickTimeLikelihood(AbstractEnvelope):
-    """`TimeLikelihood` to an *absolute* error of rounding in log a, for values only, by fewer and plainer functions."""
-
-    power: Float[Array, "*#batch"]
-    floor: Float[Array, "*#batch"]
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (0, 0)
-
-    @property
-    def is_closed(self) -> bool:
-        return True
-
-    def log_a(self, t, *, time_loc, time_scale):
-        decay = jnp.log1p(-self.floor) + Unfloored(self.power).log_a(t, time_loc=time_loc, time_scale=time_scale)
-        log_floor = jnp.log(self.floor)
-        share = jnp.exp(-jnp.abs(decay - log_floor))  # of the smaller term in the greater, at most 1
-        return jnp.maximum(decay, log_floor) + jnp.log(1 + share)
-
-
 class CallableEnvelope(AbstractEnvelope):
     """Any function that gives log a, with or without parameters, as an envelope.
 

@@ -20,14 +20,14 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._checks import invalid, one_of, whole, within
-from foldgauss._components import Parameters, log_likelihoods, pairs_of
-from foldgauss._em import EMStatus, Run, best, expectation_maximisation, used_degrees
-from foldgauss._online import FORGETTING, batch_sums, online_step
-from foldgauss._prune import compressed, num_parameters, pruned
-from foldgauss._scaling import Scaling, scaling_of, to_mixture, variances_of
-from foldgauss._starts import STARTS, from_joint, start
-from foldgauss._statistics import Points, points_of, scores
-from foldgauss._updates import Model
+from foldgauss._em.components import Parameters, log_likelihoods, pairs_of
+from foldgauss._em.loop import EMStatus, Run, best, expectation_maximisation, used_degrees
+from foldgauss._em.online import FORGETTING, batch_sums, online_step
+from foldgauss._em.prune import compressed, num_parameters, pruned
+from foldgauss._em.scaling import Scaling, scaling_of, to_mixture, variances_of
+from foldgauss._em.starts import STARTS, from_joint, start
+from foldgauss._em.statistics import Points, points_of, scores
+from foldgauss._em.updates import Model
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.mixture import FoldedMixture
 
@@ -44,6 +44,8 @@ _CURES = {
 }
 #: Of the points, this many for each component that "auto" starts with.
 _POINTS_PER_COMPONENT = 8
+#: Steps between floating-point times up to this share of a component's spread are no loss.
+_COARSEST = 0.01
 
 
 class FoldedGaussianMixture(DensityMixin, BaseEstimator):
@@ -69,7 +71,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     * `reg_relative`: added too, this share of each column's own variance.
     * `init_params`: "kmeans", "k-means++", "random", "random_from_data", or "trajectories" (random curves grown along
       the points: for tracks that cross).
-    * `annealing`: the inverse temperature that EM starts with; 1 is none.
+    * `annealing`: the inverse temperature that EM starts with, raised to 1 in 50 steps; 1 is none. 0.1 finds tracks
+      that cross from nearly any start; round groups far apart are better off without.
     * `criterion`: "bic" or "aic", for "auto".
     * `devices`: how many of JAX's devices the points are spread over.
 
@@ -222,7 +225,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 envelope,
                 model,
                 total=total,
-                least_mass=0.0 if self.n_components == "auto" else 0.5 * total / len(weights),
+                least_mass=0.5 * total / len(weights),
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,
@@ -352,8 +355,9 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             total, batches = float(weights.sum(dtype=np.float64)), batches + 1
             share = (total / (seen + total)) ** FORGETTING
             params = self._arrays(scaled.dtype)
-            value = float(batch_sums(params, points).log_likelihood) / total
-            params, sums = online_step(params, sums, points, model, jnp.asarray(share, scaled.dtype))
+            new = batch_sums(params, points)
+            value = float(new.log_likelihood) / total
+            params, sums = online_step(params, sums, new, model, jnp.asarray(share, scaled.dtype))
         status = EMStatus.NOT_CONVERGED if np.isfinite(value) else EMStatus.NOT_FINITE
         if status == EMStatus.NOT_FINITE:
             raise invalid("X", expected="a batch within reach of the components", got="none", cure="Shuffle the data.")
@@ -394,7 +398,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def score(self, X, y=None) -> float:
         """The mean of `score_samples`."""
-        return float(self.score_samples(X).mean())
+        return float(self.score_samples(X).mean(dtype=np.float64))
 
     def predict(self, X) -> Int[np.ndarray, "n"]:
         """The likeliest component of each row."""
@@ -425,10 +429,28 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     # --- the mixture --------------------------------------------------------------------------------------------
 
     def to_mixture(self) -> FoldedMixture:
-        """The fitted `FoldedMixture`, **time last**; in float32 unless JAX has float64 enabled."""
+        """The fitted `FoldedMixture`, **time last**; in float32 unless JAX has float64 enabled.
+
+        Warns where its times, far from zero, then lie too far apart for how fast its components move.
+        """
         check_is_fitted(self)
-        params = Parameters(*(jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)) for z in self._params))
+        dtype = jax.dtypes.canonicalize_dtype(self._params.curve.dtype)
+        if dtype != self._params.curve.dtype:
+            self._warn_of_coarse_times(dtype)
+        params = Parameters(*(jnp.asarray(z, dtype) for z in self._params))
         return to_mixture(params, self._scaling, self._envelope)
+
+    def _warn_of_coarse_times(self, dtype) -> None:
+        step = np.spacing((np.abs(self.time_means_) + 3 * self.time_scales_).astype(dtype)).astype(np.float64)
+        speed = np.abs(self.fold_coefficients_[:, :1]).sum(1) / np.sqrt(_diagonals(self.space_covariances_))
+        worst = float((step * np.maximum(1 / self.time_scales_, speed.max(1))).max())
+        if worst > _COARSEST:
+            warnings.warn(
+                f"In {np.dtype(dtype).name} times lie so far apart that a component moves or fades by {worst:.2g} of "
+                "its own spread from one to the next. Subtract an offset from the time column before the fit, or "
+                "enable float64: jax.config.update('jax_enable_x64', True).",
+                stacklevel=3,
+            )
 
     def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, "n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
@@ -523,6 +545,10 @@ def _of_kind(params: Parameters, kind: str) -> Parameters:
     return params._replace(tril=jnp.asarray(np.linalg.cholesky(covariances), params.tril.dtype))
 
 
+def _diagonals(matrices: Float[np.ndarray, "k d d"]) -> Float[np.ndarray, "k d"]:
+    return np.diagonal(matrices, axis1=-2, axis2=-1)
+
+
 def _shaped(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     value = np.asarray(value, np.float64)
     if not np.isfinite(value).all():
@@ -562,6 +588,10 @@ def _check_parameters(self) -> None:
     for name in ("tol", "reg_covar", "reg_relative"):
         if not within(getattr(self, name), "[0, inf)"):
             raise invalid(name, expected="a number >= 0", got=repr(getattr(self, name)))
+    if not isinstance(self.warm_start, bool | np.bool_):
+        raise invalid("warm_start", expected="True or False", got=repr(self.warm_start))
+    if not isinstance(self.verbose, bool | np.bool_) and not whole(self.verbose, 0):
+        raise invalid("verbose", expected="a whole number >= 0", got=repr(self.verbose), cure="0 says nothing.")
     if not within(self.annealing, "(0, 1]"):
         raise invalid("annealing", expected="a number in (0, 1]", got=repr(self.annealing), cure="1 is none.")
     one_of("covariance_type", self.covariance_type, _COVARIANCES)

@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from foldgauss._checks import invalid, whole
-from foldgauss._em import EMStatus
+from foldgauss._em.loop import EMStatus
 from foldgauss.envelope import CallableEnvelope
 from foldgauss.mixture import FoldedMixture
 

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss import _components as components
-from foldgauss._em import EMStatus, best, expectation_maximisation, used_degrees
-from foldgauss._online import seen_from
-from foldgauss._scaling import Scaling, from_mixture, to_mixture
-from foldgauss._statistics import Times, accumulate, points_of, time_steps
-from foldgauss._updates import Model, newton_step, profile, updated
+from foldgauss._em import components
+from foldgauss._em.loop import EMStatus, best, expectation_maximisation, used_degrees
+from foldgauss._em.online import seen_from
+from foldgauss._em.scaling import Scaling, from_mixture, to_mixture
+from foldgauss._em.statistics import Times, accumulate, points_of, time_steps
+from foldgauss._em.updates import Model, newton_step, profile, updated
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 
 K, N, DEGREE = 3, 200, 2
@@ -233,7 +233,7 @@ def test_singular_component_is_told():
     )
     apart = apart._replace(curve=apart.curve.at[:, 0].set(jnp.asarray(x[::20, :2])))
     run = _run(points, apart, Constant(), _model(dtype=np.float32), total=len(x), tol=1e-3, max_steps=30)
-    assert run.status in (EMStatus.SINGULAR, EMStatus.NOT_CONVERGED)
+    assert run.status == EMStatus.SINGULAR
     assert all(np.isfinite(z).all() for z in run.params)
     floored = _run(points, apart, Constant(), _model(dtype=np.float32, floor=1e-4), total=len(x), max_steps=30)
     assert floored.status == EMStatus.CONVERGED

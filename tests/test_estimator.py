@@ -14,6 +14,7 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.mixture import GaussianMixture
 from sklearn.utils import estimator_checks
 
+from foldgauss._em.loop import ANNEALING_STEPS
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture
 
@@ -142,6 +143,7 @@ def test_weights_count_repetitions():
     assert not np.allclose(weighted.means_, unweighted.means_, rtol=1e-3)  # power
 
 
+@pytest.mark.slow
 def test_batches_lead_where_all_points_do():
     x = _blobs(n=6000)[np.random.default_rng(1).permutation(6000)]
     options = {"degree": 1, "random_state": 0, "n_init": 5, "tol": 1e-5, "max_iter": 300}
@@ -171,6 +173,39 @@ def test_crossing_tracks_are_found():
     assert (nearest.min(0) < 0.03).all()  # 0.03 is the noise of one point
     assert sorted(nearest.argmin(1)) == [0, 1, 2]
     np.testing.assert_allclose(np.sqrt(fitted.space_covariances_.ravel()), 0.03, rtol=0.3)
+
+
+@pytest.mark.parametrize("start", ["kmeans", pytest.param("random_from_data", marks=pytest.mark.slow)])
+def test_annealing_finds_what_hard_starts_miss(start):
+    """Groups of neighbours, where tracks cross: from heat on, every start ends at the same best."""
+    x, labels = _tracks()
+    plain, heated = (
+        [
+            _quiet(FoldedGaussianMixture(K, degree=3, annealing=heat, init_params=start, random_state=seed), x)
+            for seed in range(6)
+        ]
+        for heat in (1.0, 0.1)
+    )
+    bounds = np.array([fitted.lower_bound_ for fitted in heated])
+    np.testing.assert_allclose(bounds, bounds.max(), atol=2e-3)
+    assert sum(fitted.lower_bound_ < bounds.min() - 0.1 for fitted in plain) >= 2
+    assert all(fitted.lower_bound_ < bounds.min() + 2e-3 for fitted in plain)
+    truth = max(_same_partition(fitted.predict(x), labels) for fitted in plain)
+    assert min(_same_partition(fitted.predict(x), labels) for fitted in heated) > truth - 0.02
+
+
+def test_heat_alone_is_not_kept():
+    """The end is one of the data's own likelihood: a step of plain EM from there hardly moves."""
+    x, _ = _tracks()
+    options = {"degree": 3, "random_state": 0, "annealing": 0.1}
+    fitted = _quiet(FoldedGaussianMixture(K, **options), x)
+    assert fitted.n_iter_ > ANNEALING_STEPS
+    assert fitted.lower_bounds_[-1] > fitted.lower_bounds_[0] + 0.1
+    bound = fitted.lower_bound_
+    again = _quiet(fitted.set_params(warm_start=True, annealing=1.0), x)
+    assert abs(again.lower_bound_ - bound) < 1e-2
+    cut = _quiet(FoldedGaussianMixture(K, max_iter=10, **options), x)
+    assert cut.status_ == EMStatus.NOT_CONVERGED
 
 
 @pytest.mark.slow
@@ -231,11 +266,14 @@ def test_hard_data_end_in_numbers():
     constant = np.concatenate([x[:, :1], np.full((N, 1), 7.0), x[:, 2:]], 1)
     still = np.concatenate([x[:, :2], np.full((N, 1), 7.0)], 1)
     duplicates = np.repeat(x[:2], N // 2, axis=0)  # two places, three components
+    ends = [({}, EMStatus.CONVERGED), ({"reg_covar": 0, "reg_relative": 0}, EMStatus.SINGULAR)]
     for data in (constant, still, duplicates):
-        fitted = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, max_iter=20), data)
-        assert np.isfinite(fitted.score_samples(data)).all()
-        assert np.isfinite(fitted.covariances_).all()
-        assert fitted.status_ in EMStatus
+        for floors, status in ends:
+            fitted = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, **floors), data)
+            assert fitted.status_ == status
+            assert fitted.converged_ == (status == EMStatus.CONVERGED)
+            assert np.isfinite(fitted.score_samples(data)).all()
+            assert np.isfinite(fitted.covariances_).all()
 
 
 @pytest.mark.parametrize(
@@ -253,6 +291,8 @@ def test_hard_data_end_in_numbers():
         ("time_column", np.zeros((5, 3)), {"time_column": 3}),
         ("annealing", np.zeros((5, 3)), {"annealing": 0.0}),
         ("devices", np.zeros((5, 3)), {"devices": 1000}),
+        ("warm_start", np.zeros((5, 3)), {"warm_start": "yes"}),
+        ("verbose", np.zeros((5, 3)), {"verbose": -1}),
         ("means_init", np.zeros((5, 3)), {"n_components": 1, "means_init": np.zeros((2, 3))}),
     ],
 )
@@ -338,6 +378,82 @@ def test_a_row_without_weight_may_hold_any_number():
     assert weighed.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
 
 
+def test_unequal_batches_lead_where_all_points_do():
+    x = _blobs(n=4000)
+    groups = [x[k::K] for k in range(K)]
+    start = {
+        "means_init": np.stack([group.mean(0) for group in groups]),
+        "precisions_init": np.stack([np.linalg.inv(np.cov(group.T)) for group in groups]),
+    }
+    x = x[np.random.default_rng(1).permutation(4000)]
+    options = {"degree": 1, "tol": 1e-5, "max_iter": 300} | start
+    whole, online = FoldedGaussianMixture(K, **options).fit(x), FoldedGaussianMixture(K, **options)
+    ends = np.cumsum([500, 250, 17, 400, 60, 512, 1, 300, 450, 200, 512, 500, 298])
+    batches = np.split(x, ends)[:-1]
+    assert ends[-1] == len(x)
+    first = online.partial_fit(batches[0]).score(x)
+    for batch in batches[1:]:
+        online.partial_fit(batch)
+    best = whole.score(x)
+    assert online.n_iter_ == len(batches)
+    assert best - first > 0.005  # there is something to learn
+    assert best - online.score(x) < 0.3 * (best - first)
+
+
+def test_a_warm_start_goes_on():
+    x = _blobs()
+    options = {"degree": 1, "random_state": 0, "tol": 1e-4}
+    whole = _quiet(FoldedGaussianMixture(K, max_iter=200, **options), x)
+    parts = FoldedGaussianMixture(K, max_iter=5, warm_start=True, **options)
+    bounds = []
+    while not bounds or not parts.converged_:
+        bounds += _quiet(parts, x).lower_bounds_
+    assert bounds == pytest.approx(whole.lower_bounds_, rel=1e-9)
+    assert len(bounds) > 5  # it did need to go on
+    cold = _quiet(FoldedGaussianMixture(K, max_iter=5, **options), x)
+    assert _quiet(cold, x).lower_bounds_ == pytest.approx(whole.lower_bounds_[:5], rel=1e-9)
+
+
+def test_verbose_says_each_iteration(capsys):
+    _quiet(FoldedGaussianMixture(K, degree=1, max_iter=3, tol=0, random_state=0), _blobs())
+    assert capsys.readouterr().out == ""
+    fitted = _quiet(FoldedGaussianMixture(K, degree=1, max_iter=3, tol=0, random_state=0, verbose=1), _blobs())
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["iteration 1", "iteration 2", "iteration 3"]
+    told = [float(line.partition("[")[2].partition("]")[0]) for line in lines]
+    np.testing.assert_allclose(np.diff(told), np.diff(fitted.lower_bounds_), atol=1e-5)
+
+
+def test_sums_of_many_points_are_taken_in_float64():
+    x = _blobs(n=4000).astype(np.float32)
+    fitted = _quiet(FoldedGaussianMixture(K, degree=1, max_iter=2, random_state=0), x)
+    each = fitted.score_samples(x)
+    assert each.dtype == np.float32
+    assert fitted.score(x) == each.astype(np.float64).mean()
+    penalty = fitted._n_parameters()
+    assert fitted.bic(x) == pytest.approx(-2 * each.astype(np.float64).sum() + penalty * np.log(4000), rel=1e-14)
+    assert fitted.aic(x) == pytest.approx(-2 * each.astype(np.float64).sum() + 2 * penalty, rel=1e-14)
+
+
+@pytest.mark.parametrize("degree", [4, *(pytest.param(degree, marks=pytest.mark.slow) for degree in (6, 10))])
+def test_float32_fits_high_degrees(degree):
+    """Uniform times, for which Hermite polynomials are not orthogonal: as good as float64."""
+    rng = np.random.default_rng(0)
+    t = rng.uniform(0, 1, 1000)
+    x = np.stack([np.sin(9 * t) + 0.01 * rng.normal(size=1000), t], 1)
+    single, double = (
+        _quiet(FoldedGaussianMixture(1, degree=degree, tol=1e-6), x.astype(dtype)) for dtype in (np.float32, np.float64)
+    )
+    assert single.fold_coefficients_.dtype == np.float32
+    assert single.score(x) == pytest.approx(double.score(x), abs=1e-3)
+    at = np.linspace(0.05, 0.95, 7)
+    curves = [
+        f.locs_[0, 0] + sum(c * (f.time_means_[0] - at) ** (j + 1) for j, c in enumerate(f.fold_coefficients_[0, :, 0]))
+        for f in (single, double)
+    ]
+    np.testing.assert_allclose(*curves, atol=2e-3)
+
+
 def test_a_small_batch_counts_for_little():
     x = _blobs()
     online = FoldedGaussianMixture(1, degree=1).partial_fit(x)
@@ -356,6 +472,20 @@ def test_conditions_far_from_zero_are_taken_in_the_precision_of_the_fit():
     assert near[0] < near[1] < near[2]
     with pytest.raises(ValueError, match="values: expected finite"):
         fitted.condition(-1, np.nan)
+
+
+def test_times_too_coarse_for_float32_are_told():
+    rng = np.random.default_rng(0)
+    t = rng.normal(size=300)
+    x = np.stack([2 * t + 0.1 * rng.normal(size=300), t], 1)
+    fitted = _quiet(FoldedGaussianMixture(1, degree=1), x + np.array([0, 1e3]))  # a millionth of a tenth
+    fitted.to_mixture()  # warnings are errors
+    far = _quiet(FoldedGaussianMixture(1, degree=1), x + np.array([0, 1e6]))
+    with pytest.warns(UserWarning, match=r"float32 times.*Subtract an offset"):
+        far.to_mixture()
+    with jax.enable_x64(True):
+        assert far.to_mixture().components.loc.dtype == jnp.float64
+    far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
 
 
 def test_a_warm_start_from_other_sizes_is_cold():

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("sklearn")
 from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikelihood
-from foldgauss._em import EMStatus
+from foldgauss._em.loop import EMStatus
 from foldgauss.estimator import FoldedGaussianMixture
 from foldgauss.gradient_fit import fit_gradient
 from foldgauss.mixture import FoldedMixture

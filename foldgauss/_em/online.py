@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._cholesky import inverse_lower
-from foldgauss._components import Parameters, moved, to_powers
+from foldgauss._em.cholesky import inverse_lower
+from foldgauss._em.components import Parameters, moved, to_powers
+from foldgauss._em.statistics import Points, Statistics, accumulate
+from foldgauss._em.updates import Model, updated
 from foldgauss._regression import hermite_to_powers
-from foldgauss._statistics import Points, Statistics, accumulate
-from foldgauss._updates import Model, updated
 from foldgauss.envelope import Constant
 
 __all__ = ["FORGETTING", "batch_sums", "online_step", "seen_from"]
@@ -31,10 +31,12 @@ def batch_sums(params: Parameters, points: Points) -> Statistics:
 
 @eqx.filter_jit
 def online_step(
-    params: Parameters, sums: Statistics, points: Points, model: Model, share: Float[Array, ""]
+    params: Parameters, sums: Statistics, new: Statistics, model: Model, share: Float[Array, ""]
 ) -> tuple[Parameters, Statistics]:
-    """A batch weighed in with `share` (both sums are taken per unit of weight), and the components' update."""
-    new = accumulate(params, Constant(), points)
+    """A batch's sums weighed in with `share` (both are taken per unit of weight), and the components' update.
+
+    Apart from `batch_sums`, so that this is compiled once, whatever the batches' sizes.
+    """
     unit = lambda sums: jax.tree.map(lambda z: z / sums.mass.sum(), sums)  # noqa: E731
     sums = jax.tree.map(lambda old, new: (1 - share) * old + share * new, unit(sums), unit(new))
     after, _ = updated(params, sums, model)

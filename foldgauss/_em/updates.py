@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._cholesky import cholesky, inverse_lower, log_det
-from foldgauss._components import Parameters, moved, to_powers
+from foldgauss._em.cholesky import cholesky, inverse_lower, log_det
+from foldgauss._em.components import Parameters, moved, to_powers
+from foldgauss._em.statistics import Statistics, Times, time_steps
 from foldgauss._regression import hermite_to_powers
-from foldgauss._statistics import Statistics, Times, time_steps
 
 __all__ = ["Model", "newton_step", "profile", "residual_scatter", "updated"]
 

@@ -12,12 +12,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._cholesky import cholesky, inverse_lower, log_det
-from foldgauss._components import Parameters, log_likelihoods, pairs_of, to_powers
-from foldgauss._em import best, expectation_maximisation, log_likelihood
+from foldgauss._em.cholesky import cholesky, inverse_lower, log_det
+from foldgauss._em.components import Parameters, log_likelihoods, pairs_of, to_powers
+from foldgauss._em.loop import best, expectation_maximisation, log_likelihood
+from foldgauss._em.statistics import Points, accumulate
+from foldgauss._em.updates import Model, residual_scatter
 from foldgauss._regression import hermite_to_powers
-from foldgauss._statistics import Points, accumulate
-from foldgauss._updates import Model, residual_scatter
 from foldgauss.envelope import AbstractEnvelope
 
 __all__ = ["compressed", "num_parameters", "pruned"]
@@ -71,9 +71,10 @@ def pruned(
     found, moves = scored(params, model), True
     while moves:
         moves = False
-        while components and (less := _fewer(found, points, envelope, fitted)) is not None:
-            found, moves = less, True
+        # Powers first: a component is worth more beside others than its share of powers that nobody needs.
         while powers and (less := _lower(found, points, envelope, fitted, penalty)) is not None:
+            found, moves = less, True
+        while components and (less := _fewer(found, points, envelope, fitted)) is not None:
             found, moves = less, True
     return found.params, found.model
 

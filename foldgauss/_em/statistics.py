@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._batch import cast
-from foldgauss._components import Pairs, Parameters, log_likelihoods, pairs_of
+from foldgauss._em.components import Pairs, Parameters, log_likelihoods, pairs_of
 from foldgauss._regression import hermite_columns
 from foldgauss.envelope import AbstractEnvelope, Constant
 
@@ -28,6 +28,8 @@ __all__ = ["PAIRS_PER_CHUNK", "Points", "Statistics", "Times", "accumulate", "po
 
 #: Pairs of point and component held at once. Arrays of this many numbers stay in a core's cache.
 PAIRS_PER_CHUNK = 2**17
+#: The least number of rows that a program is compiled for: small batches of any size share one.
+_LEAST_ROWS = 256
 
 
 class Points(eqx.Module):
@@ -65,7 +67,7 @@ def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: 
     n, d = x.shape
     most = max(2 ** int(math.log2(max(PAIRS_PER_CHUNK // num_components, 16))), 16)
     per_device = -(-n // devices)
-    rows = min(most, max(2 ** math.ceil(math.log2(max(per_device, 1))), 16))
+    rows = min(most, max(2 ** math.ceil(math.log2(max(per_device, 1))), _LEAST_ROWS))
     chunks = -(-per_device // rows)
     missing = devices * chunks * rows - n
     x = np.concatenate([x, np.zeros((missing, d), x.dtype)]) if missing else x
@@ -100,11 +102,13 @@ def accumulate(
     def of_chunk(chunk):
         x, weights, given = chunk
         pairs = pairs_of(params, envelope, x)
-        log_likelihood = log_likelihoods(pairs.log_density)
-        if given is None:
-            given = _responsibilities(pairs.log_density, log_likelihood, inverse_temperature)
+        log_likelihood, shares = _shared(pairs.log_density, weights)
+        if given is not None:
+            shares = weights[:, None] * given
+        elif inverse_temperature is not None:
+            shares = _shared(inverse_temperature * pairs.log_density, weights)[1]
         total = jnp.where(weights > 0, weights * log_likelihood, 0).sum()
-        return _summed(params, envelope, x[:, -1:], pairs, weights[:, None] * given, total, times, order)
+        return _summed(params, envelope, x[:, -1:], pairs, shares, total, times, order)
 
     def of_device(chunks):
         if chunks[0].shape[0] == 1:
@@ -133,13 +137,15 @@ def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Fl
     return value.reshape(-1)
 
 
-def _responsibilities(log_density, log_likelihood, inverse_temperature):
-    if inverse_temperature is not None:
-        log_density = inverse_temperature * log_density
-        log_likelihood = log_likelihoods(log_density)
+def _shared(log_density: Float[Array, "n k"], weights: Float[Array, "n"]):
+    """log sum_k of every point, and its weight shared out by responsibilities: one exponential a pair for both."""
+    largest = log_density.max(-1)
     # A point that no component reaches belongs to none; its log-likelihood of -inf tells the tale.
-    reached = jnp.isfinite(log_likelihood)[:, None]
-    return jnp.where(reached, jnp.exp(log_density - jnp.where(reached, log_likelihood[:, None], 0)), 0)
+    largest = jnp.where(jnp.isneginf(largest), 0, largest)
+    density = jnp.exp(log_density - largest[:, None])
+    total = density.sum(-1)
+    share = jnp.where(total == 0, 0, weights / jnp.where(total == 0, 1, total))
+    return jnp.log(total) + largest, density * share[:, None]
 
 
 def _summed(params, envelope, t, pairs: Pairs, mass, total, times, order) -> Statistics:
@@ -154,8 +160,11 @@ def _summed(params, envelope, t, pairs: Pairs, mass, total, times, order) -> Sta
         log_a = [(mass * z).sum(0) for z in log_as]
         weights = _over_a(mass, log_as)
     gram = jnp.stack([_gram(w, basis, pairs.whitened) for w in weights])
-    first = mass * v
-    return Statistics(total, mass.sum(0), first.sum(0), (first * v).sum(0), jnp.stack(log_a), gram)
+    if isinstance(envelope, Constant) and degree:  # He_0 = 1 and He_1 = v: the gram has these sums already
+        mass, first, second = gram[0, :, 0, 0], gram[0, :, 0, 1], gram[0, :, 1, 1]
+    else:
+        mass, first, second = mass.sum(0), (mass * v).sum(0), (mass * v * v).sum(0)
+    return Statistics(total, mass, first, second, jnp.stack(log_a), gram)
 
 
 def _gram(weights, basis, whitened):

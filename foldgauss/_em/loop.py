@@ -1,4 +1,4 @@
-"""Expectation maximisation: the loop. What a step does stands in `_statistics` and `_updates`.
+"""Expectation maximisation: the loop. What a step does stands in `statistics` and `updates`.
 
 **Source:** Dempster, Laird and Rubin 1977; generalised EM where the envelope hangs on time.
 """
@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._components import Parameters
-from foldgauss._statistics import Points, Times, accumulate, time_steps
-from foldgauss._updates import Model, newton_step, profile, updated
+from foldgauss._em.components import Parameters
+from foldgauss._em.statistics import Points, Times, accumulate, time_steps
+from foldgauss._em.updates import Model, newton_step, profile, updated
 from foldgauss.envelope import AbstractEnvelope, Constant
 
 __all__ = ["EMStatus", "Run", "State", "best", "expectation_maximisation", "log_likelihood", "step", "used_degrees"]
@@ -22,7 +22,9 @@ __all__ = ["EMStatus", "Run", "State", "best", "expectation_maximisation", "log_
 #: Of what a step of time promises, the share that it must bring.
 _ARMIJO = 1e-4
 #: Steps from the first inverse temperature to 1.
-ANNEALING_STEPS = 20
+ANNEALING_STEPS = 50
+#: On the way, centres are moved by this share of their own spread: components that heat has made one can part again.
+_JITTER = 0.05
 
 
 class EMStatus(IntEnum):
@@ -140,6 +142,8 @@ def expectation_maximisation(
             histories[r].append(float(values[r]))
         num_steps[going] = number
         statuses[broken] = EMStatus.NOT_FINITE
+        if not cold:
+            new = _jittered(new, number)
         if broken.any():  # back to the last parameters whose likelihood was a number
             new = _chosen(broken, before, new)
         dead = going[:, None] & ~broken[:, None] & (np.asarray(info.mass) < least_mass)
@@ -182,6 +186,21 @@ def _chosen(flags: np.ndarray, these: State, others: State) -> State:
     """These where the restart's flag is true."""
     choose = lambda a, b: jnp.where(jnp.asarray(flags).reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
     return jax.tree.map(choose, these, others)
+
+
+def _jittered(states: State, number: int) -> State:
+    """Components that lie on each other stay there: EM moves them as one.
+
+    **Source:** Rose 1998, Deterministic annealing for clustering, compression, classification, regression.
+    """
+    params = states.params
+    noise = jnp.asarray(
+        _JITTER * np.random.default_rng(number).normal(size=params.curve[:, :, 0].shape), params.curve.dtype
+    )
+    return State(
+        params._replace(curve=params.curve.at[:, :, 0].add(jnp.einsum("rkab,rkb->rka", params.tril, noise))),
+        states.share,
+    )
 
 
 def _reset(states: State, restart: int, dead: np.ndarray, mass: np.ndarray) -> State:

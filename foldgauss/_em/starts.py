@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from foldgauss._components import Parameters
-from foldgauss._statistics import Points, accumulate, points_of
-from foldgauss._updates import Model, updated
+from foldgauss._em.components import Parameters
+from foldgauss._em.statistics import Points, accumulate, points_of
+from foldgauss._em.updates import Model, updated
 from foldgauss.envelope import Constant
 
 __all__ = ["STARTS", "from_joint", "from_responsibilities", "start"]
@@ -131,7 +131,9 @@ def _trajectories(y, weights, num, degree, rng):
     near = np.exp(-0.5 * square / np.median(widths) ** 2) * mass[:, None]
     chosen, left = [], np.ones(len(part))
     for _ in range(num):
-        best = int(np.argmax(left @ near))
+        gain = left @ near
+        gain[chosen] = -1  # a curve taken twice would leave a component without points
+        best = int(np.argmax(gain))
         chosen.append(best)
         left = left * (1 - near[:, best] / mass)
     return _one_hot(_curve_distances(y, curves[chosen]).argmin(1), num)

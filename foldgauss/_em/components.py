@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._batch import cast
-from foldgauss._cholesky import inverse_lower, log_det
+from foldgauss._em.cholesky import inverse_lower, log_det
 from foldgauss._regression import hermite_to_powers
 from foldgauss._triangular import UNROLLED_SIZE
 from foldgauss.envelope import AbstractEnvelope, Constant

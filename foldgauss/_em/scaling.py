@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._components import Parameters
+from foldgauss._em.components import Parameters
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold
