@@ -14,6 +14,7 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.mixture import GaussianMixture
 from sklearn.utils import estimator_checks
 
+from foldgauss import estimator
 from foldgauss._em.loop import ANNEALING_STEPS
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture
@@ -349,6 +350,21 @@ def test_starts_are_of_the_kind_that_is_fitted(kind):
     if kind == "tied":
         np.testing.assert_allclose(given, np.broadcast_to(given[:1], given.shape), rtol=1e-9)
     np.testing.assert_allclose(given, given * np.eye(given.shape[-1]), atol=1e-12)
+
+
+def test_auto_begins_with_every_component_at_work(monkeypatch):
+    """More curves than tracks: none is taken twice, none is left without points."""
+    begun = []
+
+    def nothing_goes(params, points, envelope, model, **_):
+        begun.append(params)
+        return params, model
+
+    monkeypatch.setattr(estimator, "pruned", nothing_goes)
+    x, _ = _tracks()
+    _quiet(FoldedGaussianMixture(degree=1, max_components=12, init_params="trajectories", random_state=0), x)
+    assert begun[0].log_weights.shape == (12,)
+    assert (np.exp(begun[0].log_weights) > 0.4 / N).all()
 
 
 def test_weights_that_are_shares_prune_as_well():
