@@ -44,6 +44,9 @@ _CURES = {
 }
 #: Of the points, this many for each component that "auto" starts with.
 _POINTS_PER_COMPONENT = 8
+#: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
+#: than float32 has: up to 1 nat a point at degree 10 (docs/estimator.md).
+_SINGLE_DEGREE = 6
 #: Steps between floating-point times up to this share of a component's spread are no loss.
 _COARSEST = 0.01
 
@@ -76,7 +79,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     * `criterion`: "bic" or "aic", for "auto".
     * `devices`: how many of JAX's devices the points are spread over.
 
-    **dtype:** float32 data are fitted in float32, all others in float64, whatever JAX is set to.
+    **dtype:** float32 data are fitted in float32, those with degrees above 6 and all others in float64, whatever JAX is
+    set to.
 
     **Fitted:** `weights_` (K,), `means_` (K, d) and `covariances_` (K, d, d) of whole components, columns as
     in X, `locs_` (K, d-1), `space_covariances_` (K, d-1, d-1), `time_means_`, `time_scales_` (K,), `fold_coefficients_`
@@ -160,6 +164,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     def _fit(self, X, sample_weight):
         _check_parameters(self)
         x, weights = self._checked(X, sample_weight)
+        if (self.max_degree if self.degree == "auto" else self.degree) > _SINGLE_DEGREE:
+            x, weights = x.astype(np.float64), weights.astype(np.float64)
         present = weights > 0  # rows without weight may hold anything
         with _precision(x.dtype):
             run, model = self._runs(x[present], weights[present])
@@ -369,7 +375,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     def _first_batch(self, X, sample_weight):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
-            scaled = self.fit(X, sample_weight=sample_weight)._scaled(X)
+            scaled = self.fit(X, sample_weight=sample_weight)._scaled(X).astype(self._params.curve.dtype)
         if self.status_ in (EMStatus.NOT_FINITE, EMStatus.SINGULAR):
             warnings.warn(
                 f"The first batch ended as {self.status_.name}. {_CURES[self.status_]}",

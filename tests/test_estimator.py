@@ -14,6 +14,7 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.mixture import GaussianMixture
 from sklearn.utils import estimator_checks
 
+from foldgauss import estimator
 from foldgauss._em.loop import ANNEALING_STEPS
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture
@@ -351,6 +352,21 @@ def test_starts_are_of_the_kind_that_is_fitted(kind):
     np.testing.assert_allclose(given, given * np.eye(given.shape[-1]), atol=1e-12)
 
 
+def test_auto_begins_with_every_component_at_work(monkeypatch):
+    """More curves than tracks: none is taken twice, none is left without points."""
+    begun = []
+
+    def nothing_goes(params, points, envelope, model, **_):
+        begun.append(params)
+        return params, model
+
+    monkeypatch.setattr(estimator, "pruned", nothing_goes)
+    x, _ = _tracks()
+    _quiet(FoldedGaussianMixture(degree=1, max_components=12, init_params="trajectories", random_state=0), x)
+    assert begun[0].log_weights.shape == (12,)
+    assert (np.exp(begun[0].log_weights) > 0.4 / N).all()
+
+
 def test_weights_that_are_shares_prune_as_well():
     rng = np.random.default_rng(0)
     t = rng.normal(size=300)
@@ -437,21 +453,23 @@ def test_sums_of_many_points_are_taken_in_float64():
 
 @pytest.mark.parametrize("degree", [4, *(pytest.param(degree, marks=pytest.mark.slow) for degree in (6, 10))])
 def test_float32_fits_high_degrees(degree):
-    """Uniform times, for which Hermite polynomials are not orthogonal: as good as float64."""
+    """Times in two heaps, for which Hermite polynomials are nearly dependent: as good as float64."""
     rng = np.random.default_rng(0)
-    t = rng.uniform(0, 1, 1000)
+    t = rng.normal(np.repeat([0.0, 1.0], 500), 0.1)
     x = np.stack([np.sin(9 * t) + 0.01 * rng.normal(size=1000), t], 1)
     single, double = (
         _quiet(FoldedGaussianMixture(1, degree=degree, tol=1e-6), x.astype(dtype)) for dtype in (np.float32, np.float64)
     )
-    assert single.fold_coefficients_.dtype == np.float32
-    assert single.score(x) == pytest.approx(double.score(x), abs=1e-3)
-    at = np.linspace(0.05, 0.95, 7)
+    assert single.fold_coefficients_.dtype == (np.float32 if degree <= 6 else np.float64)
+    assert single.score(x.astype(np.float32)) == pytest.approx(double.score(x), abs=1e-3)
+    at = np.quantile(t, np.linspace(0.05, 0.95, 7))
     curves = [
         f.locs_[0, 0] + sum(c * (f.time_means_[0] - at) ** (j + 1) for j, c in enumerate(f.fold_coefficients_[0, :, 0]))
         for f in (single, double)
     ]
     np.testing.assert_allclose(*curves, atol=2e-3)
+    online = FoldedGaussianMixture(1, degree=degree).partial_fit(x.astype(np.float32)).partial_fit(x.astype(np.float32))
+    assert online.score(x) == pytest.approx(double.score(x), abs=0.01)
 
 
 def test_a_small_batch_counts_for_little():
