@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
+from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.video import EditedVideo, VideoModel, edit
 from tests.video.soft_models import NUM, SIZE, soft_model
 
@@ -155,7 +155,7 @@ def test_what_export_and_import_refuse(work, tmp_path, capsys):
     assert "--out" in refused("export", model, "--format", "ply", "--out", tmp_path / "folder")
     assert "--out" in refused("export", model, "--format", "obj", "--out", video)
     assert "--times" in refused("export", model, "--format", "ply", "--out", video, "--times", "0.5")
-    assert "--times" in refused("export", model, "--format", "ply3dgs", "--out", video)
+    assert "times: expected one" in refused("export", model, "--format", "ply3dgs", "--out", video)
     assert not video.exists()
     video.write_bytes(b"precious")
     assert "--overwrite" in refused("export", model, "--format", "ply", "--out", video)
@@ -170,11 +170,13 @@ def test_what_export_and_import_refuse(work, tmp_path, capsys):
     assert "exists" in refused("import", video, "--out", tmp_path / "m.safetensors")
 
 
-def test_a_mask_of_a_video(work, tmp_path):
+def test_a_folder_of_masks(work, tmp_path):
     """As a user has it: a mask drawn in some other program."""
-    masks = np.zeros((FRAMES, *SIZE, 3), np.uint8)
-    masks[:, 10:30, 12:32] = 255
-    write_video(tmp_path / "masks", masks, 25.0)
+    mask = np.zeros(SIZE, np.uint8)
+    mask[10:30, 12:32] = 255
+    (tmp_path / "masks").mkdir()
+    for k in range(FRAMES):
+        assert cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), mask)
     script = tmp_path / "edits.toml"
     script.write_text('[selections.it]\nmask = "masks"\n[[edits]]\ndo = "vanish"\nselect = "it"')
     assert run("edit", work / "model.safetensors", script, "--out", tmp_path / "out.safetensors") == 0

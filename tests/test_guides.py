@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from foldgauss.io import write_image
 from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.video import EditedVideo
 
@@ -81,7 +81,7 @@ def test_editing(tmp_path, monkeypatch):
         assert np.abs(picture - names["model"].render(0.4)).max() > 0.02
     # The script, as it stands there.
     (tmp_path / "masks").mkdir()
-    write_image(tmp_path / "masks" / "ball.png", np.repeat(255 * names["masks"][0][..., None].astype(np.uint8), 3, -1))
+    Image.fromarray(255 * names["masks"][0].astype(np.uint8)).save(tmp_path / "masks" / "ball.png")
     script = re.search(r"```toml\n(.*?)```", (DOCS / "editing.md").read_text(), re.S)[1]
     edited = parse_edit_script(script, folder=tmp_path).apply(names["model"])
     assert edited.num_gaussians > names["model"].num_gaussians
