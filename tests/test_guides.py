@@ -5,6 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+
+from foldgauss.io.edit_script import parse_edit_script
+from foldgauss.video import EditedVideo
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -62,6 +66,26 @@ def test_rendering():
     for other in ("added", "sharp", "soft", "aside", "from_above"):
         assert np.isfinite(names[other]).all()
         assert np.abs(names[other] - image).max() > 0.05
+
+
+@pytest.mark.slow
+def test_editing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = _run("editing.md")
+    assert len(names["ball"]) > 5
+    assert names["gone"].num_gaussians == names["model"].num_gaussians - len(names["ball"])
+    assert names["picture"].shape == (48, 80, 3)
+    for video in ("night", "jump", "there_and_back", "still", "stacked", "popped", "orbit", "waving", "grown", "again"):
+        picture = names[video].render(0.4)
+        assert np.isfinite(picture).all()
+        assert np.abs(picture - names["model"].render(0.4)).max() > 0.02
+    # The script, as it stands there.
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(255 * names["masks"][0].astype(np.uint8)).save(tmp_path / "masks" / "ball.png")
+    script = re.search(r"```toml\n(.*?)```", (DOCS / "editing.md").read_text(), re.S)[1]
+    edited = parse_edit_script(script, folder=tmp_path).apply(names["model"])
+    assert edited.num_gaussians > names["model"].num_gaussians
+    assert isinstance(edited, EditedVideo)
 
 
 @pytest.mark.slow

@@ -1,0 +1,185 @@
+"""Commands that edit, export and import, as a user meets them; a small model made by hand instead of a fit."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+
+from foldgauss.io import load_video_model, read_video, save_video_model, write_image
+from foldgauss.video import EditedVideo, VideoModel, edit
+from tests.video.soft_models import NUM, SIZE, soft_model
+
+FRAMES = 7
+BAKED = '[selections.it]\nbox = [12, 10, 32, 30]\nframe = 3\n[[edits]]\ndo = "move"\nselect = "it"\noffset = [0.2, 0]\n'
+LAID_OVER = '[[edits]]\ndo = "recolor"\ngain = 0.2\nframe = 2\n'
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A model, its pictures as a clip, scripts."""
+    folder = tmp_path_factory.mktemp("work")
+    model = soft_model()
+    save_video_model(folder / "model.safetensors", model, metadata={"clip": "clip", "frames": None})
+    (folder / "clip").mkdir()
+    for k, frame in enumerate(model.frames()):
+        write_image(folder / "clip" / f"{k}.png", frame)
+    (folder / "baked.toml").write_text(BAKED)
+    (folder / "laid.toml").write_text(LAID_OVER)
+    return folder
+
+
+def test_an_edited_model_is_a_model(work, tmp_path, capsys):
+    """Baked it is a plain one, else one with edits: told about, drawn, compared and edited again."""
+    assert run("edit", work / "model.safetensors", work / "baked.toml", "--out", tmp_path / "plain.safetensors") == 0
+    assert "a plain model, 40 Gaussians" in capsys.readouterr().out
+    plain = load_video_model(tmp_path / "plain.safetensors")
+    assert isinstance(plain, VideoModel)
+    wanted = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()
+    np.testing.assert_array_equal(plain.splats.loc, wanted.splats.loc)
+
+    assert run("edit", tmp_path / "plain.safetensors", work / "laid.toml", "--out", tmp_path / "two.safetensors") == 0
+    assert "a model with edits" in capsys.readouterr().out
+    both = load_video_model(tmp_path / "two.safetensors")
+    assert isinstance(both, EditedVideo)
+
+    assert run("info", tmp_path / "two.safetensors") == 0
+    told = capsys.readouterr().out
+    assert "1 on 40 Gaussians" in told
+    assert "laid.toml" in told
+
+    assert run("evaluate", tmp_path / "two.safetensors", work / "clip", "--json", tmp_path / "figures.json") == 0
+    psnr = json.loads((tmp_path / "figures.json").read_text())["psnr"]
+    assert len(psnr) == FRAMES
+    assert psnr[2] < min(psnr[:2] + psnr[3:]) - 1
+
+    assert run("render", tmp_path / "two.safetensors", "--out", tmp_path / "frames") == 0
+    own = list(both.frames())
+    for k, picture in enumerate(read_video(tmp_path / "frames").frames):
+        np.testing.assert_array_equal(picture, own[k])
+    assert run("edit", tmp_path / "two.safetensors", work / "laid.toml", "--out", tmp_path / "three.safetensors") == 0
+    assert len(load_video_model(tmp_path / "three.safetensors").layers[0].overlays) == 2
+
+
+def test_pictures_of_an_edit(work, tmp_path, capsys):
+    for name, size in (("edited.gif", None), ("edited.mp4", "20x32"), ("edited", "20x32")):
+        options = [] if size is None else ["--size", size]
+        assert run("edit", work / "model.safetensors", work / "baked.toml", "--out", tmp_path / name, *options) == 0
+        assert "7 frames at 25 frames a second" in capsys.readouterr().out
+        clip = read_video(tmp_path / name)
+        assert (clip.num_frames, clip.size) == (FRAMES, (20, 32) if size else SIZE)
+    edited = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()
+    np.testing.assert_array_equal(read_video(tmp_path / "edited").frames, np.stack(list(edited.frames(size=(20, 32)))))
+
+
+def test_what_edit_refuses(work, tmp_path, capsys):
+    model, baked, target = work / "model.safetensors", work / "baked.toml", tmp_path / "out.safetensors"
+
+    def refused(*arguments) -> tuple[int, str]:
+        code = run("edit", *arguments)
+        told = capsys.readouterr().err
+        assert told.startswith("error: ")
+        assert len(told.strip().splitlines()) == 1
+        assert not target.exists()
+        return code, told
+
+    code, told = refused(model, work / "none.toml", "--out", target)
+    assert code == 2
+    assert "none.toml" in told
+    code, told = refused(work / "none.safetensors", baked, "--out", target)
+    assert code == 2
+    assert "none.safetensors" in told
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text('[[edits]]\ndo = "vanish"\n\n[[edits]]\ndo = "move"\nofset = [1, 0]\n')
+    code, told = refused(model, wrong, "--out", target)
+    assert code == 1
+    assert f"{wrong}, line 6, [[edits]] number 2: ofset: expected one of" in told
+    assert "Did you mean 'offset'?" in told
+    wrong.write_text("[selections.it]\nbox = [900, 900, 901, 901]\nframe = 0")
+    code, told = refused(model, wrong, "--out", target)
+    assert code == 1
+    assert f"{wrong}, line 2, [selections.it]: box: " in told
+    code, told = refused(model, baked, "--out", target, "--size", "20x32")
+    assert code == 2
+    assert "--size" in told
+    code, told = refused(model, baked, "--out", tmp_path / "out.png")
+    assert code == 2
+    assert ".safetensors" in told
+
+    target.write_bytes(b"precious")
+    assert run("edit", model, baked, "--out", target) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert target.read_bytes() == b"precious"
+    assert run("edit", model, baked, "--out", target, "--overwrite") == 0
+    assert load_video_model(target).num_gaussians == NUM
+
+
+def test_export_and_import(work, tmp_path, capsys):
+    model = work / "model.safetensors"
+    assert run("export", model, "--format", "ply", "--out", tmp_path / "video.ply") == 0
+    assert run("import", tmp_path / "video.ply", "--out", tmp_path / "again.safetensors") == 0
+    assert f"7 frames, {NUM} Gaussians" in capsys.readouterr().out
+    again = load_video_model(tmp_path / "again.safetensors")
+    assert (again.size, again.fps) == (SIZE, 25.0)
+    np.testing.assert_allclose(again.splats.loc, soft_model().splats.loc, atol=1e-6)
+    assert run("import", tmp_path / "video.ply", "--out", tmp_path / "fast.safetensors", "--fps", 50) == 0
+    assert load_video_model(tmp_path / "fast.safetensors").fps == 50
+
+    assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "scenes") == 0
+    assert len(list((tmp_path / "scenes").glob("*.ply"))) == FRAMES
+    assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "one.ply", "--times", "0.5") == 0
+    assert (tmp_path / "one.ply").read_bytes().startswith(b"ply\n")
+
+    assert run("export", model, "--format", "obj", "--out", tmp_path / "mesh", "--times", "0:1:3") == 0
+    assert len(list((tmp_path / "mesh").glob("*.obj"))) == 3
+    assert run("import", tmp_path / "mesh", "--out", tmp_path / "pictures") == 0
+    picture = cv2.imread(str(sorted((tmp_path / "pictures").iterdir())[1]))[..., ::-1]
+    own = next(soft_model().frames(np.array([0.5])))
+    assert np.abs(picture.astype(int) - own).max() <= 2
+    assert run("import", tmp_path / "mesh", "--out", tmp_path / "mesh.gif") == 0
+    assert read_video(tmp_path / "mesh.gif").num_frames == 3
+
+
+def test_what_export_and_import_refuse(work, tmp_path, capsys):
+    model, video = work / "model.safetensors", tmp_path / "video.ply"
+    assert run("edit", model, work / "laid.toml", "--out", tmp_path / "laid.safetensors") == 0
+    capsys.readouterr()
+
+    def refused(*arguments) -> str:
+        assert run(*arguments) == 2
+        return capsys.readouterr().err
+
+    assert "one with edits" in refused("export", tmp_path / "laid.safetensors", "--format", "ply", "--out", video)
+    assert "--format" in refused("export", model, "--format", "fbx", "--out", video)
+    assert "--out" in refused("export", model, "--format", "ply", "--out", tmp_path / "folder")
+    assert "--out" in refused("export", model, "--format", "obj", "--out", video)
+    assert "--times" in refused("export", model, "--format", "ply", "--out", video, "--times", "0.5")
+    assert "times: expected one" in refused("export", model, "--format", "ply3dgs", "--out", video)
+    assert not video.exists()
+    video.write_bytes(b"precious")
+    assert "--overwrite" in refused("export", model, "--format", "ply", "--out", video)
+    assert video.read_bytes() == b"precious"
+    assert run("import", video, "--out", tmp_path / "m.safetensors") == 1
+    told = capsys.readouterr().err
+    assert "video.ply" in told
+    assert "--out" in refused("import", video, "--out", tmp_path / "m.ply")
+    assert "missing" in refused("import", tmp_path / "none.ply", "--out", tmp_path / "m.safetensors")
+    assert run("export", model, "--format", "ply", "--out", video, "--overwrite") == 0
+    assert run("import", video, "--out", tmp_path / "m.safetensors") == 0
+    assert "exists" in refused("import", video, "--out", tmp_path / "m.safetensors")
+
+
+def test_a_folder_of_masks(work, tmp_path):
+    """As a user has it: a mask drawn in some other program."""
+    mask = np.zeros(SIZE, np.uint8)
+    mask[10:30, 12:32] = 255
+    (tmp_path / "masks").mkdir()
+    for k in range(FRAMES):
+        assert cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), mask)
+    script = tmp_path / "edits.toml"
+    script.write_text('[selections.it]\nmask = "masks"\n[[edits]]\ndo = "vanish"\nselect = "it"')
+    assert run("edit", work / "model.safetensors", script, "--out", tmp_path / "out.safetensors") == 0
+    boxed = edit(soft_model()).select(box=(12, 10, 32, 30)).vanish().video()
+    assert 0 < boxed.num_gaussians < NUM
+    assert load_video_model(tmp_path / "out.safetensors").num_gaussians == boxed.num_gaussians
