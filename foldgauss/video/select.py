@@ -23,7 +23,7 @@ from foldgauss.video.regions import (
 #: Share of what a Gaussian adds that has to lie inside a mask.
 THRESHOLD = 0.5
 #: Delta E: a shade for all of the clip; and, where a chain of neighbours holds it together, more.
-COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 20.0
+COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 15.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -313,8 +313,9 @@ def by_click(
 
     A Gaussian is in if it *looks* like the pixel, to within `tolerance`, and a chain of such neighbours leads to it
     that touch and move alike in most of the frames in which they touch. So the set goes on through time, up to the cuts
-    of the shot, and ends where another colour or another motion begins. Gaussians that are seen in none of the frames
-    looked at (48 at most) are left out.
+    of the shot, and ends where another colour or another motion begins: what is of one colour and at rest all over the
+    frame is told apart by neither, so intersect it with a box. Gaussians that are seen in none of the frames looked at
+    (48 at most) are left out.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 
