@@ -132,6 +132,12 @@ def fit(
     compositing: Annotated[
         str | None, typer.Option(help="Blend of the Gaussians: over (front to back) or sum [default: over].")
     ] = None,
+    between_share: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of the steps that learn what lies between frames, for slow motion, as 0.5 [default: 0]."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
@@ -160,6 +166,7 @@ def fit(
         "batch_size": batch_size,
         "power": power,
         "compositing": compositing,
+        "between_share": between_share,
         "seed": seed,
     }
     try:

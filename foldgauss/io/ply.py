@@ -31,6 +31,8 @@ from foldgauss.video.shots import out_of_cuts
 
 #: The envelope's power of the published code, which scales standard deviations by exp(-tau^2 / 2).
 VEGAS_POWER = 2.0
+#: Standard deviations, in its units, above which alone the published code draws a Gaussian.
+VEGAS_SCALE_CUTOFF = 1e-4
 #: What the published code keeps in `scale_1`, across the plane, does not show; an eps of this size is written there.
 _VEGAS_ACROSS = math.log(1e-8)
 #: Our own facts about a model in a comment of the header: other programs skip it.
@@ -72,7 +74,8 @@ def read_vegas_ply(
 
     `size` = (height, width) and `fps` are not in such a file and must be given, the first always, the second where 25
     is wrong; files that `write_vegas_ply` made carry both. What is drawn follows the published constants: power 2, low
-    pass 0.3 px^2, alpha up to 0.99 and from 1/255 on, exp(-tau^2 / 2) > 0.01.
+    pass 0.3 px^2, alpha up to 0.99 and from 1/255 on, exp(-tau^2 / 2) > 0.01, and standard deviations above 1e-4 of its
+    units (`VideoModel.scale_cutoff`).
 
     **Raises:** `FileNotFoundError`, and `FormatError` for a file that is damaged, of another kind, with colours that
     depend on the view, or without a size.
@@ -84,7 +87,7 @@ def read_vegas_ply(
     """
     ply = read_ply(path, ("vertex", "time"))
     _check_vegas(ply)
-    size, fps, options = _filled_in(ply, size, fps)
+    size, fps, options, scale_cutoff = _filled_in(ply, size, fps)
     degree = _degree(ply)
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(2 * degree))])
@@ -105,7 +108,7 @@ def read_vegas_ply(
         **{name: _float32(ply, name, leaf) for name, leaf in leaves.items()},
         envelope=TimeLikelihood(np.float32(VEGAS_POWER), np.float32(0)),
     )
-    return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options)
+    return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
 
 
 def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
@@ -137,6 +140,7 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     columns |= {f"w1_{k}": weights[:, k] for k in range(weights.shape[1])}
     time_weights = {f"time_func_{k}": [weight] for k, weight in enumerate(_float64(model.frame_times.logits))}
     note = {"size": list(model.size), "fps": model.fps, "options": dataclasses.asdict(model.options)}
+    note["scale_cutoff"] = model.scale_cutoff
     return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[_NOTE + json.dumps(note)])
 
 
@@ -190,7 +194,7 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, "intervals"]:
 
 def _filled_in(
     ply: Ply, size: tuple[int, int] | None, fps: float | None
-) -> tuple[tuple[int, int], float, RenderOptions]:
+) -> tuple[tuple[int, int], float, RenderOptions, float]:
     """What the file's columns do not say: as given, or as our own writer noted it, or the default."""
     note = _note(ply)
     if size is None and "size" not in note:
@@ -201,11 +205,14 @@ def _filled_in(
         size = note["size"] if size is None else size
         fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
         check_size(size)
+        cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
+        if not within(cutoff, "[0, 1]"):
+            raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
         if not within(fps, f"(0, {MAX_FPS}]"):
             raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
     except (TypeError, ValueError) as error:
         raise FormatError(f"{ply.path}: {error}") from error
-    return (int(size[0]), int(size[1])), float(fps), options
+    return (int(size[0]), int(size[1])), float(fps), options, float(cutoff)
 
 
 def _note(ply: Ply) -> dict:

@@ -85,6 +85,7 @@ def _describe_video(model: VideoModel) -> dict:
         "fps": model.fps,
         "options": dataclasses.asdict(model.options),
         "compositing": model.compositing,
+        "scale_cutoff": model.scale_cutoff,
     }
 
 
@@ -107,6 +108,7 @@ def _video_skeleton(header: dict) -> VideoModel:
             fps=float(header["fps"]),
             options=RenderOptions(**header["options"]),
             compositing=compositing,
+            scale_cutoff=float(header.get("scale_cutoff", 0.0)),
         )
 
     return jax.eval_shape(build)  # traced, not computed: nothing is allocated

@@ -251,6 +251,26 @@ def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) ->
     )
 
 
+def narrow_windows(rows: np.ndarray, window: np.ndarray, shape: Shape, scale_cutoff: float) -> None:
+    """Leave out of the spans in `window` (num, 2) when a standard deviation is not above `scale_cutoff`, model units.
+
+    With s the smaller one: s^2 a > cutoff^2, that is (1 - floor) exp(-power tau^2 / 2) > (cutoff / s)^2 - floor.
+    """
+    if scale_cutoff <= 0:
+        return
+    places = columns(shape.degree)
+    centre, spread = (rows[:, places[name].start].astype(float) for name in ("time_loc_logit", "log_time_scale"))
+    smaller = rows[:, places["log_scale"]].min(axis=1).astype(float)
+    needed = np.exp(2 * (math.log(scale_cutoff) - smaller)) - shape.floor
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = 2 * (math.log1p(-shape.floor) - np.log(needed)) / shape.power  # tau^2 where both sides are equal
+    never, always = needed >= 1 - shape.floor, needed <= 0
+    reach = np.where(always, np.inf, np.sqrt(np.where(never | always, 0, square)))
+    reach = np.minimum(reach, TAU_MAX) * np.exp(spread)
+    middle = 1 / (1 + np.exp(-centre))
+    window[:, 0], window[:, 1] = np.maximum(window[:, 0], middle - reach), np.minimum(window[:, 1], middle + reach)
+
+
 def condition(
     rows: np.ndarray, window: np.ndarray, t: float, shape: Shape, members: np.ndarray | None = None
 ) -> Conditioned:

@@ -120,6 +120,9 @@ class FitConfig:
     quarter_share: float = 0.2
     half_share: float = 0.4
     square_share: float = 0.3  # of the plan, at its end: squared error alone, which is what PSNR measures
+    #: Of the steps: a time between two frames, where what the optical flow knows of it is learned instead of a frame.
+    #: Better slow motion, and less quality at the frames.
+    between_share: float = 0.0
     #: Adam's steps are for Gaussians alive in the batch; False: for all, by momentum, as published.
     only_alive: bool = True
     rates: LearningRates = LearningRates()
@@ -156,6 +159,7 @@ class FitConfig:
             "ssim_share": "[0, 1]",
             "final_rate": "[0, 1]",
             "square_share": "[0, 1]",
+            "between_share": "[0, 1)",
             "quarter_share": "[0, 1]",
             "half_share": "[0, 1]",
         }

@@ -116,6 +116,9 @@ def fit_steps(
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
         raise invalid("compositing", expected="'over' for frames with alpha", got="'sum'", cure=cure)
+    if frames.shape[3] == 4 and config.between_share > 0:
+        cure = "Leave it out: the flow knows nothing of what is behind."
+        raise invalid("between_share", expected="0 for frames with alpha", got=config.between_share, cure=cure)
     _warm_up(frames, config)
     state = start(frames, config) if state is None else state
     step = _Stepper(frames, config, state)
@@ -130,7 +133,8 @@ def fit_steps(
         loss, squared_error, num_alive = step(state, _progress(state, config), level)
         another = state.plan > 0 and level != level_at(step.levels, (state.step - 1) / state.plan)
         memory = max(1 - config.batch_size / len(frames), 0.5) if state.step and not another else 0.0
-        state.error = memory * state.error + (1 - memory) * squared_error
+        if not math.isnan(squared_error) or not math.isfinite(loss):
+            state.error = memory * state.error + (1 - memory) * squared_error
         state.step += 1
         if state.statistics is not None and state.plan:
             step.grow(state)
@@ -147,6 +151,7 @@ def fit_steps(
 def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
     """Compile the kernels, or load them, on a corner of the clip, before any clock runs: the first time takes 20 s."""
     tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
+    tiny = dataclasses.replace(tiny, between_share=0.0)
     corner = np.ascontiguousarray(frames[:2, :32, :32])
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
     for progress in (0.0, 1.0):  # with either loss
@@ -335,6 +340,7 @@ class _Stepper:
         for name, place in columns(config.degree).items():
             self.rates[place] = getattr(config.rates, name)
             self.falling[place] = config.falling in ("all", name)
+        self.between = _Between(frames, config) if config.between_share > 0 else None
         self._make_room(state)
 
     def _make_room(self, state: FitState) -> None:
@@ -344,21 +350,27 @@ class _Stepper:
         update_windows(state.rows, np.arange(len(state.rows)), self.window)
 
     def __call__(self, state: FitState, progress: float, level: int = -1) -> tuple[float, float, int]:
-        """Advance `state` by frames of a level; returns loss, mean squared error and how many Gaussians took part."""
+        """Advance `state` by frames of a level; returns loss, mean squared error and how many Gaussians took part.
+
+        The error is that of frames; NaN where all the batch lies between frames.
+        """
         if self.frames.shape[3] == 4:
             self.background = random_background(self.config.seed, state.step)
         decay = self.config.final_rate**progress if self.config.final_rate > 0 else 1 - progress
         times = np.asarray(_frame_times(state.time_logits))
         by_time = np.zeros_like(times)
-        losses, alive, squared = [], [], progress >= 1 - self.config.square_share
+        losses, alive, squared, errors = [], [], progress >= 1 - self.config.square_share, []
         views = None if state.statistics is None else []
         for view in self._batch(state.step):
             k = int(view) % self.num_frames
             mirrored = int(view) >= self.num_frames
-            loss, done, d_time = self._frame(
-                state.rows, k, times[k], self.shapes[level], squared=squared, mirrored=mirrored, views=views
-            )
-            by_time[k] += d_time  # a batch may hold a frame twice
+            share = None if self.between is None else self.between.share(state.step, k)
+            how = {"squared": squared, "mirrored": mirrored, "views": views, "share": share}
+            t = times[k] if share is None else (1 - share) * times[k] + share * times[k + 1]
+            loss, done, d_time = self._frame(state.rows, k, t, self.shapes[level], **how)
+            if share is None:
+                by_time[k] += d_time  # a batch may hold a frame twice
+                errors.append(loss.mean_squared_error)
             losses.append(loss)
             alive.append(done.alive)
         if state.statistics is not None:
@@ -375,8 +387,8 @@ class _Stepper:
         if self.config.learn_frame_times and self.num_frames > 2:
             rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0))
             state.time_logits, state.time_moments = _update_times(state.time_logits, state.time_moments, by_time, rate)
-        mean = np.mean([(loss.value, loss.mean_squared_error) for loss in losses], axis=0)
-        return float(mean[0]), float(mean[1]), num_alive
+        squared_error = float(np.mean(errors)) if errors else math.nan
+        return float(np.mean([loss.value for loss in losses])), squared_error, num_alive
 
     def grow(self, state: FitState) -> None:
         """Births, deaths and resets that are due now that the plan is known; after the last, statistics end."""
@@ -431,16 +443,18 @@ class _Stepper:
         squared: bool,
         mirrored: bool,
         views: list[tuple[np.ndarray, np.ndarray]] | None,
+        share: float | None = None,
     ) -> tuple[ImageLoss, Conditioned, float]:
-        """Loss of frame k; its gradients are added to `self.grad`, dL/dt_k is returned.
+        """Loss of frame k, or of what lies `share` of the way to the next; gradients are added to `self.grad`, dL/dt is
+        returned.
 
         To `views`, where asked for, comes what `Statistics.add` wants.
         """
-        target = _planar(shrunk(self.frames[k], shape.size), self.background)
+        target = None if share is not None else _planar(shrunk(self.frames[k], shape.size), self.background)
         done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
         if mirrored:
-            target = np.ascontiguousarray(target[:, :, ::-1])
+            target = np.ascontiguousarray(target[:, :, ::-1]) if share is None else None
             mean, factor = _mirrored(mean, factor, shape.size[1])
         trace = cpu.forward(
             mean,
@@ -452,6 +466,8 @@ class _Stepper:
             compositing=self.config.compositing,
             options=self.config.options,
         )
+        if share is not None:
+            target = self.between.target(k, share, shape.size, trace.image, mirrored=mirrored)
         if squared:
             loss = squared_loss(trace.image, target)
         else:
@@ -464,6 +480,29 @@ class _Stepper:
             half = np.float32(shape.size[::-1]) / 2
             views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
         return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), shape, self.grad)
+
+
+class _Between:
+    """What a fit learns of the times between frames: which ones, and what is to be seen there."""
+
+    def __init__(self, frames: np.ndarray, config: FitConfig):
+        self.frames, self.config = np.ascontiguousarray(frames[..., :3]), config
+        self.motion = Motion.of(self.frames)
+        self.last_of_shots = {*(k - 1 for k in self.motion.cuts()), len(frames) - 1}
+
+    def share(self, step: int, k: int) -> float | None:
+        """How far from frame k to the next the time of a step lies; None for the frame itself."""
+        rng = np.random.default_rng([self.config.seed, 2, step, k])
+        chosen, share = rng.random() < self.config.between_share, rng.uniform(0.1, 0.9)
+        return share if chosen and step and k not in self.last_of_shots else None
+
+    def target(self, k: int, share: float, size: tuple[int, int], drawn: np.ndarray, *, mirrored: bool) -> np.ndarray:
+        """Planes (3, height, width): what is `drawn` already wherever nothing else is known."""
+        guess, known = self.motion.between(self.frames, k, share, size)
+        if mirrored:
+            guess, known = guess[:, ::-1], known[:, ::-1]
+        planes = np.moveaxis(guess, -1, 0) * np.float32(1 / 255)
+        return np.ascontiguousarray(np.where(known, planes, drawn), np.float32)
 
 
 def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,11 +16,11 @@ from scipy.special import expit
 
 from foldgauss._checks import invalid
 from foldgauss.render import cpu
-from foldgauss.video.conditioning import Conditioned, Shape, condition, update_windows
+from foldgauss.video.conditioning import Conditioned, condition
 from foldgauss.video.model import VideoModel
-from foldgauss.video.packing import pack
 from foldgauss.video.regions import Region
 from foldgauss.video.shots import out_of_cuts
+from foldgauss.video.stage import Stage
 
 _DARK = np.zeros(3, np.float32)
 
@@ -36,19 +36,17 @@ class LitModel:
             cure = "Select in each layer's own model, before layers and edits are put together."
             raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
         self.model, self.size = model, model.size
-        self.rows = pack(model.splats)
-        broken = int((~np.isfinite(self.rows)).any(-1).sum())
-        if broken:
-            raise invalid("model", expected="finite numbers", got=f"{broken:,} Gaussians that have none")
-        power, floor = (_the_one(model.splats.envelope, name) for name in ("power", "floor"))
-        self.shape = Shape(model.splats.degree, power, floor, self.size, aspect=self.size[0] / self.size[1])
-        self.window = np.empty((len(self.rows), 2), np.float32)
-        update_windows(self.rows, np.arange(len(self.rows)), self.window)
+        self._conditioned = Stage(model, model.size)
         self.times = np.asarray(model.frame_times.times())
 
     @property
     def num_gaussians(self) -> int:
-        return len(self.rows)
+        return self.model.num_gaussians
+
+    @property
+    def window(self) -> Float32[np.ndarray, "num_gaussians 2"]:
+        """First and last time at which each Gaussian is drawn."""
+        return self._conditioned.window
 
     def frame(self, k: int) -> "Light":
         """The light of frame k."""
@@ -56,12 +54,12 @@ class LitModel:
 
     def at(self, t: float) -> "Light":
         """The light at time t; between two shots the nearer one's, as pictures are drawn."""
-        return Light(self, condition(self.rows, self.window, float(out_of_cuts(t, self.times)), self.shape))
+        return Light(self, self._conditioned.at(float(out_of_cuts(t, self.times))))
 
     def position(self, indices: Int[np.ndarray, "num"], t: float) -> Float32[np.ndarray, "num 2"]:
         """Centres of the named Gaussians, in pixels, at any time, alive or not."""
         ever = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
-        return condition(self.rows[indices], ever, t, self.shape).mean
+        return condition(self._conditioned.rows[indices], ever, t, self._conditioned.shape).mean
 
     def own_place(self, indices: Int[np.ndarray, "num"]) -> Float[np.ndarray, "num 2"]:
         """Centres of the named Gaussians at their own times, in pixels: there the fold is 0."""
@@ -76,15 +74,6 @@ class LitModel:
     def nearest_frame(self, indices: Int[np.ndarray, "num"]) -> Int[np.ndarray, "num"]:
         """The frame next to each named Gaussian's own time."""
         return np.searchsorted((self.times[1:] + self.times[:-1]) / 2, self.own_times[indices])
-
-
-def _the_one(envelope, name: str) -> float:
-    """The number that all Gaussians share."""
-    values = np.unique(np.asarray(getattr(envelope, name)))
-    if values.size != 1:
-        got = f"{values.size} different ones"
-        raise invalid(f"model.splats.envelope.{name}", expected="one number for all Gaussians", got=got)
-    return float(values[0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -122,14 +122,18 @@ class FoldedSplats(eqx.Module):
         """
         return FoldedMixture(self.gaussians(), logits=jax.nn.log_sigmoid(self.opacity_logit))
 
-    def at(self, t: Float[Array, ""]) -> Splats2D:
+    def at(self, t: Float[Array, ""], *, scale_cutoff: float = 0.0) -> Splats2D:
         """The splats of time t, in model space: every Gaussian conditioned on t (eq:vegas_equiv_cond).
 
-        A Gaussian too far away in time (`TIME_CUTOFF`) keeps its place with opacity 0.
+        A Gaussian too far away in time (`TIME_CUTOFF`), or with a standard deviation not above `scale_cutoff` by then,
+        keeps its place with opacity 0.
         """
         folded = self.gaussians()
         conditional = folded.condition_time(t)
         near = jnp.abs(t - folded.time_loc) < TAU_MAX * folded.time_scale
+        if scale_cutoff > 0:
+            log_a = self.envelope.log_a(t, time_loc=folded.time_loc, time_scale=folded.time_scale)
+            near &= self.log_scale.min(axis=-1) + log_a / 2 > float(np.log(scale_cutoff))
         opacity = jnp.where(near, jax.nn.sigmoid(self.opacity_logit), jnp.zeros_like(self.opacity_logit))
         color = jnp.maximum(0.5 + SH_C0 * self.color_dc, 0.0)
         return Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
@@ -197,7 +201,8 @@ class VideoModel(eqx.Module):
     """A fitted video: what is stored in a model file.
 
     `size` is (height, width) of the frames it was fitted to, `fps` their rate, `options` the constants and
-    `compositing` the blend ("over" or "sum") it was fitted with and must be drawn with.
+    `compositing` the blend ("over" or "sum") it was fitted with and must be drawn with. `scale_cutoff`: a Gaussian is
+    drawn only where its standard deviations exceed it, in model units; 0 but for imported VeGaS videos.
     """
 
     splats: FoldedSplats
@@ -206,6 +211,7 @@ class VideoModel(eqx.Module):
     fps: float = eqx.field(static=True)
     options: RenderOptions = eqx.field(static=True)
     compositing: str = eqx.field(static=True, default="over")
+    scale_cutoff: float = eqx.field(static=True, default=0.0)
 
     @property
     def num_frames(self) -> int:
@@ -228,7 +234,9 @@ class VideoModel(eqx.Module):
     def at(self, t: Float[Array, ""], size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, in pixels of a picture of `size` (default: the fitted one)."""
         height, width = self.size
-        return self.splats.at(t).to_pixels(self.size if size is None else size, aspect=height / width)
+        return self.splats.at(t, scale_cutoff=self.scale_cutoff).to_pixels(
+            self.size if size is None else size, aspect=height / width
+        )
 
     def render(
         self,

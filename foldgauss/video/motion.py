@@ -126,6 +126,36 @@ class Motion:
                 shift[on, column] = here - position[on]
         return Tracks(shift, known)
 
+    def between(
+        self, frames: UInt8[np.ndarray, "frames height width 3"], k: int, share: float, size: tuple[int, int]
+    ) -> tuple[Float32[np.ndarray, "rows columns 3"], Bool[np.ndarray, "rows columns"]]:
+        """What is seen `share` of the way from frame k to k + 1, about [0, 255], and where that is known.
+
+        Both frames are moved along the flow, as if it were the same there as at the pixel itself, and meet. In pictures
+        of `size` (height, width). It is not known where they show different colours or come from outside the frame, or
+        where the flow forth is not the flow back: there something comes into sight or goes.
+        """
+        rows, columns = size
+        grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+        unit = np.float32([columns / self.size[1], rows / self.size[0]])
+        flows = [cv2.resize(each[k].astype(np.float32), (columns, rows)) * unit for each in (self.there, self.back)]
+        sure = np.hypot(*np.moveaxis(flows[0] + flows[1], -1, 0)) < 1 + MISS_SHARE * np.hypot(
+            *np.moveaxis(flows[0], -1, 0)
+        )
+        moved = []
+        for frame, flow, way in zip(frames[k : k + 2], flows, (share, 1 - share), strict=True):
+            picture = (
+                frame if frame.shape[:2] == size else cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_AREA)
+            )
+            origin = grid - way * flow
+            sure &= ((origin >= 0) & (origin <= [columns - 1, rows - 1])).all(-1)
+            moved.append(
+                cv2.remap(picture, origin, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+            )
+        apart = cv2.GaussianBlur(moved[0] - moved[1], (0, 0), 0.7)
+        sure &= np.sqrt((apart * apart).mean(-1)) < 255 * COLOR_CHANGE
+        return (1 - share) * moved[0] + share * moved[1], sure
+
     def _step(self, at, here, direction: int, color) -> tuple[np.ndarray, np.ndarray]:
         """Where points of frames `at` are in the next frame (or the one before), and of which that is known."""
         flows, opposite = (self.there, self.back) if direction > 0 else (self.back, self.there)

@@ -6,7 +6,7 @@ from foldgauss._checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Splats2D
 from foldgauss.render.splats import check_size
-from foldgauss.video.conditioning import Conditioned, Shape, condition, update_windows
+from foldgauss.video.conditioning import Conditioned, Shape, condition, narrow_windows, update_windows
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.packing import pack
 
@@ -30,6 +30,7 @@ class Stage:
         self.shape = _shape_of(model.splats, tuple(size), height / width if aspect is None else aspect)
         self.window = np.empty((len(self.rows), 2), np.float32)
         update_windows(self.rows, np.arange(len(self.rows)), self.window)
+        narrow_windows(self.rows, self.window, self.shape, model.scale_cutoff)
 
     def at(self, t: float, members: np.ndarray | None = None) -> Conditioned:
         """The Gaussians alive at time t, any number; of `members`, bool (num_gaussians,), if given."""

@@ -1,10 +1,12 @@
 """PLY files: the published VeGaS video with its picture, 3DGS scenes that viewers open, and damage that is refused."""
 
+import dataclasses
 import math
 import struct
 import warnings
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.lib import recfunctions
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io import ply as ply_file
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._ply import FormatError, read_ply, write_ply
@@ -34,13 +37,14 @@ HALF_WIDTH = math.tan(0.6911112 / 2)  # of the published frame, at distance 1
 
 
 def vegas_columns(seed=0, num=NUM, degree=DEGREE):
-    """Raw columns of a published video: smooth Gaussians over the frame, none so thin that a cutoff hits it."""
+    """Raw columns of a published video over the frame, a third so thin that the cutoff of scales takes them."""
     rng = np.random.default_rng(seed)
     columns = {"x": rng.uniform(-0.4, 0.4, num), "y": rng.normal(size=num), "z": rng.uniform(-0.3, 0.3, num)}
     columns |= {name: np.zeros(num) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{c}": rng.uniform(-2.5, 1.5, num) for c in range(3)}
     columns |= {"opacity": rng.normal(0, 2, num)}
     columns |= {f"scale_{k}": np.log(rng.uniform(0.02, 0.15, num)) for k in range(3)}
+    columns["scale_0"][::3] = np.log(rng.uniform(1e-4, 2e-3, len(columns["scale_0"][::3])))
     columns |= {"rot_0": rng.normal(0, 2, num), "m_0": rng.normal(0, 1.5, num)}
     columns |= {"sigma_0": np.log(rng.uniform(0.15, 0.8, num))}
     columns |= {f"w1_{k}": rng.normal(0, 0.2, num) for k in range(2 * degree)}
@@ -231,6 +235,32 @@ def test_sums_and_diverged_models_are_refused(tmp_path):
     with pytest.raises(ValueError, match="VideoModel"):
         write_vegas_ply(tmp_path / "v.ply", model.splats)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_cutoff_of_scales_is_one(tmp_path):
+    """The slow way, the fast one and a saved model leave the same Gaussians out; models of ours none."""
+    path = write_raw(tmp_path / "v.ply", vegas_columns(), time_weights())
+    model = read_vegas_ply(path, size=(40, 64))
+    again = load_video_model(save_video_model(tmp_path / "v.safetensors", model))
+    assert again.scale_cutoff == model.scale_cutoff == pytest.approx(1e-4 / (2 * HALF_WIDTH))
+    seen = np.asarray(model.at(jnp.float32(0.4)).opacity) > 0
+    whole = np.asarray(model.splats.at(jnp.float32(0.4)).opacity) > 0
+    assert 0 < seen.sum() < whole.sum()
+    for one in (model, again, read_vegas_ply(write_vegas_ply(tmp_path / "w.ply", model))):
+        assert len(Playback(one).splats(0.4).opacity) == seen.sum()
+    own = random_model()
+    assert read_vegas_ply(write_vegas_ply(tmp_path / "w.ply", own)).scale_cutoff == own.scale_cutoff == 0
+
+
+@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1), (0.0, 0.0)])
+def test_the_cutoff_of_scales_with_any_envelope(power, floor):
+    model = random_model(power=power, floor=floor, num=300)
+    model = eqx.tree_at(lambda m: m.splats.log_scale, model, model.splats.log_scale - 3)
+    model = dataclasses.replace(model, scale_cutoff=1e-3)
+    for t in (0.1, 0.7):
+        seen = np.asarray(model.at(jnp.float32(t)).opacity) > 0
+        assert 0 < seen.sum() < (np.asarray(model.splats.at(jnp.float32(t)).opacity) > 0).sum()
+        assert len(Playback(model).splats(t).opacity) == seen.sum()
 
 
 def test_size_and_rate_must_be_known(tmp_path):

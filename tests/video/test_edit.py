@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates, spline_filter
+from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
 from foldgauss.render import RenderOptions, cpu
 from foldgauss.video import Clock, EditedVideo, Selection, VideoModel, edit, layers
 from foldgauss.video.playback import Playback
 from foldgauss.video.stage import Stage
-from tests.video.soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
 MODEL = soft_model()
 TIMES = np.asarray(MODEL.frame_times.times())
@@ -123,7 +123,7 @@ def test_what_is_baked_is_what_the_overlay_draws(name, power, floor):
         assert apart(baked, laid_over, t) < 1e-5
 
 
-@pytest.mark.parametrize("name", set(BAKED) - {"vanish", "multiply"})
+@pytest.mark.parametrize("name", sorted(set(BAKED) - {"vanish", "multiply"}))
 def test_what_is_not_selected_keeps_its_bits(name):
     edited = BAKED[name](edit(MODEL).select(OBJECT)).video()
     for one, other in zip(jax.tree.leaves(edited.splats), jax.tree.leaves(MODEL.splats), strict=True):

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.model_file import read_header
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, project, render
 from foldgauss.video import Clock, EditedVideo, VideoModel, edit, layers
 from foldgauss.video.playback import Playback
-from tests.video.soft_models import NUM, OBJECT, SIZE, soft_model
 
 MODEL = soft_model(options=RenderOptions())
 TIMES = np.asarray(MODEL.frame_times.times())

@@ -8,9 +8,10 @@ import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
+from test_motion import panning
 
 from foldgauss import _threads
-from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
 from foldgauss.video.config import chosen_num_gaussians, planned_steps
 from foldgauss.video.fit import check_frames, start, to_model
 
@@ -57,6 +58,8 @@ def test_learns_a_clip():
         {"own_time": False},
         {"square_share": 0.0},
         {"square_share": 1.0},
+        {"between_share": 0.5},
+        {"between_share": 0.9, "batch_size": 2, "two_cameras": True, "target_psnr": 60.0},
     ],
     ids=str,
 )
@@ -129,23 +132,45 @@ def test_a_finished_state_yields_once():
     assert again[0][1].progress == 1
 
 
+def test_what_lies_between_frames_is_learned():
+    """Frames never seen come out better than without, and what is told is the quality at frames alone."""
+    finer = panning(9, (2.0, 1.0), height=48, width=64)
+    seen, never = np.ascontiguousarray(finer[::2]), finer[1::2]
+    scores = {}
+    for share in (0.0, 0.6):
+        config = FitConfig(num_gaussians=600, steps=300, follow_motion=False, between_share=share)
+        result = fit(seen, config)
+        times = interpolated_times(np.asarray(result.model.frame_times.times()), 2)[1::2]
+        drawn = list(result.model.frames(times))
+        scores[share] = np.mean([psnr(target, made) for target, made in zip(never, drawn, strict=True)])
+    assert scores[0.6] > scores[0.0] + 0.5
+    assert abs(result.history[-1].psnr - evaluate(result.model, seen).mean_psnr) < 2
+
+
+def test_between_share_knows_no_alpha():
+    frames = np.full((3, 20, 20, 4), 9, np.uint8)
+    with pytest.raises(ValueError, match="between_share"):
+        fit(frames, FitConfig(num_gaussians=9, steps=2, between_share=0.5))
+
+
 def test_seed_matters():
     frames = moving_blobs()
     one, other = (fit(frames, dataclasses.replace(CONFIG, seed=seed, steps=2)).model for seed in (0, 1))
     assert not np.array_equal(one.splats.loc, other.splats.loc)
 
 
-def test_a_stopped_fit_goes_on_to_the_same_bits():
-    frames = moving_blobs()
-    whole = leaves_of(fit(frames, CONFIG).model)
-    for state, info in fit_steps(frames, CONFIG):
+@pytest.mark.parametrize("between_share", [0.0, 0.5])
+def test_a_stopped_fit_goes_on_to_the_same_bits(between_share):
+    frames, config = moving_blobs(), dataclasses.replace(CONFIG, between_share=between_share)
+    whole = leaves_of(fit(frames, config).model)
+    for state, info in fit_steps(frames, config):
         if info.step == 25:
             break
     kept = jax.tree.map(np.array, state)
-    for state, info in fit_steps(frames, CONFIG, kept):
+    for state, info in fit_steps(frames, config, kept):
         pass
     assert info.step == 60
-    for one, other in zip(whole, leaves_of(to_model(state, CONFIG, (48, 64), 25.0)), strict=True):
+    for one, other in zip(whole, leaves_of(to_model(state, config, (48, 64), 25.0)), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -266,6 +291,7 @@ def test_size_of_the_file_bounds_the_number():
         ({"rates": 3}, "rates"),
         ({"options": None}, "options"),
         ({"learn_frame_times": "no"}, "learn_frame_times"),
+        ({"between_share": 1.0}, "between_share"),
     ],
 )
 def test_bad_settings(changes, message):

@@ -44,6 +44,25 @@ def test_tracks_follow_a_panning_camera(step):
     )
 
 
+def test_what_lies_between_two_frames():
+    """Of a texture that moves by 4 pixels a frame it is the same texture, moved by a share of that."""
+    finer = panning(9, (1.0, 0.5))
+    found, known = Motion.of(np.ascontiguousarray(finer[::4])).between(finer[::4], 1, 0.75, (96, 160))
+    inside = np.zeros((96, 160), bool)
+    inside[8:-8, 8:-8] = True
+    assert known[inside].mean() > 0.9
+    assert np.abs(found - finer[7])[inside & known].mean() < 0.25 * np.abs(found - finer[8])[inside & known].mean()
+    assert not known[:, -2:].all()  # which come from outside the frame
+    small, known = Motion.of(np.ascontiguousarray(finer[::4])).between(finer[::4], 0, 0.5, (48, 80))
+    assert small.shape == (48, 80, 3)
+    assert known[8:-8, 8:-8].mean() > 0.9
+
+
+def test_nothing_is_known_between_unlike_frames():
+    unlike = np.concatenate([panning(2, (2, 0)), panning(2, (2, 0), seed=5)])
+    assert Motion.of(unlike).between(unlike, 1, 0.5, (96, 160))[1].mean() < 0.05
+
+
 def test_cuts_are_found():
     one, other, third = panning(7, (2, 0)), panning(5, (0, 0), seed=5), panning(4, (0, -1), seed=9)
     assert Motion.of(np.concatenate([one, other, third])).cuts() == [7, 12]
