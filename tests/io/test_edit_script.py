@@ -228,7 +228,11 @@ MISTAKES = {  # text: line, table, and what is told
     '[selections.it]\nmask = "nowhere.png"\nframe = 1': (2, "[selections.it]", "mask: .*nowhere.png.*missing"),
     '[selections.it]\nframe = 1\nfile = "nowhere"': (3, "[selections.it]", "file: .*nowhere.*missing"),
     '[selections.it]\nany = ["other"]': (2, "[selections.it]", "any: .*there is none.*'other'"),
-    '[selections.a]\nframe=1\n[selections.ab]\nany=["a"]\nall=["b"]': (5, "[selections.ab]", "all: .*before: a, got 'b'"),
+    '[selections.a]\nframe=1\n[selections.ab]\nany=["a"]\nall=["b"]': (
+        5,
+        "[selections.ab]",
+        "all: .*before: a, got 'b'",
+    ),
     "selections = 3": (1, "", "selections: .*SELECTIONS.NAME"),
     "\n\nedits = 3": (3, "", r"edits: .*\[\[edits\]\]"),
     "[edits]\ndo = 1": (1, "", r"edits: .*\[\[edits\]\]"),
