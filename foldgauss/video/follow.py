@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from foldgauss.video.light import Light, Stage, weighted_mean
+from foldgauss.video.light import Light, LitModel, weighted_mean
 from foldgauss.video.shots import is_cut
 
 #: A frame in which a Gaussian's weights sum to less than this share of what they come to in its best frame shows too
@@ -53,13 +53,13 @@ class Traits(NamedTuple):
         return Traits(self.light, *(leaf[keep] for leaf in self[1:]))
 
 
-def traits(stage: Stage, k: int) -> Traits:
+def traits(lit: LitModel, k: int) -> Traits:
     """What is seen in frame k."""
-    light = stage.frame(k)
+    light = lit.frame(k)
     which = np.flatnonzero(light.total > 0)
     total = light.total[which]
     everyone = light.drawn(np.ones((len(light.alive), 1)))
-    own_motion = _motion(stage, k, light)
+    own_motion = _motion(lit, k, light)
     flow = light.drawn(own_motion) / np.maximum(everyone, 1e-6)
     *motion, square = (light.gathered(np.stack([*flow, (flow * flow).sum(0)]))[which] / total[:, None]).T
     motion = np.stack(motion, -1)
@@ -69,12 +69,12 @@ def traits(stage: Stage, k: int) -> Traits:
     return Traits(light, which, light.alive[which], position, motion, spread, own_motion, color, total)
 
 
-def _motion(stage: Stage, k: int, light: Light) -> Float32[np.ndarray, "num_alive 2"]:
+def _motion(lit: LitModel, k: int, light: Light) -> Float32[np.ndarray, "num_alive 2"]:
     """How far each Gaussian's centre goes in the time of a frame, in pixels."""
-    intervals = np.diff(stage.times)
+    intervals = np.diff(lit.times)
     half = intervals[max(k - 1, 0) : k + 1].min() / 2  # not that of a cut
-    t = float(stage.times[k])
-    return stage.position(light.alive, t + half) - stage.position(light.alive, t - half)
+    t = float(lit.times[k])
+    return lit.position(light.alive, t + half) - lit.position(light.alive, t - half)
 
 
 def lab(color: Float[np.ndarray, "num 3"]) -> Float32[np.ndarray, "num 3"]:
@@ -91,7 +91,7 @@ def difference(one: Float[np.ndarray, "num 3"], other: Float[np.ndarray, "3"]) -
 
 
 def followed(
-    stage: Stage,
+    lit: LitModel,
     label: Int8[np.ndarray, "num_gaussians"],
     frames: Iterable[int],
     best: Float[np.ndarray, "num_gaussians"],
@@ -102,35 +102,35 @@ def followed(
     `best`: the sum of each Gaussian's weights in its best frame.
     """
     label = label.copy()
-    for k in _outward(stage, sorted(frames)):
+    for k in _outward(lit, sorted(frames)):
         if (label != UNKNOWN).all():
             break
-        if not (label[stage.frame(k).alive] == UNKNOWN).any():
+        if not (label[lit.frame(k).alive] == UNKNOWN).any():
             continue
-        seen = traits(stage, k)
+        seen = traits(lit, k)
         own = label[seen.index]
         known, asked = own != UNKNOWN, (own == UNKNOWN) & (seen.total >= CLEAR * best[seen.index])
         if known.any() and asked.any():
-            unit = max(stage.size)
+            unit = max(lit.size)
             like = np.hstack([seen.position / (PLACE * unit), seen.motion / (MOTION * unit), seen.color / COLOR])
             label[seen.index[asked]] = _voted(like[known], own[known], like[asked])
     return label
 
 
 def settled(
-    stage: Stage, label: Int8[np.ndarray, "num_gaussians"], frames: Iterable[int]
+    lit: LitModel, label: Int8[np.ndarray, "num_gaussians"], frames: Iterable[int]
 ) -> Int8[np.ndarray, "num_gaussians"]:
     """The rest of the labels, of those hidden: by the place of those known, in the frame next to their own time."""
     label, first = label.copy(), label
     rest = np.flatnonzero(first == UNKNOWN)
-    home = stage.nearest_frame(rest)
-    reached = set(_outward(stage, sorted(frames)))
+    home = lit.nearest_frame(rest)
+    reached = set(_outward(lit, sorted(frames)))
     for k in np.unique(home):
-        light = stage.frame(k)
+        light = lit.frame(k)
         known = first[light.alive] != UNKNOWN
         if k in reached and known.any():
             asked = rest[home == k]
-            place = stage.position(asked, float(stage.times[k]))
+            place = lit.position(asked, float(lit.times[k]))
             label[asked] = _voted(light.splats.mean[known], first[light.alive[known]], place)
     return label
 
@@ -143,9 +143,9 @@ def _voted(known: np.ndarray, label: np.ndarray, asked: np.ndarray) -> Int8[np.n
     return np.where((weight * label[who]).sum(1) > 0.5 * weight.sum(1), IN, OUT).astype(np.int8)
 
 
-def _outward(stage: Stage, frames: list[int]) -> list[int]:
+def _outward(lit: LitModel, frames: list[int]) -> list[int]:
     """The frames beside `frames`, in their shots, nearest first."""
-    shot = _shots(stage)
+    shot = _shots(lit)
     away = {}
     for k in set(range(len(shot))) - set(frames):
         same = [abs(k - one) for one in frames if shot[one] == shot[k]]
@@ -154,41 +154,41 @@ def _outward(stage: Stage, frames: list[int]) -> list[int]:
     return sorted(away, key=lambda k: (away[k], k))
 
 
-def _shots(stage: Stage) -> Int[np.ndarray, "num_frames"]:
+def _shots(lit: LitModel) -> Int[np.ndarray, "num_frames"]:
     """The number of each frame's shot."""
-    return np.concatenate([[0], np.cumsum(np.asarray(is_cut(stage.times)))])
+    return np.concatenate([[0], np.cumsum(np.asarray(is_cut(lit.times)))])
 
 
 # -------------------------------------------------------------------------------------------------- growing
 
 
-def grown(stage: Stage, pixel: tuple[int, int], k: int, tolerance: float) -> Bool[np.ndarray, "num_gaussians"] | None:
+def grown(lit: LitModel, pixel: tuple[int, int], k: int, tolerance: float) -> Bool[np.ndarray, "num_gaussians"] | None:
     """What is connected to a pixel (row, column) of frame k through neighbours that move alike, and of its colour.
 
     None where nothing is drawn at the pixel.
     """
-    here, (row, column) = stage.frame(k), pixel
-    point = np.zeros((1, *stage.size), np.float32)
+    here, (row, column) = lit.frame(k), pixel
+    point = np.zeros((1, *lit.size), np.float32)
     point[0, row, column] = 1
     weight = here.gathered(point)[:, 0]
     if not (weight > 0).any():
         return None
-    seen = [traits(stage, n) for n in _sampled(stage, k)]
+    seen = [traits(lit, n) for n in _sampled(lit, k)]
     wanted = lab(here.picture[:, row, column][None])[0]
     parts = ((one.index, one.color, one.total) for one in seen)
-    color, alike = weighted_mean(stage.num_gaussians, parts)
+    color, alike = weighted_mean(lit.num_gaussians, parts)
     alike[alike] = difference(color[alike], wanted) <= tolerance
     of_color = np.where(alike[here.alive], weight, 0)
     seed = here.alive[np.argmax(of_color if of_color.any() else weight)]
     alike[seed] = True
-    pairs = _pairs(stage, seen, alike)
-    inside = _connected(stage.num_gaussians, pairs, seed)
-    return inside | _joining(stage.num_gaussians, pairs, inside)
+    pairs = _pairs(lit, seen, alike)
+    inside = _connected(lit.num_gaussians, pairs, seed)
+    return inside | _joining(lit.num_gaussians, pairs, inside)
 
 
-def _sampled(stage: Stage, k: int) -> list[int]:
+def _sampled(lit: LitModel, k: int) -> list[int]:
     """Frames of the shot of frame k, evenly apart, with k itself."""
-    shot = _shots(stage)
+    shot = _shots(lit)
     own = np.flatnonzero(shot == shot[k])
     step = -(-len(own) // GROWN_FRAMES)
     return list(range(own[0] + (k - own[0]) % step, own[-1] + 1, step))
@@ -230,13 +230,13 @@ def _joining(num: int, pairs: _Pairs, inside: Bool[np.ndarray, "num_gaussians"])
     return free & (gaps[0] < gaps[1])
 
 
-def _pairs(stage: Stage, seen: list[Traits], among: Bool[np.ndarray, "num_gaussians"]) -> _Pairs:
+def _pairs(lit: LitModel, seen: list[Traits], among: Bool[np.ndarray, "num_gaussians"]) -> _Pairs:
     """All pairs among some, in each frame those seen clearly: of one that is hidden one sees what is in front."""
-    best = np.zeros(stage.num_gaussians)
+    best = np.zeros(lit.num_gaussians)
     for one in seen:
         best[one.index] = np.maximum(best[one.index], one.total)
     clear = (one.those(among[one.index] & (one.total >= CLEAR * best[one.index])) for one in seen)
-    found = [_touching(one, MOTION * max(stage.size)) for one in clear if len(one.index)]
+    found = [_touching(one, MOTION * max(lit.size)) for one in clear if len(one.index)]
     return _Pairs(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 

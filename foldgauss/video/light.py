@@ -25,7 +25,7 @@ from foldgauss.video.shots import out_of_cuts
 _DARK = np.zeros(3, np.float32)
 
 
-class Stage:
+class LitModel:
     """A model ready to be asked, at any time and its own size, what its Gaussians add to the picture.
 
     **Raises:** ValueError for what is no `VideoModel`, for numbers that are not finite, and for several envelopes.
@@ -91,7 +91,7 @@ def _the_one(envelope, name: str) -> float:
 class Light:
     """One time of a model: the Gaussians alive, and the weights by which they make the picture."""
 
-    stage: Stage
+    lit: LitModel
     splats: Conditioned
 
     @property
@@ -111,7 +111,7 @@ class Light:
     @functools.cached_property
     def total(self) -> Float32[np.ndarray, "num_alive"]:
         """Sum over pixels of the weights, in pixels."""
-        return self.gathered(np.ones((1, *self.stage.size), np.float32))[:, 0]
+        return self.gathered(np.ones((1, *self.lit.size), np.float32))[:, 0]
 
     def drawn(self, values: Float[np.ndarray, "num_alive channels"]) -> Float32[np.ndarray, "channels height width"]:
         """A v: the picture of up to three numbers per Gaussian, as if they were its colours."""
@@ -122,9 +122,9 @@ class Light:
         return cpu.backward(self._trace, _three(planes, 0))[3][:, : len(planes)]
 
     def _forward(self, color: Float32[np.ndarray, "num_alive 3"]) -> cpu.Trace:
-        splats, model = self.splats, self.stage.model
+        splats, model = self.splats, self.lit.model
         leaves = splats.mean, splats.factor, splats.opacity, color, _DARK
-        return cpu.forward(*leaves, self.stage.size, compositing=model.compositing, options=model.options)
+        return cpu.forward(*leaves, self.lit.size, compositing=model.compositing, options=model.options)
 
 
 def _three(values: np.ndarray, axis: int) -> np.ndarray:
@@ -135,13 +135,13 @@ def _three(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def contributions(
-    stage: Stage, region: Region
+    lit: LitModel, region: Region
 ) -> tuple[Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"]]:
     """What each Gaussian adds over the frames of a region: inside it, in all, and in its best frame; px, float64."""
-    inside, total, best = np.zeros((3, stage.num_gaussians))
-    everywhere = np.ones(stage.size, np.float32)
+    inside, total, best = np.zeros((3, lit.num_gaussians))
+    everywhere = np.ones(lit.size, np.float32)
     for k in region.frames:
-        light = stage.frame(k)
+        light = lit.frame(k)
         own_inside, own = light.gathered(np.stack([region.at(k), everywhere])).T
         inside[light.alive] += own_inside
         total[light.alive] += own
@@ -150,29 +150,29 @@ def contributions(
 
 
 def best_frames(
-    stage: Stage, frames: Iterable[int], best: Float[np.ndarray, "num_gaussians"]
+    lit: LitModel, frames: Iterable[int], best: Float[np.ndarray, "num_gaussians"]
 ) -> Float[np.ndarray, "num_gaussians"]:
     """What each Gaussian adds in its best frame, of `frames` too, if that is more than `best`."""
     best = best.copy()
     for k in frames:
-        light = stage.frame(k)
+        light = lit.frame(k)
         best[light.alive] = np.maximum(best[light.alive], light.total)
     return best
 
 
 def seen_colors(
-    stage: Stage,
+    lit: LitModel,
 ) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, "num_gaussians"]]:
     """The picture's colour where each Gaussian is seen, the mean over all frames; and which are seen at all."""
 
     def parts():
-        for k in range(len(stage.times)):
-            light = stage.frame(k)
+        for k in range(len(lit.times)):
+            light = lit.frame(k)
             seen = light.total > 0
             total = light.total[seen]
             yield light.alive[seen], light.gathered(light.picture)[seen] / total[:, None], total
 
-    return weighted_mean(stage.num_gaussians, parts())
+    return weighted_mean(lit.num_gaussians, parts())
 
 
 def weighted_mean(
@@ -187,20 +187,22 @@ def weighted_mean(
     return np.divide(value, total, out=value, where=there[:, None]), there
 
 
-def drawn_share(stage: Stage, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Float32[np.ndarray, "height width"]:
+def drawn_share(
+    lit: LitModel, mask: Bool[np.ndarray, "num_gaussians"], t: float
+) -> Float32[np.ndarray, "height width"]:
     """The share of a set of Gaussians in each pixel at time t: sum of their weights over that of all; 0 where none."""
-    light = stage.at(t)
+    light = lit.at(t)
     chosen = mask[light.alive]
     own, everyone = light.drawn(np.stack([chosen, np.ones_like(chosen)], 1))
     return np.divide(own, everyone, out=np.zeros_like(own), where=everyone > 0)
 
 
-def reached(stage: Stage, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
+def reached(lit: LitModel, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
     """The pixels at time t that a set of Gaussians reaches: where the alpha of one is not cut off, seen or hidden."""
-    splats = stage.at(t).splats
+    splats = lit.at(t).splats
     chosen = mask[splats.alive]
     leaves = splats.mean[chosen], splats.factor[chosen], splats.opacity[chosen]
     bright = np.ones((int(chosen.sum()), 3), np.float32)
     # Added up: nothing hides behind anything then.
-    drawn = cpu.forward(*leaves, bright, _DARK, stage.size, compositing="sum", options=stage.model.options)
+    drawn = cpu.forward(*leaves, bright, _DARK, lit.size, compositing="sum", options=lit.model.options)
     return drawn.image[0] > 0

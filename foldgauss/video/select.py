@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
 from foldgauss._checks import invalid
 from foldgauss.video.follow import CLEAR, IN, OUT, UNKNOWN, difference, followed, grown, lab, settled
-from foldgauss.video.light import Stage, best_frames, contributions, drawn_share, reached, seen_colors
+from foldgauss.video.light import LitModel, best_frames, contributions, drawn_share, reached, seen_colors
 from foldgauss.video.model import SH_C0, VideoModel
 from foldgauss.video.regions import (
     Masks,
@@ -23,7 +23,7 @@ from foldgauss.video.regions import (
 #: Share of what a Gaussian adds that has to lie inside a mask.
 THRESHOLD = 0.5
 #: Delta E: a shade for all of the clip; and, where a chain of neighbours holds it together, more.
-COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 20.0
+COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 15.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ def contribution(
 
     **Raises:** ValueError as `by_mask`. **Source:** the weights of eq:colorblending, as gradients of the colours.
     """
-    return contributions(Stage(model), mask_region(model, mask, frame, frames))[:2]
+    return contributions(LitModel(model), mask_region(model, mask, frame, frames))[:2]
 
 
 def by_mask(
@@ -270,10 +270,10 @@ def by_color(
     if wanted.shape != (3,) or wanted.dtype.kind not in "fiu" or not ((wanted >= 0) & (wanted <= 1)).all():
         raise invalid("color", expected="red, green and blue in [0, 1]", got=color)
     tolerance = checked_share("tolerance", tolerance, "[0, inf)")
-    stage = Stage(model)
+    lit = LitModel(model)
     own = np.maximum(0.5 + SH_C0 * np.asarray(model.splats.color_dc), 0)
     if seen:
-        looks, shown = seen_colors(stage)
+        looks, shown = seen_colors(lit)
         own[shown] = looks[shown]
     return Selection(difference(lab(own), lab(wanted[None])[0]) <= tolerance)
 
@@ -298,11 +298,11 @@ def by_time(
     """
     if (times is not None) + (frame is not None) + (frames is not None) != 1:
         raise invalid("times, frames, frame", expected="one of them", got="several or none")
-    stage = Stage(model)
-    start, stop = _span(stage, times, frame, frames, widened=not alive)
+    lit = LitModel(model)
+    start, stop = _span(lit, times, frame, frames, widened=not alive)
     if alive:
-        return Selection((stage.window[:, 0] < stop) & (start < stage.window[:, 1]))
-    own = stage.own_times
+        return Selection((lit.window[:, 0] < stop) & (start < lit.window[:, 1]))
+    own = lit.own_times
     return Selection((start <= own) & (own <= stop))
 
 
@@ -313,8 +313,9 @@ def by_click(
 
     A Gaussian is in if it *looks* like the pixel, to within `tolerance`, and a chain of such neighbours leads to it
     that touch and move alike in most of the frames in which they touch. So the set goes on through time, up to the cuts
-    of the shot, and ends where another colour or another motion begins. Gaussians that are seen in none of the frames
-    looked at (48 at most) are left out.
+    of the shot, and ends where another colour or another motion begins: what is of one colour and at rest all over the
+    frame is told apart by neither, so intersect it with a box. Gaussians that are seen in none of the frames looked at
+    (48 at most) are left out.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 
@@ -327,7 +328,7 @@ def by_click(
         raise invalid("click", expected=f"(x, y) in pixels of a {height}x{width} frame", got=click)
     tolerance = checked_share("tolerance", tolerance, "[0, inf)")
     k = chosen_frames(model, frame, None)[0]
-    found = grown(Stage(model), (int(point[1]), int(point[0])), k, tolerance)
+    found = grown(LitModel(model), (int(point[1]), int(point[0])), k, tolerance)
     if found is None:
         raise invalid("click", expected="a place where something is drawn", got=f"{click} of frame {k}")
     return Selection(found)
@@ -351,39 +352,39 @@ def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndar
     return reached(*_known(model, selection), t)
 
 
-def _known(model: VideoModel, selection: Selection) -> tuple[Stage, Bool[np.ndarray, "num_gaussians"]]:
+def _known(model: VideoModel, selection: Selection) -> tuple[LitModel, Bool[np.ndarray, "num_gaussians"]]:
     """The model, ready to be asked, and the mask of a selection that fits it."""
-    stage = Stage(model)
-    return stage, (Selection.none(model) | selection).mask
+    lit = LitModel(model)
+    return lit, (Selection.none(model) | selection).mask
 
 
 def _inside(model: VideoModel, region: Region, threshold: float, follow: bool) -> Selection:
     """Those with at least `threshold` of what they add to the region's frames in it; see `by_mask`."""
-    threshold, stage = checked_share("threshold", threshold), Stage(model)
-    inside, total, best = contributions(stage, region)
+    threshold, lit = checked_share("threshold", threshold), LitModel(model)
+    inside, total, best = contributions(lit, region)
     by_share = np.where(inside >= threshold * total, IN, OUT).astype(np.int8)
     by_share[total == 0] = UNKNOWN
     label = by_share
     if follow:
-        overall = best_frames(stage, set(range(model.num_frames)) - set(region.frames), best)
-        label = followed(stage, np.where(best >= CLEAR * overall, by_share, UNKNOWN), region.frames, overall)
+        overall = best_frames(lit, set(range(model.num_frames)) - set(region.frames), best)
+        label = followed(lit, np.where(best >= CLEAR * overall, by_share, UNKNOWN), region.frames, overall)
         label = np.where(label == UNKNOWN, by_share, label)
-    label = _by_place(stage, region, label)
+    label = _by_place(lit, region, label)
     if follow:
-        label = settled(stage, label, region.frames)
+        label = settled(lit, label, region.frames)
     return Selection(label == IN)
 
 
 def _by_place(
-    stage: Stage, region: Region, label: Int8[np.ndarray, "num_gaussians"]
+    lit: LitModel, region: Region, label: Int8[np.ndarray, "num_gaussians"]
 ) -> Int8[np.ndarray, "num_gaussians"]:
     """Decide the unknown by their centres at their own time, where the frame next to it has a mask."""
     label, unknown = label.copy(), np.flatnonzero(label == UNKNOWN)
-    home = stage.nearest_frame(unknown)
+    home = lit.nearest_frame(unknown)
     for k in set(region.frames) & set(home.tolist()):
         own = unknown[home == k]
-        column, row = np.floor(stage.own_place(own)).astype(np.int64).T
-        height, width = stage.size
+        column, row = np.floor(lit.own_place(own)).astype(np.int64).T
+        height, width = lit.size
         there = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         share = region.at(k)[row.clip(0, height - 1), column.clip(0, width - 1)]
         label[own] = np.where(there & (share >= 0.5), IN, OUT)
@@ -391,7 +392,7 @@ def _by_place(
 
 
 def _span(
-    stage: Stage,
+    lit: LitModel,
     times: tuple[float, float] | None,
     frame: int | None,
     frames: tuple[int, int] | None,
@@ -400,9 +401,9 @@ def _span(
 ) -> tuple[float, float]:
     """The span of time that is meant, from first to last; frames `widened` by half a frame to either side."""
     if times is None:
-        chosen = chosen_frames(stage.model, frame, frames)
+        chosen = chosen_frames(lit.model, frame, frames)
         ends = np.array([chosen[0], chosen[-1]]) + (np.array([-0.5, 0.5]) if widened else 0)
-        return tuple(np.interp(ends, np.arange(len(stage.times)), stage.times))
+        return tuple(np.interp(ends, np.arange(len(lit.times)), lit.times))
     pair = np.asarray(times)
     if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
         raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)

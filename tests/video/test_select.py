@@ -27,7 +27,7 @@ from foldgauss.video import (
     matte,
     select,
 )
-from foldgauss.video.light import Stage
+from foldgauss.video.light import LitModel
 from foldgauss.video.playback import Playback
 
 MODEL, LABEL = named_model()
@@ -47,9 +47,9 @@ def object_masks(name):
 
 def errors(found, wanted, model=MODEL):
     """The worst frame's shares of what the object, and of what all others add, that were missed and wrongly taken."""
-    stage, worst = Stage(model), np.zeros(2)
+    lit, worst = LitModel(model), np.zeros(2)
     for t in np.linspace(0, 1, 2 * model.num_frames - 1):  # between frames, too
-        light = stage.at(t)
+        light = lit.at(t)
         own, chosen = wanted.mask[light.alive], found.mask[light.alive]
         shares = (
             light.total[own & ~chosen].sum() / light.total[own].sum(),
@@ -126,10 +126,10 @@ def test_bad_sets():
 
 def weights(model, k):
     """The definition, pixel by pixel: (num_gaussians, height, width), float64."""
-    stage, options = Stage(model), model.options
-    splats = stage.frame(k).splats
+    lit, options = LitModel(model), model.options
+    splats = lit.frame(k).splats
     y, x = np.mgrid[: model.size[0], : model.size[1]] + 0.5
-    found, light = np.zeros((stage.num_gaussians, *model.size)), np.ones(model.size)
+    found, light = np.zeros((lit.num_gaussians, *model.size)), np.ones(model.size)
     for i, mean, factor, opacity in zip(splats.alive, splats.mean, splats.factor, splats.opacity, strict=True):
         precision = np.linalg.inv(factor.astype(float) @ factor.T + options.low_pass * np.eye(2))
         offset = np.stack([x - mean[0], y - mean[1]], -1)
