@@ -36,6 +36,7 @@ from benchmarks._common import console
 from foldgauss.datasets import bikes
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import (
+    Edit,
     EditedVideo,
     FitConfig,
     Selection,
@@ -66,8 +67,8 @@ OUTLINES = {
 # fmt: on
 #: Pixels that a rough outline may be off.
 ROUGH = 10
-#: A frame at which all that he crossed is seen.
-AFTER = 20
+#: Columns that he crosses, and a frame at which he is past them, and the taxi that follows not yet there.
+PAST = {(0, 205): 12, (205, 384): 20}
 #: A mask is grown by so many pixels before it is said what is seen beside it.
 BESIDE = 5
 TINT = np.array([255.0, 0.0, 255.0])
@@ -105,27 +106,35 @@ def rider() -> Scene:
     return Scene("rider", clip.frames, masks, _seen_beside(clip.frames, beside), clip.fps, shown, few, made, 1.6)
 
 
+def alone(model: VideoModel, it: Selection) -> Edit:
+    """The object without anything else, for a layer."""
+    return edit(model).select(~it).vanish().select()
+
+
 class RiderEdits:
     """What he rides past was never seen while he hid it, so where he `crossed` it stands still as it is after him.
 
-    He himself becomes a layer in front: else cars that stand before him in array order would cover his copies.
+    He himself becomes a layer in front: cars that stand before him in array order would cover his copies.
     """
 
     def __init__(self, crossed: np.ndarray):
         self._crossed = crossed
 
     def gone(self, model: VideoModel, it: Selection) -> Video:
-        hidden = by_mask(model, self._crossed, frames=(0, model.num_frames)) - it
-        return edit(model).select(it).vanish().select(hidden).freeze(AFTER).video()
+        gone = edit(model).select(it).vanish()
+        for (first, stop), frame in PAST.items():
+            crossed = np.zeros_like(self._crossed)
+            crossed[:, first:stop] = self._crossed[:, first:stop]
+            hidden = by_mask(model, crossed, frames=(0, model.num_frames)) - it
+            gone = gone.select(hidden).freeze(frame)
+        return gone.video()
 
     def three(self, model: VideoModel, it: Selection) -> Video:
-        alone = edit(model).select(~it).vanish().select()
-        copies = alone.multiply([(-0.34, 0.0), (0.34, 0.0)], delays=[0.04, 0.0])
+        copies = alone(model, it).multiply([(-0.34, 0.0), (0.34, 0.0)], delays=[0.04, 0.0])
         return layers(copies.video(), self.gone(model, it))
 
     def smaller(self, model: VideoModel, it: Selection) -> Video:
-        alone = edit(model).select(~it).vanish().select()
-        return layers(alone.scale(0.6, about=(0.0, 160 / 384 / 2)).video(), self.gone(model, it))
+        return layers(alone(model, it).scale(0.6, about=(0.0, 160 / 384 / 2)).video(), self.gone(model, it))
 
     def red(self, frame: int) -> Callable[[VideoModel, Selection], Video]:
         return lambda model, it: edit(model).select(it).recolor((0.8, 0.1, 0.1), frame=frame).video()
@@ -190,10 +199,11 @@ def shapes(num_frames: int = 24, size: tuple[int, int] = (128, 256)) -> Scene:
     shown = (3, 9, 15, 20)
     edits = {
         "vanish": lambda model, it: edit(model).select(it).vanish().video(),
-        "multiply": lambda model, it: (
-            edit(model).select(it).multiply([(0.0, 0.14), (0.0, 0.28)], delays=[0.1, 0.2], scale=0.7).video()
+        "multiply": lambda model, it: layers(
+            alone(model, it).multiply([(0.0, 0.14), (0.0, 0.28)], delays=[0.1, 0.2], scale=0.7, originals=True).video(),
+            edit(model).select(it).vanish().video(),
         ),
-        "scale": lambda model, it: edit(model).select(it).scale(1.6).video(),
+        "scale": lambda model, it: layers(alone(model, it).scale(1.6).video(), edit(model).select(it).vanish().video()),
         "single frame": lambda model, it: edit(model).select(it).recolor(hue=0.8, frame=shown[1]).video(),
     }
     return Scene("shapes", frames, np.stack(masks), behind, 24.0, shown, (2, 11, 21), edits)
@@ -261,10 +271,11 @@ def measured(scene: Scene, model: VideoModel) -> tuple[dict[str, float], dict[st
     }
     share = np.stack([matte(model, it, float(times[k])) for k in scene.shown])[..., None]
     numbers = list(scene.shown)
-    rows = {"original": scene.frames[numbers], "selected": before[numbers] * (1 - 0.6 * share) + TINT * 0.6 * share}
-    for name, video in videos.items():
-        rows[name] = np.stack(list(video.frames(times[numbers])))
-    return figures, {name: scene.brightness * row for name, row in rows.items()}
+    bright = {"original": scene.frames[numbers], "selected": before[numbers]}
+    bright |= {name: np.stack(list(video.frames(times[numbers]))) for name, video in videos.items()}
+    rows = {name: scene.brightness * pictures for name, pictures in bright.items()}
+    rows["selected"] = rows["selected"] * (1 - 0.6 * share) + TINT * 0.6 * share
+    return figures, rows
 
 
 def sheet(rows: dict[str, np.ndarray]) -> np.ndarray:
