@@ -169,6 +169,8 @@ ACTIONS = {
     ),
     "retime": _Action("retime", takes={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER, "outside": _TEXT}),
     "freeze": _Action("freeze", {"at": _NUMBER}, named={"at": "frame"}, spans=False),
+    "to_front": _Action("to_front", spans=False),
+    "to_back": _Action("to_back", spans=False),
     "place": _Action("place", takes={"depth": _NUMBER, "degrees": _THREE, "about": _PAIR}, named={"degrees": "rotate"}),
 }
 

@@ -101,8 +101,8 @@ class Edit:
         `selection`: a `Selection`, a mask bool (num_gaussians,) or a function of `video()` that gives one of the two.
         Else `criteria` as `foldgauss.video.select.select` takes them (`mask=`, `box=`, `color=`, ...), asked of each
         layer's model, or of layer number `layer` alone, as it is without overlays: edits that could be baked are seen,
-        others not. Masks count the Gaussians of all layers, front layer first, or of `layer`: those that there are now,
-        or those that the chain was begun with, whose copies then go along.
+        others not. Masks count the Gaussians of all layers, front layer first, or of `layer`: those that the chain was
+        begun with, whose copies then go along; or, where there are more or fewer, those that there are now.
         """
         if selection is not None and criteria:
             got = f"{type(selection).__name__} and {', '.join(criteria)}"
@@ -136,10 +136,6 @@ class Edit:
             raise invalid("selection", expected=expected, got=got, cure=cure)
         if len(mask) != sum(before):
             return _split(mask, counts)
-        moved = any(not np.array_equal(source, np.arange(count)) for source, count in zip(sources, before, strict=True))
-        if moved and sum(counts) == sum(before):
-            cure = "As many were copied as deleted: end the chain with .video(), and begin anew with that."
-            raise invalid("selection", expected="a mask that can mean but one thing", got="one of two", cure=cure)
         return [part[source] for part, source in zip(_split(mask, before), sources, strict=True)]
 
     # ------------------------------------------------------------------------------------- where, in the plane
@@ -259,6 +255,29 @@ class Edit:
             made.append(layer)
             sources.append(source)
         return self._with(made, Selection(np.zeros(sum(map(len, sources)), bool)), sources)
+
+    def to_front(self) -> "Edit":
+        """Before all other Gaussians of its layer, in their own order. Baked: the array's order is that of depth.
+
+        After a fit, Gaussians of the ground stand before an object, where they do not touch it: it has to come forward
+        before it is moved, copied or enlarged, or they cover it at its new place.
+        """
+        return self._reordered(front=True)
+
+    def to_back(self) -> "Edit":
+        """Behind all other Gaussians of its layer, in their own order. Baked, as `to_front`."""
+        return self._reordered(front=False)
+
+    def _reordered(self, *, front: bool) -> "Edit":
+        self._check_selected()
+        parts = self._parts()
+        sources = [np.argsort(~mask if front else mask, kind="stable") for mask in parts]
+        made = [
+            _gathered(layer, source, mask, np.zeros(len(source), int))
+            for layer, source, mask in zip(self._video.layers, sources, parts, strict=True)
+        ]
+        chosen = [mask[source] for mask, source in zip(parts, sources, strict=True)]
+        return self._with(made, Selection(np.concatenate(chosen)), sources)
 
     def opacity(self, factor: float, **when: Unpack[When]) -> "Edit":
         """Opacity times `factor` >= 0, held at 1. Baked without a span, where it stays below 1; 0 is `vanish`."""

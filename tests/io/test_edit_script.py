@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from foldgauss.io import save_selection, save_video_model
+from foldgauss.io import read_masks, save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
 from foldgauss.render import Camera
@@ -75,6 +75,8 @@ CHAINS = {
         lambda e, **when: e.retime(shift=0.1, stretch=-1, about=0.5, outside="hold", **when),
     ),
     "freeze": ("at = 2.5", lambda e: e.freeze(2.5)),
+    "to_front": ("", lambda e: e.to_front()),
+    "to_back": ("", lambda e: e.to_back()),
     "place": (
         "depth = 0.3\ndegrees = [0, 30, 0]\nabout = [0, 0]",
         lambda e, **when: e.place(depth=0.3, rotate=(0, DEGREES, 0), about=(0, 0), **when),
@@ -95,7 +97,7 @@ def test_a_script_does_what_the_chain_does(name):
     assert 0 < len(start.selection) < NUM
     assert same(made(THERE + do), chain(start).video())
     assert not same(made(THERE + do), MODEL)
-    if name != "freeze":
+    if ACTIONS[name.split()[0]].spans:
         spanned = made(THERE + do + SPAN)
         assert isinstance(spanned, EditedVideo)
         assert same(spanned, chain(start, **IN).video())
@@ -185,7 +187,9 @@ def test_selections_from_files(folder):
     assert same(left('mask = "masks"\nframe = 3'), boxed)  # of masks for all frames, the one looked at
     over = edit(MODEL).select(box=BOX, frames=(1, 3)).vanish().video()
     assert same(left('mask = "masks"\nframes = [1, 3]'), over)
-    assert not same(left('mask = "masks"'), over)
+    assert not same(left('mask = "masks"\nframe = 0'), boxed)
+    every = edit(MODEL).select(mask=read_masks(folder / "masks")).vanish().video()
+    assert same(left('mask = "masks"'), every)
 
 
 def test_layers_and_camera(folder):
@@ -376,8 +380,11 @@ def scripts(draw):
     text = "[selections.it]\n" + "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
     for _ in range(draw(st.integers(0, 3))):
         name = draw(st.sampled_from(sorted(CHAINS)))
-        keys = tomllib.loads(CHAINS[name][0] + ("\n" + SPAN if name != "freeze" and draw(st.booleans()) else ""))
-        keys |= draw(st.dictionaries(st.sampled_from(sorted(ACTIONS[name.split()[0]].keys)), VALUES, max_size=2))
+        keys = tomllib.loads(
+            CHAINS[name][0] + ("\n" + SPAN if ACTIONS[name.split()[0]].spans and draw(st.booleans()) else "")
+        )
+        own = sorted(ACTIONS[name.split()[0]].keys)
+        keys |= draw(st.dictionaries(st.sampled_from(own), VALUES, max_size=2)) if own else {}
         keys |= draw(st.just({}) | st.just({"select": "it"}))
         text += f'[[edits]]\ndo = "{name.split()[0]}"\n' + "".join(f"{k} = {toml(v)}\n" for k, v in keys.items())
     return text

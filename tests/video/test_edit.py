@@ -544,8 +544,9 @@ def test_selections_of_before_go_on():
     with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 59"):
         chain.select(lambda model: OBJECT)  # asked now
     equal = edit(MODEL).select(some).multiply([(0.1, 0)]).select(np.arange(NUM) < 5).vanish()
-    with pytest.raises(ValueError, match=r"^selection: expected a mask that can mean but one thing"):
-        equal.select(OBJECT)
+    np.testing.assert_array_equal(
+        equal.select(OBJECT).selection.mask, OBJECT[np.r_[5 : NUM - 5, np.repeat(np.arange(NUM - 5, NUM), 2)]]
+    )
     assert len(equal.select(lambda model: OBJECT).selection) == OBJECT.sum()
     assert len(equal.select().selection) == NUM
 
@@ -646,3 +647,21 @@ def test_broken_triangles():
     ):
         with pytest.raises(ValueError, match=f"^{message}"):
             edit(MODEL).apply_triangles(function).video().render(0.5)
+
+
+def test_to_the_front_and_to_the_back():
+    """Who covers whom is all that changes, and a selection of before still means the same Gaussians."""
+    order = np.arange(NUM)
+    for chain, expected in (
+        (edit(MODEL).select(OBJECT).to_front(), np.concatenate([order[OBJECT], order[~OBJECT]])),
+        (edit(MODEL).select(OBJECT).to_back(), np.concatenate([order[~OBJECT], order[OBJECT]])),
+    ):
+        np.testing.assert_array_equal(chain.video().splats.loc, np.asarray(MODEL.splats.loc)[expected])
+        np.testing.assert_array_equal(chain.selection.mask, OBJECT[expected])
+        again = chain.select(OBJECT)
+        np.testing.assert_array_equal(again.selection.mask, OBJECT[expected])
+    eased = edit(MODEL).select(OBJECT).scale(1.5, frame=2).to_front()  # an overlay goes along
+    assert isinstance(eased.video(), EditedVideo)
+    np.testing.assert_array_equal(eased.video().layers[0].overlays[0].mask, eased.selection.mask)
+    with pytest.raises(ValueError, match="selection"):
+        edit(MODEL).select(np.zeros(NUM, bool)).to_front()
