@@ -185,7 +185,9 @@ def test_selections_from_files(folder):
     assert same(left('mask = "masks"\nframe = 3'), boxed)  # of masks for all frames, the one looked at
     over = edit(MODEL).select(box=BOX, frames=(1, 3)).vanish().video()
     assert same(left('mask = "masks"\nframes = [1, 3]'), over)
-    assert not same(left('mask = "masks"'), over)
+    elsewhere = edit(MODEL).select(box=(40, 0, 64, 40), frame=0).vanish().video()
+    assert same(left('mask = "masks"\nframe = 0'), elsewhere)
+    assert elsewhere.num_gaussians != boxed.num_gaussians
 
 
 def test_layers_and_camera(folder):
