@@ -69,9 +69,11 @@ OUTLINES = {
 ROUGH = 10
 #: Columns that he crosses, and a frame at which he is past them, and the taxi that follows not yet there.
 PAST = {(0, 205): 12, (205, 384): 20}
+#: Share of what a Gaussian of an object alone adds that has to lie in its masks.
+WITHIN = 0.7
 #: A mask is grown by so many pixels before it is said what is seen beside it.
 BESIDE = 5
-TINT = np.array([255.0, 0.0, 255.0])
+TINT = np.array([0.0, 220.0, 255.0])
 #: A sheet's file is made smaller until it is within.
 SHEET_BYTES, SHEET_WIDTH, COLORS = 400_000, 1280, 200
 
@@ -100,15 +102,16 @@ def rider() -> Scene:
     clip = bikes(frames=(30, 55), size=(160, 384))
     masks = np.stack([_cut_out(frame, _outline(k)) for k, frame in enumerate(clip.frames)])
     beside = np.stack([_grown(mask, BESIDE) for mask in masks])
-    shown, edits = (3, 7, 10, 13), RiderEdits(beside.any(0))
+    shown, edits = (3, 7, 10, 13), RiderEdits(masks, beside.any(0))
     made = {"vanish": edits.gone, "multiply": edits.three, "scale": edits.smaller, "single frame": edits.red(shown[1])}
     few = (0, 4, 8, 12, 16)
     return Scene("rider", clip.frames, masks, _seen_beside(clip.frames, beside), clip.fps, shown, few, made, 1.6)
 
 
-def alone(model: VideoModel, it: Selection) -> Edit:
-    """The object without anything else, for a layer."""
-    return edit(model).select(~it).vanish().select()
+def alone(model: VideoModel, it: Selection, masks: np.ndarray) -> Edit:
+    """The object without anything else, for a layer; nor what others used to hide, beyond the masks."""
+    cut = edit(model).select(~it).vanish()
+    return cut.select(lambda video: ~by_mask(video, masks, threshold=WITHIN, follow=False)).vanish().select()
 
 
 class RiderEdits:
@@ -117,8 +120,8 @@ class RiderEdits:
     He himself becomes a layer in front: cars that stand before him in array order would cover his copies.
     """
 
-    def __init__(self, crossed: np.ndarray):
-        self._crossed = crossed
+    def __init__(self, masks: np.ndarray, crossed: np.ndarray):
+        self._masks, self._crossed = masks, crossed
 
     def gone(self, model: VideoModel, it: Selection) -> Video:
         gone = edit(model).select(it).vanish()
@@ -130,11 +133,13 @@ class RiderEdits:
         return gone.video()
 
     def three(self, model: VideoModel, it: Selection) -> Video:
-        copies = alone(model, it).multiply([(-0.34, 0.0), (0.34, 0.0)], delays=[0.04, 0.0])
+        copies = alone(model, it, self._masks).multiply([(-0.34, 0.0), (0.34, 0.0)], delays=[0.04, 0.0])
         return layers(copies.video(), self.gone(model, it))
 
     def smaller(self, model: VideoModel, it: Selection) -> Video:
-        return layers(alone(model, it).scale(0.6, about=(0.0, 160 / 384 / 2)).video(), self.gone(model, it))
+        return layers(
+            alone(model, it, self._masks).scale(0.6, about=(0.0, 160 / 384 / 2)).video(), self.gone(model, it)
+        )
 
     def red(self, frame: int) -> Callable[[VideoModel, Selection], Video]:
         return lambda model, it: edit(model).select(it).recolor((0.8, 0.1, 0.1), frame=frame).video()
@@ -195,18 +200,23 @@ def shapes(num_frames: int = 24, size: tuple[int, int] = (128, 256)) -> Scene:
         behind.append(picture)
         frames.append(np.where(disc[..., None], np.stack([stripe, 0.35 * stripe, 0.15 * stripe], -1), picture))
         masks.append(disc)
+    masks = np.stack(masks)
     frames, behind = ((255 * np.stack(one)).round().clip(0, 255).astype(np.uint8) for one in (frames, behind))
     shown = (3, 9, 15, 20)
     edits = {
         "vanish": lambda model, it: edit(model).select(it).vanish().video(),
         "multiply": lambda model, it: layers(
-            alone(model, it).multiply([(0.0, 0.14), (0.0, 0.28)], delays=[0.1, 0.2], scale=0.7, originals=True).video(),
+            alone(model, it, masks)
+            .multiply([(0.0, 0.14), (0.0, 0.28)], delays=[0.1, 0.2], scale=0.7, originals=True)
+            .video(),
             edit(model).select(it).vanish().video(),
         ),
-        "scale": lambda model, it: layers(alone(model, it).scale(1.6).video(), edit(model).select(it).vanish().video()),
+        "scale": lambda model, it: layers(
+            alone(model, it, masks).scale(1.6).video(), edit(model).select(it).vanish().video()
+        ),
         "single frame": lambda model, it: edit(model).select(it).recolor(hue=0.8, frame=shown[1]).video(),
     }
-    return Scene("shapes", frames, np.stack(masks), behind, 24.0, shown, (2, 11, 21), edits)
+    return Scene("shapes", frames, masks, behind, 24.0, shown, (2, 11, 21), edits)
 
 
 SCENES = {"rider": rider, "shapes": shapes}
