@@ -73,7 +73,7 @@ PAST = {(0, 205): 12, (205, 384): 20}
 WITHIN = 0.7
 #: A mask is grown by so many pixels before it is said what is seen beside it.
 BESIDE = 5
-TINT = np.array([0.0, 220.0, 255.0])
+CYAN, MAGENTA = (0.0, 220.0, 255.0), (255.0, 0.0, 255.0)
 #: A sheet's file is made smaller until it is within.
 SHEET_BYTES, SHEET_WIDTH, COLORS = 400_000, 1280, 200
 
@@ -91,6 +91,7 @@ class Scene(NamedTuple):
     shown: tuple[int, ...]  # frames of the sheet; the second is the one edited alone
     few: tuple[int, ...]  # frames whose masks select the object in `iou_few`
     edits: dict[str, Callable[[VideoModel, Selection], Video]]
+    tint: tuple[float, float, float]  # of the selection, in the sheet
     brightness: float = 1.0  # of the sheet
 
     @property
@@ -105,7 +106,7 @@ def rider() -> Scene:
     shown, edits = (3, 7, 10, 13), RiderEdits(masks, beside.any(0))
     made = {"vanish": edits.gone, "multiply": edits.three, "scale": edits.smaller, "single frame": edits.red(shown[1])}
     few = (0, 4, 8, 12, 16)
-    return Scene("rider", clip.frames, masks, _seen_beside(clip.frames, beside), clip.fps, shown, few, made, 1.6)
+    return Scene("rider", clip.frames, masks, _seen_beside(clip.frames, beside), clip.fps, shown, few, made, CYAN, 1.6)
 
 
 def alone(model: VideoModel, it: Selection, masks: np.ndarray) -> Edit:
@@ -216,7 +217,7 @@ def shapes(num_frames: int = 24, size: tuple[int, int] = (128, 256)) -> Scene:
         ),
         "single frame": lambda model, it: edit(model).select(it).recolor(hue=0.8, frame=shown[1]).video(),
     }
-    return Scene("shapes", frames, masks, behind, 24.0, shown, (2, 11, 21), edits)
+    return Scene("shapes", frames, masks, behind, 24.0, shown, (2, 11, 21), edits, MAGENTA)
 
 
 SCENES = {"rider": rider, "shapes": shapes}
@@ -284,7 +285,7 @@ def measured(scene: Scene, model: VideoModel) -> tuple[dict[str, float], dict[st
     bright = {"original": scene.frames[numbers], "selected": before[numbers]}
     bright |= {name: np.stack(list(video.frames(times[numbers]))) for name, video in videos.items()}
     rows = {name: scene.brightness * pictures for name, pictures in bright.items()}
-    rows["selected"] = rows["selected"] * (1 - 0.6 * share) + TINT * 0.6 * share
+    rows["selected"] = rows["selected"] * (1 - 0.6 * share) + np.array(scene.tint) * 0.6 * share
     return figures, rows
 
 
