@@ -394,6 +394,7 @@ def test_a_row_without_weight_may_hold_any_number():
     assert weighed.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_unequal_batches_lead_where_all_points_do():
     x = _blobs(n=4000)
     groups = [x[k::K] for k in range(K)]
