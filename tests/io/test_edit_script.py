@@ -390,7 +390,7 @@ def scripts(draw):
     return text
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(text=scripts())
 def test_whatever_a_script_says_it_works_or_is_told(text):
     """And what is made can be drawn and saved, so nothing wrong goes in unseen."""
