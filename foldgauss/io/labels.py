@@ -10,6 +10,7 @@ from foldgauss._checks import invalid
 
 #: Kinds of image whose stored numbers are the labels: palette ("P"), grey ("L") and black and white ("1").
 _NUMBERED = ("P", "L", "1")
+_COLORED = ("RGB", "RGBA")
 _WHITE = 255
 #: The label of pixels that may be anything.
 VOID = 255
@@ -19,7 +20,7 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
     """Masks as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 what is void.
 
     A palette image gives the *index* of each pixel, whatever colour it is shown in (OpenCV gives the colour, hence
-    Pillow here); a grey one its level. Masks that are black and white throughout, as those of DAVIS 2016, become 0 and
+    Pillow here); a grey one its level, also where that is stored as three equal colours. Masks that are black and white throughout, as those of DAVIS 2016, become 0 and
     1. Raises ValueError for an image that does not decode, has colours instead of numbers, or differs in size.
     """
     masks, grey = [], True
@@ -48,6 +49,8 @@ def _read(path: Path) -> tuple[np.ndarray, str]:
         raise invalid(
             "path", expected="masks that decode", got=f"{str(path)!r}, which does not", cure="Copy it again."
         ) from error
+    if mode in _COLORED and (pixels[..., :3] == pixels[..., :1]).all():  # grey all the same, as paint programs write it
+        mode, pixels = "L", pixels[..., 0]
     if mode not in _NUMBERED:
         raise invalid(
             "path",

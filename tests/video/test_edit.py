@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates, spline_filter
 from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
+from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.video import Clock, EditedVideo, Selection, VideoModel, edit, layers
+from foldgauss.video import Clock, EditedVideo, FrameTimes, SelectedGaussians, Selection, VideoModel, edit, layers
 from foldgauss.video.playback import Playback
+from foldgauss.video.shots import time_logits
 from foldgauss.video.stage import Stage
 
 MODEL = soft_model()
@@ -121,6 +123,19 @@ def test_what_is_baked_is_what_the_overlay_draws(name, power, floor):
     assert max(apart(baked, model, t) for t in BETWEEN) > 0.02
     for t in BETWEEN:
         assert apart(baked, laid_over, t) < 1e-5
+
+
+@pytest.mark.parametrize("name", ["move", "gain", "vanish", "reverse", "multiply"])
+def test_masks_are_of_the_model_not_of_those_alive(name):
+    """As above where most come and go."""
+    short = MODEL.splats.log_time_scale - np.float32(2.2)
+    model = dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, log_time_scale=short))
+    chain = edit(model).select(OBJECT)
+    baked, laid_over = BAKED[name](chain).video(), BAKED[name](chain, **ALWAYS).video()
+    for t in BETWEEN:
+        assert apart(baked, laid_over, t) < 1e-5
+    assert max(apart(baked, model, t) for t in BETWEEN) > 0.02
+    assert min(len(splats(model, t).opacity) for t in BETWEEN) < NUM / 2
 
 
 @pytest.mark.parametrize("name", sorted(set(BAKED) - {"vanish", "multiply"}))
@@ -243,13 +258,13 @@ def test_no_way_through_nothing(matrix, progress):
 
 def test_edits_act_in_their_order():
     """An affine edit after an overlay of the same Gaussians must not slip in under it."""
-    chain = edit(MODEL).select(OBJECT).scale(1.5)  # about its own centre: an overlay
-    later = chain.move((0.1, 0)).scale(0.5, about=(0, 0)).video()
-    assert isinstance(later, EditedVideo)
-    centre = lambda video: video.at(0.31).mean[OBJECT].mean(0)  # noqa: E731
-    middle = np.array(SIZE[::-1]) / 2
-    expected = 0.5 * (centre(chain.video()) + np.array([6.4, 0]) - middle) + middle
-    np.testing.assert_allclose(centre(later), expected, atol=1e-3)
+    turned = edit(MODEL).select(OBJECT).rotate(0.8)  # about its own centre: an overlay
+    wide = np.diag([2.0, 0.5])
+    both = turned.move((0.1, 0)).transform(wide, about=(0, 0)).video().at(0.31)
+    before, middle = turned.video().at(0.31), np.array(SIZE[::-1]) / 2
+    mean = (before.mean[OBJECT] + np.array([6.4, 0]) - middle) @ wide + middle
+    np.testing.assert_allclose(both.mean[OBJECT], mean, atol=1e-3)
+    np.testing.assert_allclose(both.factor[OBJECT], wide @ before.factor[OBJECT], atol=1e-3)
     other = edit(MODEL).select(OBJECT).scale(1.5).select(~OBJECT).move((0.1, 0)).video()
     assert len(other.layers[0].overlays) == 1  # others of its Gaussians are free to be baked
 
@@ -349,6 +364,31 @@ def test_about_its_own_centre_it_stays_where_it_is():
         np.testing.assert_allclose(own_centre(video), own_centre(MODEL), atol=1e-5)
 
 
+def test_the_own_centre_is_where_most_of_it_is():
+    """Weighted by opacity and area: by hand, of two."""
+    ones = np.ones((2, 3), np.float32)
+    factor = np.float32([[[2, 1], [0, 1]], [[1, 0], [3, 1]]])  # areas 2 and 1
+    mean, opacity = np.float32([[0, 0], [1, 2]]), np.float32([0.3, 0.9])
+    flat = SelectedGaussians(np.arange(2), mean, factor, opacity, ones)
+    for gaussians in (flat, flat.in_space()):
+        np.testing.assert_allclose(gaussians.centre[:2], [0.6, 1.2], rtol=1e-6)
+    unseen = dataclasses.replace(flat, opacity=0 * opacity)
+    np.testing.assert_allclose(unseen.centre, [0.5, 1.0])
+
+
+def test_what_is_left_stays_where_it_was():
+    """Half of an object deleted does not move the centre about which the other half was scaled."""
+    some = np.arange(NUM) < 5
+    whole = edit(MODEL).select(OBJECT).scale(1.5)
+    left = whole.select(some).vanish()
+    rest = OBJECT & ~some
+    np.testing.assert_allclose(left.video().at(0.31).mean[rest[5:]], whole.video().at(0.31).mean[rest], atol=1e-4)
+    # Where nothing of it stays, it is deleted, and the edit with it.
+    gone = whole.vanish().video()
+    assert isinstance(gone, VideoModel)
+    assert gone.splats.num_gaussians == NUM - OBJECT.sum()
+
+
 def own_centre(video):
     found = []
     edit(video).select(OBJECT).apply(lambda g, t: found.append(g.centre) or g).video().at(0.31)
@@ -367,6 +407,14 @@ def test_copies_stand_behind_their_originals():
     both = edit(MODEL).select(OBJECT).multiply([(0.1, 0)], originals=True)
     assert len(both.selection) == 2 * OBJECT.sum()
     assert not chain.selection.mask[~np.repeat(OBJECT, np.where(OBJECT, 3, 1))].any()
+
+
+def test_an_envelope_of_each_ones_own_goes_with_it():
+    powers = np.linspace(1, 2, NUM).astype(np.float32)
+    model = dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, envelope=TimeLikelihood(powers, 0.1)))
+    envelope = edit(model).select(OBJECT).multiply([(0.1, 0)]).video().splats.envelope
+    np.testing.assert_array_equal(envelope.power, np.repeat(powers, np.where(OBJECT, 2, 1)))
+    assert envelope.floor == np.float32(0.1)
 
 
 def test_copies_have_their_own_edits_and_times():
@@ -425,6 +473,22 @@ def test_clocks_follow_one_another():
     crossed = edit(MODEL).select(OBJECT).freeze(0).select(some).retime(shift=0.2, outside="hold").video()
     np.testing.assert_array_equal(crossed.at(0.5).mean[OBJECT], base.at(0.0).mean[OBJECT])
     np.testing.assert_allclose(crossed.at(0.5).mean[some & ~OBJECT], base.at(0.3).mean[some & ~OBJECT], atol=1e-3)
+
+
+def test_shots():
+    """Between two shots the nearer one's frame is seen, by an object's own clock, too; and no leaves say that."""
+    model = dataclasses.replace(MODEL, frame_times=FrameTimes(time_logits(8, [4])))
+    times = np.asarray(model.frame_times.times())
+    assert times[4] - times[3] > 0.5
+    late = edit(model).select(OBJECT).retime(shift=0.02).video()
+    assert isinstance(late, EditedVideo)
+    base = edit(model).apply(lambda g, t: g).video()
+    for t, seen in ((times[3] + 0.1, times[3]), (times[3] + 0.4, times[4])):
+        got = edit(model).select(OBJECT).retime(clock=Clock.frozen(float(t))).video().at(times[0])
+        np.testing.assert_array_equal(got.mean[OBJECT], base.at(seen).mean[OBJECT])
+    one_frame = edit(model).select(OBJECT).move((0.2, 0), frame=3).video()
+    assert apart(one_frame, model, float(times[3] + 0.1)) > 0.01
+    assert apart(one_frame, model, float(times[3] + 0.4)) == 0
 
 
 # ----------------------------------------------------------------------------------------------------------- colours

@@ -15,6 +15,7 @@ from foldgauss.io.model_file import read_header
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, project, render
 from foldgauss.video import Clock, EditedVideo, VideoModel, edit, layers
 from foldgauss.video.playback import Playback
+from foldgauss.video.stage import Stage
 
 MODEL = soft_model(options=RenderOptions())
 TIMES = np.asarray(MODEL.frame_times.times())
@@ -98,6 +99,10 @@ def test_layers_of_different_kinds():
     np.testing.assert_array_equal(both.at(0.31).mean[:NUM], ahead.mean)
     np.testing.assert_array_equal(both.at(0.31).factor[:NUM], ahead.factor)
     assert layers(front, MODEL, timeline=0).size == (80, 128)
+    lower = soft_model(seed=1, size=(79, 128), options=RenderOptions())  # the same shape to a pixel, and fitted over
+    fitted_over = Stage(lower, SIZE, aspect=SIZE[0] / SIZE[1]).splats(0.31)
+    np.testing.assert_array_equal(layers(lower, MODEL).at(0.31).mean[:NUM], fitted_over.mean)
+    assert np.abs(fitted_over.mean - Playback(lower, SIZE).splats(0.31).mean).max() > 0.1
     three = layers(MODEL, layers(front, MODEL, timeline=0), timeline=1)
     assert (len(three.layers), three.timeline, three.size) == (3, 1, (80, 128))
 
