@@ -218,6 +218,8 @@ def broken_inputs(tmp_path, work):
         "times beyond": (["render", model, "--out", tmp_path / "f", "--times", "0,1.5"], 2, "--times"),
         "times misspelt": (["render", model, "--out", tmp_path / "f", "--times", "0:1"], 2, "--times"),
         "remap misspelt": (["render", model, "--out", tmp_path / "f", "--remap", "0,1"], 2, "--remap"),
+        "remap beyond": (["render", model, "--out", tmp_path / "f", "--remap", "0=0,1e15=1"], 2, "--remap"),
+        "speed beyond": (["render", model, "--out", tmp_path / "f", "--speed", "1e-4", "--fps", "900"], 2, "pictures"),
         "remap back": (["render", model, "--out", tmp_path / "f", "--remap", "0=0,2=1,1=1"], 2, "--remap"),
         "upsample beyond": (["render", model, "--out", tmp_path / "f", "--upsample", "1000000000"], 2, "100,000"),
         "no such folder for json": (["evaluate", model, clip, "--json", tmp_path / "no" / "f.json"], 1, "folder"),

@@ -142,6 +142,7 @@ def test_davis_names_what_is_there(root, tmp_path):
 def test_davis_refuses_masks_that_do_not_fit(root):
     place = root / "Annotations" / "480p" / "bear"
     colours = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    colours[0, 0] = 1, 2, 3
     write_image(place / "00002.png", colours)
     _fails(ValueError, "masks with a number per pixel.*'RGB'.*00002.png", root, "bear")
     (place / "00002.png").write_text("cut off")

@@ -42,8 +42,8 @@ from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.metrics import evaluate
 
-MAX_UPSAMPLE = MAX_SHOWN
-MIN_SPEED = 1e-4
+MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
+MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
 
 
 @app.command()
@@ -84,8 +84,8 @@ def render(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
-    refuse_huge(picture_size)
     model = load_video_model(model_path)
+    refuse_huge(picture_size or model.size)
     shown, rate = course.times(np.asarray(model.frame_times.times()), model.fps), course.rate(model.fps)
     how = {"size": picture_size, "background": behind, "overwrite": overwrite}
     draw(model, out_path, shown, rate, image_format=image_format or "png", **how)
@@ -124,13 +124,20 @@ class _Course:
         if self.chosen is not None:
             return self.chosen
         if self.upsample is not None:
+            self._refuse_long("--upsample", (len(frame_times) - 1) * self.upsample)
             return interpolated_times(frame_times, self.upsample)
         rate = self.rate(fps) / fps
         if self.remap is not None:
-            if self.remap[-1][0] * fps * rate > MAX_SHOWN:
-                raise WrongUse(f"--remap: expected at most {MAX_SHOWN:,} pictures, got {self.remap[-1][0]:g} seconds.")
+            self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
             return times_at(frame_times, remapped_positions(self.remap, fps, rate))
-        return times_at(frame_times, played_positions(len(frame_times), rate, speed=self.speed or 1.0))
+        speed = self.speed or 1.0
+        self._refuse_long("--speed", (len(frame_times) - 1) * rate / abs(speed))
+        return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
+
+    def _refuse_long(self, option: str, num_pictures: float) -> None:
+        if num_pictures > MAX_PICTURES:
+            expected = f"at most {MAX_PICTURES:,} pictures"
+            raise WrongUse(str(invalid(option, expected=expected, got=f"{num_pictures:,.0f} of them")))
 
 
 @app.command(name="evaluate")
@@ -211,7 +218,9 @@ def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:
     pairs = [part.partition("=") for part in text.split(",")]
     try:
         points = [(float(shown), float(of_clip)) for shown, _, of_clip in pairs]
-        remapped_positions(points, fps=1e-3)
+        if points[-1][0] > MAX_SECONDS:
+            raise ValueError("too long")
+        remapped_positions(points, fps=1.0)
     except ValueError as error:
         expected = "seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2"
         raise WrongUse(str(invalid("--remap", expected=expected, got=text))) from error

@@ -49,6 +49,8 @@ def edit_command(
 
     An edited model is rendered, evaluated and edited again like any other.
     """
+    if out_path.exists() and model_path.exists() and out_path.samefile(model_path):
+        raise WrongUse(f"--out: expected another file than the model, got {out_path}.")
     script = read_edit_script(script_path)
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     picture_size = parse_size(size)
@@ -60,7 +62,10 @@ def edit_command(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
-    edited = script.apply(load_video_model(model_path))
+    model = load_video_model(model_path)
+    if not as_model:
+        refuse_huge(picture_size or model.size)
+    edited = script.apply(model)
     if as_model:
         about = read_header(model_path)["metadata"]
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
@@ -95,9 +100,9 @@ def export_command(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
     model = load_video_model(model_path)
-    if not isinstance(model, VideoModel):
-        cure = "Its edits act on pictures of a time: export frames of a model whose edits could all be baked."
-        raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
+    if file_format == "ply" and not isinstance(model, VideoModel):
+        cure = "Frames of it go out as ply3dgs or obj."
+        raise WrongUse(str(invalid("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)))
     path = export(model, file_format, out_path, times=parse_times(times), overwrite=overwrite)
     out.print(f"{path}: {file_format}", soft_wrap=True)
 
@@ -123,7 +128,9 @@ def import_command(
         if not out_path.is_dir():
             refuse_existing(out_path, overwrite)
             check_writable(out_path)
+        refuse_huge(picture_size)
         mesh = read_pseudomesh(source, size=picture_size, fps=fps)
+        refuse_huge(mesh.size)
         with progress_bar("Drawing", mesh.num_frames) as advance:
             write_video(out_path, counted(mesh.frames(), advance), mesh.fps, overwrite=overwrite)
         out.print(f"{out_path}: {mesh.num_frames} frames at {mesh.fps:g} frames a second", soft_wrap=True)

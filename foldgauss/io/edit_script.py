@@ -39,6 +39,9 @@ Video = VideoModel | EditedVideo
 
 #: The largest script that is read: tens of thousands of edits.
 MAX_BYTES = 4_000_000
+#: Parts of a dotted key; each costs the parser a table.
+MAX_PARTS = 16
+_DEEP_KEY = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}")
 #: Beyond, a number is no place, time or angle, and its square overflows.
 LARGEST = 1e9
 
@@ -168,7 +171,7 @@ ACTIONS = {
         },
     ),
     "retime": _Action("retime", takes={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER, "outside": _TEXT}),
-    "freeze": _Action("freeze", {"at": _NUMBER}, named={"at": "frame"}, spans=False),
+    "freeze": _Action("freeze", {"at": _NUMBER}),
     "to_front": _Action("to_front", spans=False),
     "to_back": _Action("to_back", spans=False),
     "place": _Action("place", takes={"depth": _NUMBER, "degrees": _THREE, "about": _PAIR}, named={"degrees": "rotate"}),
@@ -282,6 +285,8 @@ def read_edit_script(path: str | os.PathLike) -> EditScript:
 
 def parse_edit_script(text: str, *, source: str = "script", folder: str | os.PathLike = ".") -> EditScript:
     """As `read_edit_script`, of a text; paths in it are relative to `folder`."""
+    if _DEEP_KEY.search(text):
+        raise EditScriptError(f"{source}: expected keys of a few parts, got one of more than {MAX_PARTS}.")
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -397,7 +402,7 @@ def _check_selections(source: str, text: str, selections: Any) -> None:
     if not (isinstance(selections, dict) and all(isinstance(table, dict) for table in selections.values())):
         expected = "tables, each begun by [selections.NAME]"
         raise _Place(source, text, ()).error("selections", expected, "something else")
-    known: list[str] = []
+    known: dict[str, None] = {}
     for name, table in selections.items():
         place = _Place(source, text, ("selections", name))
         if not table:
@@ -409,10 +414,10 @@ def _check_selections(source: str, text: str, selections: Any) -> None:
             _check_keys(place, table, {**_CRITERIA, **(_MASK_FILE if "mask" in table else {})})
             if "mask" in table and "file" in table:
                 raise place.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
-        known.append(name)
+        known[name] = None
 
 
-def _check_combined(place: _Place, table: dict[str, list[str]], known: list[str]) -> None:
+def _check_combined(place: _Place, table: dict[str, list[str]], known: dict[str, None]) -> None:
     for key, names in table.items():
         for name in names:
             if name not in known:

@@ -20,8 +20,9 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
     """Masks as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 what is void.
 
     A palette image gives the *index* of each pixel, whatever colour it is shown in (OpenCV gives the colour, hence
-    Pillow here); a grey one its level, also where that is stored as three equal colours. Masks that are black and white throughout, as those of DAVIS 2016, become 0 and
-    1. Raises ValueError for an image that does not decode, has colours instead of numbers, or differs in size.
+    Pillow here); a grey one its level, also where that is stored as three equal colours. Masks that are black and white
+    throughout, as those of DAVIS 2016, become 0 and 1. Raises ValueError for an image that does not decode, has colours
+    instead of numbers, or differs in size.
     """
     masks, grey = [], True
     for path in paths:

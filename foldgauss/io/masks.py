@@ -13,6 +13,8 @@ from foldgauss.render.splats import check_size
 
 Range = tuple[int | None, int | None]
 
+DARK_LEVEL = 0.5  # of white: what is darker in a video is no mask
+
 
 def read_masks(
     path: str | os.PathLike,
@@ -20,7 +22,7 @@ def read_masks(
     label: int | None = None,
     frames: Range | None = None,
     size: tuple[int, int] | None = None,
-    level: float = 0.5,
+    level: float = DARK_LEVEL,
 ) -> Bool[np.ndarray, "height width"] | Bool[np.ndarray, "num_frames height width"]:
     """The masks of an object, ready for `foldgauss.video.by_mask`.
 
@@ -51,6 +53,8 @@ def read_masks(
 
 def _read(path: Path, label: int | None, frames: Range | None, level: float) -> Bool[np.ndarray, "*num height width"]:
     """The masks as they are."""
+    if level != DARK_LEVEL and (path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES):
+        raise invalid("level", expected="a video with it", got=f"images, {str(path)!r}", cure="They have labels.")
     if path.is_dir():
         return _of_label(_images(path, frames), label, path)
     if path.suffix.lower() in IMAGE_SUFFIXES:

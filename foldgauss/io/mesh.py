@@ -259,7 +259,7 @@ def _read_frame(path: Path, axes: str) -> Triangles:
     if not beside.exists():
         got = f"{path.name!r} without {beside.name!r}"
         raise format_error(path.parent, expected="a .ply with opacity and colour beside every .obj", got=got)
-    look, vertices = read_3dgs_ply(beside), read_obj(path)
+    look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where nothing was to be seen
     if len(vertices) != len(look.opacity):
         cure = "Faces were added or removed: keep them all, and make a Gaussian vanish by opacity instead."
         expected = f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}"
@@ -304,7 +304,7 @@ def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
             vertices.append(_parsed_vertex(path, number, words[1:]))
         elif words[0] == "f":
             faces.append((number, _parsed_face(path, number, words[1:], len(vertices))))
-    if not faces:
+    if not faces and vertices:
         raise format_error(path, expected="faces", got=f"none, and {len(vertices)} vertices", cure="Export them too.")
     _check_soup(path, faces, len(vertices))
     return np.array(vertices).reshape(-1, 3, 3)

@@ -32,6 +32,9 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
 
     **Example:** `save_selection("bear.selection", by_mask(model, masks), model)`.
     """
+    if not isinstance(model, VideoModel):
+        cure = "Save the selection with the model that it was made in."
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     num = model.splats.num_gaussians
     if selection.num_gaussians != num:
         raise invalid("selection", expected=f"one of the model's {num:,} Gaussians", got=f"{selection.num_gaussians:,}")

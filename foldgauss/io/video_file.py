@@ -24,6 +24,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".webm")  # what `write_video` makes; reading takes whatever OpenCV decodes
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both exact
+MAX_WEBP_SIDE = 16_383
 MAX_GIF_FPS = 50.0  # frames of less than 2 hundredths of a second are shown for 10 by browsers
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
@@ -526,6 +527,10 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
                 first.save(temporary, "WEBP", duration=1000 / fps, quality=WEBP_QUALITY, **shared)
         except OSError as error:
             raise not_writable(path, error) from error
+        except (OverflowError, RuntimeError, ValueError) as error:
+            height, width = first.height, first.width
+            expected, got = f"a size and a rate that {suffix} can hold", f"{height}x{width} at {fps:g} a second"
+            raise _error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
     return path
 
 
@@ -601,6 +606,9 @@ def _relabel_as_webm(path: Path) -> None:
 
 def _webp(frame: np.ndarray) -> bytes:
     quality = [cv2.IMWRITE_WEBP_QUALITY, 101]  # above 100: lossless
+    if max(frame.shape[:2]) > MAX_WEBP_SIDE:
+        got = _shape_text(frame.shape)
+        raise _error("frames", expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP", got=got, cure="Take PNG.")
     return cv2.imencode(".webp", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
 
 

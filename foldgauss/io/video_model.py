@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._checks import invalid, one_of
+from foldgauss._checks import invalid, one_of, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
@@ -98,6 +98,8 @@ def _video_skeleton(header: dict) -> VideoModel:
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
     one_of("compositing", compositing, COMPOSITINGS)
+    if not within(header.get("scale_cutoff", 0.0), "[0, 1]"):
+        raise ValueError("the cutoff of scales is out of range")
     row_width = columns(degree)["coefficients"].stop
 
     def build() -> VideoModel:

@@ -8,7 +8,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from foldgauss._checks import invalid, whole
+from foldgauss._checks import invalid, whole, within
 from foldgauss.render import Camera
 from foldgauss.video import baking
 from foldgauss.video.edited import EditedVideo, Layer, as_edited
@@ -310,10 +310,12 @@ class Edit:
         linear = any(x is not None for x in (gain, offset, matrix))
         if (color is not None) + (hue is not None) + linear != 1:
             raise invalid("color, hue, gain", expected="one way to recolour", got="none, or several")
+        if hue is not None and not within(hue, "[0, 1]"):
+            raise invalid("hue", expected="turns in [0, 1]", got=repr(hue), cure="Degrees over 360.")
         if color is not None:
             target = checked_numbers("color", color, 3)
-            if min(target) < 0:
-                raise invalid("color", expected="three numbers >= 0", got=target)
+            if min(target) < 0 or max(target) > 1:
+                raise invalid("color", expected="red, green and blue in [0, 1]", got=target)
             matrix, gain = np.outer(target, LIGHTNESS), 1 / self._mean_lightness()
         make = _recolor(gain, offset, matrix, None if hue is None else checked_number("hue", hue))
         identity = make(np.zeros(0, bool), None) == _recolor(None, None, None, None)(np.zeros(0, bool), None)
@@ -355,6 +357,8 @@ class Edit:
         """
         if clock is not None and (shift, stretch, about) != (0, 1, 0):
             raise invalid("clock", expected="a clock, or shift, stretch and about", got="both")
+        if clock is not None and outside != "continue":
+            raise invalid("outside", expected="a clock that has its own", got=outside, cure="Clock(..., outside=...).")
         line = Clock.shifted(shift, stretch, about=about, outside=outside)  # and the checks
         if clock is not None and not isinstance(clock, Clock):
             raise invalid("clock", expected="a Clock", got=type(clock).__name__)
@@ -365,13 +369,13 @@ class Edit:
         make = partial(Retimed, clock=line if clock is None else clock)
         return self._apply(make, when, bake if bakes else None, skip=identity)
 
-    def freeze(self, frame: int) -> "Edit":
-        """The selection stands still as it is at a frame, or a position between two."""
+    def freeze(self, at: float, **when: Unpack[When]) -> "Edit":
+        """The selection stands still as it is at frame `at`, or a position between two."""
         times = self._frame_times()
-        position = checked_number("frame", frame)
+        position = checked_number("at", at)
         if not 0 <= position <= len(times) - 1:
-            raise invalid("frame", expected=f"a number in [0, {len(times) - 1}]", got=frame)
-        return self.retime(clock=Clock.frozen(float(np.interp(position, np.arange(len(times)), times))))
+            raise invalid("at", expected=f"a frame in [0, {len(times) - 1}]", got=at)
+        return self.retime(clock=Clock.frozen(float(np.interp(position, np.arange(len(times)), times))), **when)
 
     # ------------------------------------------------------------------------------------------------ any function
 
@@ -461,8 +465,12 @@ class Edit:
                 made.append(layer)
                 continue
             made_so = make(mask, span)
+            if isinstance(made_so, Retimed):
+                _check_apart(layer, mask)
             before = layer.clocks if isinstance(made_so, Retimed) else layer.overlays
             free = span is None and not any((np.asarray(other.mask) & mask).any() for other in before)
+            if layer.model.scale_cutoff > 0 and isinstance(made_so, Affine) and made_so.stretch != IDENTITY:
+                free = False  # other sizes would be left out at other times
             baked = bake(layer.model.splats, mask) if bake is not None and free else None
             made.append(_with_overlay(layer, made_so) if baked is None else _with_splats(layer, baked))
         return self._with(made, self.selection)
@@ -519,6 +527,18 @@ def _gathered(
     clocks = [dataclasses.replace(clock, mask=np.asarray(clock.mask)[source]) for clock in layer.clocks]
     model = dataclasses.replace(layer.model, splats=baking.gathered(layer.model.splats, source))
     return Layer(model, tuple(overlays), tuple(clock for clock in clocks if clock.mask.any()))
+
+
+def _check_apart(layer: Layer, mask: Mask) -> None:
+    """Refuse another time for a part of what an edit takes as a whole: its rest would act otherwise."""
+    for overlay in layer.overlays:
+        own = np.asarray(overlay.mask)
+        whole_of_it = isinstance(overlay, Function | FaceFunction) or (
+            isinstance(overlay, Affine | Place) and overlay.about is None and not getattr(overlay, "moves_only", False)
+        )
+        if whole_of_it and (own & mask).any() and (own & ~mask).any():
+            expected = "another time for all Gaussians of an edit about their centre, or for none of them"
+            raise invalid("selection", expected=expected, got="a part of them", cure="Retime it before that edit.")
 
 
 def _can_lose(layer: Layer, mask: Mask) -> bool:

@@ -13,7 +13,7 @@ from foldgauss._checks import invalid, whole
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.model import VideoModel
+from foldgauss.video.model import VideoModel, check_time
 from foldgauss.video.overlays import AbstractOverlay, Retimed, SelectedGaussians, acts, padded, room_for
 from foldgauss.video.playback import Playback
 from foldgauss.video.shots import is_cut, out_of_cuts
@@ -133,6 +133,7 @@ class EditedVideo(eqx.Module):
         background: tuple[float, float, float] = BLACK,
     ) -> Float[np.ndarray, "height width 3"]:
         """The picture at any time t in [0, 1], values about [0, 1], over `background`; of `Playback`, so NumPy."""
+        check_time(t)
         return np.moveaxis(Playback(self, size, background=background).image(t), 0, -1)
 
     def frames(
@@ -154,7 +155,7 @@ def layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo
     `Edit.freeze`. Sizes may differ in pixels, envelopes and degrees in all. The video numbered `timeline` (default: the
     last, the background) gives frame times, size and rate.
 
-    **Example:** `layers(person, edit(street).freeze(frame=10).video())`.
+    **Example:** `layers(person, edit(street).freeze(10).video())`.
 
     **Raises:** ValueError for no videos, those of another aspect (to a pixel), compositing or `RenderOptions`, and for
     one with a camera: a camera sees all layers.

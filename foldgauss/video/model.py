@@ -197,6 +197,14 @@ def _checked_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
     return jnp.broadcast_to(color, (num, 3))
 
 
+def check_time(t: float) -> None:
+    """Raise unless t is a time of a video, where that is known."""
+    value = known(jnp.asarray(t))
+    if value is not None and not ((value >= 0) & (value <= 1)).all():
+        cure = "Frame k is at frame_times.times()[k]."
+        raise invalid("t", expected="a time in [0, 1]", got=value, cure=cure)
+
+
 class VideoModel(eqx.Module):
     """A fitted video: what is stored in a model file.
 
@@ -252,6 +260,7 @@ class VideoModel(eqx.Module):
         """
         size = self.size if size is None else size
         check_size(size)
+        check_time(t)
         t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
         behind = jnp.asarray(checked_background(background, self.compositing), splats.mean.dtype)

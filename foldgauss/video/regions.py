@@ -55,7 +55,7 @@ def box_region(
     model: VideoModel, box: tuple[float, float, float, float], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
     """The pixels whose centres lie in x0 <= x < x1, y0 <= y < y1."""
-    edges = np.asarray(box)
+    edges = _as_numbers(box)
     if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
         raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=box)
     if not (edges[0] < edges[2] and edges[1] < edges[3]):
@@ -69,12 +69,20 @@ def polygon_region(
     model: VideoModel, polygon: Float[ArrayLike, "corners 2"], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
     """The pixels whose centres lie in a polygon of corners (x, y), even-odd."""
-    corners = np.asarray(polygon)
+    corners = _as_numbers(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
     if bad or not np.isfinite(corners).all():
         raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=polygon)
     # There a pixel's centre is a whole number, and rows come first.
     return _still("polygon", model, polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames)
+
+
+def _as_numbers(given: object) -> np.ndarray:
+    """As an array; an empty one for rows of unlike length."""
+    try:
+        return np.asarray(given)
+    except ValueError:
+        return np.zeros(0)
 
 
 def chosen_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:

@@ -154,6 +154,15 @@ def select(
         if value is not None:
             found.append(function(model, value, **where, threshold=threshold, follow=follow))
     placed = bool(found) or click is not None
+    regional, timed = bool(found), times is not None or not (placed or (frame is None and frames is None))
+    for name, given, wanted in (
+        ("threshold", threshold != THRESHOLD and not regional, "a mask, box or polygon with it"),
+        ("follow", not follow and not regional, "a mask, box or polygon with it"),
+        ("alive", alive and not timed, "times or frames with it"),
+        ("frames", click is not None and frames is not None, "frame, the one that was clicked in"),
+    ):
+        if given:
+            raise invalid(name, expected=wanted, got="none")
     if tolerance is not None and color is None and click is None:
         raise invalid("tolerance", expected="color or click with it", got="neither")
     if color is not None:

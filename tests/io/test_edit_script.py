@@ -74,7 +74,7 @@ CHAINS = {
         'shift = 0.1\nstretch = -1\nabout = 0.5\noutside = "hold"',
         lambda e, **when: e.retime(shift=0.1, stretch=-1, about=0.5, outside="hold", **when),
     ),
-    "freeze": ("at = 2.5", lambda e: e.freeze(2.5)),
+    "freeze": ("at = 2.5", lambda e, **w: e.freeze(2.5, **w)),
     "to_front": ("", lambda e: e.to_front()),
     "to_back": ("", lambda e: e.to_back()),
     "place": (
@@ -248,7 +248,6 @@ MISTAKES = {  # text: line, table, and what is told
     "[[edits]]\ndo = 'scale'\nfactor = -1": (3, "[[edits]] number 1", "factor: .*> 0"),
     "[[edits]]\ndo = 'rotate'\ndegrees = true": (3, "[[edits]] number 1", "degrees: expected a number"),
     "[[edits]]\ndo = 'freeze'\nat = 70": (3, "[[edits]] number 1", r"at: .*\[0, 6\]"),
-    "[[edits]]\ndo = 'freeze'\nat = 1\nframe = 1": (4, "[[edits]] number 1", "frame: expected one of at"),
     "[[edits]]\ndo = 'vanish'\nframes = [3, 2]": (3, "[[edits]] number 1", "frames: .*first < stop"),
     "[[edits]]\ndo = 'vanish'\nframe = 1\ncurve = 'x'": (4, "[[edits]] number 1", "curve: .*'linear'"),
     "[[edits]]\ndo = 'vanish'\nframe = 1\ntimes = [0, 1]": (3, "[[edits]] number 1", "frame, frames, times: "),
@@ -420,3 +419,8 @@ def test_whatever_a_text_is_lines_are_found_or_it_is_told(text):
         found = tables
         for key in path:
             found = found[key]
+
+
+def test_keys_of_endless_parts_are_refused():
+    with pytest.raises(EditScriptError, match="keys of a few parts"):
+        parse_edit_script(".".join(["a"] * 16_000) + "=1")

@@ -185,7 +185,6 @@ def test_existing_folders(folder, model):
 
 SOUP = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 DAMAGED = {
-    "nothing": ("", "faces"),
     "no faces": (SOUP, "3 vertices"),
     "short": ("v 0 0\n", "line 1"),
     "words": ("v 0 north 0\n", "north"),
@@ -301,3 +300,9 @@ def refusal(folder):
     except FormatError as error:
         return str(error)
     return ""
+
+
+def test_a_time_with_nothing_to_see_comes_back(tmp_path):
+    """A frame in which no Gaussian is alive is a frame without faces."""
+    (tmp_path / "empty.obj").write_text("# nothing here\n")
+    assert read_obj(tmp_path / "empty.obj").shape == (0, 3, 3)

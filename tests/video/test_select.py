@@ -468,3 +468,19 @@ def test_a_fitted_object_is_selected(fitted, name):
     assert overlap(model, by_click(model, (x, y), frame=4), masks) > 0.95
     other = by_mask(model, labels == 3 - name)
     assert overlap(model, other, masks) < 0.05  # the measure can fail
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"color": (1, 0, 0), "threshold": 0.2}, "threshold"),
+        ({"color": (1, 0, 0), "follow": False}, "follow"),
+        ({"box": (0, 0, 9, 9), "alive": True}, "alive"),
+        ({"click": (5, 5), "frame": 0, "frames": (0, 2)}, "frames"),
+        ({"polygon": [[1, 2], [3]], "frame": 0}, "polygon"),
+        ({"box": [[1, 2], [3]], "frame": 0}, "box"),
+    ],
+)
+def test_options_of_what_is_not_asked(options, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        select(MODEL, **options)
