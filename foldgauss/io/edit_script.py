@@ -271,12 +271,17 @@ def read_edit_script(path: str | os.PathLike) -> EditScript:
     path = Path(path)
     if not os.path.exists(path):
         raise FileNotFoundError(f"script: expected a TOML file, got {str(path)!r}, which is missing.")
-    if not path.is_file() or path.stat().st_size > MAX_BYTES:
-        raise EditScriptError(f"{path}: expected a text of at most {MAX_BYTES:,} bytes, got something else.")
+    if not path.is_file():
+        raise EditScriptError(f"{path}: expected a TOML file, got a folder or a device.")
+    if path.stat().st_size > MAX_BYTES:
+        got = f"{path.stat().st_size:,}"
+        raise EditScriptError(f"{path}: expected a text of at most {MAX_BYTES:,} bytes, got {got}. Is it a model?")
     try:
         text = path.read_bytes().decode("utf-8-sig")  # some editors of Windows begin with a mark
     except UnicodeDecodeError as error:
-        raise EditScriptError(f"{path}: expected a text in UTF-8, got other bytes at {error.start}.") from error
+        raise EditScriptError(
+            f"{path}: expected a text in UTF-8, got other bytes at {error.start}. Is it a model?"
+        ) from error
     except OSError as error:
         raise EditScriptError(f"{path}: expected a file that can be read, got {error}.") from error
     script = parse_edit_script(text, source=str(path), folder=path.parent)

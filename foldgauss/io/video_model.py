@@ -16,6 +16,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
+from foldgauss.video.edit import Edit
 from foldgauss.video.edited import EditedVideo, Layer
 from foldgauss.video.fit import TIME_ADAM, FitState
 from foldgauss.video.frame_times import FrameTimes
@@ -32,6 +33,8 @@ def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *
 
     Raises `ModelFileError` for edits that hold code: `apply`, `apply_triangles`, a camera that is a function.
     """
+    if isinstance(model, Edit):
+        raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
     return save_model(path, model, metadata=metadata)
 
 

@@ -1,6 +1,7 @@
 """Edits, chained: who, then what, then the video. `edit(model).select(mask=...).move((0.1, 0.0)).video()`."""
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypedDict, Unpack
@@ -129,10 +130,14 @@ class Edit:
         if callable(selection):  # it is asked now, so it answers for now
             selection, before = selection(self.video()), counts
             sources = [np.arange(count) for count in counts]
+        if isinstance(selection, str | os.PathLike):
+            cure = "Read a file with foldgauss.io.load_selection(path, model)."
+            raise invalid("selection", expected="a Selection or a mask", got=repr(selection), cure=cure)
         mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
         if mask.dtype != bool or mask.shape not in ((sum(counts),), (sum(before),)):
             expected = f"a Selection or mask of {sum(counts):,} Gaussians"
-            got, cure = f"{mask.dtype} {mask.shape}", "Is it another model's?"
+            cure = "For a mask of pixels: select(mask=mask, frame=k)." if mask.ndim > 1 else "Is it another model's?"
+            got = f"{mask.dtype} {mask.shape}"
             raise invalid("selection", expected=expected, got=got, cure=cure)
         if len(mask) != sum(before):
             return _split(mask, counts)
@@ -582,8 +587,8 @@ def _rows(parameter: str, values: object) -> list:
         rows = list(values)
     except TypeError:
         rows = []
-    if not rows:
-        raise invalid(parameter, expected="at least one", got=repr(values))
+    if not rows or any(not np.iterable(row) for row in rows):
+        raise invalid(parameter, expected="pairs, as [(0.1, 0.0), (0.2, 0.0)]", got=repr(values))
     return rows
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Mapping
 from numbers import Integral
 
@@ -34,6 +35,9 @@ def mask_region(model: VideoModel, mask: Masks, frame: int | None, frames: tuple
         if frame is not None or frames is not None:
             raise invalid("mask", expected="its frames named once", got="{frame: mask} and frame or frames as well")
         found = {_checked_frame(model, k): _checked_mask(model, one, ndim=2) for k, one in mask.items()}
+    elif isinstance(mask, str | os.PathLike):
+        cure = "Read it: mask=foldgauss.io.read_masks(path)."
+        raise invalid("mask", expected="bool (height, width)", got=f"the path {str(mask)!r}", cure=cure)
     else:
         mask = np.asarray(mask)
         if mask.ndim == 2 and frame is None and frames is None:
@@ -57,7 +61,7 @@ def box_region(
     """The pixels whose centres lie in x0 <= x < x1, y0 <= y < y1."""
     edges = _as_numbers(box)
     if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
-        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=box)
+        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=_shown(box))
     if not (edges[0] < edges[2] and edges[1] < edges[3]):
         raise invalid("box", expected="x0 < x1 and y0 < y1", got=box, cure="x is right, y is down.")
     (height, width), (x0, y0, x1, y1) = model.size, edges
@@ -72,7 +76,7 @@ def polygon_region(
     corners = _as_numbers(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
     if bad or not np.isfinite(corners).all():
-        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=polygon)
+        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=_shown(polygon))
     # There a pixel's centre is a whole number, and rows come first.
     return _still("polygon", model, polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames)
 
@@ -83,6 +87,11 @@ def _as_numbers(given: object) -> np.ndarray:
         return np.asarray(given)
     except ValueError:
         return np.zeros(0)
+
+
+def _shown(given: object) -> str:
+    """In an error of one line: a model is told by its type."""
+    return repr(given) if isinstance(given, list | tuple | np.ndarray | str | float | int) else type(given).__name__
 
 
 def chosen_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:
@@ -131,7 +140,7 @@ def _checked_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
     """One mask or a stack of them, of the model's aspect; bool, or numbers in [0, 1]."""
     mask = np.asarray(mask)
     if mask.ndim != ndim or mask.size == 0 or mask.dtype.kind not in "bf":
-        cure = "Of labels take those of one object: mask=(labels == 1)."
+        cure = "Of labels take those of one object: mask=(labels == 1); of grey levels, mask=(levels > 127)."
         raise invalid("mask", expected="bool (height, width)", got=f"{mask.dtype} {mask.shape}", cure=cure)
     if mask.dtype.kind == "f" and not ((mask >= 0) & (mask <= 1)).all():
         raise invalid("mask", expected="bool, or shares in [0, 1]", got="other numbers")

@@ -11,7 +11,7 @@ from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.model_file import read_header
 from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit_steps
+from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit_steps
 from foldgauss.video.fit import to_model
 from foldgauss.video.growth import Growth
 from foldgauss.video.packing import unpack
@@ -126,3 +126,8 @@ def test_truncated(tmp_path, cut):
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(ModelFileError):
         load_video_model(path)
+
+
+def test_a_chain_of_edits_is_no_video_yet(tmp_path):
+    with pytest.raises(ValueError, match=r"^model: expected a video, got a chain of edits. End it with .video\(\)"):
+        save_video_model(tmp_path / "m.safetensors", edit(random_model()))

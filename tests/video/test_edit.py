@@ -637,8 +637,8 @@ WRONG = {
     "ragged": (lambda: E.scale([(1, 2), 3]), "factor: expected finite numbers"),
     "flat matrix": (lambda: E.transform([[1, 2], [2, 4]]), "matrix: expected a matrix that has an inverse"),
     "opacity": (lambda: E.opacity(-1), "factor: expected a number >= 0"),
-    "no copies": (lambda: E.multiply([]), "offsets: expected at least one"),
-    "no list": (lambda: E.multiply(3), "offsets: expected at least one"),
+    "no copies": (lambda: E.multiply([]), "offsets: expected pairs"),
+    "no list": (lambda: E.multiply(3), "offsets: expected pairs"),
     "delays": (lambda: E.multiply([(0, 0)], delays=(1, 2)), "delays: expected one number or 1"),
     "colour": (lambda: E.recolor((1, 2)), "color: expected 3 finite"),
     "dark colour": (lambda: E.recolor((1, 2, -1)), "color: expected red, green and blue in"),
@@ -759,3 +759,12 @@ def test_freezing_over_a_span():
     np.testing.assert_allclose(frozen.render(TIMES[2]), MODEL.render(TIMES[3]), atol=1e-4)
     np.testing.assert_allclose(frozen.render(TIMES[0]), MODEL.render(TIMES[0]), atol=1e-4)
     assert np.abs(frozen.render(TIMES[2]) - MODEL.render(TIMES[2])).max() > 0.01
+
+
+def test_what_is_no_selection_is_told():
+    with pytest.raises(ValueError, match=r"^selection: .*got 'it.selection'.*load_selection"):
+        E.select("it.selection")
+    with pytest.raises(ValueError, match=r"^selection: .*select\(mask=mask, frame=k\)"):
+        E.select(np.ones(SIZE, bool))
+    with pytest.raises(ValueError, match=r"^offsets: expected pairs"):
+        E.multiply((0.2, 0))

@@ -484,3 +484,12 @@ def test_a_fitted_object_is_selected(fitted, name):
 def test_options_of_what_is_not_asked(options, name):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         select(MODEL, **options)
+
+
+def test_files_are_to_be_read_first():
+    with pytest.raises(ValueError, match=r"^mask: expected .*got the path 'm.png'.*read_masks"):
+        by_mask(MODEL, "m.png", frame=0)
+    with pytest.raises(ValueError, match=r"^mask: .*mask=\(levels > 127\)"):
+        by_mask(MODEL, np.full(MODEL.size, 255, np.uint8), frame=0)
+    with pytest.raises(ValueError, match=r"^box: expected .*got VideoModel\.$"):
+        by_box(MODEL, MODEL, frame=0)
