@@ -367,6 +367,7 @@ def test_auto_begins_with_every_component_at_work(monkeypatch):
     assert (np.exp(begun[0].log_weights) > 0.4 / N).all()
 
 
+@pytest.mark.slow
 def test_weights_that_are_shares_prune_as_well():
     rng = np.random.default_rng(0)
     t = rng.normal(size=300)
@@ -511,6 +512,7 @@ def test_times_too_coarse_for_float32_are_told():
     far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
 
 
+@pytest.mark.slow
 def test_a_warm_start_from_other_sizes_is_cold():
     x = _blobs()
     fitted = _quiet(FoldedGaussianMixture(2, degree=1, warm_start=True, random_state=0), x)

@@ -102,6 +102,7 @@ def test_a_few_wide_splats_take_one_round_inside_jit():
     assert plans[1].capacity < 2 * num  # but no more than that
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("capacity", "most"), [(200, 2), pytest.param(64, 4, marks=pytest.mark.slow)])
 def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
@@ -144,6 +145,7 @@ def test_tile_size_changes_nothing(tile_size):
     check_same(*results, 1e-5)
 
 
+@pytest.mark.slow
 def test_batches_of_tiles(monkeypatch):
     """Cut into many small batches, the last of them not full, the picture is the same."""
     splats, size = scene("plain")
@@ -153,6 +155,7 @@ def test_batches_of_tiles(monkeypatch):
     check_same(picture_and_grads(lambda s: how(s), splats, weights), whole, 1e-5)
 
 
+@pytest.mark.slow
 def test_unrolled_chunks(monkeypatch):
     """The form for GPUs gives the same."""
     splats, size = scene("plain")
@@ -280,6 +283,7 @@ def test_retraces():
     assert xla._render_jit._cache_size() <= before + 2  # one inside the jitted step, one eager
 
 
+@pytest.mark.slow
 def test_vmap_of_gradients():
     """A batch of different scenes: each one's lists and rounds are its own."""
     splats, size = scene("plain")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import BACKGROUND, BOX, COLOR, DISC, NUM_FRAMES, SPEED, START, named_model, square, textured_clip
+from object_clips import BACKGROUND, BOX, COLOR, DISC, NUM_FRAMES, SPEED, START, named_model, square, textured_clip
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video import (
