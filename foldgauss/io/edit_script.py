@@ -224,7 +224,7 @@ class EditScript:
 
     def _edited(self, edits: Edit, action: _Action, table: dict[str, Any], named: dict[str, Selection]) -> Edit:
         if "select" in table:
-            edits = edits.select(named[table["select"]])
+            edits = edits.select_begun(named[table["select"]])
             if not len(edits.selection):
                 got = f"{table['select']!r}, which found nothing, or what has vanished"
                 raise invalid("select", expected="a selection of at least one Gaussian", got=got)

@@ -103,7 +103,8 @@ class Edit:
         Else `criteria` as `foldgauss.video.select.select` takes them (`mask=`, `box=`, `color=`, ...), asked of each
         layer's model, or of layer number `layer` alone, as it is without overlays: edits that could be baked are seen,
         others not. Masks count the Gaussians of all layers, front layer first, or of `layer`: those that the chain was
-        begun with, whose copies then go along; or, where there are more or fewer, those that there are now.
+        begun with, whose copies then go along; or, where there are more or fewer, those that there are now. A mask that
+        could be either is refused: see `select_begun`.
         """
         if selection is not None and criteria:
             got = f"{type(selection).__name__} and {', '.join(criteria)}"
@@ -120,6 +121,19 @@ class Edit:
         for k, mask in zip(numbers, chosen, strict=True):
             masks[k] = mask
         return dataclasses.replace(self, selection=Selection(np.concatenate(masks)))
+
+    def select_begun(self, selection: "Selection | Mask") -> "Edit":
+        """Act on these of the Gaussians that the chain was begun with, wherever they are now, and on their copies.
+
+        As `select`, and never in doubt: there a mask is refused where as many Gaussians were copied as deleted, or
+        their order was changed. Raises ValueError for a mask of another number.
+        """
+        mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
+        if mask.dtype != bool or mask.shape != (sum(self._begun_with),):
+            expected = f"a Selection or mask of {sum(self._begun_with):,} Gaussians"
+            raise invalid("selection", expected=expected, got=f"{mask.dtype} {mask.shape}")
+        parts = zip(_split(mask, list(self._begun_with)), self._sources, strict=True)
+        return dataclasses.replace(self, selection=Selection(np.concatenate([part[new] for part, new in parts])))
 
     def _given(self, selection: object, numbers: Sequence[int]) -> list[Mask]:
         """A mask by layers, of those that there are now."""
@@ -139,8 +153,12 @@ class Edit:
             cure = "For a mask of pixels: select(mask=mask, frame=k)." if mask.ndim > 1 else "Is it another model's?"
             got = f"{mask.dtype} {mask.shape}"
             raise invalid("selection", expected=expected, got=got, cure=cure)
-        if len(mask) != sum(before):
+        if len(mask) != sum(before) or selection is self.selection:
             return _split(mask, counts)
+        moved = any(not np.array_equal(source, np.arange(count)) for source, count in zip(sources, before, strict=True))
+        if moved and sum(counts) == sum(before):
+            cure = "Of what the chain was begun with: select_begun(mask). Of now: select(lambda video: mask)."
+            raise invalid("selection", expected="a mask that can mean but one thing", got="one of two", cure=cure)
         return [part[source] for part, source in zip(_split(mask, before), sources, strict=True)]
 
     # ------------------------------------------------------------------------------------- where, in the plane

@@ -3,7 +3,9 @@
 import contextlib
 import math
 import re
+import tempfile
 import tomllib
+from pathlib import Path
 
 import cv2
 import jax
@@ -424,3 +426,18 @@ def test_whatever_a_text_is_lines_are_found_or_it_is_told(text):
 def test_keys_of_endless_parts_are_refused():
     with pytest.raises(EditScriptError, match="keys of a few parts"):
         parse_edit_script(".".join(["a"] * 16_000) + "=1")
+
+
+def test_names_mean_the_first_gaussians_however_many_there_are_now():
+    """Also where as many were copied as deleted, and in another order."""
+    first, last, middle = (Selection.of(MODEL, np.arange(*ends)) for ends in ((0, 5), (NUM - 5, NUM), (9, 20)))
+    chain = edit(MODEL).select(first).vanish().select_begun(last).multiply([(0.1, 0)]).select_begun(middle).to_front()
+    expected = chain.select_begun(middle).recolor(hue=0.5).video()
+    with tempfile.TemporaryDirectory() as name:
+        for key, one in (("a", first), ("b", last), ("c", middle)):
+            save_selection(Path(name) / f"{key}.selection", one, MODEL)
+        text = "".join(f'[selections.{key}]\nfile = "{key}.selection"\n' for key in "abc")
+        for do, key in (("vanish", "a"), ("multiply", "b"), ("to_front", "c"), ("recolor", "c")):
+            more = {"multiply": "offsets = [[0.1, 0]]\n", "recolor": "hue = 0.5\n"}.get(do, "")
+            text += f'[[edits]]\ndo = "{do}"\nselect = "{key}"\n{more}'
+        assert same(made(text, folder=name), expected)

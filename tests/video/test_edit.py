@@ -608,9 +608,12 @@ def test_selections_of_before_go_on():
     with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 59"):
         chain.select(lambda model: OBJECT)  # asked now
     equal = edit(MODEL).select(some).multiply([(0.1, 0)]).select(np.arange(NUM) < 5).vanish()
-    np.testing.assert_array_equal(
-        equal.select(OBJECT).selection.mask, OBJECT[np.r_[5 : NUM - 5, np.repeat(np.arange(NUM - 5, NUM), 2)]]
-    )
+    with pytest.raises(ValueError, match=r"^selection: expected a mask that can mean but one thing"):
+        equal.select(OBJECT)
+    begun = OBJECT[np.r_[5 : NUM - 5, np.repeat(np.arange(NUM - 5, NUM), 2)]]
+    np.testing.assert_array_equal(equal.select_begun(OBJECT).selection.mask, begun)
+    with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 40"):
+        equal.select_begun(OBJECT[:-1])
     assert len(equal.select(lambda model: OBJECT).selection) == OBJECT.sum()
     assert len(equal.select().selection) == NUM
 
@@ -722,8 +725,15 @@ def test_to_the_front_and_to_the_back():
     ):
         np.testing.assert_array_equal(chain.video().splats.loc, np.asarray(MODEL.splats.loc)[expected])
         np.testing.assert_array_equal(chain.selection.mask, OBJECT[expected])
-        again = chain.select(OBJECT)
-        np.testing.assert_array_equal(again.selection.mask, OBJECT[expected])
+        for again in (
+            chain.select_begun(OBJECT),
+            chain.select().select_begun(Selection(OBJECT)),
+            chain.select(chain.selection),
+        ):
+            np.testing.assert_array_equal(again.selection.mask, OBJECT[expected])
+        if (expected != order).any():
+            with pytest.raises(ValueError, match=r"^selection: expected a mask that can mean but one.*select_begun"):
+                chain.select(OBJECT)
     eased = edit(MODEL).select(OBJECT).scale(1.5, frame=2).to_front()  # an overlay goes along
     assert isinstance(eased.video(), EditedVideo)
     np.testing.assert_array_equal(eased.video().layers[0].overlays[0].mask, eased.selection.mask)
