@@ -1,7 +1,27 @@
 """How sure the learned frame times are: likelihood profiles, and what is drawn from them."""
 
 from foldgauss.uncertainty.drawing import Evidence, evidence
+from foldgauss.uncertainty.exact import ExactTimes, exact_times
+from foldgauss.uncertainty.increments import Increments
+from foldgauss.uncertainty.laplace import LaplaceTimes, laplace_times
+from foldgauss.uncertainty.log_prob import FrameTimeLogProb, drawn_log_likelihood, frame_time_log_prob
 from foldgauss.uncertainty.noise import FrameNoise
+from foldgauss.uncertainty.posterior import FrameTimePosterior, frame_time_posterior
 from foldgauss.uncertainty.profiles import Profiles
 
-__all__ = ["Evidence", "FrameNoise", "Profiles", "evidence"]
+__all__ = [
+    "Evidence",
+    "ExactTimes",
+    "FrameNoise",
+    "FrameTimeLogProb",
+    "FrameTimePosterior",
+    "Increments",
+    "LaplaceTimes",
+    "Profiles",
+    "drawn_log_likelihood",
+    "evidence",
+    "exact_times",
+    "frame_time_log_prob",
+    "frame_time_posterior",
+    "laplace_times",
+]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 
 from foldgauss._checks import invalid
-from foldgauss._kernels import kernel
+from foldgauss._kernels import inline, kernel
 
 _d = nb.float64
 
@@ -87,26 +87,29 @@ class Profiles:
         return dataclasses.replace(self, values=self.values * factor, slopes=self.slopes * factor)
 
 
+@inline
+def value_at(t, nodes, values, slopes, last):
+    """A profile at time t; `last` is the number of its last node. -inf outside, and for NaN."""
+    if not (t >= nodes[0] and t <= nodes[last]):
+        return -np.inf
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if nodes[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    width = nodes[high] - nodes[low]
+    u = (t - nodes[low]) / width
+    v = _d(1) - u
+    return v * v * ((_d(1) + _d(2) * u) * values[low] + u * width * slopes[low]) + u * u * (
+        (_d(1) + _d(2) * v) * values[high] - v * width * slopes[high]
+    )
+
+
 @kernel
 def _look_up(times, nodes, values, slopes, count, found):
     rows, frames = times.shape
     for k in range(frames):
-        at, height, slope, last = nodes[k], values[k], slopes[k], count[k] - 1
         for row in range(rows):
-            t = times[row, k]
-            if not (t >= at[0] and t <= at[last]):  # NaN, too
-                found[row, k] = -np.inf
-                continue
-            low, high = 0, last
-            while high - low > 1:
-                middle = (low + high) // 2
-                if at[middle] <= t:
-                    low = middle
-                else:
-                    high = middle
-            width = at[high] - at[low]
-            u = (t - at[low]) / width
-            v = _d(1) - u
-            found[row, k] = v * v * ((_d(1) + _d(2) * u) * height[low] + u * width * slope[low]) + u * u * (
-                (_d(1) + _d(2) * v) * height[high] - v * width * slope[high]
-            )
+            found[row, k] = value_at(times[row, k], nodes[k], values[k], slopes[k], count[k] - 1)
