@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from commands import run
+from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.video import EditedVideo, VideoModel, edit
-from tests.video.soft_models import NUM, SIZE, soft_model
 
 FRAMES = 7
 BAKED = '[selections.it]\nbox = [12, 10, 32, 30]\nframe = 3\n[[edits]]\ndo = "move"\nselect = "it"\noffset = [0.2, 0]\n'

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
 from foldgauss.render import Camera
 from foldgauss.video import EditedVideo, Selection, VideoModel, edit, layers, select
-from tests.video.soft_models import NUM, OBJECT, SIZE, soft_model
 
 MODEL = soft_model()
 BOX, FRAME = (12, 10, 32, 30), 3
