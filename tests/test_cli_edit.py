@@ -106,6 +106,7 @@ def test_what_edit_refuses(work, tmp_path, capsys):
     code, told = refused(model, baked, "--out", tmp_path / "out.png")
     assert code == 2
     assert ".safetensors" in told
+    assert "foldgauss render MODEL --times T --out FILE.png" in told
 
     target.write_bytes(b"precious")
     assert run("edit", model, baked, "--out", target) == 2
