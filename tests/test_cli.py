@@ -321,6 +321,18 @@ def test_help_and_version(capsys):
     assert "foldgauss 0.1" in capsys.readouterr().out
 
 
+def test_commands_are_listed_as_one_comes_to_need_them(capsys):
+    assert run("--help") == 0
+    lines = capsys.readouterr().out.partition("Commands:\n")[2].splitlines()
+    assert [line.split()[0] for line in lines if line.strip()] == [
+        "fit", "render", "evaluate", "info", "edit", "export", "import", "demo",
+    ]  # fmt: skip
+    assert not any("..." in line for line in lines)  # none is cut
+    assert run("evaluate", "--help") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "B of the clip, as many as the model has [default: those that it was fitted to]" in told
+
+
 def test_debug_shows_the_traceback(tmp_path):
     with pytest.raises(FileNotFoundError):
         cli.main(["info", str(tmp_path / "none"), "--debug"])

@@ -119,6 +119,8 @@ def test_what_edit_refuses(work, tmp_path, capsys):
 def test_export_and_import(work, tmp_path, capsys):
     model = work / "model.safetensors"
     assert run("export", model, "--format", "ply", "--out", tmp_path / "video.ply") == 0
+    told = capsys.readouterr().out.replace("\n", "")
+    assert told == f"{tmp_path / 'video.ply'}: VeGaS video (ply), 7 frames, {NUM} Gaussians"
     assert run("import", tmp_path / "video.ply", "--out", tmp_path / "again.safetensors") == 0
     assert f"7 frames, {NUM} Gaussians" in capsys.readouterr().out
     again = load_video_model(tmp_path / "again.safetensors")
@@ -129,11 +131,14 @@ def test_export_and_import(work, tmp_path, capsys):
 
     assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "scenes") == 0
     assert len(list((tmp_path / "scenes").glob("*.ply"))) == FRAMES
+    assert f"3DGS scenes (ply3dgs), 7 frames, up to {NUM} Gaussians each" in capsys.readouterr().out
     assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "one.ply", "--times", "0.5") == 0
     assert (tmp_path / "one.ply").read_bytes().startswith(b"ply\n")
+    assert f"3DGS scenes (ply3dgs), 1 frame, up to {NUM} Gaussians\n" in capsys.readouterr().out
 
     assert run("export", model, "--format", "obj", "--out", tmp_path / "mesh", "--times", "0:1:3") == 0
     assert len(list((tmp_path / "mesh").glob("*.obj"))) == 3
+    assert f"triangles (obj), 3 frames, up to {NUM} Gaussians each" in capsys.readouterr().out
     assert run("import", tmp_path / "mesh", "--out", tmp_path / "pictures") == 0
     picture = cv2.imread(str(sorted((tmp_path / "pictures").iterdir())[1]))[..., ::-1]
     own = next(soft_model().frames(np.array([0.5])))

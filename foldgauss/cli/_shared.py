@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+import typer.core
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -31,7 +32,20 @@ from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+class _InOrderOfUse(typer.core.TyperGroup):
+    """The commands as one comes to need them; typer has them as they were registered."""
+
+    _ORDER = ("fit", "render", "evaluate", "info", "edit", "export", "import", "demo")
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:
+        others = set(self.commands).difference(self._ORDER)
+        return [name for name in (*self._ORDER, *sorted(others)) if name in self.commands]
+
+
+app = typer.Typer(
+    cls=_InOrderOfUse, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None
+)
 # No markup: names of files may hold brackets.
 out = Console(markup=False, highlight=False)
 err = Console(stderr=True, markup=False, highlight=False)
@@ -41,7 +55,9 @@ MAX_SHOWN = 100_000  # above, a clip of seconds plays for days
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
-Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B.")]
+Frames = Annotated[
+    str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be left out.")
+]
 
 
 class WrongUse(ValueError):

@@ -11,7 +11,6 @@ from rich.table import Table
 from foldgauss._checks import invalid
 from foldgauss.cli._shared import (
     MAX_SHOWN,
-    Frames,
     Overwrite,
     Size,
     WrongUse,
@@ -158,10 +157,20 @@ def evaluate_command(
     model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
     video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
-    frames: Frames = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A:B",
+            help="Frames A up to, not including, B of the clip, as many as the model has "
+            "[default: those that it was fitted to].",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compare a model with its clip: PSNR and SSIM per frame, size of the file, bits per pixel."""
+    """Compare a model with its clip: PSNR and SSIM of every frame.
+
+    Tells the size of the file and its bits per pixel, too.
+    """
     if json_path is not None:
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
@@ -173,7 +182,7 @@ def evaluate_command(
     if clip.num_frames != model.num_frames:
         raise WrongUse(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
-            "Name the frames it was fitted to."
+            f"Name those that it was fitted to, as 0:{model.num_frames}."
         )
     _say_other_frames(about, clip)
     scores = evaluate_with_progress(model, clip.frames)

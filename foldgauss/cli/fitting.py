@@ -60,9 +60,10 @@ class Stopped(Exception):
 def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
 ) -> None:
-    """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out.
+    """Fit 24 frames of the sample clip Bunny and show what comes out.
 
-    A later demo replaces the files of an earlier one; a folder with other files in it is left alone.
+    The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files in it is
+    left alone.
     """
     _refuse_foreign(out_dir)
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
@@ -151,7 +152,7 @@ def fit(
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings and errors.")] = False,
     log_json: Annotated[bool, typer.Option("--log-json", help="Tell progress and figures as lines of JSON.")] = False,
 ) -> None:
-    """Fit a model to a clip, until the first of the given budgets binds.
+    """Fit a model to a clip; the first of the given budgets ends it.
 
     A stopped fit is kept and goes on with --resume.
     """
