@@ -264,6 +264,8 @@ def broken_inputs(tmp_path, work):
         "no time": (["fit", clip, "--out", out, "--minutes", "0"], 2, "minutes"),
         "no quality": (["fit", clip, "--out", out, "--target-psnr", "-3"], 2, "--target-psnr"),
         "no room": (["fit", clip, "--out", out, "--max-size-mb", "0.001"], 2, "--max-size-mb.*at least"),
+        "out is a video": (["fit", clip, "--out", tmp_path / "m.mp4"], 2, "--out: .* as m.safetensors"),
+        "out is something": (["fit", clip, "--out", tmp_path / "m.bin"], 2, "--out: .* as m.safetensors"),
         "nothing to resume": (["fit", clip, "--out", out, "--resume"], 2, "stopped fit"),
         "no such folder": (["fit", clip, "--out", tmp_path / "no" / "m.safetensors"], 1, "folder"),
         "out is a folder": (["fit", clip, "--out", mixed, "--overwrite"], 1, "file"),

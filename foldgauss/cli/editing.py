@@ -28,10 +28,9 @@ from foldgauss.io.exchange import FORMATS, export, import_model
 from foldgauss.io.mesh import read_pseudomesh
 from foldgauss.io.model_file import read_header
 from foldgauss.io.video_file import write_video
-from foldgauss.io.video_model import load_video_model, save_video_model
+from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, save_video_model
 from foldgauss.video.model import VideoModel
 
-MODEL_SUFFIX = ".safetensors"
 _CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles"}
 
 

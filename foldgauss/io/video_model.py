@@ -25,17 +25,33 @@ from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
 
+MODEL_SUFFIX = ".safetensors"
 VIDEO, EDITED, CHECKPOINT = "video", "edited-video", "fit-checkpoint"
 
 
 def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *, metadata: dict | None = None) -> Path:
     """Write a fitted or an edited video; `metadata` is free: where it came from, how good it is. See `save_model`.
 
-    Raises `ModelFileError` for edits that hold code: `apply`, `apply_triangles`, a camera that is a function.
+    The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
+    that hold code: `apply`, `apply_triangles`, a camera that is a function.
     """
     if isinstance(model, Edit):
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
+    check_model_name(path)
     return save_model(path, model, metadata=metadata)
+
+
+def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
+    """Raise ValueError for a name with an extension that is another format's."""
+    path = Path(path)
+    if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
+        cure = "Pictures: write_video, or foldgauss render; other programs' formats: export."
+        raise invalid(
+            parameter,
+            expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
+            got=repr(str(path)),
+            cure=cure,
+        )
 
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
