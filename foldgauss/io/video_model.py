@@ -13,6 +13,7 @@ import numpy as np
 
 from foldgauss._checks import invalid, one_of, within
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io._atomic import checked_path
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
@@ -37,6 +38,9 @@ def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *
     """
     if isinstance(model, Edit):
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
+    checked_path(path, "path, model")
+    if not isinstance(model, VideoModel | EditedVideo):
+        raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__)
     check_model_name(path)
     return save_model(path, model, metadata=metadata)
 
@@ -56,7 +60,7 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
     """Read a fitted or an edited video. Raises `ModelFileError` also where the file holds something else of ours."""
-    return _load(path, VIDEO, EDITED)
+    return _load(checked_path(path), VIDEO, EDITED)
 
 
 def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
