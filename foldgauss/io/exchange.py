@@ -44,8 +44,8 @@ def export(
       and `times` is one (`write_3dgs_ply`)
     - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
 
-    `times` in [0, 1] (default: the model's frame times) for the formats of frames; `depth_step`, `axes` and `sh_degree`
-    for `ply3dgs`. What exists is refused unless `overwrite`.
+    `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
+    `axes` and `sh_degree` for `ply3dgs`. What exists is refused unless `overwrite`.
 
     **Raises:** ValueError for an unknown format, an option that the format does not know, and as the function;
     `OutputError` where the output cannot be written or exists.
@@ -56,10 +56,8 @@ def export(
         cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     one_of("format", format, FORMATS)
-    out, options = (
-        checked_path(out, "model, format, out"),
-        {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree},
-    )
+    out = checked_path(out, "model, format, out")
+    options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
     given = {name: value for name, value in options.items() if value is not None}
     unknown = list(given) if format != "ply3dgs" else []
     unknown += ["times"] if format == "ply" and times is not None else []

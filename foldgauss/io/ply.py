@@ -406,10 +406,8 @@ def _check_covers(model: VideoModel) -> None:
 
 def checked_times(model: VideoModel, times: Sequence[float] | None) -> Float[np.ndarray, "frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
-    try:
-        found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times, np.float64))
-    except (TypeError, ValueError):
-        found = np.zeros(0)
+    found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
+    found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)
     if found.ndim != 1 or found.size == 0 or not ((found >= 0) & (found <= 1)).all():
         raise invalid("times", expected="one or more numbers in [0, 1]", got=short_repr(times))
     return found

@@ -46,6 +46,25 @@ def error(text, model=MODEL, folder=".") -> str:
 
 # ------------------------------------------------------------------------------------------------------ what it does
 
+
+@pytest.mark.parametrize(
+    ("text", "frames"), [('"3:"', (3, None)), ('":4"', (None, 4)), ('"2:5"', (2, 5)), ('":"', (None, None))]
+)
+def test_frames_with_open_ends(text, frames):
+    """Of edits with easing, and of where a selection is looked at."""
+    moved = made(f'[[edits]]\ndo = "move"\noffset = [0.1, 0]\nframes = {text}\nease = 1')
+    assert same(moved, edit(MODEL).move((0.1, 0), frames=frames, ease=1).video())
+    gone = f'[selections.it]\nbox = {list(BOX)}\nframes = {text}\n[[edits]]\ndo = "vanish"\nselect = "it"'
+    assert same(made(gone), edit(MODEL).select(box=BOX, frames=frames).vanish().video())
+
+
+@pytest.mark.parametrize("text", ['"3"', '"a:b"', '"3:-1"', "[3, -1]", "[3]", '"1:2:3"', '""'])
+def test_frames_that_are_none(text):
+    told = error(f'[[edits]]\ndo = "vanish"\nframes = {text}')
+    assert "line 3, [[edits]] number 1: frames: expected two whole numbers" in told
+    assert 'or "10:", from there to the end' in told
+
+
 DEGREES = math.radians(30)
 SPAN = 'frames = [1, 5]\nease = [1, 2]\ncurve = "smooth"'
 IN = {"frames": (1, 5), "ease": (1, 2), "curve": "smooth"}
