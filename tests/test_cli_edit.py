@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import run
+from PIL import Image
 from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
@@ -71,6 +72,28 @@ def test_pictures_of_an_edit(work, tmp_path, capsys):
         assert (clip.num_frames, clip.size) == (FRAMES, (20, 32) if size else SIZE)
     edited = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()
     np.testing.assert_array_equal(read_video(tmp_path / "edited").frames, np.stack(list(edited.frames(size=(20, 32)))))
+
+
+@pytest.mark.parametrize("name", ["out.gif", "out.webp", "pngs", "webps"])
+def test_what_is_written_is_what_was_drawn(work, tmp_path, name):
+    """Read back by another program: how many frames, of what size, how fast, and the pictures."""
+    options = ["--format", "webp"] if name == "webps" else []
+    out = tmp_path / name
+    assert run("render", work / "model.safetensors", "--out", out, "--size", "32x52", "--fps", 12.5, *options) == 0
+    own = np.stack(list(soft_model().frames(np.linspace(0, 1, 7)[::2], (32, 52))))  # 25 a second, every other one
+    if out.is_dir():
+        suffix = name.removesuffix("s")
+        assert sorted(path.name for path in out.iterdir()) == [f"{k:05d}.{suffix}" for k in range(4)]
+        images = [Image.open(path) for path in sorted(out.iterdir())]
+        np.testing.assert_array_equal([np.asarray(image.convert("RGB")) for image in images], own)
+        return
+    with Image.open(out) as image:
+        assert (image.n_frames, image.size, image.info["loop"]) == (4, (52, 32), 0)
+        for k in range(4):
+            image.seek(k)
+            error = np.asarray(image.convert("RGB")).astype(float) - own[k]
+            assert image.info["duration"] == 80
+            assert 10 * np.log10(255**2 / np.mean(error**2)) > 30
 
 
 def test_what_edit_refuses(work, tmp_path, capsys):
