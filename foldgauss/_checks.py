@@ -1,6 +1,9 @@
 """Errors that carry their cure: parameter, expected, got, what to try."""
 
+import inspect
 import math
+import warnings
+from collections.abc import Callable
 from numbers import Integral, Real
 
 
@@ -13,7 +16,13 @@ def invalid(parameter: str, *, expected: str, got: object, cure: str = "") -> Va
 def one_of(parameter: str, value: object, choices: tuple[str, ...]) -> None:
     """Raise unless `value` is one of `choices`; an unknown option never falls through to a default."""
     if value not in choices:
-        raise invalid(parameter, expected="one of " + ", ".join(map(repr, choices)), got=repr(value))
+        raise invalid(parameter, expected="one of " + ", ".join(map(repr, choices)), got=short_repr(value))
+
+
+def short_repr(value: object) -> str:
+    """For an error of one line: what is long, as a model is, is told by its type."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else type(value).__name__
 
 
 def within(value: object, bounds: str) -> bool:
@@ -29,3 +38,24 @@ def within(value: object, bounds: str) -> bool:
 def whole(value: object, least: int) -> bool:
     """Whether `value` is a whole number of at least `least`."""
     return isinstance(value, Integral) and not isinstance(value, bool) and value >= least
+
+
+def check_takes(parameter: str, function: Callable, *arguments: str) -> None:
+    """Raise unless `function` can be called with so many arguments; what cannot be told is left alone."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # some that are built in have none
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        got = f"the class {function.__name__}" if isinstance(function, type) else f"one of {signature}"
+        raise invalid(parameter, expected=f"a function of ({', '.join(arguments)})", got=got) from None
+
+
+def warn_of_degrees(parameter: str, *angles: float, stacklevel: int = 3) -> None:
+    """Warn of angles that are hardly radians: whole or half numbers beyond a turn."""
+    for angle in angles:
+        if abs(angle) > 2 * math.pi and float(2 * angle).is_integer():
+            text = f"{parameter}: expected radians, got {angle:g}, {abs(angle) / (2 * math.pi):.1f} turns."
+            warnings.warn(f"{text} For degrees use math.radians({angle:g}).", stacklevel=stacklevel)

@@ -91,6 +91,34 @@ def test_other_rates_speeds_and_times(work, tmp_path, capsys):
     assert read_video(tmp_path / "v.mp4").fps == pytest.approx(12)
 
 
+def test_one_picture(work, tmp_path, capsys):
+    """A .png takes one time, and no more."""
+    model, target = work / "model.safetensors", tmp_path / "one.png"
+    assert run("render", model, "--out", target) == 2
+    assert "--out: expected one picture for a .png, got 6 of them. Choose it by --times T" in capsys.readouterr().err
+    assert not target.exists()
+    assert run("render", model, "--out", target, "--times", "0.5", "--size", "24x32") == 0
+    assert f"{target}: the picture at time 0.5" in capsys.readouterr().out.replace("\n", "")
+    own = next(load_video_model(model).frames(np.array([0.5]), (24, 32)))
+    np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], own)
+    assert run("render", model, "--out", target, "--times", "0.5") == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run("render", model, "--out", tmp_path / "folder", "--times", "0.5") == 0
+    assert "1 frame at" in capsys.readouterr().out
+
+
+def test_remapping_beyond_the_end_is_said(work, tmp_path, capsys):
+    """6 frames, 12 a second, last half a second."""
+    model = work / "model.safetensors"
+    assert run("render", model, "--out", tmp_path / "whole", "--remap", "0=0,0.5=0.5") == 0
+    assert "warning" not in capsys.readouterr().err
+    assert run("render", model, "--out", tmp_path / "beyond", "--remap", "0=0,0.5=2,1=0") == 0
+    told = capsys.readouterr().err
+    assert "warning: --remap: the clip ends at second 0.5, 2 was asked for: its last frame is held" in told
+    assert len(told.strip().splitlines()) == 1
+    assert read_video(tmp_path / "beyond").num_frames == 13
+
+
 def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("fit", work / "clip.mp4", "--frames", "1:5", "--size", "24x32", *QUICK) == 0
@@ -236,6 +264,8 @@ def broken_inputs(tmp_path, work):
         "no time": (["fit", clip, "--out", out, "--minutes", "0"], 2, "minutes"),
         "no quality": (["fit", clip, "--out", out, "--target-psnr", "-3"], 2, "--target-psnr"),
         "no room": (["fit", clip, "--out", out, "--max-size-mb", "0.001"], 2, "--max-size-mb.*at least"),
+        "out is a video": (["fit", clip, "--out", tmp_path / "m.mp4"], 2, "--out: .* as m.safetensors"),
+        "out is something": (["fit", clip, "--out", tmp_path / "m.bin"], 2, "--out: .* as m.safetensors"),
         "nothing to resume": (["fit", clip, "--out", out, "--resume"], 2, "stopped fit"),
         "no such folder": (["fit", clip, "--out", tmp_path / "no" / "m.safetensors"], 1, "folder"),
         "out is a folder": (["fit", clip, "--out", mixed, "--overwrite"], 1, "file"),
@@ -291,6 +321,18 @@ def test_help_and_version(capsys):
     assert "[default:" in capsys.readouterr().out  # brackets are not eaten as markup
     assert run("--version") == 0
     assert "foldgauss 0.1" in capsys.readouterr().out
+
+
+def test_commands_are_listed_as_one_comes_to_need_them(capsys):
+    assert run("--help") == 0
+    lines = capsys.readouterr().out.partition("Commands:\n")[2].splitlines()
+    assert [line.split()[0] for line in lines if line.strip()] == [
+        "fit", "render", "evaluate", "info", "edit", "export", "import", "demo",
+    ]  # fmt: skip
+    assert not any("..." in line for line in lines)  # none is cut
+    assert run("evaluate", "--help") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "B of the clip, as many as the model has [default: those that it was fitted to]" in told
 
 
 def test_debug_shows_the_traceback(tmp_path):

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from commands import run
+from PIL import Image
+from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.video import EditedVideo, VideoModel, edit
-from tests.video.soft_models import NUM, SIZE, soft_model
 
 FRAMES = 7
 BAKED = '[selections.it]\nbox = [12, 10, 32, 30]\nframe = 3\n[[edits]]\ndo = "move"\nselect = "it"\noffset = [0.2, 0]\n'
@@ -73,6 +74,28 @@ def test_pictures_of_an_edit(work, tmp_path, capsys):
     np.testing.assert_array_equal(read_video(tmp_path / "edited").frames, np.stack(list(edited.frames(size=(20, 32)))))
 
 
+@pytest.mark.parametrize("name", ["out.gif", "out.webp", "pngs", "webps"])
+def test_what_is_written_is_what_was_drawn(work, tmp_path, name):
+    """Read back by another program: how many frames, of what size, how fast, and the pictures."""
+    options = ["--format", "webp"] if name == "webps" else []
+    out = tmp_path / name
+    assert run("render", work / "model.safetensors", "--out", out, "--size", "32x52", "--fps", 12.5, *options) == 0
+    own = np.stack(list(soft_model().frames(np.linspace(0, 1, 7)[::2], (32, 52))))  # 25 a second, every other one
+    if out.is_dir():
+        suffix = name.removesuffix("s")
+        assert sorted(path.name for path in out.iterdir()) == [f"{k:05d}.{suffix}" for k in range(4)]
+        images = [Image.open(path) for path in sorted(out.iterdir())]
+        np.testing.assert_array_equal([np.asarray(image.convert("RGB")) for image in images], own)
+        return
+    with Image.open(out) as image:
+        assert (image.n_frames, image.size, image.info["loop"]) == (4, (52, 32), 0)
+        for k in range(4):
+            image.seek(k)
+            error = np.asarray(image.convert("RGB")).astype(float) - own[k]
+            assert image.info["duration"] == 80
+            assert 10 * np.log10(255**2 / np.mean(error**2)) > 30
+
+
 def test_what_edit_refuses(work, tmp_path, capsys):
     model, baked, target = work / "model.safetensors", work / "baked.toml", tmp_path / "out.safetensors"
 
@@ -106,6 +129,7 @@ def test_what_edit_refuses(work, tmp_path, capsys):
     code, told = refused(model, baked, "--out", tmp_path / "out.png")
     assert code == 2
     assert ".safetensors" in told
+    assert "foldgauss render MODEL --times T --out FILE.png" in told
 
     target.write_bytes(b"precious")
     assert run("edit", model, baked, "--out", target) == 2
@@ -118,6 +142,8 @@ def test_what_edit_refuses(work, tmp_path, capsys):
 def test_export_and_import(work, tmp_path, capsys):
     model = work / "model.safetensors"
     assert run("export", model, "--format", "ply", "--out", tmp_path / "video.ply") == 0
+    told = capsys.readouterr().out.replace("\n", "")
+    assert told == f"{tmp_path / 'video.ply'}: VeGaS video (ply), 7 frames, {NUM} Gaussians"
     assert run("import", tmp_path / "video.ply", "--out", tmp_path / "again.safetensors") == 0
     assert f"7 frames, {NUM} Gaussians" in capsys.readouterr().out
     again = load_video_model(tmp_path / "again.safetensors")
@@ -128,11 +154,14 @@ def test_export_and_import(work, tmp_path, capsys):
 
     assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "scenes") == 0
     assert len(list((tmp_path / "scenes").glob("*.ply"))) == FRAMES
+    assert f"3DGS scenes (ply3dgs), 7 frames, up to {NUM} Gaussians each" in capsys.readouterr().out
     assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "one.ply", "--times", "0.5") == 0
     assert (tmp_path / "one.ply").read_bytes().startswith(b"ply\n")
+    assert f"3DGS scenes (ply3dgs), 1 frame, up to {NUM} Gaussians\n" in capsys.readouterr().out
 
     assert run("export", model, "--format", "obj", "--out", tmp_path / "mesh", "--times", "0:1:3") == 0
     assert len(list((tmp_path / "mesh").glob("*.obj"))) == 3
+    assert f"triangles (obj), 3 frames, up to {NUM} Gaussians each" in capsys.readouterr().out
     assert run("import", tmp_path / "mesh", "--out", tmp_path / "pictures") == 0
     picture = cv2.imread(str(sorted((tmp_path / "pictures").iterdir())[1]))[..., ::-1]
     own = next(soft_model().frames(np.array([0.5])))

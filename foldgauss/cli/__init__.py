@@ -1,6 +1,7 @@
 """The command `foldgauss`: arguments and exit codes. The work is done on the floors below."""
 
 import sys
+import warnings
 from typing import Annotated
 
 import typer
@@ -35,7 +36,9 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments  # taken out, so that it may stand anywhere
     try:
-        app([argument for argument in arguments if argument != "--debug"], standalone_mode=True)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            app([argument for argument in arguments if argument != "--debug"], standalone_mode=True)
     except (Exception, KeyboardInterrupt) as error:
         if debug:
             raise
@@ -47,6 +50,12 @@ def main(arguments: list[str] | None = None) -> None:
             text = f"{type(error).__name__}: {text[:300]} (--debug shows where)"
         err.print(f"error: {text}", style="red", soft_wrap=True)
         sys.exit(_exit_code(error))
+
+
+def _show_warning(message: Warning | str, *where: object) -> None:
+    """One line, without the place in the code."""
+    del where
+    err.print(f"warning: {' '.join(str(message).split())}", soft_wrap=True)
 
 
 def _exit_code(error: BaseException) -> int:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+import typer.core
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -23,6 +24,7 @@ from foldgauss.io.video_file import (
     VIDEO_SUFFIXES,
     Clip,
     memory_limit,
+    write_image,
     write_video,
 )
 from foldgauss.video.alpha import BLACK
@@ -30,16 +32,32 @@ from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+class _InOrderOfUse(typer.core.TyperGroup):
+    """The commands as one comes to need them; typer has them as they were registered."""
+
+    _ORDER = ("fit", "render", "evaluate", "info", "edit", "export", "import", "demo")
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:
+        others = set(self.commands).difference(self._ORDER)
+        return [name for name in (*self._ORDER, *sorted(others)) if name in self.commands]
+
+
+app = typer.Typer(
+    cls=_InOrderOfUse, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None
+)
 # No markup: names of files may hold brackets.
 out = Console(markup=False, highlight=False)
 err = Console(stderr=True, markup=False, highlight=False)
 
+PICTURE_SUFFIX = ".png"
 MAX_SHOWN = 100_000  # above, a clip of seconds plays for days
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
-Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B.")]
+Frames = Annotated[
+    str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be left out.")
+]
 
 
 class WrongUse(ValueError):
@@ -190,12 +208,14 @@ def as_option(text: str) -> str:
     return f"--{name.replace('num_gaussians', 'gaussians').replace('_', '-')}{colon}{rest}"
 
 
-def check_picture_path(path: Path, *, others: str = "") -> None:
-    """Refuse a name that pictures cannot be written to."""
-    wanted = (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES)
+def check_picture_path(path: Path, *, others: str = "", single: bool = False) -> None:
+    """Refuse a name that pictures cannot be written to; with `single`, FILE.png is one for a picture alone."""
+    wanted = (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES, *([PICTURE_SUFFIX] if single else []))
     if path.suffix and not path.is_dir() and path.suffix.lower() not in wanted:
         expected = ", ".join((others, *wanted) if others else wanted) + ", or a folder without extension"
-        raise WrongUse(str(invalid("--out", expected=expected, got=path)))
+        is_picture = path.suffix.lower() == PICTURE_SUFFIX
+        cure = "One picture of a model: foldgauss render MODEL --times T --out FILE.png." if is_picture else ""
+        raise WrongUse(str(invalid("--out", expected=expected, got=path, cure=cure)))
 
 
 def draw(
@@ -209,7 +229,15 @@ def draw(
     image_format: str = "png",
     overwrite: bool = False,
 ) -> None:
-    """Write the pictures at `times` to `path`, `rate` a second, with a bar."""
+    """Write the pictures at `times` to `path`, `rate` a second, with a bar; a picture alone to a .png."""
+    if path.suffix.lower() == PICTURE_SUFFIX and not path.is_dir():
+        if len(times) != 1:
+            cure = "Choose it by --times T, or write to a folder (a name without extension)."
+            got = f"{len(times):,} of them"
+            raise WrongUse(str(invalid("--out", expected="one picture for a .png", got=got, cure=cure)))
+        write_image(path, next(model.frames(times, size, background=background)))
+        out.print(f"{path}: the picture at time {times[0]:g}", soft_wrap=True)
+        return
     most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
     if path.suffix and not path.is_dir() and rate > most:
         expected, cure = f"at most {most:g} frames a second", "Give a lower one, or write to a folder instead."
@@ -218,7 +246,8 @@ def draw(
         pictures = counted(model.frames(times, size, background=background), advance)
         kind = {"overwrite": overwrite, "image_format": image_format}
         write_video(path, pictures, min(rate, MAX_FPS), **kind)
-    out.print(f"{path}: {len(times)} frames at {rate:g} frames a second", soft_wrap=True)
+    frames = "1 frame" if len(times) == 1 else f"{len(times):,} frames"
+    out.print(f"{path}: {frames} at {rate:g} frames a second", soft_wrap=True)
 
 
 def parse_times(text: str | None) -> np.ndarray | None:

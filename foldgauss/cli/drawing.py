@@ -11,7 +11,6 @@ from rich.table import Table
 from foldgauss._checks import invalid
 from foldgauss.cli._shared import (
     MAX_SHOWN,
-    Frames,
     Overwrite,
     Size,
     WrongUse,
@@ -49,7 +48,9 @@ MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
 @app.command()
 def render(
     model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
-    out_path: Annotated[Path, typer.Option("--out", help="FILE.mp4, .webm, .gif or .webp, or a folder for images.")],
+    out_path: Annotated[
+        Path, typer.Option("--out", help="FILE.mp4, .webm, .gif or .webp; a folder for images; FILE.png for one time.")
+    ],
     size: Size = None,
     upsample: Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")] = None,
     fps: Annotated[
@@ -76,7 +77,7 @@ def render(
     """Draw a model as a video, in between its frames too."""
     course = _Course(upsample, fps, speed, _parse_remap(remap), parse_times(times))
     picture_size, behind = parse_size(size), parse_color(background)
-    check_picture_path(out_path)
+    check_picture_path(out_path, single=True)
     if image_format is not None and (out_path.suffix and not out_path.is_dir()):
         raise WrongUse(str(invalid("--format", expected="a folder as --out", got=out_path)))
     if image_format is not None and image_format not in IMAGE_FORMATS:
@@ -87,6 +88,7 @@ def render(
     model = load_video_model(model_path)
     refuse_huge(picture_size or model.size)
     shown, rate = course.times(np.asarray(model.frame_times.times()), model.fps), course.rate(model.fps)
+    course.warn_of_end(model.num_frames, model.fps)
     how = {"size": picture_size, "background": behind, "overwrite": overwrite}
     draw(model, out_path, shown, rate, image_format=image_format or "png", **how)
 
@@ -134,6 +136,16 @@ class _Course:
         self._refuse_long("--speed", (len(frame_times) - 1) * rate / abs(speed))
         return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
 
+    def warn_of_end(self, num_frames: int, fps: float) -> None:
+        """Say so where more of the clip is asked for than there is: its last frame lasts until num_frames / fps."""
+        asked = 0.0 if self.remap is None else max(of_clip for _, of_clip in self.remap)
+        if asked > num_frames / fps * (1 + 1e-6):
+            err.print(
+                f"warning: --remap: the clip ends at second {num_frames / fps:.4g}, {asked:.4g} was asked for: "
+                "its last frame is held from there on.",
+                soft_wrap=True,
+            )
+
     def _refuse_long(self, option: str, num_pictures: float) -> None:
         if num_pictures > MAX_PICTURES:
             expected = f"at most {MAX_PICTURES:,} pictures"
@@ -145,10 +157,20 @@ def evaluate_command(
     model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
     video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
-    frames: Frames = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A:B",
+            help="Frames A up to, not including, B of the clip, as many as the model has "
+            "[default: those that it was fitted to].",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compare a model with its clip: PSNR and SSIM per frame, size of the file, bits per pixel."""
+    """Compare a model with its clip: PSNR and SSIM of every frame.
+
+    Tells the size of the file and its bits per pixel, too.
+    """
     if json_path is not None:
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
@@ -160,7 +182,7 @@ def evaluate_command(
     if clip.num_frames != model.num_frames:
         raise WrongUse(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
-            "Name the frames it was fitted to."
+            f"Name those that it was fitted to, as 0:{model.num_frames}."
         )
     _say_other_frames(about, clip)
     scores = evaluate_with_progress(model, clip.frames)

@@ -28,10 +28,10 @@ from foldgauss.io.exchange import FORMATS, export, import_model
 from foldgauss.io.mesh import read_pseudomesh
 from foldgauss.io.model_file import read_header
 from foldgauss.io.video_file import write_video
-from foldgauss.io.video_model import load_video_model, save_video_model
+from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, save_video_model
 from foldgauss.video.model import VideoModel
 
-MODEL_SUFFIX = ".safetensors"
+_CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles"}
 
 
 @app.command(name="edit")
@@ -45,9 +45,9 @@ def edit_command(
     size: Size = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Edit objects or single frames of a model by a script: see docs/editing.md.
+    """Edit objects or single frames of a model by a script.
 
-    An edited model is rendered, evaluated and edited again like any other.
+    Scripts: docs/editing.md. An edited model is rendered, evaluated and edited again like any other.
     """
     if out_path.exists() and model_path.exists() and out_path.samefile(model_path):
         raise WrongUse(f"--out: expected another file than the model, got {out_path}.")
@@ -103,8 +103,13 @@ def export_command(
     if file_format == "ply" and not isinstance(model, VideoModel):
         cure = "Frames of it go out as ply3dgs or obj."
         raise WrongUse(str(invalid("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)))
-    path = export(model, file_format, out_path, times=parse_times(times), overwrite=overwrite)
-    out.print(f"{path}: {file_format}", soft_wrap=True)
+    chosen = parse_times(times)
+    path = export(model, file_format, out_path, times=chosen, overwrite=overwrite)
+    num_frames = model.num_frames if chosen is None else len(chosen)
+    frames = f"{num_frames:,} frame{'' if num_frames == 1 else 's'}"
+    most = "" if file_format == "ply" else "up to "  # of frames, those alive
+    told = f"{_CALLED[file_format]} ({file_format}), {frames}, {most}{model.num_gaussians:,} Gaussians"
+    out.print(f"{path}: {told}{' each' if most and num_frames > 1 else ''}", soft_wrap=True)
 
 
 @app.command(name="import")

@@ -37,8 +37,8 @@ from foldgauss.datasets import sample_clip
 from foldgauss.io._atomic import OutputError, check_writable
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.pictures import comparison
-from foldgauss.io.video_file import VIDEO_SUFFIXES, Clip, read_video, write_image, write_video
-from foldgauss.io.video_model import load_checkpoint, save_checkpoint, save_video_model
+from foldgauss.io.video_file import Clip, read_video, write_image, write_video
+from foldgauss.io.video_model import check_model_name, load_checkpoint, save_checkpoint, save_video_model
 from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
 
@@ -47,9 +47,6 @@ CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
-
-#: What a user may take `fit --out` for: the clip as a picture, not the model.
-_OTHER_SUFFIXES = {*VIDEO_SUFFIXES, ".mov", ".avi", ".mkv", ".gif", ".png", ".jpg", ".jpeg", ".json", ".jsonl"}
 
 
 class Stopped(Exception):
@@ -60,9 +57,10 @@ class Stopped(Exception):
 def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
 ) -> None:
-    """Fit 24 frames of the sample clip Bunny at 160x320 and show what comes out.
+    """Fit 24 frames of the sample clip Bunny and show what comes out.
 
-    A later demo replaces the files of an earlier one; a folder with other files in it is left alone.
+    The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files in it is
+    left alone.
     """
     _refuse_foreign(out_dir)
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
@@ -151,7 +149,7 @@ def fit(
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings and errors.")] = False,
     log_json: Annotated[bool, typer.Option("--log-json", help="Tell progress and figures as lines of JSON.")] = False,
 ) -> None:
-    """Fit a model to a clip, until the first of the given budgets binds.
+    """Fit a model to a clip; the first of the given budgets ends it.
 
     A stopped fit is kept and goes on with --resume.
     """
@@ -169,18 +167,15 @@ def fit(
         "between_share": between_share,
         "seed": seed,
     }
+    target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
+    if target.exists() and video.exists() and target.samefile(video):
+        raise WrongUse(f"--out: expected another file than the clip, got {target}.")
     try:
+        check_model_name(target, "out")
         config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
-    target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
     kept = target.with_name(f"{target.name}.checkpoint")
-    if target.exists() and video.exists() and target.samefile(video):
-        raise WrongUse(f"--out: expected another file than the clip, got {target}.")
-    if out_path is not None and out_path.suffix.lower() in _OTHER_SUFFIXES:
-        raise WrongUse(
-            f"--out: expected a name for the model, as {out_path.with_suffix('.safetensors')}, got {out_path}."
-        )
     manner = _manner(quiet, log_json)
     refuse_existing(target, overwrite)
     curves = _check_records(target, video, history, preview, overwrite or resume)

@@ -8,9 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from foldgauss._checks import invalid, short_repr
+
 
 class OutputError(OSError):
     """An output path cannot be written; the message is one line and says what to do."""
+
+
+def checked_path(path: object, order: str = "") -> Path:
+    """`path` as a Path. Raises ValueError for what is none; `order` says how the arguments follow one another."""
+    if not isinstance(path, str | os.PathLike):
+        cure = f"The order is ({order})." if order else ""
+        raise invalid("path", expected="a path", got=short_repr(path), cure=cure)
+    return Path(path)
 
 
 def _check_target(path: Path) -> None:

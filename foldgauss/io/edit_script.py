@@ -8,6 +8,7 @@ Schema, every table optional; paths are relative to the script, angles in degree
   out. All are found in the video as it was before the first edit.
 - `[[edits]]`, in their order: `do` is one of `ACTIONS`, `select` a name (without: what is selected as it stands, at
   first everything), and the action's own keys; `frame`, `frames` or `times` with `ease` and `curve` for when.
+- `frames` is `[first, stop]`, or "first:stop" where either may be left out: "10:" goes on to the end.
 - `[[layers]]`: other videos, `model` and `where` ("front" or "behind"), with `freeze` (a frame) or a `script` of
   their own; those behind from front to back.
 - `[camera]`: `azimuth` and `elevation`, from the front; it sees all layers.
@@ -66,6 +67,11 @@ def _is_whole(value: Any) -> bool:
     return _is_number(value) and isinstance(value, int) and value >= 0
 
 
+def _is_range(value: Any) -> bool:
+    """As the commands have it, "A:B", either left out."""
+    return isinstance(value, str) and re.fullmatch("[0-9]{0,9}:[0-9]{0,9}", value) is not None
+
+
 def _numbers(*lengths: int, is_one: Callable[[Any], bool] = _is_number) -> Callable[[Any], bool]:
     """A list of so many numbers; of any length but 0 if none is said."""
     return lambda value: (
@@ -87,7 +93,10 @@ _BOOL = _Kind("true or false", lambda value: isinstance(value, bool))
 _TEXT = _Kind("a text in quotes", lambda value: isinstance(value, str) and bool(value))
 _PATH = _Kind("a path in quotes", lambda value: isinstance(value, str) and bool(value) and "\0" not in value)
 _PAIR = _Kind("two numbers, as [0.1, 0.2]", _numbers(2))
-_FRAMES = _Kind("two whole numbers, as [10, 20]: first, and the first beyond", _numbers(2, is_one=_is_whole))
+_FRAMES = _Kind(
+    'two whole numbers, as [10, 20]: first, and the first beyond; or "10:", from there to the end',
+    _either(_numbers(2, is_one=_is_whole), _is_range),
+)
 _THREE = _Kind("three numbers, as [0.9, 0.2, 0.1]", _numbers(3))
 _PAIRS = _Kind("pairs of numbers, as [[0.1, 0.0], [0.2, 0.0]]", _rows(2))
 _ONE_OR_TWO = _Kind("a number, or two as [1.5, 1.0]", _either(_is_number, _numbers(2)))
@@ -466,9 +475,14 @@ def _of_frames(masks, num_frames: int, criteria: dict[str, Any]):
 
 
 def _with_pairs(table: dict[str, Any]) -> dict[str, Any]:
-    """Lists that stand for spans as tuples."""
-    spans = {key: tuple(table[key]) for key in ("frames", "times") if key in table}
+    """What stands for spans, lists or "A:B", as tuples."""
+    spans = {key: _pair(table[key]) for key in ("frames", "times") if key in table}
     return table | spans
+
+
+def _pair(value: list[float] | str) -> tuple[float | None, ...]:
+    ends = value.split(":") if isinstance(value, str) else value
+    return tuple((int(end) if end else None) if isinstance(end, str) else end for end in ends)
 
 
 def _camera(table: dict[str, Any], size: tuple[int, int]) -> Camera:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._checks import invalid, one_of
-from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io._atomic import OutputError, check_writable, checked_path
 from foldgauss.io._ply import format_error
 from foldgauss.io.mesh import write_pseudomesh
 from foldgauss.io.ply import (
@@ -18,6 +18,8 @@ from foldgauss.io.ply import (
     write_3dgs_ply,
     write_vegas_ply,
 )
+from foldgauss.video.edit import Edit
+from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 
 #: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame.
@@ -25,7 +27,7 @@ FORMATS = ("ply", "ply3dgs", "obj")
 
 
 def export(
-    model: VideoModel,
+    model: VideoModel | EditedVideo,
     format: str,
     out: str | os.PathLike,
     *,
@@ -42,16 +44,20 @@ def export(
       and `times` is one (`write_3dgs_ply`)
     - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
 
-    `times` in [0, 1] (default: the model's frame times) for the formats of frames; `depth_step`, `axes` and `sh_degree`
-    for `ply3dgs`. What exists is refused unless `overwrite`.
+    `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
+    `axes` and `sh_degree` for `ply3dgs`. What exists is refused unless `overwrite`.
 
     **Raises:** ValueError for an unknown format, an option that the format does not know, and as the function;
     `OutputError` where the output cannot be written or exists.
 
     **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
     """
+    if not isinstance(model, VideoModel | EditedVideo):
+        cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
+        raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     one_of("format", format, FORMATS)
-    out, options = Path(out), {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
+    out = checked_path(out, "model, format, out")
+    options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
     given = {name: value for name, value in options.items() if value is not None}
     unknown = list(given) if format != "ply3dgs" else []
     unknown += ["times"] if format == "ply" and times is not None else []
@@ -62,6 +68,9 @@ def export(
         _check_new(out, overwrite)
         return write_vegas_ply(out, model)
     if format == "obj":
+        if out.suffix.lower() == ".obj" and not out.is_dir():
+            cure = "Each frame becomes a file in it: leave the extension out."
+            raise invalid("out", expected="a folder", got=repr(str(out)), cure=cure)
         return write_pseudomesh(out, model, times, overwrite=overwrite)
     given = {"depth_step": DEPTH_STEP, "axes": AXES[0], "sh_degree": 3} | given
     if out.suffix.lower() != ".ply" or out.is_dir():
@@ -92,7 +101,7 @@ def import_model(
 
     **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
     """
-    path = Path(path)
+    path = checked_path(path)
     if path.is_dir() or path.suffix.lower() == ".obj":
         cure = "Draw frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
         raise format_error(path, expected="a .ply file with a video", got="a folder or a mesh", cure=cure)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from foldgauss._checks import invalid, whole, within
+from foldgauss.io._atomic import checked_path
 from foldgauss.io.labels import VOID, read_labels
 from foldgauss.io.video_file import IMAGE_SUFFIXES, aspect_window, image_paths, read_video
 from foldgauss.render.splats import check_size
@@ -39,7 +40,7 @@ def read_masks(
     **Raises:** `FileNotFoundError`; ValueError for images that are no masks, a label that is in none of them, options
     that do not apply, and as `read_video`.
     """
-    path = Path(path)
+    path = checked_path(path)
     if not os.path.exists(path):
         raise FileNotFoundError(f"path: expected an image, a folder or a video, got {str(path)!r}, which is missing.")
     if label is not None and not (whole(label, 1) and label < VOID):

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
-from foldgauss._checks import invalid, one_of, within
+from foldgauss._checks import invalid, one_of, short_repr, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import atomic_folder, check_replaceable
 from foldgauss.io._ply import FormatError, Ply, format_error, read_ply, write_ply
@@ -406,9 +406,10 @@ def _check_covers(model: VideoModel) -> None:
 
 def checked_times(model: VideoModel, times: Sequence[float] | None) -> Float[np.ndarray, "frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
-    found = np.asarray(model.frame_times.times() if times is None else times, np.float64)
+    found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
+    found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)
     if found.ndim != 1 or found.size == 0 or not ((found >= 0) & (found <= 1)).all():
-        raise invalid("times", expected="one or more numbers in [0, 1]", got=times)
+        raise invalid("times", expected="one or more numbers in [0, 1]", got=short_repr(times))
     return found
 
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from foldgauss._checks import invalid
+from foldgauss.io._atomic import checked_path
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.video.model import VideoModel
 from foldgauss.video.select import Selection
@@ -32,6 +33,10 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
 
     **Example:** `save_selection("bear.selection", by_mask(model, masks), model)`.
     """
+    checked_path(path, "path, selection, model")
+    if not isinstance(selection, Selection):
+        cure = "The order is (path, selection, model); Selection(mask) makes one of a mask."
+        raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
     if not isinstance(model, VideoModel):
         cure = "Save the selection with the model that it was made in."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
@@ -48,6 +53,10 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     order of Gaussians, or other values; `FileNotFoundError`, and `ModelFileError` for a file of another kind, a
     damaged or newer one.
     """
+    checked_path(path, "path, model")
+    if not isinstance(model, VideoModel):
+        cure = "The order is (path, model)."
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     kind = read_header(path)["kind"]
     if kind != SELECTION:
         cure = "Give the file that save_selection wrote."

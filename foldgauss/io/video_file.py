@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._checks import invalid, one_of
-from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_replaceable, not_writable
+from foldgauss._checks import invalid, one_of, within
+from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_replaceable, checked_path, not_writable
 
 # FFmpeg writes to stderr about every damaged packet; our errors say it in one line. OpenCV reads this
 # variable when it first opens a video, so it stands before the import. -8 is AV_LOG_QUIET.
@@ -100,7 +100,7 @@ def read_video(
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
-    path = Path(path)
+    path = checked_path(path)
     if not os.path.exists(path):
         raise FileNotFoundError(
             f"path: expected a video file or a folder of images, got {str(path)!r}, which is missing. "
@@ -447,8 +447,11 @@ def write_video(
     Raises `VideoError` for another extension, no frames, or frames of other kinds; `OutputError` where the
     path cannot be written.
     """
-    path = Path(path)
+    path = checked_path(path, "path, frames, fps")
     _check_fps(fps)
+    if not isinstance(frames, Iterable):
+        cure = "Of a model: model.frames()."
+        raise _error("frames", expected="pictures, one by one", got=type(frames).__name__, cure=cure)
     one_of("image_format", image_format, IMAGE_FORMATS)
     if path.is_dir() or not path.suffix:
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
@@ -460,7 +463,7 @@ def write_video(
             "path",
             expected="a name ending in .mp4, .webm, .gif or .webp, or a folder (no extension) for images",
             got=repr(path.name),
-            cure="Rename the output.",
+            cure="One picture: write_image." if suffix == ".png" else "Rename the output.",
         )
     # OpenCV prints a warning for every VP9 tag in WebM, none in its superset Matroska, whose header is then
     # relabelled.
@@ -677,7 +680,7 @@ def _checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tupl
 
 
 def _check_fps(fps: float) -> None:
-    if not 0 < fps <= MAX_FPS:
+    if not within(fps, f"(0, {MAX_FPS}]"):
         raise _error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
 
 

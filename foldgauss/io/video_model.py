@@ -13,6 +13,7 @@ import numpy as np
 
 from foldgauss._checks import invalid, one_of, within
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io._atomic import checked_path
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
@@ -25,22 +26,41 @@ from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
 
+MODEL_SUFFIX = ".safetensors"
 VIDEO, EDITED, CHECKPOINT = "video", "edited-video", "fit-checkpoint"
 
 
 def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *, metadata: dict | None = None) -> Path:
     """Write a fitted or an edited video; `metadata` is free: where it came from, how good it is. See `save_model`.
 
-    Raises `ModelFileError` for edits that hold code: `apply`, `apply_triangles`, a camera that is a function.
+    The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
+    that hold code: `apply`, `apply_triangles`, a camera that is a function.
     """
     if isinstance(model, Edit):
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
+    checked_path(path, "path, model")
+    if not isinstance(model, VideoModel | EditedVideo):
+        raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__)
+    check_model_name(path)
     return save_model(path, model, metadata=metadata)
+
+
+def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
+    """Raise ValueError for a name with an extension that is another format's."""
+    path = Path(path)
+    if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
+        cure = "Pictures: write_video, or foldgauss render; other programs' formats: export."
+        raise invalid(
+            parameter,
+            expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
+            got=repr(str(path)),
+            cure=cure,
+        )
 
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
     """Read a fitted or an edited video. Raises `ModelFileError` also where the file holds something else of ours."""
-    return _load(path, VIDEO, EDITED)
+    return _load(checked_path(path), VIDEO, EDITED)
 
 
 def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:

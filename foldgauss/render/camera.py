@@ -11,11 +11,12 @@ from numbers import Real
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._batch import known
-from foldgauss._checks import invalid, one_of
+from foldgauss._checks import invalid, one_of, short_repr, warn_of_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.
@@ -165,9 +166,13 @@ class Camera(eqx.Module):
         """This camera carried about `target`: first up by `elevation` about x, then by `azimuth` about the vertical.
 
         Angles in radians. From the front, a positive azimuth goes to the right, a positive elevation up. Quarter turns
-        are exact, so Gaussians at one depth stay at one depth.
+        are exact, so Gaussians at one depth stay at one depth. Warns of angles that seem to be degrees.
         """
         dtype = self.position.dtype
+        _check_angle("azimuth", azimuth)
+        _check_angle("elevation", elevation)
+        if np.shape(target) != (3,):
+            raise invalid("target", expected="(x, y, z)", got=short_repr(target))
         (cos_a, sin_a), (cos_e, sin_e) = (_cos_sin(jnp.asarray(angle, dtype)) for angle in (azimuth, elevation))
         zero, one, target = jnp.zeros((), dtype), jnp.ones((), dtype), jnp.asarray(target, dtype)
         about_y = jnp.stack([cos_a, zero, -sin_a, zero, one, zero, sin_a, zero, cos_a]).reshape(3, 3)
@@ -295,6 +300,16 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
     sign_cos = jnp.where((which == 1) | (which == 2), -1.0, 1.0).astype(angle.dtype)
     sign_sin = jnp.where(which >= 2, -1.0, 1.0).astype(angle.dtype)
     return sign_cos * jnp.where(odd, sin, cos), sign_sin * jnp.where(odd, cos, sin)
+
+
+def _check_angle(parameter: str, angle: ArrayLike) -> None:
+    """Raise for what is no number, warn of degrees; nothing can be said under tracing."""
+    try:
+        value = known(jnp.asarray(angle))
+    except (TypeError, ValueError):
+        raise invalid(parameter, expected="an angle in radians", got=short_repr(angle)) from None
+    if value is not None:
+        warn_of_degrees(parameter, *value.ravel().tolist(), stacklevel=4)
 
 
 def _as_float(x: ArrayLike) -> Array:

@@ -1,7 +1,9 @@
 """Edits, chained: who, then what, then the video. `edit(model).select(mask=...).move((0.1, 0.0)).video()`."""
 
 import dataclasses
+import difflib
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypedDict, Unpack
@@ -9,7 +11,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from foldgauss._checks import invalid, whole, within
+from foldgauss._checks import check_takes, invalid, short_repr, warn_of_degrees, whole, within
 from foldgauss.render import Camera
 from foldgauss.video import baking
 from foldgauss.video.edited import EditedVideo, Layer, as_edited
@@ -33,6 +35,9 @@ from foldgauss.video.timing import Clock, Span, checked_number, checked_numbers,
 
 Mask = Bool[np.ndarray, "num"]
 Bake = Callable[[FoldedSplats, Mask], FoldedSplats | None]
+
+#: A place or a shift this many frames away is one in pixels, most likely.
+FAR = 10.0
 
 
 class When(TypedDict, total=False):
@@ -72,7 +77,8 @@ class Edit:
     **Example:** `edit(model).select(mask=mask, frame=0).multiply([(0.2, 0), (0.4, 0)]).scale(0.8).video()`
 
     **Source:** VeGaS, "modification of videos"; eq:cond_dens for what can be baked. **Raises:** ValueError from every
-    method for numbers that make no sense, and for an edit of nothing.
+    method for numbers that make no sense, and for an edit of nothing. Numbers that seem to be of other units, degrees,
+    pixels or frames, are warned of.
     """
 
     _video: EditedVideo
@@ -87,6 +93,11 @@ class Edit:
         plain = len(video.layers) == 1 and video.camera is None
         layer = video.layers[0]
         return layer.model if plain and not layer.overlays and not layer.clocks else video
+
+    def __getattr__(self, name: str) -> object:
+        """There is none; most likely `video()` was forgotten."""
+        cure = " End the chain with .video()." if name in dir(EditedVideo) else ""
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}.{cure}", name=name, obj=self)
 
     # ------------------------------------------------------------------------------------------------- who
 
@@ -142,6 +153,7 @@ class Edit:
         if selection is None:
             return [np.ones(count, bool) for count in counts]
         if callable(selection):  # it is asked now, so it answers for now
+            check_takes("selection", selection, "video")
             selection, before = selection(self.video()), counts
             sources = [np.arange(count) for count in counts]
         if isinstance(selection, str | os.PathLike):
@@ -151,6 +163,8 @@ class Edit:
         if mask.dtype != bool or mask.shape not in ((sum(counts),), (sum(before),)):
             expected = f"a Selection or mask of {sum(counts):,} Gaussians"
             cure = "For a mask of pixels: select(mask=mask, frame=k)." if mask.ndim > 1 else "Is it another model's?"
+            if mask.dtype.kind in "iu" and mask.ndim <= 1:
+                cure = "For numbers of Gaussians: Selection.of(model, [...])."
             got = f"{mask.dtype} {mask.shape}"
             raise invalid("selection", expected=expected, got=got, cure=cure)
         if len(mask) != sum(before) or selection is self.selection:
@@ -165,7 +179,7 @@ class Edit:
 
     def move(self, offset: ArrayLike, **when: Unpack[When]) -> "Edit":
         """Shift by `offset` (x, y). Baked without a span."""
-        return self._map(0.0, IDENTITY, offset, None, when)
+        return self._map(0.0, IDENTITY, self._point("offset", offset), None, when)
 
     def scale(self, factor: ArrayLike, *, about: ArrayLike | None = None, **when: Unpack[When]) -> "Edit":
         """Larger by `factor`, one number or (along x, along y), all > 0.
@@ -176,6 +190,7 @@ class Edit:
         if len(given) not in (1, 2) or min(given) <= 0:
             cure = "Mirror with transform(), delete with vanish()."
             raise invalid("factor", expected="one or two numbers > 0", got=factor, cure=cure)
+        about = None if about is None else self._point("about", about)
         return self._map(0.0, ((given[0], 0.0), (0.0, given[-1])), (0.0, 0.0), about, when)
 
     def rotate(self, angle: float, *, about: ArrayLike | None = None, **when: Unpack[When]) -> "Edit":
@@ -183,7 +198,10 @@ class Edit:
 
         `about`: the point (x, y) that stays; baked then, without a span. None: the selection's own centre at each time.
         """
-        return self._map(checked_number("angle", angle), IDENTITY, (0.0, 0.0), about, when)
+        angle = checked_number("angle", angle)
+        warn_of_degrees("angle", angle)
+        about = None if about is None else self._point("about", about)
+        return self._map(angle, IDENTITY, (0.0, 0.0), about, when)
 
     def transform(
         self,
@@ -201,11 +219,19 @@ class Edit:
         rows = _square("matrix", matrix, 2)
         if not abs(np.linalg.det(rows)) > 1e-12 * np.abs(rows).max() ** 2:
             raise invalid("matrix", expected="a matrix that has an inverse", got=rows.tolist(), cure="See vanish().")
+        offset, about = self._point("offset", offset), None if about is None else self._point("about", about)
         return self._map(*_polar(rows), offset, about, when)
 
-    def _map(self, angle: float, stretch, offset: ArrayLike, about: ArrayLike | None, when: When) -> "Edit":
-        offset = checked_numbers("offset", offset, 2)
-        about = None if about is None else checked_numbers("about", about, 2)
+    def _point(self, parameter: str, value: ArrayLike, *, stacklevel: int = 3) -> tuple[float, ...]:
+        """(x, y) in model space; what is far beyond the frame is warned of."""
+        point = checked_numbers(parameter, value, 2)
+        if max(map(abs, point)) > FAR:
+            side = max(self._video.size)
+            text = f"{parameter}: expected units of the frame's longer side, got {value}, far beyond it."
+            warnings.warn(f"{text} For pixels divide by {side}.", stacklevel=stacklevel)
+        return point
+
+    def _map(self, angle: float, stretch, offset: tuple, about: tuple | None, when: When) -> "Edit":
         make = partial(Affine, angle=angle, stretch=stretch, offset=offset, about=about)
         identity = make(mask=np.zeros(0, bool), span=None).does_nothing
         return self._apply(make, when, lambda splats, mask: baking.moved(splats, mask, make(mask, None)), skip=identity)
@@ -231,15 +257,25 @@ class Edit:
 
         Copies have the edits of their originals, each about its own centre, even if the edit was of a wider selection.
         """
-        shifts = [checked_numbers("offsets", offset, 2) for offset in _rows("offsets", offsets)]
+        shifts = [self._point("offsets", offset) for offset in _rows("offsets", offsets)]
+        about = None if about is None else self._point("about", about)
         named = (("delays", delays), ("scale", scale), ("angle", angle))
         each = {name: _one_each(name, values, len(shifts)) for name, values in named}
+        if min(each["scale"]) <= 0:
+            raise invalid("scale", expected="numbers > 0", got=scale, cure="Mirror with transform().")
+        if not isinstance(originals, bool | np.bool_):
+            raise invalid("originals", expected="True or False", got=short_repr(originals))
+        warn_of_degrees("angle", *each["angle"])
+        for delay in each["delays"]:
+            _warn_of_frames("delays", delay, 1.0, 0.0, self._video.num_frames)
         span = self._span(when)
         copied, copies = self._copied(len(shifts))
         for k, (shift, mask) in enumerate(zip(shifts, copies, strict=True)):
             one = dataclasses.replace(copied, selection=Selection(mask))
-            one = one.scale(each["scale"][k], about=about, **when).rotate(each["angle"][k], about=about, **when)
-            one = one.move(shift, **when).retime(shift=each["delays"][k], **when)
+            size, still = each["scale"][k], (0.0, 0.0)
+            one = one._map(0.0, ((size, 0.0), (0.0, size)), still, about, when)
+            one = one._map(each["angle"][k], IDENTITY, still, about, when)._map(0.0, IDENTITY, shift, None, when)
+            one = one._by_line(each["delays"][k], 1.0, 0.0, "continue", when)
             if span is not None:
                 one = one._overlaid(partial(Opacity, factor=1.0, before=0.0), span)
             copied = dataclasses.replace(one, selection=copied.selection)
@@ -382,15 +418,23 @@ class Edit:
             raise invalid("clock", expected="a clock, or shift, stretch and about", got="both")
         if clock is not None and outside != "continue":
             raise invalid("outside", expected="a clock that has its own", got=outside, cure="Clock(..., outside=...).")
-        line = Clock.shifted(shift, stretch, about=about, outside=outside)  # and the checks
         if clock is not None and not isinstance(clock, Clock):
-            raise invalid("clock", expected="a Clock", got=type(clock).__name__)
-        identity = clock is None and (shift, stretch) == (0, 1) and outside == "continue"
+            cure = "Clock(times, own_times) goes straight between knots." if callable(clock) else ""
+            raise invalid("clock", expected="a Clock", got=type(clock).__name__, cure=cure)
+        if clock is not None:
+            return self._apply(partial(Retimed, clock=clock), when)
+        Clock.shifted(shift, stretch, about=about, outside=outside)  # the checks
+        _warn_of_frames("shift", shift, stretch, about, self._video.num_frames)
+        return self._by_line(shift, stretch, about, outside, when)
+
+    def _by_line(self, shift: float, stretch: float, about: float, outside: str, when: When) -> "Edit":
+        """What it does at t at about + shift + stretch (t - about): baked where it can be."""
+        line = Clock.shifted(shift, stretch, about=about, outside=outside)
+        identity = (shift, stretch) == (0, 1) and outside == "continue"
         bake = partial(baking.retimed, shift=float(shift), stretch=float(stretch), about=float(about))
         # Between shots a clock shows the nearer one, which no leaves say.
-        bakes = clock is None and outside == "continue" and not any(layer.has_cuts for layer in self._video.layers)
-        make = partial(Retimed, clock=line if clock is None else clock)
-        return self._apply(make, when, bake if bakes else None, skip=identity)
+        bakes = outside == "continue" and not any(layer.has_cuts for layer in self._video.layers)
+        return self._apply(partial(Retimed, clock=line), when, bake if bakes else None, skip=identity)
 
     def freeze(self, at: float, **when: Unpack[When]) -> "Edit":
         """The selection stands still as it is at frame `at`, or a position between two."""
@@ -410,7 +454,7 @@ class Edit:
 
         **Example:** `edit(model).apply(lambda g, t: dataclasses.replace(g, mean=g.mean * (1 + t)))`
         """
-        return self._apply_function(Function, function, when)
+        return self._apply_function(Function, function, "gaussians", when)
 
     def apply_triangles(
         self,
@@ -425,11 +469,12 @@ class Edit:
         **Source:** VeGaS eq:traingle_face, eq:gaussrecons1; GaMeS. **Raises:** ValueError, when drawn, for faces
         without area and numbers that are not finite.
         """
-        return self._apply_function(FaceFunction, function, when)
+        return self._apply_function(FaceFunction, function, "vertices", when)
 
-    def _apply_function(self, kind: type[AbstractOverlay], function: object, when: When) -> "Edit":
+    def _apply_function(self, kind: type[AbstractOverlay], function: object, of: str, when: When) -> "Edit":
         if not callable(function):
             raise invalid("function", expected="a function", got=type(function).__name__)
+        check_takes("function", function, of, "t")
         return self._apply(partial(kind, function=function), when)
 
     # --------------------------------------------------------------------------------------------------- in space
@@ -452,8 +497,9 @@ class Edit:
         fields = {
             "depth": checked_number("depth", depth),
             "rotation": checked_numbers("rotate", rotate, 3),
-            "about": None if about is None else checked_numbers("about", about, 2),
+            "about": None if about is None else self._point("about", about),
         }
+        warn_of_degrees("rotate", *fields["rotation"])
         return self._apply(partial(Place, **fields), when, skip=not fields["depth"] and not any(fields["rotation"]))
 
     def seen_from(self, camera: Camera | Callable[[float], Camera] | None) -> "Edit":
@@ -463,6 +509,8 @@ class Edit:
         """
         if camera is not None and not isinstance(camera, Camera) and not callable(camera):
             raise invalid("camera", expected="a Camera, a function of t or None", got=type(camera).__name__)
+        if camera is not None and not isinstance(camera, Camera):
+            check_takes("camera", camera, "t")
         if isinstance(camera, Camera) and camera.position.ndim != 1:
             raise invalid("camera", expected="one camera", got=f"positions of shape {camera.position.shape}")
         return dataclasses.replace(self, _video=dataclasses.replace(self._video, camera=camera))
@@ -524,6 +572,11 @@ class Edit:
         return _split(self.selection.mask, [layer.num_gaussians for layer in self._video.layers])
 
     def _span(self, when: When) -> Span | None:
+        for name in when:
+            if name not in When.__annotations__:
+                near = difflib.get_close_matches(name, When.__annotations__, 1)
+                expected, cure = "one of " + ", ".join(When.__annotations__), f"Did you mean {near[0]}?" if near else ""
+                raise invalid("when", expected=expected, got=name, cure=cure)
         return span_of(self._frame_times(), **when)
 
     def _frame_times(self) -> Float[np.ndarray, "num_frames"]:
@@ -610,17 +663,26 @@ def _rows(parameter: str, values: object) -> list:
     return rows
 
 
+def _warn_of_frames(parameter: str, shift: float, stretch: float, about: float, num_frames: int) -> None:
+    """Warn of a time at which nothing of the clip is left."""
+    ends = [about + shift + stretch * (own - about) for own in (0.0, 1.0)]
+    if max(ends) < 0 or min(ends) > 1:
+        text = f"{parameter}: expected times of a clip of [0, 1], got {shift:g}: nothing of it is left there."
+        warnings.warn(f"{text} For frames divide by {num_frames - 1}.", stacklevel=3)
+
+
 def _listed(parameter: str, values: ArrayLike) -> tuple[float, ...]:
     """Numbers, or one number alone, as a tuple."""
     several = isinstance(values, (list, tuple)) or getattr(values, "ndim", 0) > 0
-    return checked_numbers(parameter, values if several else [values])
+    return checked_numbers(parameter, values) if several else (checked_number(parameter, values),)
 
 
 def _square(parameter: str, values: ArrayLike, side: int) -> Float[np.ndarray, "side side"]:
-    rows = [checked_numbers(parameter, row, side) for row in _rows(parameter, values)]
-    if len(rows) != side:
-        raise invalid(parameter, expected=f"shape ({side}, {side})", got=f"{len(rows)} rows")
-    return np.array(rows)
+    try:
+        return np.array([checked_numbers(parameter, row, side) for row in values]).reshape(side, side)
+    except (TypeError, ValueError):
+        expected = f"finite numbers of shape ({side}, {side})"
+        raise invalid(parameter, expected=expected, got=short_repr(values)) from None
 
 
 def _one_each(parameter: str, values: ArrayLike, num: int) -> tuple[float, ...]:

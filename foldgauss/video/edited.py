@@ -1,5 +1,6 @@
 """Edited videos: models in layers, with edits that no folded model holds, drawn as one."""
 
+import os
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -161,6 +162,8 @@ def layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo
     one with a camera: a camera sees all layers.
     """
     parts = [as_edited(video) for video in videos]
+    if not parts:
+        raise invalid("videos", expected="at least one", got="none")
     if not _numbers_one(timeline, len(parts)):
         raise invalid("timeline", expected=f"the number of one of {len(parts)} videos", got=timeline)
     for part in parts:
@@ -179,6 +182,10 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
         return video
     if not isinstance(video, VideoModel):
         cure = "End a chain of edits with .video()."
+        if isinstance(video, list | tuple):
+            cure = "Put several together by layers(*videos)."
+        elif isinstance(video, str | os.PathLike):
+            cure = "Read a file with foldgauss.io.load_video_model(path)."
         raise invalid("video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cure)
     return EditedVideo((Layer(video),), timeline=0)
 

@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.special import expit
 
-from foldgauss._checks import invalid
 from foldgauss.render import cpu
 from foldgauss.video.conditioning import Conditioned, condition
-from foldgauss.video.model import VideoModel
+from foldgauss.video.model import VideoModel, check_model
 from foldgauss.video.regions import Region
 from foldgauss.video.shots import out_of_cuts
 from foldgauss.video.stage import Stage
@@ -32,9 +31,7 @@ class LitModel:
     """
 
     def __init__(self, model: VideoModel):
-        if not isinstance(model, VideoModel):
-            cure = "Select in each layer's own model, before layers and edits are put together."
-            raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+        check_model(model)
         self.model, self.size = model, model.size
         self._conditioned = Stage(model, model.size)
         self.times = np.asarray(model.frame_times.times())

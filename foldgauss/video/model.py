@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._batch import known
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, short_repr
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
@@ -199,10 +199,24 @@ def _checked_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
 
 def check_time(t: float) -> None:
     """Raise unless t is a time of a video, where that is known."""
-    value = known(jnp.asarray(t))
+    try:
+        value = known(jnp.asarray(t))
+    except (TypeError, ValueError):
+        raise invalid("t", expected="a time in [0, 1]", got=short_repr(t)) from None
     if value is not None and not ((value >= 0) & (value <= 1)).all():
         cure = "Frame k is at frame_times.times()[k]."
         raise invalid("t", expected="a time in [0, 1]", got=value, cure=cure)
+
+
+def check_model(model: object) -> None:
+    """Raise unless it is a `VideoModel`."""
+    if not isinstance(model, VideoModel):
+        cures = {
+            "EditedVideo": "Select in each layer's own model, before layers and edits are put together.",
+            "Edit": "End the chain with .video().",
+        }
+        cure = cures.get(type(model).__name__, "The model comes first.")
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
 
 
 class VideoModel(eqx.Module):

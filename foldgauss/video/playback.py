@@ -11,6 +11,7 @@ import numba as nb
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from foldgauss._checks import invalid, short_repr
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
 from foldgauss.render import Splats2D, cpu
@@ -66,7 +67,12 @@ class Playback:
 
     def frames(self, times: Float[np.ndarray, "frames"] | None = None) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         """The pictures at `times` (default: the model's frame times), one by one."""
-        for t in np.asarray(self._times if times is None else times):
+        shown = np.asarray(self._times if times is None else times)
+        close = 1e-6  # sums of steps miss the ends by their rounding
+        if shown.ndim != 1 or shown.dtype.kind not in "fiu" or not ((shown >= -close) & (shown <= 1 + close)).all():
+            cure = "Frame k is at frame_times.times()[k]."
+            raise invalid("times", expected="a list of times in [0, 1]", got=short_repr(times), cure=cure)
+        for t in shown:
             yield self.frame(t)
 
     def image(self, t: float) -> Float[np.ndarray, "3 height width"]:

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32
 from skimage.draw import polygon2mask
 
-from foldgauss._checks import invalid, within
-from foldgauss.video.model import VideoModel
+from foldgauss._checks import invalid, whole, within
+from foldgauss.video.model import VideoModel, check_model
 
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
 Masks = Mask | Bool[np.ndarray, "num_frames height width"] | Mapping[int, Mask]
@@ -31,6 +31,7 @@ class Region:
 
 def mask_region(model: VideoModel, mask: Masks, frame: int | None, frames: tuple[int, int] | None) -> Region:
     """A mask of one frame or several alike, one mask for each of a range of frames, or {frame: mask}."""
+    check_model(model)
     if isinstance(mask, Mapping):
         if frame is not None or frames is not None:
             raise invalid("mask", expected="its frames named once", got="{frame: mask} and frame or frames as well")
@@ -59,6 +60,7 @@ def box_region(
     model: VideoModel, box: tuple[float, float, float, float], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
     """The pixels whose centres lie in x0 <= x < x1, y0 <= y < y1."""
+    check_model(model)
     edges = _as_numbers(box)
     if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
         raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=_shown(box))
@@ -73,6 +75,7 @@ def polygon_region(
     model: VideoModel, polygon: Float[ArrayLike, "corners 2"], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
     """The pixels whose centres lie in a polygon of corners (x, y), even-odd."""
+    check_model(model)
     corners = _as_numbers(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
     if bad or not np.isfinite(corners).all():
@@ -96,6 +99,7 @@ def _shown(given: object) -> str:
 
 def chosen_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:
     """One frame, the frames first <= k < stop, or all."""
+    check_model(model)
     if frame is not None and frames is not None:
         raise invalid("frame, frames", expected="one of the two", got="both")
     if frame is not None:
@@ -129,11 +133,18 @@ def _checked_frame(model: VideoModel, k: object) -> int:
 
 
 def _checked_frames(model: VideoModel, frames: object) -> tuple[int, int]:
-    pair = isinstance(frames, tuple | list) and len(frames) == 2 and all(isinstance(k, Integral) for k in frames)
-    if not (pair and 0 <= frames[0] < frames[1] <= model.num_frames):
+    pair = tuple(frames) if isinstance(frames, tuple | list | np.ndarray) else ()
+    if len(pair) == 2:
+        pair = tuple(end if given is None else given for given, end in zip(pair, (0, model.num_frames), strict=True))
+    if not (len(pair) == 2 and all(whole(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames):
         expected = f"(first, stop) with 0 <= first < stop <= {model.num_frames}"
-        raise invalid("frames", expected=expected, got=repr(frames), cure="For one frame give frame=k.")
-    return int(frames[0]), int(frames[1])
+        raise invalid(
+            "frames",
+            expected=expected,
+            got=repr(frames),
+            cure="None is the clip's own end; for one frame give frame=k.",
+        )
+    return int(pair[0]), int(pair[1])
 
 
 def _checked_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:

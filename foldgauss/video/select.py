@@ -6,10 +6,10 @@ import functools
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, whole
 from foldgauss.video.follow import CLEAR, IN, OUT, UNKNOWN, difference, followed, grown, lab, settled
 from foldgauss.video.light import LitModel, best_frames, contributions, drawn_share, reached, seen_colors
-from foldgauss.video.model import SH_C0, VideoModel
+from foldgauss.video.model import SH_C0, VideoModel, check_model, check_time
 from foldgauss.video.regions import (
     Masks,
     Region,
@@ -50,6 +50,7 @@ class Selection:
     @classmethod
     def of(cls, model: VideoModel, indices: Int[np.ndarray, "num"]) -> "Selection":
         """The Gaussians of these numbers. Raises ValueError for numbers that the model has not."""
+        check_model(model)
         indices, num = np.asarray(indices), model.splats.num_gaussians
         if indices.size == 0:
             return cls.none(model)
@@ -62,11 +63,13 @@ class Selection:
     @classmethod
     def all(cls, model: VideoModel) -> "Selection":
         """Every Gaussian."""
+        check_model(model)
         return cls(np.ones(model.splats.num_gaussians, bool))
 
     @classmethod
     def none(cls, model: VideoModel) -> "Selection":
         """No Gaussian."""
+        check_model(model)
         return cls(np.zeros(model.splats.num_gaussians, bool))
 
     @property
@@ -83,7 +86,7 @@ class Selection:
         return int(self.mask.sum())
 
     def __contains__(self, index: int) -> bool:
-        return bool(self.mask[index])
+        return whole(index, 0) and index < self.num_gaussians and bool(self.mask[index])
 
     def __or__(self, other: "Selection") -> "Selection":
         return Selection(self.mask | self._mask_of(other))
@@ -108,7 +111,7 @@ class Selection:
 
     def _mask_of(self, other: "Selection") -> Bool[np.ndarray, "num_gaussians"]:
         if not isinstance(other, Selection):
-            raise TypeError(f"expected a Selection, got {type(other).__name__}")
+            raise TypeError(f"expected a Selection, got {type(other).__name__}. Selection(mask) makes one of a mask.")
         if other.num_gaussians != self.num_gaussians:
             expected = f"a selection of {self.num_gaussians:,} Gaussians"
             raise invalid(
@@ -350,7 +353,9 @@ def matte(model: VideoModel, selection: Selection, t: float) -> Float32[np.ndarr
 
     **Example:** `matte(model, selection, 0.5) > 0.5`. **Raises:** ValueError for a selection of another model.
     """
-    return drawn_share(*_known(model, selection), t)
+    lit, mask = _known(model, selection)
+    check_time(t)
+    return drawn_share(lit, mask, t)
 
 
 def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndarray, "height width"]:
@@ -358,12 +363,17 @@ def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndar
 
     Reached is where a Gaussian's alpha is not cut off (`RenderOptions.alpha_cutoff`). Else as `matte`.
     """
-    return reached(*_known(model, selection), t)
+    lit, mask = _known(model, selection)
+    check_time(t)
+    return reached(lit, mask, t)
 
 
 def _known(model: VideoModel, selection: Selection) -> tuple[LitModel, Bool[np.ndarray, "num_gaussians"]]:
     """The model, ready to be asked, and the mask of a selection that fits it."""
     lit = LitModel(model)
+    if not isinstance(selection, Selection):
+        cure = "The order is (model, selection, t); Selection(mask) makes one of a mask."
+        raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
     return lit, (Selection.none(model) | selection).mask
 
 

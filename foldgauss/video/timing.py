@@ -9,7 +9,7 @@ from numbers import Real
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._checks import invalid, one_of, whole, within
+from foldgauss._checks import invalid, one_of, short_repr, whole, within
 
 CURVES = ("linear", "smooth")
 OUTSIDE = ("hold", "continue")
@@ -206,21 +206,25 @@ class Clock:
 
 
 def checked_number(parameter: str, value: object) -> float:
-    """`value` as a float. Raises ValueError unless it is one finite number."""
+    """`value` as a float. Raises ValueError unless it is one finite number, alone or as an array without axes."""
+    value = value.item() if getattr(value, "ndim", None) == 0 else value
     if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-        raise invalid(parameter, expected="a finite number", got=repr(value))
+        raise invalid(parameter, expected="a finite number", got=short_repr(value))
     return float(value)
 
 
 def checked_numbers(parameter: str, values: object, length: int | None = None) -> tuple[float, ...]:
     """`values` as a tuple of floats, `length` of them. Raises ValueError for anything else."""
-    wanted = "finite numbers" if length is None else f"{length} finite numbers"
+    wanted = "finite numbers in a list" if length is None else f"{length} finite numbers"
     try:
-        array = np.asarray(values, np.float64)
+        array = np.asarray(values)
+        if array.dtype.kind in "USbOcmM":  # texts, too, would become numbers
+            raise TypeError
+        array = array.astype(np.float64)
     except (TypeError, ValueError):
-        raise invalid(parameter, expected=wanted, got=repr(values)) from None
+        raise invalid(parameter, expected=wanted, got=short_repr(values)) from None
     if array.ndim != 1 or not np.isfinite(array).all() or length not in (None, len(array)):
-        raise invalid(parameter, expected=wanted, got=repr(values))
+        raise invalid(parameter, expected=wanted, got=short_repr(values))
     return tuple(array.tolist())
 
 
@@ -237,6 +241,8 @@ def _checked_ease(ease: object) -> tuple[float, float]:
 
 
 def _pair(parameter: str, value: object) -> Sequence:
+    value = value.tolist() if isinstance(value, np.ndarray) else value
     if not isinstance(value, (tuple, list)) or len(value) != 2:
-        raise invalid(parameter, expected="two of them, (start, stop)", got=repr(value))
+        cure = "For one frame give frame=k." if parameter == "frames" else ""
+        raise invalid(parameter, expected="two of them, (start, stop)", got=short_repr(value), cure=cure)
     return value

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
 from foldgauss.render import Camera
 from foldgauss.video import EditedVideo, Selection, VideoModel, edit, layers, select
-from tests.video.soft_models import NUM, OBJECT, SIZE, soft_model
 
 MODEL = soft_model()
 BOX, FRAME = (12, 10, 32, 30), 3
@@ -45,6 +45,25 @@ def error(text, model=MODEL, folder=".") -> str:
 
 
 # ------------------------------------------------------------------------------------------------------ what it does
+
+
+@pytest.mark.parametrize(
+    ("text", "frames"), [('"3:"', (3, None)), ('":4"', (None, 4)), ('"2:5"', (2, 5)), ('":"', (None, None))]
+)
+def test_frames_with_open_ends(text, frames):
+    """Of edits with easing, and of where a selection is looked at."""
+    moved = made(f'[[edits]]\ndo = "move"\noffset = [0.1, 0]\nframes = {text}\nease = 1')
+    assert same(moved, edit(MODEL).move((0.1, 0), frames=frames, ease=1).video())
+    gone = f'[selections.it]\nbox = {list(BOX)}\nframes = {text}\n[[edits]]\ndo = "vanish"\nselect = "it"'
+    assert same(made(gone), edit(MODEL).select(box=BOX, frames=frames).vanish().video())
+
+
+@pytest.mark.parametrize("text", ['"3"', '"a:b"', '"3:-1"', "[3, -1]", "[3]", '"1:2:3"', '""'])
+def test_frames_that_are_none(text):
+    told = error(f'[[edits]]\ndo = "vanish"\nframes = {text}')
+    assert "line 3, [[edits]] number 1: frames: expected two whole numbers" in told
+    assert 'or "10:", from there to the end' in told
+
 
 DEGREES = math.radians(30)
 SPAN = 'frames = [1, 5]\nease = [1, 2]\ncurve = "smooth"'

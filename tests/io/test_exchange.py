@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import (
@@ -9,14 +10,21 @@ from foldgauss.io import (
     OutputError,
     export,
     import_model,
+    load_selection,
+    load_video_model,
+    read_masks,
     read_pseudomesh,
+    read_video,
+    save_selection,
+    save_video_model,
     write_3dgs_frames,
     write_3dgs_ply,
     write_pseudomesh,
     write_vegas_ply,
+    write_video,
 )
 from foldgauss.render import RenderOptions
-from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video import FrameTimes, Selection, VideoModel, edit
 from foldgauss.video.packing import pack, unpack
 
 
@@ -97,3 +105,46 @@ def test_what_is_no_video(tmp_path, model):
         import_model(write_pseudomesh(tmp_path / "mesh", model))
     with pytest.raises(FileNotFoundError, match="missing"):
         import_model(tmp_path / "none.ply")
+
+
+SWAPPED = {
+    "save": (lambda m, s, p: save_video_model(m, p), r"path: expected a path, got VideoModel\. .*\(path, model\)"),
+    "save a selection as a model": (lambda m, s, p: save_video_model(p, s), "model: .*got Selection"),
+    "load": (lambda m, s, p: load_video_model(m), "path: expected a path, got VideoModel"),
+    "save a selection": (lambda m, s, p: save_selection(s, p, m), r"path: .*\(path, selection, model\)"),
+    "save two, swapped": (lambda m, s, p: save_selection(p, m, s), "selection: expected a Selection, got VideoModel"),
+    "save a mask": (lambda m, s, p: save_selection(p, s.mask, m), r"selection: .*got ndarray.*Selection\(mask\)"),
+    "load a selection": (lambda m, s, p: load_selection(m, p), "path: expected a path"),
+    "load for no model": (lambda m, s, p: load_selection(p, "m"), "model: expected a VideoModel, got str"),
+    "format first": (lambda m, s, p: export("ply", m, p), r"model: .*got str\. .*\(model, format, out\)"),
+    "path second": (lambda m, s, p: export(m, p, "ply"), "format: expected one of"),
+    "a chain": (lambda m, s, p: export(edit(m), "ply", p), r"model: .*got Edit\. End the chain with \.video"),
+    "no path": (lambda m, s, p: export(m, "ply", 3), "path: expected a path, got 3"),
+    "obj in a file": (lambda m, s, p: export(m, "obj", f"{p}.obj"), "out: expected a folder, got .*extension out"),
+    "no times": (lambda m, s, p: export(m, "ply3dgs", p, times="x"), "times: expected one or more numbers"),
+    "times of frames": (lambda m, s, p: export(m, "obj", p, times=[0, 3]), "times: expected one or more numbers"),
+    "import": (lambda m, s, p: import_model(3), "path: expected a path, got 3"),
+    "masks": (
+        lambda m, s, p: read_masks(s.mask),
+        "path: expected a path, got .*array",
+    ),
+    "frames first": (lambda m, s, p: write_video(m.frames(), p, 24), r"path: .*\(path, frames, fps\)"),
+    "a model": (lambda m, s, p: write_video(p, m, 24), r"frames: .*got VideoModel\. Of a model: model\.frames\(\)"),
+    "a rate in a text": (lambda m, s, p: write_video(p, m.frames(), "24"), r"fps: expected a rate in \(0, 1000\]"),
+    "one picture": (lambda m, s, p: write_video(f"{p}.png", m.frames(), 24), "path: .*One picture: write_image"),
+    "a clip": (lambda m, s, p: read_video(3), "path: expected a path, got 3"),
+}
+
+
+@pytest.mark.parametrize("name", SWAPPED)
+def test_swapped_arguments(tmp_path, name):
+    call, message = SWAPPED[name]
+    model = soft_model()
+    with pytest.raises(ValueError, match=f"^({message})"):
+        call(model, Selection.all(model), str(tmp_path / "out"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_time_needs_no_list(tmp_path):
+    export(soft_model(), "ply3dgs", tmp_path / "frames", times=0.5)
+    assert len(list((tmp_path / "frames").iterdir())) == 1

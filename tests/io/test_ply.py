@@ -376,7 +376,7 @@ def test_frames_go_to_a_folder(tmp_path):
     (folder / "precious.txt").touch()
     with pytest.raises(OutputError, match="precious"):
         write_3dgs_frames(folder, model, overwrite=True)
-    for times in ([], [1.5], [math.nan], 0.5):
+    for times in ([], [1.5], [math.nan], "0.5"):
         with pytest.raises(ValueError, match="times"):
             write_3dgs_frames(tmp_path / "other", model, times)
     assert not (tmp_path / "other").exists()

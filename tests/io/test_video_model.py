@@ -119,6 +119,19 @@ def test_kinds_are_not_mixed_up(tmp_path):
         load_checkpoint(tmp_path / "m", config=CONFIG, source=SOURCE)
 
 
+@pytest.mark.parametrize("name", ["m.mp4", "m.png", "m.ply", "m.v2"])
+def test_names_of_other_formats_are_refused(tmp_path, name):
+    """A model called clip.mp4 is no video, and nothing is written."""
+    with pytest.raises(ValueError, match=r"^path: expected a name for the model, as m\.safetensors, got .*export\."):
+        save_video_model(tmp_path / name, random_model())
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_models(tmp_path):
+    for name in ("m", "m.safetensors", "M.SafeTensors", "m.v2.safetensors"):
+        assert load_video_model(save_video_model(tmp_path / name, random_model())).num_frames
+
+
 @pytest.mark.parametrize("cut", [0, 4, 8, 100, 600, -1, -100])
 def test_truncated(tmp_path, cut):
     path = tmp_path / "m.safetensors"

@@ -491,3 +491,18 @@ def test_errors(make, message):
 
 def test_a_blind_camera_is_nan_under_tracing():
     assert bool(jnp.isnan(jax.jit(Camera.look_at)(jnp.asarray([0.0, -1.0, 0.0])).rotation[0]).all())
+
+
+def test_what_orbit_is_told():
+    """Degrees are warned of, and what is no angle or place is refused; turns that are meant are not."""
+    camera = Camera.front(0.5)
+    camera.orbit(6.0, -1.5).orbit(4 * math.pi)
+    jax.jit(lambda angle: camera.orbit(angle).position)(20.0)
+    with pytest.warns(UserWarning, match=r"^azimuth: expected radians, got 20, 3\.2 turns\. .*math\.radians\(20\)"):
+        camera.orbit(20)
+    with pytest.warns(UserWarning, match=r"^elevation: expected radians, got -22\.5"):
+        camera.orbit(0.1, -22.5)
+    with pytest.raises(ValueError, match=r"^azimuth: expected an angle in radians, got 'x'"):
+        camera.orbit("x")
+    with pytest.raises(ValueError, match=r"^target: expected \(x, y, z\), got \(0, 0\)"):
+        camera.orbit(0.1, target=(0, 0))

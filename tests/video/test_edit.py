@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.render import RenderOptions, cpu
+from foldgauss.render import Camera, RenderOptions, cpu
 from foldgauss.video import Clock, EditedVideo, FrameTimes, SelectedGaussians, Selection, VideoModel, edit, layers
 from foldgauss.video.playback import Playback
 from foldgauss.video.shots import time_logits
@@ -178,7 +178,7 @@ def test_functions_that_change_nothing_are_exact():
 
 # ---------------------------------------------------------------------------------------------------- composition
 
-angles = st.floats(-7, 7)
+angles = st.floats(-6, 6)
 points = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 
 
@@ -631,24 +631,31 @@ WRONG = {
     "offset": (lambda: E.move((1, 2, 3)), "offset: expected 2 finite numbers"),
     "nan": (lambda: E.move((np.nan, 0)), "offset: expected 2 finite numbers"),
     "text": (lambda: E.move("ab"), "offset: expected 2 finite"),
+    "number in a text": (lambda: E.scale("2"), "factor: expected a finite number, got '2'"),
+    "numbers in texts": (lambda: E.move(("0.1", "0.2")), "offset: expected 2 finite numbers"),
     "about": (lambda: E.rotate(1, about=(0,)), "about: expected 2 finite"),
     "angle": (lambda: E.rotate(np.inf), "angle: expected a finite number"),
     "factor 0": (lambda: E.scale(0), "factor: expected one or two numbers > 0"),
     "three factors": (lambda: E.scale((1, 2, 3)), "factor: expected one or two"),
-    "matrix": (lambda: E.transform(np.eye(3)), "matrix: expected 2 finite numbers"),
-    "matrix of one row": (lambda: E.transform([[1, 2]]), "matrix: expected shape"),
+    "matrix": (lambda: E.transform(np.eye(3)), r"matrix: expected finite numbers of shape \(2, 2\)"),
+    "matrix of one row": (
+        lambda: E.transform([[1, 2]]),
+        r"matrix: expected finite numbers of shape \(2, 2\), got \[\[1, 2\]\]",
+    ),
     "ragged": (lambda: E.scale([(1, 2), 3]), "factor: expected finite numbers"),
     "flat matrix": (lambda: E.transform([[1, 2], [2, 4]]), "matrix: expected a matrix that has an inverse"),
     "opacity": (lambda: E.opacity(-1), "factor: expected a number >= 0"),
     "no copies": (lambda: E.multiply([]), "offsets: expected pairs"),
     "no list": (lambda: E.multiply(3), "offsets: expected pairs"),
+    "size of copies": (lambda: E.multiply([(0, 0)], scale=0), "scale: expected numbers > 0"),
+    "originals": (lambda: E.multiply([(0, 0)], originals="yes"), "originals: expected True or False"),
     "delays": (lambda: E.multiply([(0, 0)], delays=(1, 2)), "delays: expected one number or 1"),
     "colour": (lambda: E.recolor((1, 2)), "color: expected 3 finite"),
     "dark colour": (lambda: E.recolor((1, 2, -1)), "color: expected red, green and blue in"),
     "no way": (lambda: E.recolor(), "color, hue, gain: expected one way"),
     "two ways": (lambda: E.recolor((1, 0, 0), hue=0.1), "color, hue, gain: expected one way"),
     "gains": (lambda: E.recolor(gain=(1, 2)), "gain: expected one number or 3"),
-    "colour matrix": (lambda: E.recolor(matrix=np.eye(2)), "matrix: expected 3 finite numbers"),
+    "colour matrix": (lambda: E.recolor(matrix=np.eye(2)), r"matrix: expected finite numbers of shape \(3, 3\)"),
     "black object": (lambda: E.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object with some light"),
     "standing still": (lambda: E.retime(stretch=0), "stretch: expected a number but 0"),
     "two clocks": (lambda: E.retime(shift=1, clock=Clock.frozen(0)), "clock: expected a clock, or"),
@@ -657,6 +664,19 @@ WRONG = {
     "frozen": (lambda: E.freeze(7), r"at: expected a frame in \[0, 6\]"),
     "function": (lambda: E.apply(3), "function: expected a function"),
     "depth": (lambda: E.place(depth=None), "depth: expected a finite number"),
+    "function of one": (
+        lambda: E.apply(lambda g: g),
+        r"function: expected a function of \(gaussians, t\), got one of \(g",
+    ),
+    "of triangles": (lambda: E.apply_triangles(lambda v: v), r"function: expected a function of \(vertices, t\)"),
+    "camera of none": (lambda: E.seen_from(lambda: 3), r"camera: expected a function of \(t\), got one of \(\)"),
+    "camera itself": (lambda: E.seen_from(Camera), r"camera: expected a function of \(t\), got the class Camera"),
+    "selection of none": (lambda: E.select(lambda: OBJECT), r"selection: expected a function of \(video\)"),
+    "numbers": (lambda: E.select([1, 2]), r"selection: .*For numbers of Gaussians: Selection.of"),
+    "no videos": (lambda: layers(), "videos: expected at least one"),
+    "list of videos": (lambda: layers([MODEL]), r"video: .*layers\(\*videos\)"),
+    "path": (lambda: edit("m.safetensors"), r"video: .*load_video_model\(path\)"),
+    "another when": (lambda: E.move((0, 0), easing=2), "when: expected one of .*got easing. Did you mean ease"),
     "camera": (lambda: E.seen_from("left"), "camera: expected a Camera"),
     "frame": (lambda: E.move((0, 0), frame=7), r"frame: expected a whole number in \[0, 6\]"),
     "frames": (lambda: E.move((0, 0), frames=(3, 3)), "frames: expected .first, stop."),
@@ -677,6 +697,51 @@ def test_malformed_arguments(name):
     call, message = WRONG[name]
     with pytest.raises(ValueError, match=f"^{message}"):
         call()
+
+
+OTHER_UNITS = {
+    "degrees": (
+        lambda: E.rotate(45),
+        r"angle: expected radians, got 45, 7\.2 turns\. For degrees use math\.radians\(45\)",
+    ),
+    "degrees of copies": (lambda: E.multiply([(0, 0)], angle=90), "angle: expected radians, got 90"),
+    "degrees in space": (lambda: E.place(rotate=(0, -45, 0)), "rotate: expected radians, got -45"),
+    "pixels": (lambda: E.move((50, 20)), r"offset: expected units .* For pixels divide by 64"),
+    "pixels of copies": (lambda: E.multiply([(50, 20)]), "offsets: expected units"),
+    "pixels of a point": (lambda: E.scale(2, about=(32, 20)), "about: expected units"),
+    "frames": (lambda: E.retime(shift=3), "shift: expected times .* For frames divide by 6"),
+    "frames of copies": (lambda: E.multiply([(0, 0)], delays=(3,)), "delays: expected times"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_UNITS)
+def test_numbers_of_other_units_are_warned_of(name):
+    call, message = OTHER_UNITS[name]
+    with pytest.warns(UserWarning, match=f"^{message}"):
+        assert call().video() is not None
+
+
+def test_turns_shifts_and_ways_that_are_meant():
+    """No warning: it would be an error here."""
+    E.rotate(4 * np.pi, frames=(0, 5), ease=2)
+    E.rotate(np.array(6.0)).retime(stretch=-1, shift=1).retime(stretch=3, about=0.5)
+    E.move((5, -5)).multiply([(0.1, 0)], delays=0.9)
+
+
+def test_a_forgotten_end_of_the_chain_is_told():
+    with pytest.raises(AttributeError, match=r"no attribute 'render'\. End the chain with \.video\(\)\."):
+        E.move((0.1, 0)).render(0.5)
+    with pytest.raises(AttributeError, match=r"no attribute 'mve'\.$"):
+        E.mve((0.1, 0))
+
+
+@pytest.mark.parametrize("times", [5, [0, 7], "x", [np.nan]])
+def test_times_beyond_the_clip_are_no_times(times):
+    for video in (MODEL, E.rotate(1.0).video()):
+        with pytest.raises(ValueError, match=r"^times: expected a list of times in \[0, 1\], got .*frame_times"):
+            next(video.frames(times))
+        with pytest.raises(ValueError, match=r"^t: expected a time in"):
+            video.render("x")
 
 
 DRAWN_WRONG = {

@@ -129,7 +129,7 @@ def test_sums_are_layered_too():
 
 
 WRONG_LAYERS = {
-    "none": (lambda: layers(), "timeline: expected the number of one of 0"),
+    "none": (lambda: layers(), "videos: expected at least one"),
     "timeline": (lambda: layers(MODEL, timeline=1), "timeline: expected the number of one of 1"),
     "no number": (lambda: layers(MODEL, timeline="first"), "timeline"),
     "kind": (lambda: layers(MODEL, edit(MODEL)), r"video: expected a VideoModel .*got Edit\. End .* \.video"),

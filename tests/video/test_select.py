@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from object_clips import BACKGROUND, BOX, COLOR, DISC, NUM_FRAMES, SPEED, START, named_model, square, textured_clip
+from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video import (
@@ -22,6 +23,7 @@ from foldgauss.video import (
     by_polygon,
     by_time,
     contribution,
+    edit,
     fit,
     influence,
     matte,
@@ -493,3 +495,40 @@ def test_files_are_to_be_read_first():
         by_mask(MODEL, np.full(MODEL.size, 255, np.uint8), frame=0)
     with pytest.raises(ValueError, match=r"^box: expected .*got VideoModel\.$"):
         by_box(MODEL, MODEL, frame=0)
+
+
+SWAPPED = {
+    "text": (lambda m, s: by_box("m", (1, 2, 3, 4)), "model: expected a VideoModel, got str. The model comes first"),
+    "box first": (lambda m, s: by_box((1, 2, 3, 4), m, frame=0), "model: expected a VideoModel, got tuple"),
+    "mask first": (lambda m, s: by_mask(np.ones((4, 4), bool), m, frame=0), "model: .*got ndarray"),
+    "chain": (lambda m, s: by_box(edit(m), (1, 2, 3, 4)), "model: .*got Edit. End the chain with .video"),
+    "all of no model": (lambda m, s: Selection.all(s), "model: .*got Selection"),
+    "of no model": (lambda m, s: Selection.of(3, [1]), "model: .*got int"),
+    "a mask": (lambda m, s: matte(m, s.mask, 0.5), r"selection: expected a Selection, got ndarray.*Selection\(mask\)"),
+    "time first": (lambda m, s: influence(m, 0.5, s), r"selection: .*The order is \(model, selection, t\)"),
+    "time beyond": (lambda m, s: matte(m, s, 3), "t: expected a time in"),
+    "no time": (lambda m, s: influence(m, s, "x"), "t: expected a time in"),
+}
+
+
+@pytest.mark.parametrize("name", SWAPPED)
+def test_swapped_arguments(name):
+    call, message = SWAPPED[name]
+    model = soft_model()
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call(model, Selection.all(model))
+
+
+def test_frames_with_open_ends():
+    model = soft_model()
+    box = (12, 10, 32, 30)
+    assert by_box(model, box, frames=(2, None)) == by_box(model, box, frames=(2, 7))
+    assert by_box(model, box, frames=(None, 3)) == by_box(model, box, frames=np.array([0, 3]))
+    for frames in ((3, 3), (-1, 2), (2, 8), (1,), "13", (None, 0), (1.0, 3)):
+        with pytest.raises(ValueError, match=r"^frames: expected \(first, stop\) with"):
+            by_box(model, box, frames=frames)
+
+
+def test_numbers_beyond_are_in_no_selection():
+    chosen = Selection(np.array([True, False, True]))
+    assert [k in chosen for k in (0, 1, 2, 3, -1)] == [True, False, True, False, False]
