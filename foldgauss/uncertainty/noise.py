@@ -130,8 +130,8 @@ def score_share(
 
     With the residual r and the slope g = dR/dt, scores s_p = r_p g_p have the sum whose variance V is estimated with
     their covariances up to `reach` pixels (Bartlett weights), where the plain likelihood takes J = scale^2 sum g^2 for
-    granted: share = J / V. Exact where residuals are as correlated in seen frames as noise is; a fit that has learned the noise
-    leaves residuals whose scores cancel, and then it is too sure.
+    granted: share = J / V. Exact where residuals are as correlated in seen frames as noise is; a fit that has learned
+    the noise leaves residuals whose scores cancel, and then it is too sure.
 
     **Source:** the sandwich of Huber 1967; covariances as Newey and West 1987, over two dimensions Conley 1999.
     """

@@ -48,8 +48,8 @@ class FrameTimePosterior:
     `converged`: more than 50 tau of every frame, and every R-hat < 1.01. `message` says so, or what is missing.
     `laplace`, `exact`: the same posterior by Laplace's approximation and by forward and backward passes.
 
-    **Source:** emcee, Foreman-Mackey et al. 2013; R-hat, Vehtari et al. 2021. The walkers of one ensemble depend on each
-    other, so each ensemble is one chain; ESS is steps times walkers over tau.
+    **Source:** emcee, Foreman-Mackey et al. 2013; R-hat, Vehtari et al. 2021. The walkers of one ensemble depend on
+    each other, so each ensemble is one chain; ESS is steps times walkers over tau.
     """
 
     log_prob: FrameTimeLogProb
@@ -92,7 +92,7 @@ class FrameTimePosterior:
         return np.quantile(self.draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
 
     def identified(self, share: float = 0.8) -> np.ndarray:
-        """Which frames tell their time: bool (num_frames,), true where the posterior is narrower than `share` of the prior.
+        """Which frames tell their time: bool (num_frames,); there the posterior is narrower than `share` of the prior.
 
         The prior's spread is that of a frame between two others at the posterior's mean; frames held count as told.
         """
