@@ -450,11 +450,14 @@ class _Stepper:
 
         To `views`, where asked for, comes what `Statistics.add` wants.
         """
-        target = None if share is not None else _planar(shrunk(self.frames[k], shape.size), self.background)
+        if share is None:
+            target = _planar(shrunk(self.frames[k], shape.size), self.background)
+        else:
+            target = self.between.target(k, share, shape.size)
         done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
         if mirrored:
-            target = np.ascontiguousarray(target[:, :, ::-1]) if share is None else None
+            target = np.ascontiguousarray(target[:, :, ::-1])
             mean, factor = _mirrored(mean, factor, shape.size[1])
         trace = cpu.forward(
             mean,
@@ -466,8 +469,6 @@ class _Stepper:
             compositing=self.config.compositing,
             options=self.config.options,
         )
-        if share is not None:
-            target = self.between.target(k, share, shape.size, trace.image, mirrored=mirrored)
         if squared:
             loss = squared_loss(trace.image, target)
         else:
@@ -496,13 +497,10 @@ class _Between:
         chosen, share = rng.random() < self.config.between_share, rng.uniform(0.1, 0.9)
         return share if chosen and step and k not in self.last_of_shots else None
 
-    def target(self, k: int, share: float, size: tuple[int, int], drawn: np.ndarray, *, mirrored: bool) -> np.ndarray:
-        """Planes (3, height, width): what is `drawn` already wherever nothing else is known."""
-        guess, known = self.motion.between(self.frames, k, share, size)
-        if mirrored:
-            guess, known = guess[:, ::-1], known[:, ::-1]
-        planes = np.moveaxis(guess, -1, 0) * np.float32(1 / 255)
-        return np.ascontiguousarray(np.where(known, planes, drawn), np.float32)
+    def target(self, k: int, share: float, size: tuple[int, int]) -> np.ndarray:
+        """Planes (3, height, width)."""
+        guess = self.motion.between(self.frames, k, share, size)
+        return np.ascontiguousarray(np.moveaxis(guess, -1, 0) * np.float32(1 / 255))
 
 
 def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
