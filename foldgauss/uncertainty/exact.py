@@ -179,7 +179,7 @@ def _from_end(grid: np.ndarray, end: float, alpha: float) -> np.ndarray:
 def _hats(behind: np.ndarray, here: np.ndarray, alpha: float) -> np.ndarray:
     """Integrals of the hat function of each point of `behind` against (t - s)_+^(alpha - 1), t on `here`.
 
-    Exact for piecewise linear messages, however near the two grids are: what is infinite at s = t is integrated by hand.
+    Exact for piecewise linear messages, however near the two grids are: infinity at s = t is integrated by hand.
     """
     away = np.maximum(here[:, None] - behind[None, :], 0.0)
     first = away if alpha == 1 else away**alpha / alpha

@@ -79,9 +79,10 @@ def frame_time_log_prob(
 ) -> FrameTimeLogProb:
     """The log-posterior of the times of `frames` (default: of all but the first and the last), given the splats.
 
-    `video`: uint8 (num_frames, height, width, 3 or 4) at the model's size; it may be another cut of the same scene, with
-    another number of frames. `noise`, `on_picture`: see `evidence`, whose result may be handed in as `seen`. `concentration`: of the
-    Dirichlet prior on increments. `held`: the times of all other frames (default: the posterior medians of all).
+    `video`: uint8 (num_frames, height, width, 3 or 4) at the model's size; it may be another cut of the same scene,
+    with another number of frames. `noise`, `on_picture`: see `evidence`, whose result may be handed in as `seen`.
+    `concentration`: of the Dirichlet prior on increments. `held`: the times of all other frames (default: the posterior
+    medians of all).
 
     Raises ValueError for a video of another size or scene, one that shows nothing of its times, frames out of the
     model's order, and settings out of range.

@@ -8,8 +8,8 @@ from emcee.moves import Move
 from emcee.state import State
 
 from foldgauss._kernels import inline, kernel
-from foldgauss.uncertainty.log_prob import FrameTimeLogProb
 from foldgauss.uncertainty.exact import profile_grid
+from foldgauss.uncertainty.log_prob import FrameTimeLogProb
 from foldgauss.uncertainty.profiles import Profiles, value_at
 
 _d = nb.float64
