@@ -24,7 +24,8 @@ def weights(trace: Trace) -> scipy.sparse.csr_array:
 
     Rows are pixels in reading order; within a row splats stand in array order, front to back. The product is left out
     where splats are added up. Cutoff, ceiling and stop are those that the picture was drawn with, so that
-    `A @ color + light * background` is the picture of `trace` up to rounding.
+    `A @ color + light * background` is the picture of `trace` up to rounding: now and then, at a pixel, it decides
+    about a weight that is just being cut off.
 
     **Example:** `weights(cpu.forward(mean, factor, opacity, color, background, size))`.
 

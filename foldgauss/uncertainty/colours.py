@@ -55,13 +55,20 @@ def evidence_without_colours(
     each colour about the model's own with standard deviation `prior_scale`, in units of the pixels' range; towards 0
     `base` comes back.
 
+    **How much wider:** at the same colours a time's information g^T C^{-1} g, with g = dR/dt, never exceeds that with
+    colours held, g^T g / s^2. The profile may still be narrower than `base`'s and stand elsewhere: its colours are the
+    best for the other frames, which those of a fit, stopped early and clamped, are not.
+
     Up to `most_dense` Gaussians everything is exact (Cholesky). Beyond, the quadratic form is by conjugate gradients,
     to about 1e-3 nats, and differences of log det by the trapezoidal rule over traces estimated with `probes` random
-    signs, drawn from `seed` and the same at all times of a frame. `on_frame` is called with how many are done, and how
+    signs, drawn from `seed` and the same at all times of a frame. 40,000 Gaussians at 160x320, 132 frames, one core:
+    80 s for the equations, then 30 to 55 s a frame. `on_frame` is called with how many are done, and how
     many there are.
 
     Where the base profile has nodes further out, the new one goes on as that does, scaled so that it falls as steeply
     at first, and is nowhere greater than where it is joined.
+
+    **Shapes and units:** as `Profiles`; nats, the greatest value of each new profile 0.
 
     **Raises:** ValueError for a video, base or frames that do not fit, and numbers out of range.
 
