@@ -144,7 +144,7 @@ def solved(
     In the preconditioner's norm. Raises ValueError where they do not come down so far. Source: Hestenes and Stiefel
     1952.
     """
-    x, goal = start.copy(), tolerance**2 * np.maximum((rhs * precondition(rhs)).sum(0), np.finfo(float).tiny)
+    x, goal = start.copy(), np.maximum(tolerance**2 * (rhs * precondition(rhs)).sum(0), np.finfo(float).tiny)
     left = rhs - product(x)
     turned = precondition(left)
     direction, size = turned.copy(), (left * turned).sum(0)

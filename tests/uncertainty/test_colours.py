@@ -166,6 +166,12 @@ def test_conjugate_gradients_solve_and_hold_still_at_zero():
     np.testing.assert_allclose(found, np.linalg.solve(matrix, rhs), atol=1e-8)
 
 
+def test_equations_that_are_not_solved_are_told():
+    rhs = np.ones((4, 1))
+    with pytest.raises(ValueError, match="prior_scale: expected colours solved to 1e-05"):
+        solved(np.zeros_like, lambda r: r, rhs, np.zeros_like(rhs), 1e-5)
+
+
 def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
     base_nodes = np.linspace(0, 1, 41)
     base_values = -2000 * (base_nodes - 0.5) ** 2
