@@ -1,5 +1,6 @@
 """How sure the learned frame times are: likelihood profiles, and what is drawn from them."""
 
+from foldgauss.uncertainty.colors import evidence_without_colors
 from foldgauss.uncertainty.drawing import Evidence, evidence
 from foldgauss.uncertainty.exact import ExactTimes, exact_times
 from foldgauss.uncertainty.increments import Increments
@@ -20,6 +21,7 @@ __all__ = [
     "Profiles",
     "drawn_log_likelihood",
     "evidence",
+    "evidence_without_colors",
     "exact_times",
     "frame_time_log_prob",
     "frame_time_posterior",

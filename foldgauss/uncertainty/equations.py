@@ -34,7 +34,7 @@ _level = 1 / 255
 _d = nb.float64
 
 
-class ColourEquations:
+class ColorEquations:
     r"""H c = b of all colours' offsets c from the model's own, of every frame at its time.
 
     .. math:: H = \lambda^{-2} I + \sum_j A_j^T A_j / s_j^2, \quad b = \sum_j A_j^T (y_j - A_j c_0) / s_j^2
@@ -114,7 +114,7 @@ class ColourEquations:
 class FrameAt:
     """The equations with one frame at a time of its own: what is taken off, and what is put there."""
 
-    def __init__(self, equations: ColourEquations, k: int, t: float):
+    def __init__(self, equations: ColorEquations, k: int, t: float):
         self.equations, self.k, self.t = equations, k, t
         self.variance = equations.variance[k]
         self.weights = equations.weights(t)

@@ -14,7 +14,7 @@ from jaxtyping import Float64, UInt8
 
 from foldgauss._checks import invalid, whole, within
 from foldgauss.uncertainty.drawing import Evidence
-from foldgauss.uncertainty.equations import ColourEquations, FrameAt, solved
+from foldgauss.uncertainty.equations import ColorEquations, FrameAt, solved
 from foldgauss.uncertainty.profiles import Profiles
 from foldgauss.uncertainty.screen import Screen
 from foldgauss.video.model import VideoModel
@@ -28,7 +28,7 @@ STEP, MOST = 1.5, 13
 TOLERANCE, TRACE_TOLERANCE = 1e-5, 1e-3
 
 
-def evidence_without_colours(
+def evidence_without_colors(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     base: Evidence,
@@ -80,7 +80,7 @@ def evidence_without_colours(
     chosen = _chosen(frames, num_frames)
     times = base.profiles.modes()
     times[[0, -1]] = np.asarray(model.frame_times.times(), np.float64)[[0, -1]]
-    equations = ColourEquations(screen, base.noise, times, float(prior_scale))
+    equations = ColorEquations(screen, base.noise, times, float(prior_scale))
     nodes, values = (list(each) for each in zip(*map(base.profiles.one, range(num_frames)), strict=True))
     for done, k in enumerate(chosen):
         if equations.num <= most_dense:
@@ -128,7 +128,7 @@ def _between(times: Float64[np.ndarray, "num_frames"], k: int) -> tuple[float, f
 class _Curve:
     """A frame's log-likelihood at the times drawn so far, in their order."""
 
-    def __init__(self, equations: ColourEquations, k: int):
+    def __init__(self, equations: ColorEquations, k: int):
         self.equations, self.k = equations, k
         self.times: list[float] = []
         self.points: list = []
@@ -168,7 +168,7 @@ class _Point(NamedTuple):
 class _Estimated(_Curve):
     """By conjugate gradients, and random probes of the determinant."""
 
-    def __init__(self, equations: ColourEquations, k: int, signs: Float64[np.ndarray, "pixels probes"]):
+    def __init__(self, equations: ColorEquations, k: int, signs: Float64[np.ndarray, "pixels probes"]):
         super().__init__(equations, k)
         self.signs = signs
 

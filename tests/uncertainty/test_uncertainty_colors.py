@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from tests.video.soft_models import NUM, NUM_FRAMES, soft_model
 
 from foldgauss.uncertainty import FrameNoise, evidence
-from foldgauss.uncertainty import colours as module
-from foldgauss.uncertainty.colours import evidence_without_colours
-from foldgauss.uncertainty.equations import ColourEquations, solved
+from foldgauss.uncertainty import colors as module
+from foldgauss.uncertainty.colors import evidence_without_colors
+from foldgauss.uncertainty.equations import ColorEquations, solved
 from foldgauss.uncertainty.screen import Screen
-from tests.video.soft_models import NUM, NUM_FRAMES, soft_model
 
 SIZE, NOISE, PRIOR, FRAME = (20, 32), 0.03, 0.3, 3
 
@@ -45,7 +45,7 @@ def _nothing():
 def _equations(model, video, base, prior_scale=PRIOR):
     times = base.profiles.modes()
     times[[0, -1]] = 0, 1
-    return ColourEquations(Screen(model, video), base.noise, times, prior_scale)
+    return ColorEquations(Screen(model, video), base.noise, times, prior_scale)
 
 
 def _by_hand(equations, k, t, prior_scale=PRIOR):
@@ -96,8 +96,8 @@ def test_estimated_profile_is_the_exact_one_given_all_probes(over):
 
 def test_estimate_is_near_the_exact_profile(over):
     model, video, base = over
-    exact = evidence_without_colours(model, video, base, frames=[FRAME], prior_scale=PRIOR)
-    near = evidence_without_colours(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16)
+    exact = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR)
+    near = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16)
     nodes, values = exact[FRAME].one(0)
     top = values > -module.REACH
     np.testing.assert_allclose(near[FRAME](nodes[top, None])[:, 0], values[top], atol=0.5)
@@ -105,7 +105,7 @@ def test_estimate_is_near_the_exact_profile(over):
 
 def test_sure_colours_give_the_base_profile_back(over):
     model, video, base = over
-    found = evidence_without_colours(model, video, base, frames=[FRAME], prior_scale=1e-7)
+    found = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=1e-7)
     nodes, values = base.profiles.one(FRAME)
     top = values > -8
     np.testing.assert_allclose(found[FRAME](nodes[top, None])[:, 0], values[top], atol=0.1)
@@ -114,7 +114,7 @@ def test_sure_colours_give_the_base_profile_back(over):
 def test_profiles_are_wider_and_others_are_kept(scene):
     model, video, base = scene
     done = []
-    found = evidence_without_colours(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
+    found = evidence_without_colors(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
     assert done == [(1, 2), (2, 2)]
     for k in range(NUM_FRAMES):
         if k not in (2, 4):
@@ -152,7 +152,7 @@ def test_information_is_what_colours_leave_of_it(scene):
 def test_seeds_reproduce(over):
     model, video, base = over
     few = {"frames": [FRAME], "most_dense": 0, "probes": 2}
-    one, same, other = (evidence_without_colours(model, video, base, **few, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (evidence_without_colors(model, video, base, **few, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.values, same.values)
     assert one.count[FRAME] != other.count[FRAME] or (one.values[FRAME] != other.values[FRAME]).any()
 
@@ -207,11 +207,11 @@ def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
 def test_wrong_input_is_told(over, change, match):
     model, video, base = over
     with pytest.raises(ValueError, match=match):
-        evidence_without_colours(**{"model": model, "video": video, "base": base, **change})
+        evidence_without_colors(**{"model": model, "video": video, "base": base, **change})
 
 
 def test_models_with_numbers_missing_are_told(over):
     model, video, base = over
     broken = dataclasses.replace(model.splats, loc=jnp.asarray(model.splats.loc).at[0, 0].set(jnp.nan))
     with pytest.raises(ValueError, match="model: expected finite numbers"):
-        evidence_without_colours(dataclasses.replace(model, splats=broken), video, base)
+        evidence_without_colors(dataclasses.replace(model, splats=broken), video, base)
