@@ -7,9 +7,10 @@ What is still conditioned on. Time and folds trade against each other: with any 
 m_t, sigma_t and folds follow g show the same frames, as far as folds of the model's degree can follow. Only
 :math:`t_0 = 0` and :math:`t_{n-1} = 1` are fixed by definition; all else that holds a smooth warp is where the fit
 starts and how far it goes. So absolute times spread the more the longer the fit, without end in principle, and
-`RefitTimes.local` gives what hardly any smooth warp changes, each frame's time between its neighbours'. Also given are
-the number of Gaussians and, with start="model", their order in depth and the optimum that the model is near. From
-scratch most of what is found is not the pictures' noise, but where another order of steps leads to: compare "order".
+`RefitTimes.local` gives what hardly any smooth warp changes, each frame's time between its neighbours'. Few steps hold
+times back where they start, so that they spread less than they might. Also given are the number of Gaussians and, with
+start="model", their order in depth and the optimum that the model is near. From scratch most of what is found is not
+the pictures' noise, but where another order of steps leads to: compare "order".
 """
 
 import dataclasses
