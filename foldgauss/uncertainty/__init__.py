@@ -9,6 +9,7 @@ from foldgauss.uncertainty.log_prob import FrameTimeLogProb, drawn_log_likelihoo
 from foldgauss.uncertainty.noise import FrameNoise
 from foldgauss.uncertainty.posterior import FrameTimePosterior, frame_time_posterior
 from foldgauss.uncertainty.profiles import Profiles
+from foldgauss.uncertainty.refit import Refit, RefitTimes, refit_frame_times, refits
 
 __all__ = [
     "Evidence",
@@ -19,6 +20,8 @@ __all__ = [
     "Increments",
     "LaplaceTimes",
     "Profiles",
+    "Refit",
+    "RefitTimes",
     "drawn_log_likelihood",
     "evidence",
     "evidence_without_colors",
@@ -26,4 +29,6 @@ __all__ = [
     "frame_time_log_prob",
     "frame_time_posterior",
     "laplace_times",
+    "refit_frame_times",
+    "refits",
 ]

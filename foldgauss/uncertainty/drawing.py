@@ -58,7 +58,7 @@ def evidence(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     *,
-    noise: str | FrameNoise = "effective",
+    noise: str | FrameNoise = "score",
     reach: int | None = None,
     on_picture: Callable[[int, int], None] | None = None,
 ) -> Evidence:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from tests.video.soft_models import NUM, NUM_FRAMES, soft_model
+from soft_models import NUM, NUM_FRAMES, soft_model
 
 from foldgauss.uncertainty import FrameNoise, evidence
 from foldgauss.uncertainty import colors as module
