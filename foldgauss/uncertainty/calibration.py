@@ -25,8 +25,8 @@ from foldgauss.video.model import VideoModel
 SAMPLERS = ("exact", "emcee")
 #: Draws of which ranks are taken, unless said otherwise: 100 ranks, of which 5 and 25 are whole shares.
 DRAWS = 99
-#: Steps of emcee a replicate, unless said otherwise. Some hundred draws from as many autocorrelation times.
-STEPS = 2000
+#: Steps of emcee a replicate, unless said otherwise: enough for 99 draws of some hundred independent ones.
+STEPS = 600
 #: Pictures kept between replicates take at most so many bytes.
 KEPT = 2**30
 #: Simulated sets of ranks behind an envelope: its level is right to 0.1%.

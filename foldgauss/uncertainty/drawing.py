@@ -207,7 +207,11 @@ class _Samples:
         at_best[max(best - 1, 0) : best + 1] = True
         matters = near[:-1] | near[1:]
         unknown = ~self.settled | (at_best & (step > STEP))
-        self.asked = np.flatnonzero(matters & unknown & (step > MISS) & (np.diff(self.times) > 2 * finest))
+        # Two nodes may be as high as each other on two sides of a hill: then their slopes are not 0.
+        slopes = weight * np.abs(np.gradient(self.errors, self.times, edge_order=2))
+        width = np.diff(self.times)
+        bent = np.maximum(step, np.maximum(slopes[:-1], slopes[1:]) * width / 4) > MISS
+        self.asked = np.flatnonzero(matters & unknown & bent & (width > 2 * finest))
         return (self.times[self.asked] + self.times[self.asked + 1]) / 2
 
     def insert(self, errors: np.ndarray, weight: float) -> None:
