@@ -23,8 +23,8 @@ from foldgauss.video.model import VideoModel
 
 #: Coarse nodes in each interval between two frame times.
 COARSE = 4
-#: A profile is drawn finer where it is within DEPTH nats of its maximum, until the cubic meets what is drawn half way to
-#: MISS nats and MISS_SHARE of the distance from the maximum, or nodes are this share of a coarse step apart.
+#: A profile is drawn finer where it is within DEPTH nats of its maximum, until the cubic meets what is drawn half way
+#: to MISS nats and MISS_SHARE of the distance from the maximum, or nodes are the share FINEST of a coarse step apart.
 DEPTH, MISS, MISS_SHARE, FINEST = 25.0, 0.02, 0.02, 1 / 512
 #: A frame shows nothing of its time where its profile rises by less than this many nats.
 FLAT = 0.5
@@ -58,7 +58,7 @@ def evidence(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     *,
-    noise: str | FrameNoise = "effective",
+    noise: str | FrameNoise = "score",
     reach: int | None = None,
     on_picture: Callable[[int, int], None] | None = None,
 ) -> Evidence:

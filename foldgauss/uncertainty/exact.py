@@ -7,7 +7,6 @@ with transitions :math:`(t_{k+1} - t_k)^{\alpha - 1}`. Forward and backward pass
 import dataclasses
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float64
 from scipy.special import gammaln
 
@@ -17,6 +16,10 @@ from foldgauss.uncertainty.profiles import Profiles
 
 #: Grid points between two nodes of a profile, where it is within NEAR nats of its maximum.
 FINER, NEAR = 8, 30.0
+#: Pieces of a frame's grid have less than this share of its mass, and reach as far as it has more than NOTHING.
+POINTS, NOTHING = 300, 1e-13
+#: Likelihoods so many nats below their maximum are 0 in float64.
+UNDERFLOW = 740.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,8 +93,29 @@ def exact_times(profiles: Profiles, increments: Increments) -> ExactTimes:
 
 
 def _run(profiles: Profiles, frames: range, ends: tuple[float, float], alpha: float):
-    """Grids, marginal densities, forward messages and the log-evidence of a run between two held times."""
-    grids = [_grid(profiles, k, *ends) for k in frames]
+    """Grids, marginal densities, forward messages and the log-evidence of a run between two held times.
+
+    Twice: where the first pass finds next to nothing there is nothing to be looked at, and elsewhere it is finer.
+    """
+    grids = [profile_grid(profiles, k, *ends, finer=2) for k in frames]
+    densities, *_ = _passes(profiles, frames, grids, ends, alpha)
+    grids = [_regridded(*each) for each in zip(grids, densities, strict=True)]
+    densities, forward, log_evidence = _passes(profiles, frames, grids, ends, alpha)
+    return grids, densities, forward, log_evidence
+
+
+def _regridded(grid: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """The part of a grid with any mass, cut so that no piece has more than a POINTS-th of it."""
+    mass = (density[1:] + density[:-1]) / 2 * np.diff(grid)
+    some = np.flatnonzero(mass > NOTHING * mass.sum())
+    first, last = max(some[0] - 1, 0), min(some[-1] + 1, len(mass) - 1)
+    cuts = np.maximum(np.ceil(POINTS * mass / mass.sum()).astype(int), 1)
+    points = [np.linspace(grid[n], grid[n + 1], cuts[n] + 1)[:-1] for n in range(first, last + 1)]
+    return np.concatenate([*points, [grid[last + 1]]])
+
+
+def _passes(profiles: Profiles, frames: range, grids: list[np.ndarray], ends: tuple[float, float], alpha: float):
+    """Marginal densities, forward messages and the log-evidence."""
     heights = [_on_grid(profiles, k, grid) for k, grid in zip(frames, grids, strict=True)]
     peaks = [height.max() for height in heights]
     likelihoods = [np.exp(height - peak) for height, peak in zip(heights, peaks, strict=True)]
@@ -113,12 +137,14 @@ def _run(profiles: Profiles, frames: range, ends: tuple[float, float], alpha: fl
         densities.append(density / _integral(grid, density))
     num, length = len(frames) + 1, ends[1] - ends[0]
     log_total += gammaln(alpha * num) - num * gammaln(alpha) - (alpha * num - 1) * np.log(length)
-    return grids, densities, forward, float(log_total)
+    return densities, forward, float(log_total)
 
 
-def _grid(profiles: Profiles, k: int, start: float, end: float) -> np.ndarray:
-    """Points from `start` to `end`, as dense as frame k's profile is known."""
-    nodes, values = profiles.one(k)
+def profile_grid(
+    profiles: Profiles, k: int, start: float, end: float, finer: int = FINER
+) -> Float64[np.ndarray, "points"]:
+    """Times from `start` to `end`, as dense as frame k's profile is known, and `finer` times as dense near its top."""
+    nodes, _ = profiles.one(k)
     low, high = max(start, nodes[0]), min(end, nodes[-1])
     if not low < high:
         got = f"frame {k} known from {nodes[0]:.4g} to {nodes[-1]:.4g}, to lie between {start:.4g} and {end:.4g}"
@@ -126,12 +152,15 @@ def _grid(profiles: Profiles, k: int, start: float, end: float) -> np.ndarray:
     inside = (nodes > low) & (nodes < high)
     here = np.concatenate([[low], nodes[inside], [high]])
     heights = profiles[k](here[:, None])[:, 0]
+    some = np.flatnonzero(heights > heights.max() - UNDERFLOW)
+    hull = slice(max(some[0] - 1, 0), some[-1] + 2)
+    here, heights = here[hull], heights[hull]
     near = heights > heights.max() - NEAR
     points = [
-        np.linspace(a, b, (FINER if close else 1) + 1)[:-1]
+        np.linspace(a, b, (finer if close else 1) + 1)[:-1]
         for a, b, close in zip(here[:-1], here[1:], near[:-1] | near[1:], strict=True)
     ]
-    return np.concatenate([*points, [high]])
+    return np.concatenate([*points, here[-1:]])
 
 
 def _on_grid(profiles: Profiles, k: int, grid: np.ndarray) -> np.ndarray:
@@ -150,10 +179,11 @@ def _from_end(grid: np.ndarray, end: float, alpha: float) -> np.ndarray:
 def _hats(behind: np.ndarray, here: np.ndarray, alpha: float) -> np.ndarray:
     """Integrals of the hat function of each point of `behind` against (t - s)_+^(alpha - 1), t on `here`.
 
-    Exact for piecewise linear messages, however near the two grids are: what is infinite at s = t is integrated by hand.
+    Exact for piecewise linear messages, however near the two grids are: infinity at s = t is integrated by hand.
     """
-    above = np.maximum(here[:, None] - behind[None, :], 0.0) ** (alpha + 1) / (alpha * (alpha + 1))
-    first = np.maximum(here[:, None] - behind[None, :], 0.0) ** alpha / alpha
+    away = np.maximum(here[:, None] - behind[None, :], 0.0)
+    first = away if alpha == 1 else away**alpha / alpha
+    above = first * away / (alpha + 1)
     chords = np.diff(above, axis=1) / np.diff(behind)
     inner = np.concatenate([np.zeros_like(chords[:, :1]), chords, np.zeros_like(chords[:, :1])], axis=1)
     hats = inner[:, 1:] - inner[:, :-1]

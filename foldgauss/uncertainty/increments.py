@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from foldgauss._checks import invalid
 
@@ -12,13 +12,13 @@ from foldgauss._checks import invalid
 class Increments:
     r"""Times of n frames, some of them free, as log-ratios of the increments between them.
 
-    A *run* is a stretch of m free frames between two whose times are held; with its m + 1 increments p, as shares of the
-    time between those two, its coordinates are :math:`z_i = \log p_i / p_m`. All times free but the first and the last:
-    one run, whose coordinates are the model's softmax weights less the last of them.
+    A *run* is a stretch of m free frames between two whose times are held; with its m + 1 increments p, as shares of
+    the time between those two, its coordinates are :math:`z_i = \log p_i / p_m`. All times free but the first and the
+    last: one run, whose coordinates are the model's softmax weights less the last of them.
 
     **Shapes:** `held` (num_frames,) times of which those at `free` do not count; coordinates (*batch, num_free).
-    **Prior:** a symmetric Dirichlet on the increments of every run, of `concentration`; 1 is uniform over all ordered times.
-    A flat prior on the softmax weights would be improper: they do not notice a number added to all.
+    **Prior:** a symmetric Dirichlet on the increments of every run, of `concentration`; 1 is uniform over all ordered
+    times. A flat prior on the softmax weights would be improper: they do not notice a number added to all.
 
     **Source:** VeGaS eq:frame_fitting; additive log-ratios, Aitchison 1982.
     **Raises:** ValueError for held times that do not rise, free first or last frames, a concentration not above 0.
@@ -57,7 +57,7 @@ class Increments:
     def among(
         cls, held: Float[np.ndarray, "num_frames"], frames: Sequence[int] | None = None, concentration: float = 1.0
     ) -> "Increments":
-        """With `frames` free, or all but the first and the last. Raises ValueError for frames that are not between these."""
+        """With `frames` free, or all but the first and the last; ValueError for frames that are not between these."""
         num_frames, free = len(held), np.zeros(len(held), bool)
         if frames is None:
             free[1:-1] = True
@@ -145,4 +145,5 @@ class Increments:
 def _log_shares(coordinates: np.ndarray) -> np.ndarray:
     """Logarithms of all increments of a run, as shares of it."""
     padded = np.concatenate([coordinates, np.zeros((*coordinates.shape[:-1], 1))], axis=-1)
-    return padded - logsumexp(padded, axis=-1, keepdims=True)
+    greatest = padded.max(-1, keepdims=True)
+    return padded - greatest - np.log(np.exp(padded - greatest).sum(-1, keepdims=True))

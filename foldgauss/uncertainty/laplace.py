@@ -16,8 +16,8 @@ STEPS, ENOUGH = 60, 1e-9
 class LaplaceTimes:
     """A Gaussian at the mode of the density of the log-ratios, carried over to times.
 
-    **Shapes:** `mode`, `std` (num_frames,), 0 for frames that are held. `precision`: for each run the main and the upper
-    diagonal (2, frames) of the tridiagonal precision of its times.
+    **Shapes:** `mode`, `std` (num_frames,), `std` 0 for frames that are held. `precision`: for each run the main and
+    the upper diagonal (2, frames) of the tridiagonal precision of its times.
     """
 
     increments: Increments
@@ -42,7 +42,7 @@ class LaplaceTimes:
 
 
 def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.ndarray, "num_frames"]) -> LaplaceTimes:
-    """Newton's method from `start`, rising times, in the density of the log-ratios (the prior's power is `concentration`).
+    """Newton's method from `start`, rising times, in the density of the log-ratios.
 
     Slopes and curvatures are differences over a tenth of a standard deviation, as far as it is known.
     """

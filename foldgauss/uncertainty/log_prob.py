@@ -1,11 +1,13 @@
 """The log-posterior of frame times, as samplers ask for it."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._checks import invalid
+from foldgauss.uncertainty.colors import evidence_without_colors
 from foldgauss.uncertainty.drawing import Evidence, evidence
 from foldgauss.uncertainty.exact import exact_times
 from foldgauss.uncertainty.increments import Increments
@@ -66,11 +68,36 @@ def drawn_log_likelihood(
     return -noise.weight * np.array(errors)
 
 
+#: What frame times are conditioned on.
+LEVELS = ("splats", "colors")
+
+
+def at_level(
+    level: str,
+    model: VideoModel,
+    video: np.ndarray | None,
+    seen: Evidence,
+    frames: Sequence[int] | None,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> Evidence:
+    """What is seen given the splats, or with the colours of these integrated out."""
+    if level not in LEVELS:
+        cure = "Refitted splats are another thing: see refit_frame_times."
+        raise invalid("level", expected=" or ".join(LEVELS), got=level, cure=cure)
+    if level == "splats":
+        return seen
+    if video is None:
+        raise invalid("video", expected="frames, where colours are integrated out", got=None)
+    profiles = evidence_without_colors(model, video, seen, frames=frames, on_frame=on_frame)
+    return dataclasses.replace(seen, profiles=profiles)
+
+
 def frame_time_log_prob(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"] | None = None,
     *,
     noise: str | FrameNoise = "score",
+    level: str = "splats",
     frames: Sequence[int] | None = None,
     concentration: float = 1.0,
     held: Float[np.ndarray, "num_frames"] | None = None,
@@ -79,9 +106,12 @@ def frame_time_log_prob(
 ) -> FrameTimeLogProb:
     """The log-posterior of the times of `frames` (default: of all but the first and the last), given the splats.
 
-    `video`: uint8 (num_frames, height, width, 3 or 4) at the model's size; it may be another cut of the same scene, with another number
-    of frames. `noise`, `on_picture`: see `evidence`, whose result may be handed in as `seen`. `concentration`: of the
-    Dirichlet prior on increments. `held`: the times of all other frames (default: the posterior medians of all).
+    `video`: uint8 (num_frames, height, width, 3 or 4) at the model's size; it may be another cut of the same scene,
+    with another number of frames. `noise`, `on_picture`: see `evidence`, whose result may be handed in as `seen`.
+    `level`: what else is unknown: "splats" holds them all, "colors" integrates their colours out
+    (`evidence_without_colors`: minutes a frame for large models, so choose `frames`); refitting all of them is another
+    thing, `refit_frame_times`. `concentration`: of the Dirichlet prior on increments. `held`: the times of all other
+    frames (default: the posterior medians of all).
 
     Raises ValueError for a video of another size or scene, one that shows nothing of its times, frames out of the
     model's order, and settings out of range.
@@ -90,6 +120,7 @@ def frame_time_log_prob(
         if video is None:
             raise invalid("video", expected="frames, or what was `seen`", got=None)
         seen = evidence(model, video, noise=noise, on_picture=on_picture)
+    seen = at_level(level, model, video, seen, frames)
     num_frames = seen.profiles.num_frames
     if held is None:
         ends = np.linspace(0.0, 1.0, num_frames)

@@ -7,9 +7,10 @@ import numpy as np
 from emcee.moves import Move
 from emcee.state import State
 
-from foldgauss._kernels import kernel
+from foldgauss._kernels import inline, kernel
+from foldgauss.uncertainty.exact import profile_grid
 from foldgauss.uncertainty.log_prob import FrameTimeLogProb
-from foldgauss.uncertainty.profiles import value_at
+from foldgauss.uncertainty.profiles import Profiles, value_at
 
 _d = nb.float64
 
@@ -19,6 +20,10 @@ BLOCK = 6
 STRETCH = 0.3
 #: Share of the latter that go the whole difference: from one hill to another.
 WHOLE = 0.05
+#: Share of sweeps that go frame by frame.
+SINGLES = 0.5
+#: A frame stays where its likelihood between its neighbours is less than this share of all: float64 cannot tell.
+LEAST_MASS = 1e-9
 _stretch = 2.0  # a of Goodman and Weare
 
 
@@ -34,43 +39,80 @@ class BlockSweep(Move):
 
     accepted by the density of z, times :math:`\zeta^{m-1}` for the first.
 
+    Half of the sweeps go frame by frame instead, first the even ones, then the odd ones: each time is proposed from its
+    own likelihood between its neighbours' times, on a grid, and accepted by what the grid misses. So a frame goes
+    from one hill of its likelihood to another, however far apart.
+
     **Source:** Goodman and Weare 2010; ter Braak 2006; emcee, Foreman-Mackey et al. 2013, algorithm 3.
     """
 
     def __init__(self, log_prob: FrameTimeLogProb, block: int = BLOCK):
         self.log_prob, self.block = log_prob, block
+        self._grids = _proposals(log_prob)
 
     def propose(self, model, state: State) -> tuple[State, np.ndarray]:
         """One sweep of all walkers; a walker's acceptance is the share of its blocks that moved."""
-        log_prob = self.log_prob
-        times = log_prob.increments.times(state.coords)
-        num = len(times)
-        order = model.random.permutation(num)
-        moved = np.zeros(num)
-        for movers, others in ((order[: num // 2], order[num // 2 :]), (order[num // 2 :], order[: num // 2])):
-            blocks = np.array(list(_blocks(log_prob.increments.runs, self.block, model.random)))
-            shape = len(movers), len(blocks)
-            first = model.random.randint(len(others), size=shape)
-            second = (first + 1 + model.random.randint(len(others) - 1, size=shape)) % len(others)
-            stretched = model.random.random_sample(shape) < STRETCH
-            root = np.sqrt(1 / _stretch) + (np.sqrt(_stretch) - np.sqrt(1 / _stretch)) * model.random.random_sample(
-                shape
-            )
-            size = np.diff(blocks, axis=1)[:, 0] + 1.0
-            along = 2.38 / np.sqrt(2 * size) * (1 + 0.1 * model.random.standard_normal(shape))
-            along[model.random.random_sample(shape) < WHOLE] = 1.0
-            factor = np.where(stretched, root**2, along)
-            jitter = 1e-5 * model.random.standard_normal((*shape, int(size.max())))
-            threshold = np.log(model.random.random_sample(shape))
-            found = log_prob.profiles
-            tables = found.nodes, found.values, found.slopes, found.count
-            moved[movers] += _sweep(
-                times, movers, others[first], others[second], stretched, factor, jitter, threshold, blocks,
-                log_prob.increments.concentration, *tables,
-            )  # fmt: skip
-        coordinates = log_prob.increments.coordinates(times)
+        times = self.log_prob.increments.times(state.coords)
+        sweep = self._singles if model.random.random_sample() < SINGLES else self._by_blocks
+        moved = sweep(times, model.random)
+        coordinates = self.log_prob.increments.coordinates(times)
         values, _ = model.compute_log_prob_fn(coordinates)
         return State(coordinates, log_prob=values), moved
+
+    def _singles(self, times: np.ndarray, random) -> np.ndarray:
+        """Move every frame of every walker by itself, in place; returns the share of its frames that each moved."""
+        moved = np.zeros(len(times))
+        free = np.flatnonzero(self.log_prob.increments.free)
+        tables, alpha = _tables(self.log_prob.profiles), self.log_prob.increments.concentration
+        for parity in (0, 1):
+            frames = free[free % 2 == parity]
+            chance = random.random_sample((2, len(times), len(frames)))
+            moved += _single(times, frames, *self._grids, chance[0], np.log(chance[1]), alpha, *tables)
+        return moved / len(free)
+
+    def _by_blocks(self, times: np.ndarray, random) -> np.ndarray:
+        """Move every block of every walker, in place; returns the share of its blocks that each moved."""
+        log_prob, num = self.log_prob, len(times)
+        order = random.permutation(num)
+        moved = np.zeros(num)
+        for movers, others in ((order[: num // 2], order[num // 2 :]), (order[num // 2 :], order[: num // 2])):
+            blocks = np.array(list(_blocks(log_prob.increments.runs, self.block, random)))
+            shape = len(movers), len(blocks)
+            first = random.randint(len(others), size=shape)
+            second = (first + 1 + random.randint(len(others) - 1, size=shape)) % len(others)
+            stretched = random.random_sample(shape) < STRETCH
+            root = np.sqrt(1 / _stretch) + (np.sqrt(_stretch) - np.sqrt(1 / _stretch)) * random.random_sample(shape)
+            size = np.diff(blocks, axis=1)[:, 0] + 1.0
+            along = 2.38 / np.sqrt(2 * size) * (1 + 0.1 * random.standard_normal(shape))
+            along[random.random_sample(shape) < WHOLE] = 1.0
+            factor = np.where(stretched, root**2, along)
+            jitter = 1e-5 * random.standard_normal((*shape, int(size.max())))
+            threshold = np.log(random.random_sample(shape))
+            moved[movers] += _sweep(
+                times, movers, others[first], others[second], stretched, factor, jitter, threshold, blocks,
+                log_prob.increments.concentration, *_tables(log_prob.profiles),
+            )  # fmt: skip
+        return moved
+
+
+def _tables(profiles: Profiles) -> tuple[np.ndarray, ...]:
+    return profiles.nodes, profiles.values, profiles.slopes, profiles.count
+
+
+def _proposals(log_prob: FrameTimeLogProb) -> tuple[np.ndarray, ...]:
+    """Grids of every frame, likelihoods there, and their integrals: (num_frames, most) each; and how many there are."""
+    found = []
+    for k in range(log_prob.profiles.num_frames):
+        grid = profile_grid(log_prob.profiles, k, 0.0, 1.0)
+        heights = log_prob.profiles[k](grid[:, None])[:, 0]
+        likelihood = np.exp(heights - heights.max())
+        masses = (likelihood[1:] + likelihood[:-1]) / 2 * np.diff(grid)
+        found.append((grid, likelihood, np.concatenate([[0.0], np.cumsum(masses)])))
+    count = np.array([len(grid) for grid, *_ in found])
+    tables = np.zeros((3, len(found), count.max()))
+    for k, each in enumerate(found):
+        tables[:, k, : count[k]] = each
+    return *tables, count
 
 
 def _blocks(runs: list[tuple[int, int]], block: int, random) -> Iterator[tuple[int, int]]:
@@ -153,4 +195,75 @@ def _sweep(
                 for m in range(size):
                     times[walker, low + m] = logs[m]
                 moved[n] += _d(1) / len(blocks)
+    return moved
+
+
+@inline
+def _mass_below(t, grid, likelihood, summed, last):
+    """Integral of the piecewise linear likelihood up to t; and the piece that t is in."""
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if grid[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    step = t - grid[low]
+    slope = (likelihood[high] - likelihood[low]) / (grid[high] - grid[low])
+    return summed[low] + step * (likelihood[low] + slope * step / 2)
+
+
+@inline
+def _density(t, grid, likelihood, last):
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if grid[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    return likelihood[low] + (likelihood[high] - likelihood[low]) * (t - grid[low]) / (grid[high] - grid[low])
+
+
+@inline
+def _time_of(mass, grid, likelihood, summed, last):
+    """The time up to which the piecewise linear likelihood has this integral."""
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if summed[middle] <= mass:
+            low = middle
+        else:
+            high = middle
+    left, width, rest = likelihood[low], grid[high] - grid[low], mass - summed[low]
+    root = np.sqrt(max(left * left + _d(2) * (likelihood[high] - left) * rest / width, _d(0)))
+    if left + root <= 0:
+        return grid[low]
+    return grid[low] + min(_d(2) * rest / (left + root), width)
+
+
+@kernel
+def _single(times, frames, grids, likelihoods, summed, counts, chance, threshold, alpha, nodes, values, slopes, count):
+    """Propose each of `frames` of each walker between its neighbours; returns how many of each walker moved."""
+    moved = np.zeros(len(times))
+    for f in range(len(frames)):
+        k = frames[f]
+        grid, likelihood, sums, last = grids[k], likelihoods[k], summed[k], counts[k] - 1
+        for walker in range(len(times)):
+            start, now, end = times[walker, k - 1], times[walker, k], times[walker, k + 1]
+            low = _mass_below(max(start, grid[0]), grid, likelihood, sums, last)
+            high = _mass_below(min(end, grid[last]), grid, likelihood, sums, last)
+            here = _density(now, grid, likelihood, last)
+            if not (high - low > LEAST_MASS * sums[last] and here > 0):
+                continue
+            new = _time_of(low + (high - low) * chance[walker, f], grid, likelihood, sums, last)
+            there = _density(new, grid, likelihood, last)
+            if not (new > start and new < end and there > 0):
+                continue
+            change = value_at(new, nodes[k], values[k], slopes[k], count[k] - 1) - np.log(there)
+            change -= value_at(now, nodes[k], values[k], slopes[k], count[k] - 1) - np.log(here)
+            change += (alpha - 1) * (np.log(new - start) + np.log(end - new) - np.log(now - start) - np.log(end - now))
+            if change > threshold[walker, f]:
+                times[walker, k] = new
+                moved[walker] += 1
     return moved

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 from foldgauss._checks import invalid
 
 #: Names of what `frame_time_log_prob` takes for `noise`, besides a FrameNoise.
-NOISES = ("effective", "score", "independent")
+NOISES = ("score", "effective", "independent")
 #: Lags are summed until the mean correlation around a ring falls below this.
 LAST_CORRELATION = 0.02
 

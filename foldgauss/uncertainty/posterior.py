@@ -20,7 +20,7 @@ from foldgauss._checks import invalid
 from foldgauss.uncertainty.drawing import Evidence, evidence
 from foldgauss.uncertainty.exact import ExactTimes, exact_times
 from foldgauss.uncertainty.laplace import LaplaceTimes, laplace_times
-from foldgauss.uncertainty.log_prob import FrameTimeLogProb, frame_time_log_prob
+from foldgauss.uncertainty.log_prob import FrameTimeLogProb, at_level, frame_time_log_prob
 from foldgauss.uncertainty.noise import FrameNoise
 from foldgauss.video.model import VideoModel
 
@@ -48,8 +48,8 @@ class FrameTimePosterior:
     `converged`: more than 50 tau of every frame, and every R-hat < 1.01. `message` says so, or what is missing.
     `laplace`, `exact`: the same posterior by Laplace's approximation and by forward and backward passes.
 
-    **Source:** emcee, Foreman-Mackey et al. 2013; R-hat, Vehtari et al. 2021. The walkers of one ensemble depend on each
-    other, so each ensemble is one chain; ESS is steps times walkers over tau.
+    **Source:** emcee, Foreman-Mackey et al. 2013; R-hat, Vehtari et al. 2021. The walkers of one ensemble depend on
+    each other, so each ensemble is one chain; ESS is steps times walkers over tau.
     """
 
     log_prob: FrameTimeLogProb
@@ -92,7 +92,7 @@ class FrameTimePosterior:
         return np.quantile(self.draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
 
     def identified(self, share: float = 0.8) -> np.ndarray:
-        """Which frames tell their time: bool (num_frames,), true where the posterior is narrower than `share` of the prior.
+        """Which frames tell their time: bool (num_frames,); there the posterior is narrower than `share` of the prior.
 
         The prior's spread is that of a frame between two others at the posterior's mean; frames held count as told.
         """
@@ -132,6 +132,7 @@ def frame_time_posterior(
     seed: int = 0,
     progress: bool | Callable[[str, int, int], None] = True,
     noise: str | FrameNoise = "score",
+    level: str = "splats",
     concentration: float = 1.0,
     ensembles: int = 4,
     thin_by: int = THIN,
@@ -146,7 +147,7 @@ def frame_time_posterior(
     which every `thin_by`-th is kept. A few frames move by emcee's differential evolution and stretch moves, many by
     `BlockSweep`; or by `moves`, as `emcee.EnsembleSampler` takes them.
 
-    `noise`, `concentration`, `video`: see `frame_time_log_prob`, whose result may be handed in as `log_prob`.
+    `noise`, `level`, `concentration`, `video`: see `frame_time_log_prob`, whose result may be handed in as `log_prob`.
     `progress`: a bar, or a function of (what, done, of how many). `backend`: an HDF5 file to which all is written as
     it goes; called again with the same arguments, sampling goes on where it stopped, to the same bits.
 
@@ -156,6 +157,10 @@ def frame_time_posterior(
     Example: `frame_time_posterior(model, frames).interval(0.9)`.
     """
     _needed("emcee")
+    if thin_by < 1:
+        raise invalid("thin_by", expected="a whole number >= 1", got=thin_by)
+    if steps < thin_by:
+        raise invalid("steps", expected=f"at least thin_by = {thin_by}", got=steps)
     with _shown(progress) as show:
         if log_prob is None:
             if model is None:
@@ -163,10 +168,10 @@ def frame_time_posterior(
             look = None if show is None else (lambda done, total: show("pictures", done, total))
             if seen is None:
                 seen = evidence(model, video, noise=noise, on_picture=look)
+            look = None if show is None else (lambda done, total: show("frames", done, total))
+            seen = at_level(level, model, video, seen, frames, look)
             log_prob = frame_time_log_prob(model, frames=frames, concentration=concentration, seen=seen)
         run = _Run(log_prob, walkers, moves, seed, ensembles, thin_by, backend)
-        if steps < thin_by:
-            raise invalid("steps", expected=f"at least thin_by = {thin_by}", got=steps)
         return run.until_converged(steps // thin_by, show, seen)
 
 
@@ -185,8 +190,6 @@ class _Run:
             raise invalid("walkers", expected=expected, got=walkers, cure="Leave it out, or choose fewer frames.")
         if ensembles < 2:
             raise invalid("ensembles", expected="at least 2, better 4: R-hat compares them", got=ensembles)
-        if thin_by < 1:
-            raise invalid("thin_by", expected="a whole number >= 1", got=thin_by)
         if "DESnookerMove" in ([] if moves is None else _kinds(moves)) and _version("emcee") < (3, 1, 7):
             cure = "Its proposals are scaled wrongly (emcee pull request 531): take DEMove, or a later emcee."
             raise invalid(
@@ -227,6 +230,7 @@ class _Run:
 
     def until_converged(self, most: int, show, seen: Evidence | None) -> FrameTimePosterior:
         done = min(sampler.iteration for sampler in self.samplers)
+        goal = min(LOOK, most)
         while True:
             if done >= min(LOOK, most):
                 found = self.result(seen)
@@ -234,12 +238,14 @@ class _Run:
                     if self.file is not None:
                         self.file.close()
                     return found
-            done = min(done + max(LOOK, done // 4), most)
+                needed = 1.1 * (TIMES_TAU + BURN_IN) * found.tau.max() / self.thin_by
+                goal = min(max(int(min(needed, 2 * done)), done + LOOK), most)
             for n, sampler in enumerate(self.samplers):
-                for _ in self._steps(sampler, done - sampler.iteration):
+                for _ in self._steps(sampler, goal - sampler.iteration):
                     if show is not None:
                         each = [other.iteration for other in self.samplers]
-                        show("steps", sum(each) * self.thin_by, len(self.samplers) * most * self.thin_by)
+                        show("steps", sum(each) * self.thin_by, len(self.samplers) * goal * self.thin_by)
+            done = goal
             if self.file is not None:
                 self.file.keep()
 

@@ -4,7 +4,7 @@ from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
 from foldgauss.video.edit import Edit, edit
 from foldgauss.video.edited import EditedVideo, Layer, layers
-from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps
+from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
@@ -64,5 +64,6 @@ __all__ = [
     "remapped_positions",
     "select",
     "ssim",
+    "start_from",
     "times_at",
 ]

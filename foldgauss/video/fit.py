@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, whole, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
@@ -268,12 +268,14 @@ def _info(
     )
 
 
-def start(frames: np.ndarray, config: FitConfig) -> FitState:
-    """State before the first step."""
+def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
+    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
     frames = np.ascontiguousarray(frames[..., :3])  # as seen over black, where there is alpha
     begun, num_frames = time.perf_counter(), len(frames)
     motion = Motion.of(frames) if config.follow_motion else None
-    logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
+    if logits is None:
+        logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
+    logits = np.array(logits, np.float32)
     rows = pack(_splats(frames, config, logits, motion))
     return FitState(
         rows=rows,
@@ -288,6 +290,56 @@ def start(frames: np.ndarray, config: FitConfig) -> FitState:
         seconds=time.perf_counter() - begun,
         error=0.0,
     )
+
+
+def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float = 0.0) -> FitState:
+    """State from which `fit_steps` goes on with a fitted model: the last `steps` of a plan of which a share is done.
+
+    So rates, sizes and loss are those of the schedule from `progress`, in [0, 1), to its end. Arrays are copied,
+    moments start at zero, and no Gaussians are born. Raises ValueError for a model that `config` could not have fitted,
+    and anything else out of range.
+
+    Example: `for state, info in fit_steps(frames, config, start_from(model, config, 300, 0.7)): ...`
+    """
+    if not whole(steps, 1):
+        raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
+    if not within(progress, "[0, 1)"):
+        raise invalid("progress", expected="a number in [0, 1)", got=repr(progress))
+    _check_config(model, config)
+    rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
+    done = round(steps * progress / (1 - progress))
+    return FitState(
+        rows=rows,
+        first=np.zeros_like(rows),
+        second=np.zeros_like(rows),
+        counts=np.zeros(len(rows), np.int32),
+        time_logits=logits,
+        time_moments=TIME_ADAM.init(jnp.asarray(logits)),
+        statistics=None,
+        step=done,
+        plan=done + steps,
+        seconds=0.0,
+        error=0.0,
+    )
+
+
+def _check_config(model: VideoModel, config: FitConfig) -> None:
+    """Raise unless a fit with `config` ends with a model of this kind."""
+    envelope = model.splats.envelope
+    pairs = {
+        "degree": (config.degree, model.degree),
+        "power": (np.float32(config.power), np.float32(envelope.power)),
+        "floor": (np.float32(config.floor), np.float32(envelope.floor)),
+        "compositing": (config.compositing, model.compositing),
+        "options": (config.options, model.options),
+    }
+    for name, (got, expected) in pairs.items():
+        if not np.all(got == expected):
+            cure = "Give the config that the model was fitted with."
+            raise invalid(f"config.{name}", expected=f"the model's, {expected}", got=got, cure=cure)
+    if model.scale_cutoff != 0:
+        cure = "Imported videos with one cannot be fitted further."
+        raise invalid("model.scale_cutoff", expected="0", got=model.scale_cutoff, cure=cure)
 
 
 def _splats(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
@@ -450,11 +502,14 @@ class _Stepper:
 
         To `views`, where asked for, comes what `Statistics.add` wants.
         """
-        target = None if share is not None else _planar(shrunk(self.frames[k], shape.size), self.background)
+        if share is None:
+            target = _planar(shrunk(self.frames[k], shape.size), self.background)
+        else:
+            target = self.between.target(k, share, shape.size)
         done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
         if mirrored:
-            target = np.ascontiguousarray(target[:, :, ::-1]) if share is None else None
+            target = np.ascontiguousarray(target[:, :, ::-1])
             mean, factor = _mirrored(mean, factor, shape.size[1])
         trace = cpu.forward(
             mean,
@@ -466,8 +521,6 @@ class _Stepper:
             compositing=self.config.compositing,
             options=self.config.options,
         )
-        if share is not None:
-            target = self.between.target(k, share, shape.size, trace.image, mirrored=mirrored)
         if squared:
             loss = squared_loss(trace.image, target)
         else:
@@ -496,13 +549,10 @@ class _Between:
         chosen, share = rng.random() < self.config.between_share, rng.uniform(0.1, 0.9)
         return share if chosen and step and k not in self.last_of_shots else None
 
-    def target(self, k: int, share: float, size: tuple[int, int], drawn: np.ndarray, *, mirrored: bool) -> np.ndarray:
-        """Planes (3, height, width): what is `drawn` already wherever nothing else is known."""
-        guess, known = self.motion.between(self.frames, k, share, size)
-        if mirrored:
-            guess, known = guess[:, ::-1], known[:, ::-1]
-        planes = np.moveaxis(guess, -1, 0) * np.float32(1 / 255)
-        return np.ascontiguousarray(np.where(known, planes, drawn), np.float32)
+    def target(self, k: int, share: float, size: tuple[int, int]) -> np.ndarray:
+        """Planes (3, height, width)."""
+        guess = self.motion.between(self.frames, k, share, size)
+        return np.ascontiguousarray(np.moveaxis(guess, -1, 0) * np.float32(1 / 255))
 
 
 def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

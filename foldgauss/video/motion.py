@@ -23,6 +23,8 @@ MISS, MISS_SHARE = 0.5, 0.2
 #: The longer side, in pixels, of the pictures that flow is read off, and of the maps that are kept: motion is smoother
 #: than pictures.
 FLOW_SIDE, KEPT_SIDE = 640, 320
+#: Flow in between is looked up in the frames so often, at the places it leads from.
+LOOKS = 2
 #: A long clip's maps are smaller, so that they take no more bytes than this, or than this share of the frames' own.
 MAP_BYTES, MAP_SHARE, BYTES_PER_CELL = 256e6, 0.25, 11
 #: Between two frames is a cut where the flow knows the way of less than this share of the points.
@@ -65,7 +67,7 @@ class Motion:
     @classmethod
     def of(cls, frames: UInt8[np.ndarray, "frames height width 3"]) -> "Motion":
         num, height, width, _ = frames.shape
-        flow_size = _at_most(FLOW_SIDE if max(height, width) > FLOW_SIDE else FLOW_SIDE // 2, height, width)
+        flow_size = _at_most(_flow_side(height, width), height, width)
         cells = max(MAP_BYTES, MAP_SHARE * frames.size) / (BYTES_PER_CELL * num)
         kept = _at_most(min(KEPT_SIDE, math.sqrt(cells * max(height, width) / min(height, width))), height, width)
         small = np.empty((num, *kept[::-1], 3), np.uint8)
@@ -79,10 +81,8 @@ class Motion:
             small[k] = cv2.resize(cv2.GaussianBlur(frames[k], (0, 0), 1.0), kept, interpolation=cv2.INTER_AREA)
 
         def match(k: int) -> None:
-            search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            pair = grey(k), grey(k + 1)
-            for way, (one, other) in enumerate((pair, pair[::-1])):
-                flows[way, k] = cv2.resize(search.calc(one, other, None) * unit, kept, interpolation=cv2.INTER_AREA)
+            for way, flow in enumerate(_forth_and_back(grey(k), grey(k + 1))):
+                flows[way, k] = cv2.resize(flow * unit, kept, interpolation=cv2.INTER_AREA)
 
         run_tasks(shrink, range(num))
         run_tasks(match, range(num - 1))
@@ -128,33 +128,45 @@ class Motion:
 
     def between(
         self, frames: UInt8[np.ndarray, "frames height width 3"], k: int, share: float, size: tuple[int, int]
-    ) -> tuple[Float32[np.ndarray, "rows columns 3"], Bool[np.ndarray, "rows columns"]]:
-        """What is seen `share` of the way from frame k to k + 1, about [0, 255], and where that is known.
+    ) -> Float32[np.ndarray, "rows columns 3"]:
+        """What is seen `share` of the way from frame k to k + 1, as far as the flow knows; about [0, 255].
 
-        Both frames are moved along the flow, as if it were the same there as at the pixel itself, and meet. In pictures
-        of `size` (height, width). It is not known where they show different colours or come from outside the frame, or
-        where the flow forth is not the flow back: there something comes into sight or goes.
+        Both frames are moved along the flow and their mean is taken, weighted by how near they are, in pictures of
+        `size` (height, width). What comes from outside one of them is taken from the other.
         """
         rows, columns = size
-        grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+        pair = [
+            frame if frame.shape[:2] == size else cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_AREA)
+            for frame in frames[k : k + 2]
+        ]
+        flow, grid, edge = self._flow_between(pair, k, share), _grid(rows, columns), np.float32([columns, rows]) - 0.5
+        origins = grid - np.float32(share) * flow, grid + np.float32(1 - share) * flow
+        moved = [_warped(picture, origin).astype(np.float32) for picture, origin in zip(pair, origins, strict=True)]
+        inside = [((origin >= -0.5) & (origin < edge)).all(-1) for origin in origins]
+        weight = np.where(inside[0] == inside[1], share, inside[1]).astype(np.float32)[..., None]
+        return (1 - weight) * moved[0] + weight * moved[1]
+
+    def _flow_between(self, pair: list[np.ndarray], k: int, share: float) -> Float32[np.ndarray, "rows columns 2"]:
+        """The flow from one picture to the other, in their pixels, of what is seen at each pixel in between.
+
+        First that of the places in either frame which it leads here from; moved along that the pictures nearly meet,
+        and the flow that is left between them is added.
+        """
+        height, width = pair[0].shape[:2]
+        columns, rows = _at_most(_flow_side(height, width), height, width)
+        small = [cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA) for picture in pair]
         unit = np.float32([columns / self.size[1], rows / self.size[0]])
-        flows = [cv2.resize(each[k].astype(np.float32), (columns, rows)) * unit for each in (self.there, self.back)]
-        sure = np.hypot(*np.moveaxis(flows[0] + flows[1], -1, 0)) < 1 + MISS_SHARE * np.hypot(
-            *np.moveaxis(flows[0], -1, 0)
-        )
-        moved = []
-        for frame, flow, way in zip(frames[k : k + 2], flows, (share, 1 - share), strict=True):
-            picture = (
-                frame if frame.shape[:2] == size else cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_AREA)
-            )
-            origin = grid - way * flow
-            sure &= ((origin >= 0) & (origin <= [columns - 1, rows - 1])).all(-1)
-            moved.append(
-                cv2.remap(picture, origin, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-            )
-        apart = cv2.GaussianBlur(moved[0] - moved[1], (0, 0), 0.7)
-        sure &= np.sqrt((apart * apart).mean(-1)) < 255 * COLOR_CHANGE
-        return (1 - share) * moved[0] + share * moved[1], sure
+        there, back = (cv2.resize(own[k].astype(np.float32), (columns, rows)) * unit for own in (self.there, self.back))
+        grid, past, ahead = _grid(rows, columns), np.float32(share), np.float32(1 - share)
+        flow = ahead * there - past * back
+        for _ in range(LOOKS):
+            from_there = _warped(there, grid - past * flow, cv2.INTER_LINEAR)
+            from_back = _warped(back, grid + ahead * flow, cv2.INTER_LINEAR)
+            flow = ahead * from_there - past * from_back
+        met = _warped(small[0], grid - past * flow), _warped(small[1], grid + ahead * flow)
+        there, back = _forth_and_back(*(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in met))
+        flow += ahead * there - past * back
+        return cv2.resize(flow, (width, height)) * np.float32([width / columns, height / rows])
 
     def _step(self, at, here, direction: int, color) -> tuple[np.ndarray, np.ndarray]:
         """Where points of frames `at` are in the next frame (or the one before), and of which that is known."""
@@ -176,6 +188,27 @@ def _at_most(side: float, height: int, width: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `side`, and none below 16: the flow needs a patch."""
     share = min(1.0, side / max(height, width))
     return max(16, round(width * share)), max(16, round(height * share))
+
+
+def _flow_side(height: int, width: int) -> int:
+    """The longer side of what flow is read off."""
+    return FLOW_SIDE if max(height, width) > FLOW_SIDE else FLOW_SIDE // 2
+
+
+def _forth_and_back(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """DIS flow between two grey pictures (rows, columns): (rows, columns, 2) each, in pixels."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return search.calc(one, other, None), search.calc(other, one, None)
+
+
+def _grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]:
+    """(x, y) of every pixel, centres at whole numbers, as OpenCV has them."""
+    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+
+
+def _warped(picture, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:
+    """The picture with pixels from `origin`, beyond its border that of the border."""
+    return cv2.remap(picture, origin, None, order, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _sampled(stack, index, position, size) -> np.ndarray:

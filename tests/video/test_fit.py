@@ -11,9 +11,10 @@ from clips import moving_blobs
 from test_motion import panning
 
 from foldgauss import _threads
+from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
 from foldgauss.video.config import chosen_num_gaussians, planned_steps
-from foldgauss.video.fit import check_frames, start, to_model
+from foldgauss.video.fit import check_frames, start, start_from, to_model
 
 fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
 
@@ -356,3 +357,61 @@ def test_compiling_is_not_counted(monkeypatch):
     for _, info in fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=2)):
         seconds.append(info.seconds)
     assert seconds[-1] < 1.0
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    frames = moving_blobs()
+    return frames, fit(frames, CONFIG).model
+
+
+def test_goes_on_from_a_model(fitted):
+    frames, model = fitted
+    before = [leaf.copy() for leaf in leaves_of(model)]
+    steps = [info.step for state, info in fit_steps(frames, CONFIG, start_from(model, CONFIG, 90, 0.7))]
+    assert steps == list(range(211, 301))  # rates are those from 70% of 300 steps on
+    *_, (state, info) = fit_steps(frames, CONFIG, start_from(model, CONFIG, 90, 0.7))
+    assert info.stopped_by == "steps"
+    on = to_model(state, CONFIG, frames.shape[1:3], 25.0)
+    assert evaluate(on, frames).mean_psnr > evaluate(model, frames).mean_psnr
+    for kept, leaf in zip(before, leaves_of(model), strict=True):
+        np.testing.assert_array_equal(kept, leaf)  # the model is not worked on
+
+
+def test_a_start_from_a_model_is_the_model(fitted):
+    model = fitted[1]
+    state = start_from(model, CONFIG, 10)
+    assert (state.step, state.plan) == (0, 10)
+    for ours, own in zip(leaves_of(to_model(state, CONFIG, model.size, model.fps)), leaves_of(model), strict=True):
+        np.testing.assert_array_equal(ours, own)
+
+
+def test_frame_times_start_where_they_are_told():
+    frames, logits = moving_blobs(), np.log([1.0, 1, 3, 1, 2])
+    state = start(frames, CONFIG, logits)
+    np.testing.assert_allclose(to_model(state, CONFIG, (48, 64), 25.0).frame_times.times()[1:3], [1 / 8, 2 / 8], 1e-5)
+    assert state.time_logits.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"degree": 2}, r"config\.degree: expected the model's, 3, got 2"),
+        ({"power": 1.0}, r"config\.power"),
+        ({"floor": 0.1}, r"config\.floor"),
+        ({"compositing": "sum"}, r"config\.compositing"),
+        ({"options": RenderOptions.standard()}, r"config\.options"),
+    ],
+    ids=str,
+)
+def test_configs_of_other_models(fitted, changes, told):
+    with pytest.raises(ValueError, match=told):
+        start_from(fitted[1], dataclasses.replace(CONFIG, **changes), 10)
+
+
+def test_starts_out_of_range(fitted):
+    for steps, progress in ((0, 0.5), (1.5, 0.5), (10, 1.0), (10, -0.1), (10, np.nan)):
+        with pytest.raises(ValueError, match="expected"):
+            start_from(fitted[1], CONFIG, steps, progress)
+    with pytest.raises(ValueError, match="scale_cutoff"):
+        start_from(dataclasses.replace(fitted[1], scale_cutoff=1e-4), CONFIG, 10)

@@ -1,0 +1,217 @@
+"""Profiles with colours integrated out, beside explicit covariances of all pixels."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from soft_models import NUM, NUM_FRAMES, soft_model
+
+from foldgauss.uncertainty import FrameNoise, evidence
+from foldgauss.uncertainty import colors as module
+from foldgauss.uncertainty.colors import evidence_without_colors
+from foldgauss.uncertainty.equations import ColorEquations, solved
+from foldgauss.uncertainty.screen import Screen
+
+SIZE, NOISE, PRIOR, FRAME = (20, 32), 0.03, 0.3, 3
+
+
+@pytest.fixture(scope="module", params=["over", "sum"])
+def scene(request):
+    model = soft_model(size=SIZE, compositing=request.param)
+    if request.param == "sum":  # light adds up: less of each
+        splats = dataclasses.replace(model.splats, opacity_logit=model.splats.opacity_logit - 2)
+        model = dataclasses.replace(model, splats=splats)
+    return _filmed(model)
+
+
+@pytest.fixture(scope="module")
+def over():
+    return _filmed(soft_model(size=SIZE))
+
+
+def _filmed(model):
+    rng = np.random.default_rng(5)
+    shown = np.moveaxis(np.stack(list(Screen(model, _nothing()).pictures(model.frame_times.times()))), 1, -1)
+    video = np.clip(np.rint(255 * (shown + NOISE * rng.normal(size=shown.shape))), 0, 255).astype(np.uint8)
+    return model, video, evidence(model, video, noise=FrameNoise(np.array(NOISE), np.array(0.5)))
+
+
+def _nothing():
+    return np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)
+
+
+def _equations(model, video, base, prior_scale=PRIOR):
+    times = base.profiles.modes()
+    times[[0, -1]] = 0, 1
+    return ColorEquations(Screen(model, video), base.noise, times, prior_scale)
+
+
+def _by_hand(equations, k, t, prior_scale=PRIOR):
+    """The density of frame k's pixels, with their covariance written out."""
+    precision, rhs = np.eye(NUM) / prior_scale**2, np.zeros((NUM, 3))
+    frames = equations.screen.frames.reshape(NUM_FRAMES, -1, 3) / 255
+    for j in range(NUM_FRAMES):
+        if j != k:
+            a = equations.weights(equations.times[j]).toarray()
+            precision += a.T @ a / equations.variance[j]
+            rhs += a.T @ (frames[j] - a @ equations.colour) / equations.variance[j]
+    covariance = np.linalg.inv(precision)
+    colour, a = equations.colour + covariance @ rhs, equations.weights(t).toarray()
+    pixels = equations.variance[k] * np.eye(len(a)) + a @ covariance @ a.T
+    expected = a @ colour
+    return sum(scipy.stats.multivariate_normal(expected[:, c], pixels).logpdf(frames[k][:, c]) for c in range(3))
+
+
+def _times(equations, k):
+    return equations.times[k] + np.array([-0.04, -0.01, 0.0, 0.02])
+
+
+def test_exact_profile_is_the_gaussian_density_of_all_pixels(scene):
+    equations = _equations(*scene)
+    curve = module._Dense(equations, FRAME)
+    times = _times(equations, FRAME)
+    for t in times:
+        curve.draw(t)
+    expected = np.array([_by_hand(equations, FRAME, t) for t in times])
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(curve.profile()[1], expected - expected.max(), rtol=1e-6, atol=1e-6)
+
+
+def test_estimated_profile_is_the_exact_one_given_all_probes(over):
+    """Signs in place of all pixels' unit vectors, scaled as a mean over probes asks for: no chance is left."""
+    equations = _equations(*over)
+    num_pixels = SIZE[0] * SIZE[1]
+    exact = module._Dense(equations, FRAME)
+    estimated = module._Estimated(equations, FRAME, np.sqrt(num_pixels) * np.eye(num_pixels))
+    for t in equations.times[FRAME] + np.linspace(-0.3, 0.3, 31):
+        exact.draw(t)
+        estimated.draw(t)
+    without = np.array([point.log_likelihood for point in estimated.points])
+    expected, found = exact.values() - without, estimated.values() - without
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(found - found[15], expected - expected[15], atol=0.01 * np.ptp(expected))
+
+
+def test_estimate_is_near_the_exact_profile(over):
+    model, video, base = over
+    exact = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR)
+    near = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16)
+    nodes, values = exact[FRAME].one(0)
+    top = values > -module.REACH
+    np.testing.assert_allclose(near[FRAME](nodes[top, None])[:, 0], values[top], atol=0.5)
+
+
+def test_sure_colours_give_the_base_profile_back(over):
+    model, video, base = over
+    found = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=1e-7)
+    nodes, values = base.profiles.one(FRAME)
+    top = values > -8
+    np.testing.assert_allclose(found[FRAME](nodes[top, None])[:, 0], values[top], atol=0.1)
+
+
+def test_profiles_are_wider_and_others_are_kept(scene):
+    model, video, base = scene
+    done = []
+    found = evidence_without_colors(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
+    assert done == [(1, 2), (2, 2)]
+    for k in range(NUM_FRAMES):
+        if k not in (2, 4):
+            np.testing.assert_array_equal(found.one(k), base.profiles.one(k))
+            continue
+        assert _spread(found[k]) > 1.02 * _spread(base.profiles[k])
+        nodes, values = found.one(k)
+        own, _ = base.profiles.one(k)
+        assert (nodes[0], nodes[-1]) == (own[0], own[-1])  # the same domain
+        assert values.max() == 0
+        fine = found[k](np.linspace(own[0], own[-1], 5001)[:, None])[:, 0]
+        assert fine.max() < 0.1
+
+
+def _spread(profile):
+    times = np.linspace(0, 1, 20001)
+    density = np.exp(profile(times[:, None])[:, 0])
+    density /= density.sum()
+    mean = (times * density).sum()
+    return np.sqrt(((times - mean) ** 2 * density).sum())
+
+
+def test_information_is_what_colours_leave_of_it(scene):
+    """With g the slope of the picture: g^T C^-1 g is g^T g / s^2 less what colours could do as well, and no more."""
+    equations = _equations(*scene)
+    t, step = equations.times[FRAME], 1e-3
+    at = equations.at(FRAME, t)
+    slope = ((equations.weights(t + step) - equations.weights(t - step)) / (2 * step)) @ equations.colour
+    seen = at.weights.T @ slope / at.variance
+    held = (slope**2).sum() / at.variance
+    free = held - (seen * np.linalg.solve(at.dense(), seen)).sum()
+    assert 0 < free < 0.99 * held
+
+
+def test_seeds_reproduce(over):
+    model, video, base = over
+    few = {"frames": [FRAME], "most_dense": 0, "probes": 2}
+    one, same, other = (evidence_without_colors(model, video, base, **few, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.values, same.values)
+    assert one.count[FRAME] != other.count[FRAME] or (one.values[FRAME] != other.values[FRAME]).any()
+
+
+def test_conjugate_gradients_solve_and_hold_still_at_zero():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(30, 20))
+    matrix, rhs = root.T @ root + np.eye(20), rng.normal(size=(20, 3))
+    rhs[:, 1] = 0
+    found = solved(lambda x: matrix @ x, lambda r: r / np.diag(matrix)[:, None], rhs, np.zeros_like(rhs), 1e-10)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, rhs), atol=1e-8)
+
+
+def test_equations_that_are_not_solved_are_told():
+    rhs = np.ones((4, 1))
+    with pytest.raises(ValueError, match="prior_scale: expected colours solved to 1e-05"):
+        solved(np.zeros_like, lambda r: r, rhs, np.zeros_like(rhs), 1e-5)
+
+
+def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
+    base_nodes = np.linspace(0, 1, 41)
+    base_values = -2000 * (base_nodes - 0.5) ** 2
+    base_values[2] = -1.0  # an island
+    times = np.linspace(0.45, 0.56, 9)
+    values = -1500 * (times - 0.505) ** 2
+    nodes, joined = module._joined(times, values, base_nodes, base_values)
+    assert (np.diff(nodes) > 0).all()
+    assert (nodes[0], nodes[-1]) == (0, 1)
+    np.testing.assert_array_equal(joined[np.isin(nodes, times)], values)
+    assert joined[nodes < times[0]].max() <= values[0]
+    assert joined[nodes > times[-1]].max() <= values[-1]
+    fine = module.Profiles.of([nodes], [joined])(np.linspace(0, 1, 9999)[:, None])
+    assert fine.max() <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"frames": [0]}, "frames: expected different frames from 1 to 5"),
+        ({"frames": [2, 2]}, "frames: expected different"),
+        ({"frames": [6]}, "frames: expected different"),
+        ({"frames": [1.5]}, "frames: expected different"),
+        ({"prior_scale": 0}, "prior_scale: expected a number > 0"),
+        ({"prior_scale": float("nan")}, "prior_scale: expected a number > 0"),
+        ({"most_dense": -1}, "most_dense: expected a whole number >= 0"),
+        ({"probes": 0}, "probes: expected a whole number >= 1"),
+        ({"base": None}, "base: expected an Evidence"),
+        ({"video": np.zeros((4, *SIZE, 3), np.uint8)}, "base: expected evidence of 4 frames"),
+        ({"video": np.zeros((7, 5, 5, 3), np.uint8)}, "video: expected"),
+    ],
+)
+def test_wrong_input_is_told(over, change, match):
+    model, video, base = over
+    with pytest.raises(ValueError, match=match):
+        evidence_without_colors(**{"model": model, "video": video, "base": base, **change})
+
+
+def test_models_with_numbers_missing_are_told(over):
+    model, video, base = over
+    broken = dataclasses.replace(model.splats, loc=jnp.asarray(model.splats.loc).at[0, 0].set(jnp.nan))
+    with pytest.raises(ValueError, match="model: expected finite numbers"):
+        evidence_without_colors(dataclasses.replace(model, splats=broken), video, base)

@@ -1,0 +1,360 @@
+"""Frame times refitted: what is drawn for the bootstrap, what is left out, and what the numbers say."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from foldgauss.uncertainty import RefitTimes, evidence, refit_frame_times, refits
+from foldgauss.uncertainty.refit import Refit, blocks_of, merged, resampled
+from foldgauss.uncertainty.screen import Screen
+from foldgauss.video import FitConfig, FrameTimes, LearningRates, fit
+
+CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2)
+#: Whoever holds the splats learns the times alone.
+HELD = LearningRates(0, 0, 0, 0, 0, 0, 0, 0, frame_times=4e-3)
+
+
+def passing(num_frames=7, height=24, width=40, noise=3.0):
+    """A light that crosses the picture: uint8 (num_frames, height, width, 3), noise in grey levels."""
+    y, x = np.mgrid[0:height, 0:width]
+    place = np.linspace(0.2, 0.8, num_frames)[:, None, None] * width
+    light = np.exp(-((x - place) ** 2 + (y - height / 2) ** 2) / 30)
+    frames = np.stack([40 + 150 * light, 60 + 80 * light, 90 + 2 * x + 0 * light], -1)
+    return np.clip(np.rint(frames + np.random.default_rng(5).normal(0, noise, frames.shape)), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return passing()
+
+
+@pytest.fixture(scope="module")
+def model(frames):
+    return fit(frames, CONFIG).model
+
+
+def own_times(model):
+    return np.asarray(model.frame_times.times(), np.float64)
+
+
+def inner_std(profiles):
+    """Standard deviations of the times whose log-likelihoods are the profiles, but for the first and the last frame."""
+    t = np.linspace(0, 1, 20_001)
+    log = np.stack([profiles[k](t[:, None])[:, 0] for k in range(1, profiles.num_frames - 1)])
+    weight = np.exp(log - log.max(1, keepdims=True))
+    weight /= weight.sum(1, keepdims=True)
+    return np.sqrt((weight * (t - (weight @ t)[:, None]) ** 2).sum(1))
+
+
+# What is drawn
+
+
+@pytest.mark.parametrize("block", [1, 5, 16])
+def test_kept_blocks_change_sign_as_one(block):
+    residual = np.ones((3, 30, 41), np.float32)
+    drawn = blocks_of(residual, block, np.random.default_rng(1))
+    assert (np.abs(drawn) == 1).all()
+    assert (drawn == drawn[:1]).all()  # all channels
+    for axis in (1, 2):
+        changes = np.flatnonzero((np.diff(drawn, axis=axis) != 0).any((0, 3 - axis)))
+        assert len(set((changes % block).tolist())) == 1  # one grid
+
+
+def test_the_grid_of_blocks_lies_at_random():
+    residual, offsets = np.ones((1, 8, 32), np.float32), []
+    for seed in range(40):
+        drawn = blocks_of(residual, 8, np.random.default_rng(seed))
+        offsets.append(int(np.flatnonzero((np.diff(drawn, axis=2) != 0).any((0, 1)))[0]) % 8)
+    assert len(set(offsets)) > 5
+
+
+def test_moved_blocks_are_pieces_of_the_frame():
+    height, width, block = 30, 42, 7
+    named = 1 + np.arange(height * width, dtype=np.float32).reshape(1, height, width)
+    drawn = blocks_of(named, block, np.random.default_rng(2), place="moved")
+    y, x = np.divmod(np.abs(drawn[0]).astype(int) - 1, width)
+    down, right = (y - np.arange(height)[:, None]) % height, (x - np.arange(width)[None, :]) % width
+    shift = down * width + right + height * width * (drawn[0] > 0)
+    assert 24 <= len(np.unique(shift)) <= 42  # 5 x 6 blocks, or 6 x 7
+    rows = np.flatnonzero((np.diff(shift, axis=0) != 0).any(1))
+    columns = np.flatnonzero((np.diff(shift, axis=1) != 0).any(0))
+    assert len(set((rows % block).tolist())) == len(set((columns % block).tolist())) == 1
+
+
+@pytest.mark.parametrize("place", ["kept", "moved"])
+def test_mean_and_variance_of_what_is_drawn(place):
+    """At every pixel: z-scores of 600 draws, beyond 5 in one of 480 pixels with probability 3e-4."""
+    rng = np.random.default_rng(3)
+    residual = rng.normal(0, 1, (1, 20, 24)) * np.where(np.arange(24) < 12, 1.0, 3.0) + 0.4
+    drawn = np.stack([blocks_of(residual, 4, rng, place=place)[0] for _ in range(600)])
+    power = residual[0] ** 2 if place == "kept" else np.full((20, 24), (residual**2).mean())
+    assert np.abs(drawn.mean(0) / np.sqrt(power / 600)).max() < 5
+    if place == "kept":
+        np.testing.assert_allclose((drawn**2).mean(0), power)
+    else:
+        fourth = (residual**4).mean() - power**2
+        assert np.abs(((drawn**2).mean(0) - power) / np.sqrt(fourth / 600)).max() < 5
+        assert np.abs((drawn**2).mean(0) / residual[0] ** 2 - 1).max() > 1  # power: they are not in their places
+
+
+def test_frames_spread_around_the_models_pictures(model, frames):
+    screen = Screen(model, frames)
+    pictures = np.stack(list(screen.pictures(own_times(model))))
+    draws = [resampled(screen, 4, np.random.default_rng(seed)) for seed in range(100)]
+    assert draws[0].dtype == np.uint8
+    assert draws[0].shape == frames.shape
+    drawn = np.moveaxis(np.stack(draws).astype(np.float64), -1, 2) / 255
+    residual = np.stack([screen.residual(k, picture) for k, picture in enumerate(pictures)])
+    inside = (pictures - np.abs(residual) > 0) & (pictures + np.abs(residual) < 1)  # where nothing is clipped
+    assert inside.mean() > 0.9
+    missed, half = drawn.mean(0) - pictures, 0.5 / 255  # of two values each of which is rounded
+    assert (np.maximum(np.abs(missed) - half, 0) / (np.abs(residual) + half))[inside].max() < 0.55  # 5.5 of 100 draws
+    assert np.abs(missed[inside].mean()) < 0.1 / 255
+    np.testing.assert_allclose(drawn.std(0)[inside].mean(), np.abs(residual)[inside].mean(), rtol=0.02)
+    one, other = draws[0][2].astype(int) - draws[1][2], draws[0][3].astype(int) - draws[1][3]
+    assert np.abs(np.corrcoef(one.ravel() != 0, other.ravel() != 0)[0, 1]) < 0.3  # each frame for itself
+
+
+# What is left out
+
+
+def test_merged_weights_leave_gaps():
+    logits = np.random.default_rng(1).normal(0, 1, 9)
+    unseen = np.array([0, 1, 0, 0, 1, 1, 0, 0, 1, 0], bool)
+    kept = np.asarray(FrameTimes(merged(logits, unseen)).times())
+    np.testing.assert_allclose(kept, np.asarray(FrameTimes(logits.astype(np.float32)).times())[~unseen], atol=1e-6)
+
+
+def test_every_frame_is_unseen_once(model, frames):
+    config, seen = dataclasses.replace(CONFIG, steps=150), []
+    found = refit_frame_times(model, frames, config, replicates=3, of="frames", on_replicate=seen.append)
+    assert [each.number for each in seen] == [0, 1, 2]
+    assert [each.model.num_frames for each in seen] == [5, 5, 6]
+    np.testing.assert_array_equal(found.unseen.sum(0), [0, 1, 1, 1, 1, 1, 0])
+    assert (np.diff(found.times) >= 0).all()
+    assert (found.times[:, 0] == 0).all()
+    assert (found.times[:, -1] == 1).all()
+    assert found.by_frames
+    assert found.freedom == 5
+    assert 0 < found.spread[1] < 0.6  # found in its neighbourhood, but not where it would be had it been seen
+    np.testing.assert_array_equal(found.std[1:-1], found.std[1])
+    assert found.std[0] == found.std[-1] == 0
+    np.testing.assert_array_equal(found.mean[[1, 4]], found.times[0, [1, 4]])
+
+
+# Replicates
+
+
+@pytest.fixture(scope="module")
+def replicates(model, frames):
+    return list(refits(model, frames, CONFIG, replicates=3, steps=40, seed=4, block=8))
+
+
+def test_times_of_replicates(model, replicates):
+    found = RefitTimes.of(model, replicates)
+    assert found.times.shape == (3, 7)
+    assert (np.diff(found.times) > 0).all()
+    assert (found.times[:, 0] == 0).all()
+    assert (found.times[:, -1] == 1).all()
+    assert not found.by_frames
+    assert (found.std[1:-1] > 0).all()
+    assert found.spread.max() < 0.2
+    assert all(each.psnr > 25 for each in replicates)
+
+
+def test_seeds_reproduce_and_replicates_stand_alone(model, frames, replicates):
+    how = {"replicates": 3, "steps": 40, "block": 8}
+    again = list(refits(model, frames, CONFIG, seed=4, first=1, **how))
+    assert [each.number for each in again] == [1, 2]
+    for one, other in zip(replicates[1:], again, strict=True):
+        np.testing.assert_array_equal(one.times, other.times)
+    another = next(refits(model, frames, CONFIG, seed=5, **how))
+    assert not np.array_equal(another.times, replicates[0].times)
+    assert not np.array_equal(replicates[0].times, replicates[1].times)
+
+
+@pytest.mark.parametrize(
+    "how", [{"start": "scratch"}, {"of": "order"}, {"of": "order", "start": "scratch"}, {"place": "moved"}], ids=str
+)
+def test_every_way_works(model, frames, how):
+    found = refit_frame_times(model, frames, CONFIG, replicates=2, steps=30, **how)
+    assert (np.diff(found.times) > 0).all()
+    assert (found.std[1:-1] > 0).all()
+
+
+def test_default_steps_are_the_end_of_the_plan(model, frames):
+    config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, target_psnr=10.0), []
+    original = FitConfig(num_gaussians=150, steps=30, degree=2)
+    for each in (config, original):
+        how = {"replicates": 1, "of": "order", "steps": None if each is config else 30}
+        steps.append(next(refits(model, frames, each, **how)).times)
+    np.testing.assert_array_equal(*steps)  # 30% of 100 steps, whatever the clock and the target say
+
+
+@pytest.mark.parametrize("place", ["kept", pytest.param("moved", marks=pytest.mark.slow)])
+def test_held_splats_give_what_the_profiles_say(place):
+    """Noise that no splat has learned, and splats that stay: times spread as the likelihood of independent pixels says.
+
+    With 24 replicates of 5 times the ratio is within a fifth of 1 with probability 0.998, were they independent. Held
+    back by too few steps, they spread less: that is the power of it.
+    """
+    clean = passing(noise=0.0)
+    base = fit(clean, CONFIG).model
+    pictures = np.stack(list(base.frames())).astype(np.float64)
+    noisy = np.clip(np.rint(pictures + np.random.default_rng(1).normal(0, 6, clean.shape)), 0, 255).astype(np.uint8)
+    config = dataclasses.replace(CONFIG, rates=HELD)
+    given = inner_std(evidence(base, noisy, noise="independent").profiles)
+    std = np.concatenate([[0], given, [0]])
+    how = {"replicates": 24, "block": 2, "place": place}
+    assert 0.8 < refit_frame_times(base, noisy, config, steps=200, **how).ratio_to(std) < 1.2
+    assert refit_frame_times(base, noisy, config, steps=20, **how).ratio_to(std) < 0.6
+
+
+# What the numbers say
+
+
+def made(times, own, unseen=None):
+    unseen = np.zeros(times.shape, bool) if unseen is None else unseen
+    return RefitTimes(times, unseen, own)
+
+
+def test_ratio_intervals_and_spread():
+    rng, own = np.random.default_rng(2), np.linspace(0, 1, 41)
+    std = np.where((own > 0) & (own < 1), 0.001 + 0.002 * own, 0.0)
+    found = made(own + 3 * std * rng.normal(size=(50, 41)), own)
+    assert abs(found.ratio_to(std) - 3) < 0.2  # 1911 degrees of freedom: 4 standard errors
+    assert abs(found.ratio_to(np.where(std > 0, 0.002, 0)) - 3) < 0.6
+    np.testing.assert_allclose(found.mean, found.times.mean(0))
+    np.testing.assert_allclose(found.spread, 40 * found.std, rtol=1e-6, atol=1e-12)
+    low, high = found.interval(0.9)
+    np.testing.assert_allclose((high - low)[1:-1] / 2, scipy.stats.t.ppf(0.95, 49) * found.std[1:-1])
+    covered = np.abs(3 * std * rng.normal(size=(400, 41)))[:, 1:-1] < ((high - low) / 2)[1:-1]
+    assert abs(covered.mean() - 0.9) < 0.02
+    assert (found.interval(0.999) >= 0).all()
+    assert (found.interval(0.999) <= 1).all()
+
+
+def test_local_knows_no_smooth_warp():
+    rng, own = np.random.default_rng(2), np.linspace(0, 1, 41)
+    bump = np.sin(np.pi * own)
+    warped = made(own + 0.01 * rng.normal(size=(50, 1)) * bump, own)
+    assert warped.local[1:-1].max() < 0.005 * warped.std.max()
+    inner = (own > 0) & (own < 1)
+    rough = made(own + 0.01 * rng.normal(size=(200, 41)) * inner, own)
+    np.testing.assert_allclose(rough.local[2:-2], 0.01 * np.sqrt(1.5), rtol=0.2)
+    assert rough.local[0] == rough.local[-1] == 0
+
+
+def test_spread_counts_frames_where_times_are_uneven():
+    own = np.array([0.0, 0.1, 0.5, 1.0])
+    times = own + np.array([[0, 0.04, 0, 0], [0, -0.01, 0, 0], [0, 0, 0, 0]])
+    found = made(times, own)
+    np.testing.assert_allclose(found.spread[1], np.std([1.1, 0.9, 1.0], ddof=1))
+
+
+def test_times_that_float32_cannot_tell_apart():
+    own = np.array([0.0, 0.5, 0.5, 1.0])
+    assert np.isfinite(made(np.stack([own, own]), own).spread).all()
+
+
+def test_left_out_frames_share_one_deviation():
+    own = np.linspace(0, 1, 5)
+    unseen = np.array([[0, 1, 0, 1, 0], [0, 0, 1, 0, 0]], bool)
+    times = own + np.array([[0, 0.03, 0.9, 0, 0], [0, 0, -0.04, 0, 0]])
+    found = made(times, own, unseen)
+    rms = np.sqrt((0.03**2 + 0.04**2) / 3)
+    np.testing.assert_allclose(found.std, [0, rms, rms, rms, 0])
+    np.testing.assert_allclose(found.ratio_to(np.array([0, 0.01, 0.02, 0.01, 0])), np.sqrt((3**2 + 2**2) / 3))
+    np.testing.assert_allclose(found.mean, own + np.array([0, 0.03, -0.04, 0, 0]))
+
+
+# Errors
+
+
+def ended(model, frames, config=CONFIG, **how):
+    return next(refits(model, frames, config, **({"steps": 5} | how)))
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ({"of": "rows"}, "of: expected one of"),
+        ({"place": "here"}, "place: expected one of"),
+        ({"start": "middle"}, "start: expected one of"),
+        ({"of": "frames", "start": "model"}, "start: expected 'scratch'"),
+        ({"of": "frames", "replicates": 6}, "replicates: expected from 2 to 5"),
+        ({"of": "frames", "replicates": 1}, "replicates: expected from 2 to 5"),
+        ({"replicates": 0}, "replicates: expected"),
+        ({"replicates": 2.0}, "replicates: expected"),
+        ({"first": -1}, "first: expected"),
+        ({"seed": -1}, "seed: expected"),
+        ({"block": 0}, "block: expected a whole number from 1 to 24"),
+        ({"block": 25}, "block: expected a whole number from 1 to 24"),
+        ({"steps": 0}, "steps: expected"),
+    ],
+    ids=str,
+)
+def test_settings_out_of_range(model, frames, how, told):
+    with pytest.raises(ValueError, match=told):
+        ended(model, frames, **how)
+
+
+def test_videos_that_are_not_the_models(model, frames):
+    with pytest.raises(ValueError, match="video: expected the 7 frames"):
+        ended(model, frames[:-1])
+    with pytest.raises(ValueError, match="video: expected uint8"):
+        ended(model, frames[:, :-1])
+    noise = np.random.default_rng(1).integers(0, 256, frames.shape, dtype=np.uint8)
+    with pytest.raises(ValueError, match="explains"):
+        ended(model, noise)
+    clear = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], -1)
+    with pytest.raises(ValueError, match="without alpha"):
+        ended(model, clear)
+    assert np.isfinite(ended(model, clear, of="order").times).all()
+
+
+def test_configs_that_do_not_fit(model, frames):
+    with pytest.raises(ValueError, match="learn_frame_times"):
+        ended(model, frames, dataclasses.replace(CONFIG, learn_frame_times=False))
+    with pytest.raises(ValueError, match="ends by the clock"):
+        ended(model, frames, dataclasses.replace(CONFIG, steps=None, minutes=1.0), steps=None)
+    for start in ("model", "scratch"):
+        with pytest.raises(ValueError, match=r"config\.degree"):
+            ended(model, frames, dataclasses.replace(CONFIG, degree=3), start=start)
+
+
+def test_results_that_say_nothing(model, frames):
+    own = own_times(model)
+    one = Refit(0, own, np.zeros(7, bool), model, 30.0)
+    for few in ([], [one], [one, one]):
+        with pytest.raises(ValueError, match="refits: expected two or more"):
+            RefitTimes.of(model, few)
+    with pytest.raises(ValueError, match="replicates: expected a whole number >= 2"):
+        refit_frame_times(model, frames, CONFIG, replicates=1)
+    found = made(np.stack([own, own]), own)
+    for level in (0, 1, np.nan, "0.9"):
+        with pytest.raises(ValueError, match="level: expected"):
+            found.interval(level)
+    for std in (np.ones(6), np.zeros(7), 0.0, np.full(7, np.nan)):
+        with pytest.raises(ValueError, match="std: expected"):
+            found.ratio_to(std)
+
+
+@pytest.mark.slow
+def test_longer_refits_spread_more_and_order_less():
+    """What the documentation says of gauge and optimiser, on a clip large enough to show it."""
+    clip, config = passing(12, 48, 80), FitConfig(num_gaussians=800, steps=1000)
+    whole = fit(clip, config).model
+    spread = {}
+    for name, how in {
+        "short": {"steps": 100},
+        "long": {"steps": 1000},
+        "order": {"steps": 1000, "of": "order"},
+        "scratch": {"start": "scratch"},
+    }.items():
+        found = refit_frame_times(whole, clip, config, replicates=10, **how)
+        spread[name] = np.sqrt(np.mean(found.spread[1:-1] ** 2))
+    assert spread["short"] < spread["long"] < spread["scratch"]
+    assert spread["order"] < spread["long"]
