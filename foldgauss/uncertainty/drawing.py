@@ -91,9 +91,7 @@ def evidence(
 class Drawn:
     """Squared errors of every frame at the times drawn for it, and which times those are."""
 
-    def __init__(
-        self, screen: Screen, reach: int | None = None, on_picture: Callable[[int, int], None] | None = None
-    ):
+    def __init__(self, screen: Screen, reach: int | None = None, on_picture: Callable[[int, int], None] | None = None):
         self.screen, self.on_picture, self.num_drawn, self.num_planned = screen, on_picture, 0, 0
         num_frames = len(screen.frames)
         self.model_times = np.asarray(screen.model.frame_times.times(), np.float64)

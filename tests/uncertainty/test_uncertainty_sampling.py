@@ -63,7 +63,9 @@ def test_few_frames_draw_the_known_posterior(near):
     np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
     assert worst_ks(near, exact_cdfs(near)) > 1e-3
     wide = toy(NEAR[0], np.array(NEAR[1]) * 1.2)
-    assert worst_ks(near, exact_cdfs(dataclasses.replace(near, exact=exact_times(wide.profiles, wide.increments)))) < 1e-3
+    assert (
+        worst_ks(near, exact_cdfs(dataclasses.replace(near, exact=exact_times(wide.profiles, wide.increments)))) < 1e-3
+    )
 
 
 def test_a_wrong_jacobian_is_found(monkeypatch):
