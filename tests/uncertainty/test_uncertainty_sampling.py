@@ -90,13 +90,15 @@ def test_draws_keep_their_order_and_their_ends(near):
 def test_blocks_draw_the_known_posterior(concentration):
     log_prob = toy((0.2, 0.25, 0.4, 0.42, 0.75), (0.03, 0.04, 0.03, 0.05, 0.06), concentration)
     found = sampled(log_prob, moves=BlockSweep(log_prob, block=2), walkers=16)
-    assert found.converged and agrees(found)
+    assert found.converged
+    assert agrees(found)
 
 
 @pytest.mark.slow
 def test_many_frames_draw_a_gaussian():
-    found = sampled(toy(*MANY, 2001), steps=20_000)
-    assert found.converged and agrees(found)
+    found = sampled(toy(*MANY, nodes=2001), steps=20_000)
+    assert found.converged
+    assert agrees(found)
     np.testing.assert_allclose(found.mean()[1:-1], MANY[0], atol=5e-4)
     np.testing.assert_allclose(found.std()[1:-1], MANY[1], rtol=0.06)
     correlation = np.corrcoef(found.draws[:, 1:-1].T) - np.eye(14)
@@ -121,9 +123,8 @@ def test_another_hill_is_reached():
 def test_seeds_reproduce_to_the_bit():
     one, again, other = (sampled(toy(*NEAR), steps=400, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.times, again.times)
-    assert one.times.shape == other.times.shape and (one.times != other.times).any()
-    ensembles = one.times[..., 1]
-    assert len({each.tobytes() for each in ensembles}) == 4
+    assert not np.array_equal(one.times[0, -1], other.times[0, -1])
+    assert len({each.tobytes() for each in one.times}) == 4
 
 
 def test_too_few_steps_say_that_they_are():
@@ -188,7 +189,7 @@ def test_a_nan_in_the_density_is_an_error():
     values = log_prob.profiles.values.copy()
     values[1, 100:140] = np.nan
     broken = FrameTimeLogProb(dataclasses.replace(log_prob.profiles, values=values), log_prob.increments)
-    with pytest.raises(ValueError, match="NaN|order"):
+    with pytest.raises(ValueError, match="NaN"):
         sampled(broken, steps=100)
 
 
@@ -199,7 +200,8 @@ def test_neither_model_nor_density_is_an_error():
 
 def test_some_frames_of_a_clip():
     found = frame_time_posterior(model(), clip(uneven()), frames=[3, 4], noise=white(), progress=False)
-    assert found.converged and agrees(found)
+    assert found.converged
+    assert agrees(found)
     np.testing.assert_array_equal(found.free, [3, 4])
     assert (found.std()[[1, 2, 5, 6]] < 1e-12).all()
     miss = (found.mean() - uneven())[[3, 4]] / found.std()[[3, 4]]
@@ -209,9 +211,8 @@ def test_some_frames_of_a_clip():
 
 def test_progress_is_told():
     told = []
-    frame_time_posterior(
-        model(), clip(uneven()), frames=[3], noise=white(), steps=20, ensembles=2, progress=lambda *each: told.append(each)
-    )  # fmt: skip
+    settings = {"noise": white(), "steps": 20, "ensembles": 2}
+    frame_time_posterior(model(), clip(uneven()), frames=[3], **settings, progress=lambda *each: told.append(each))
     assert {what for what, _, _ in told} == {"pictures", "steps"}
     assert all(0 < done <= total for _, done, total in told)
 
