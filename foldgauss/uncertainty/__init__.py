@@ -1,5 +1,6 @@
 """How sure the learned frame times are: likelihood profiles, and what is drawn from them."""
 
+from foldgauss.uncertainty.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
 from foldgauss.uncertainty.colors import evidence_without_colors
 from foldgauss.uncertainty.drawing import Evidence, evidence
 from foldgauss.uncertainty.exact import ExactTimes, exact_times
@@ -22,7 +23,10 @@ __all__ = [
     "Profiles",
     "Refit",
     "RefitTimes",
+    "SimulatedRanks",
+    "coverage",
     "drawn_log_likelihood",
+    "ecdf_band",
     "evidence",
     "evidence_without_colors",
     "exact_times",
@@ -31,4 +35,5 @@ __all__ = [
     "laplace_times",
     "refit_frame_times",
     "refits",
+    "simulated_ranks",
 ]

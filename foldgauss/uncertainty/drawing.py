@@ -80,23 +80,18 @@ def evidence(
     elif noise not in NOISES:
         raise invalid("noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=noise)
     _check_changes(screen.frames)
-    drawn = _Drawn(screen, reach, on_picture)
+    drawn = Drawn(screen, reach, on_picture)
     drawn.coarse()
     _check_explained(screen.frames, drawn)
-    found, correlation = drawn.noise(noise)
-    drawn.refine(found)
-    if not isinstance(noise, FrameNoise):  # once more, with the residuals where they are least
-        found, correlation = drawn.noise(noise)
-        drawn.refine(found)
-    profiles = drawn.profiles(found)
-    _check_identified(profiles)
-    return Evidence(profiles, found, correlation, drawn.num_drawn)
+    seen = drawn.evidence(noise)
+    _check_identified(seen.profiles)
+    return seen
 
 
-class _Drawn:
+class Drawn:
     """Squared errors of every frame at the times drawn for it, and which times those are."""
 
-    def __init__(self, screen: Screen, reach: int | None, on_picture: Callable[[int, int], None] | None):
+    def __init__(self, screen: Screen, reach: int | None = None, on_picture: Callable[[int, int], None] | None = None):
         self.screen, self.on_picture, self.num_drawn, self.num_planned = screen, on_picture, 0, 0
         num_frames = len(screen.frames)
         self.model_times = np.asarray(screen.model.frame_times.times(), np.float64)
@@ -130,6 +125,15 @@ class _Drawn:
                 found[k][1].append(error)
         for each, (at, errors) in zip(self.samples, found, strict=True):
             each.begin(np.array(at), np.array(errors))
+
+    def evidence(self, kind: str | FrameNoise) -> Evidence:
+        """After `coarse`: the noise, and profiles as fine as it asks for."""
+        noise, correlation = self.noise(kind)
+        self.refine(noise)
+        if not isinstance(kind, FrameNoise):  # once more, with the residuals where they are least
+            noise, correlation = self.noise(kind)
+            self.refine(noise)
+        return Evidence(self.profiles(noise), noise, correlation, self.num_drawn)
 
     def refine(self, noise: FrameNoise) -> None:
         """Draw pictures between the nodes of every frame but the first and the last, whose times are fixed."""
@@ -201,7 +205,11 @@ class _Samples:
         at_best[max(best - 1, 0) : best + 1] = True
         matters = near[:-1] | near[1:]
         unknown = ~self.settled | (at_best & (step > STEP))
-        self.asked = np.flatnonzero(matters & unknown & (step > MISS) & (np.diff(self.times) > 2 * finest))
+        # Two nodes may be as high as each other on two sides of a hill: then their slopes are not 0.
+        slopes = weight * np.abs(np.gradient(self.errors, self.times, edge_order=2))
+        width = np.diff(self.times)
+        bent = np.maximum(step, np.maximum(slopes[:-1], slopes[1:]) * width / 4) > MISS
+        self.asked = np.flatnonzero(matters & unknown & bent & (width > 2 * finest))
         return (self.times[self.asked] + self.times[self.asked + 1]) / 2
 
     def insert(self, errors: np.ndarray, weight: float) -> None:
@@ -226,7 +234,7 @@ def _check_changes(frames: np.ndarray) -> None:
         raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
 
 
-def _check_explained(frames: np.ndarray, drawn: _Drawn) -> None:
+def _check_explained(frames: np.ndarray, drawn: Drawn) -> None:
     variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in frames) * frames[0, ..., 0].size / 255**2
     left = sum(float(each.errors.min()) for each in drawn.samples)
     if left > (1 - EXPLAINED) * variation:

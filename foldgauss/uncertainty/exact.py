@@ -152,6 +152,8 @@ def profile_grid(
     inside = (nodes > low) & (nodes < high)
     here = np.concatenate([[low], nodes[inside], [high]])
     heights = profiles[k](here[:, None])[:, 0]
+    if np.isnan(heights).any():
+        raise invalid("profiles", expected="log-likelihoods that are numbers", got=f"NaN for frame {k}")
     some = np.flatnonzero(heights > heights.max() - UNDERFLOW)
     hull = slice(max(some[0] - 1, 0), some[-1] + 2)
     here, heights = here[hull], heights[hull]

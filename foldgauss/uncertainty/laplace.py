@@ -73,7 +73,8 @@ def _climb(profiles: Profiles, times: np.ndarray, first: int, last: int, alpha: 
     for _ in range(STEPS):
         slope, bands = _derivatives(profiles, times, first, last, alpha, step)
         step = REACH / np.sqrt(bands[0])
-        move = scipy.linalg.solveh_banded(_banded(bands), slope)
+        # Not `solveh_banded`, which SciPy cannot do for one unknown.
+        move = scipy.linalg.cho_solve_banded((scipy.linalg.cholesky_banded(_banded(bands)), False), slope)
         for _ in range(40):
             raised = height(times[part] + move)
             if raised >= now:

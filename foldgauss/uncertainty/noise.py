@@ -129,19 +129,25 @@ def score_share(
     r"""The share with which the likelihood of a time is as sure as its score is steady, at most 1.
 
     With the residual r and the slope g = dR/dt, scores s_p = r_p g_p have the sum whose variance V is estimated with
-    their covariances up to `reach` pixels (Bartlett weights), where the plain likelihood takes J = scale^2 sum g^2 for
-    granted: share = J / V. Exact where residuals are as correlated in seen frames as noise is; a fit that has learned
-    the noise leaves residuals whose scores cancel, and then it is too sure.
+    their covariances up to `reach` pixels (those up to half of it in full, then less and less), where the plain
+    likelihood takes J = scale^2 sum g^2 for granted: share = J / V. Exact where residuals are as correlated in seen
+    frames as noise is; a fit that has learned the noise leaves residuals whose scores cancel, and then it is too sure.
 
-    **Source:** the sandwich of Huber 1967; covariances as Newey and West 1987, over two dimensions Conley 1999.
+    **Source:** the sandwich of Huber 1967; covariances over two dimensions as Conley 1999, with the flat-topped weights
+    of Politis and Romano 1995: Bartlett's would miss a quarter of V at the reach that profiles use.
     """
     residual, slope = (np.asarray(each, np.float64) for each in (residual, slope))
     expected = (residual**2).mean() * (slope**2).sum()
     score = (residual * slope).sum(0)
     score -= score.mean()
     lags = np.abs(np.arange(-reach, reach + 1))
-    weights = np.clip(1 - lags / (reach + 1), 0, None)
-    variance = (weights[:, None] * weights[None, :] * _lagged_products(score[None], score[None], reach)).sum()
+    flat = np.clip(2 - 2 * lags / (reach + 1), 0, 1)
+    weights = flat[:, None] * flat[None, :]
+    variance = (weights * _lagged_products(score[None], score[None], reach)).sum()
+    # Taking off the mean makes all covariances together 0: what that takes from those that are summed.
+    height, width = score.shape
+    pairs = np.maximum(height - lags, 0)[:, None] * np.maximum(width - lags, 0)[None, :]
+    variance /= max(1 - (weights * pairs).sum() / score.size**2, 0.1)
     if not (expected > 0 and variance > 0):
         return 1.0
     return float(min(1.0, expected / variance))

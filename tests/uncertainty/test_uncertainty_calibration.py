@@ -1,0 +1,133 @@
+"""Simulation-based calibration: right posteriors have uniform ranks, and wrong ones are found out."""
+
+import numpy as np
+import pytest
+import scipy.stats
+from time_clips import SCALE, model, white
+
+from foldgauss.uncertainty import FrameNoise, Increments, coverage, ecdf_band, simulated_ranks
+
+REPLICATES, FRAMES = 300, 6
+#: Each run looks at some six quantities in 99% envelopes with a fixed seed: of right runs, 1 in 20 would fail.
+
+
+def ranks(**settings):
+    settings = {"num_frames": FRAMES, "replicates": REPLICATES, **settings}
+    return simulated_ranks(model(), white(), **settings)
+
+
+@pytest.mark.parametrize("concentration", [0.5, 1.0, 3.0])
+def test_exact_passes_are_calibrated(concentration):
+    found = ranks(concentration=concentration)
+    assert found.inside(0.99).all() and found.converged == 1
+    assert found.ranks.shape == (REPLICATES, FRAMES) and found.names[-2:] == ["any frame", "log-likelihood"]
+    for level in (0.5, 0.9):
+        # All frames of a replicate together, as if each were a half of one alone.
+        error = np.sqrt(level * (1 - level) / (REPLICATES * 2))
+        assert abs(found.coverage(level)[:-2].mean() - level) < 3.3 * error
+
+
+@pytest.mark.parametrize("factor", [1.5, 1 / 1.5])
+def test_a_wrong_noise_level_is_found(factor):
+    found = ranks(assumed_noise=FrameNoise(SCALE * factor, 1.0))
+    assert not found.inside(0.99)[-2:].any()
+    too_wide = found.coverage(0.9)[-2] > 0.95
+    assert too_wide == (factor > 1)
+
+
+def test_noise_that_is_measured_is_calibrated():
+    assert ranks(assumed_noise="score").inside(0.99).all()
+
+
+def test_smoothed_noise_needs_a_share():
+    plain, fair = (ranks(assumed_noise=kind, correlation=1.0) for kind in ("independent", "effective"))
+    assert not plain.inside(0.99).any() and plain.coverage(0.9)[-2] < 0.6
+    assert fair.inside(0.99)[:-1].all() and fair.coverage(0.9)[-2] > 0.85
+
+
+def test_a_wrong_prior_is_found(monkeypatch):
+    right = Increments.draw_prior
+
+    def wrong(self, rng, num):
+        return right(Increments(self.held, self.free, 4 * self.concentration), rng, num)
+
+    monkeypatch.setattr(Increments, "draw_prior", wrong)
+    settings = {"num_frames": 4, "replicates": REPLICATES}
+    assert not simulated_ranks(model(), white(4.0), **settings).inside(0.99).all()
+    monkeypatch.undo()
+    assert simulated_ranks(model(), white(4.0), **settings).inside(0.99).all()
+
+
+@pytest.mark.slow
+def test_emcee_is_calibrated():
+    found = ranks(sampler="emcee", num_frames=5)
+    assert found.inside(0.99).all()
+
+
+@pytest.mark.slow
+def test_emcee_with_a_wrong_noise_level_is_found():
+    found = ranks(sampler="emcee", num_frames=5, replicates=100, assumed_noise=FrameNoise(SCALE * 1.5, 1.0))
+    assert not found.inside(0.99).all()
+
+
+def test_seeds_reproduce_and_replicates_do_not_depend_on_how_many():
+    one, more = (ranks(replicates=num, seed=7) for num in (5, 8))
+    np.testing.assert_array_equal(one.ranks, more.ranks[:5])
+    np.testing.assert_array_equal(one.true, more.true[:5])
+    assert (ranks(replicates=5, seed=8).ranks != one.ranks).any()
+
+
+def test_emcee_draws_are_ranked_too():
+    found = ranks(sampler="emcee", num_frames=3, replicates=2, draws=19)
+    assert found.num_ranks == 20 and ((found.ranks >= 0) & (found.ranks < 20)).all()
+
+
+@pytest.mark.parametrize("level", [0.8, 0.99])
+def test_the_envelope_holds_what_it_says(level):
+    low, high = ecdf_band(50, 20, level)
+    assert low.shape == (20,) and (low <= high).all() and low[-1] == high[-1] == 1
+    found = np.random.default_rng(1).integers(0, 20, (4000, 50))
+    shares = (found[:, :, None] < np.arange(1, 21)).mean(1)
+    inside = ((shares >= low - 1e-12) & (shares <= high + 1e-12)).all(1).mean()
+    # Counts are whole numbers: never less than the level, and a little more.
+    assert level - 0.02 < inside < level + 0.05
+
+
+def test_the_envelope_is_pointwise_binomial():
+    low, high = ecdf_band(200, 2, 0.95)
+    expected = scipy.stats.binom.interval(0.95, 200, 0.5)
+    np.testing.assert_allclose([low[0] * 200, high[0] * 200], expected, atol=1)
+
+
+def test_coverage_counts_the_middle_ranks():
+    every = np.arange(100)[:, None]
+    for level in (0.5, 0.9, 0.98):
+        assert coverage(every, 100, level)[0] == pytest.approx(level)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"sampler": "nuts"}, "sampler"),
+        ({"num_frames": 2}, "num_frames"),
+        ({"replicates": 0}, "replicates"),
+        ({"draws": 0}, "draws"),
+        ({"correlation": 0.0}, "correlation"),
+        ({"assumed_noise": "loud"}, "assumed_noise"),
+        ({"concentration": -1.0}, "concentration"),
+        ({"assumed_noise": FrameNoise(np.full(3, 0.1), 1.0)}, "scale"),
+        ({"sampler": "emcee", "steps": 20, "draws": 5000, "num_frames": 4}, "steps"),
+    ],
+)
+def test_what_is_refused(change, word):
+    with pytest.raises(ValueError, match=word):
+        simulated_ranks(model(), white(), **{"num_frames": 5, "replicates": 2, **change})
+
+
+def test_levels_without_whole_ranks_are_refused():
+    for wrong in (0.999, 0.0, 1.0, 0.55):
+        with pytest.raises(ValueError, match="level"):
+            coverage(np.zeros((3, 1), int), 20, wrong)
+    for settings in ((0, 10), (10, 1), (10, 10, 1.0)):
+        with pytest.raises(ValueError, match="replicates|level"):
+            ecdf_band(*settings)

@@ -1,0 +1,181 @@
+"""Forward and backward passes, and Laplace's approximation, against quadrature and Gaussians."""
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import trapezoid
+from time_clips import free_times, parabolas
+
+from foldgauss.uncertainty import FrameTimeLogProb, Increments, exact_times, laplace_times
+
+#: Far from each other, in standard deviations: the order ties nothing, and the posterior is Gaussian.
+FAR = np.array([0.2, 0.4, 0.55, 0.8]), np.array([0.01, 0.02, 0.015, 0.01])
+
+
+def by_quadrature(profiles, increments, far: float, points: int):
+    """Mean and covariance of the free times, and the log-evidence, by sums over a grid of log-ratios."""
+    log_prob, num = FrameTimeLogProb(profiles, increments), increments.num_free
+    z = np.linspace(-far, far, points)
+    grid = np.stack(np.meshgrid(*[z] * num, indexing="ij"), -1).reshape(-1, num)
+    heights, times = log_prob(grid), increments.times(grid)[:, increments.free]
+    weights = np.exp(heights - heights.max())
+    mean = weights @ times / weights.sum()
+    covariance = (times - mean).T @ ((times - mean) * weights[:, None]) / weights.sum()
+    return mean, covariance, np.log(weights.sum()) + heights.max() + num * np.log(z[1] - z[0])
+
+
+@pytest.mark.parametrize("concentration", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
+def test_two_frames_agree_with_quadrature(concentration, means):
+    # Also where frames are so near, or so far out of order, that only their order keeps them apart.
+    profiles, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
+    mean, covariance, evidence = by_quadrature(profiles, increments, 14 / min(concentration, 1), 501)
+    found = exact_times(profiles, increments)
+    std = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
+    np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
+    assert found.log_evidence == pytest.approx(evidence, abs=1e-3)
+
+
+@pytest.mark.parametrize("concentration", [1.0, 4.0])
+def test_three_frames_agree_with_quadrature(concentration):
+    profiles, increments = parabolas((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), 401), free_times(5, concentration)
+    mean, covariance, evidence = by_quadrature(profiles, increments, 10.0, 91)
+    found = exact_times(profiles, increments)
+    std = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
+    np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
+    assert found.log_evidence == pytest.approx(evidence, abs=2e-3)
+
+
+def test_draws_have_the_quadratures_covariance():
+    profiles, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4)
+    _, covariance, _ = by_quadrature(profiles, increments, 14, 501)
+    draws = exact_times(profiles, increments).sample(40_000, 1)[:, 1:-1]
+    found = np.corrcoef(draws.T)[0, 1]
+    assert found == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), abs=0.02)
+    np.testing.assert_allclose(np.cov(draws.T).diagonal(), covariance.diagonal(), rtol=0.03)
+    assert (np.diff(draws) > 0).all()
+
+
+def test_frames_far_apart_are_gaussian():
+    means, widths = FAR
+    found = exact_times(parabolas(*FAR, 801), free_times(6))
+    np.testing.assert_allclose(found.mean()[1:-1], means, atol=1e-5)
+    np.testing.assert_allclose(found.std()[1:-1], widths, rtol=2e-3)
+    normal = scipy.stats.norm(means, widths)
+    for level in (0.5, 0.9):
+        np.testing.assert_allclose(found.interval(level)[:, 1:-1], normal.interval(level), atol=5e-3 * widths.min())
+    # The evidence: each Gaussian's integral, and the prior's constant 5!.
+    constant = np.log(widths * np.sqrt(2 * np.pi)).sum() + np.log(24)
+    assert found.log_evidence == pytest.approx(constant, abs=5e-3)
+
+
+def test_draws_follow_the_known_marginals():
+    means, widths = FAR
+    found = exact_times(parabolas(*FAR, 801), free_times(6))
+    draws = found.sample(5000, 3)
+    for k in range(4):  # 1 in 1000 right runs fails each; a width wrong by a fifth does, too
+        assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], widths[k]).cdf).pvalue > 1e-3
+        assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], 1.2 * widths[k]).cdf).pvalue < 1e-3
+    np.testing.assert_array_equal(draws, found.sample(5000, 3))
+    assert (draws != found.sample(5000, 4)).any()
+
+
+@pytest.mark.parametrize("concentration", [0.5, 1.0, 4.0])
+def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
+    found = exact_times(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
+    draws = found.sample(4000, 0)
+    for n, (grid, density) in enumerate(zip(found.grids, found.densities, strict=True)):
+        steps = (density[1:] + density[:-1]) / 2 * np.diff(grid)
+        summed = np.concatenate([[0], np.cumsum(steps)])
+
+        def cdf(t, grid=grid, summed=summed):
+            return np.interp(t, grid, summed)
+
+        assert scipy.stats.kstest(draws[:, n + 1], cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("concentration", [0.5, 1.0, 4.0])
+def test_profiles_that_know_nothing_leave_the_prior(concentration):
+    found = exact_times(parabolas([0.5] * 3, [1e3] * 3, 201), free_times(5, concentration))
+    for k in (1, 2, 3):
+        prior = scipy.stats.beta(concentration * k, concentration * (4 - k))
+        assert found.mean()[k] == pytest.approx(prior.mean(), abs=3e-3)
+        assert found.std()[k] == pytest.approx(prior.std(), rel=1e-2)
+    assert found.log_evidence == pytest.approx(0, abs=0.02)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), concentration=st.sampled_from([0.5, 1.0, 3.0]))
+def test_densities_are_densities_in_order(seed, concentration):
+    rng = np.random.default_rng(seed)
+    num = int(rng.integers(1, 6))
+    profiles = parabolas(np.sort(rng.uniform(0.1, 0.9, num)), rng.uniform(0.02, 0.3, num))
+    found = exact_times(profiles, free_times(num + 2, concentration))
+    for grid, density in zip(found.grids, found.densities, strict=True):
+        assert (density >= 0).all() and trapezoid(density, grid) == pytest.approx(1)
+    assert (np.diff(found.mean()) > 0).all() and (np.diff(found.quantile(0.5)) > 0).all()
+    assert (found.interval(0.5)[0] >= found.interval(0.9)[0]).all()
+    assert (np.diff(found.sample(20)) >= 0).all()
+
+
+def test_runs_are_apart():
+    held = np.array([0, 0.2, 0.4, 0.55, 0.8, 1])
+    profiles = parabolas(*FAR, 801)
+    part = exact_times(profiles, Increments.among(held, [1, 3, 4]))
+    np.testing.assert_allclose(part.std()[[0, 2, 5]], 0)
+    np.testing.assert_allclose(part.std()[[1, 3, 4]], FAR[1][[0, 2, 3]], rtol=5e-3)
+    np.testing.assert_array_equal(part.sample(5)[:, 2], 0.4)
+
+
+def test_narrow_profiles_out_of_order_have_no_times():
+    with pytest.raises(ValueError, match="order"):
+        exact_times(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001), free_times(4))
+
+
+def test_shares_are_checked():
+    found = exact_times(parabolas([0.5], [0.1]), free_times(3))
+    with pytest.raises(ValueError, match="share"):
+        found.quantile(1.5)
+
+
+# Laplace's approximation
+
+
+def test_laplace_is_exact_for_gaussians():
+    means, widths = FAR
+    found = laplace_times(parabolas(*FAR, 801), free_times(6, 1e-6), np.linspace(0, 1, 6))
+    np.testing.assert_allclose(found.mode[1:-1], means, atol=1e-5)
+    np.testing.assert_allclose(found.std[1:-1], widths, rtol=1e-3)
+    draws = found.sample(20_000, 0)
+    np.testing.assert_allclose(draws.std(0)[1:-1], widths, rtol=0.03)
+    np.testing.assert_array_equal(draws, found.sample(20_000, 0))
+
+
+def test_laplace_is_at_the_top_of_the_log_ratios_density():
+    profiles, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4, 2.0)
+    found = laplace_times(profiles, increments, np.linspace(0, 1, 4))
+    log_prob = FrameTimeLogProb(profiles, increments)
+    top = increments.coordinates(found.mode)
+    around = top + 1e-2 * np.random.default_rng(0).standard_normal((200, 2))
+    assert (log_prob(around) <= log_prob(top)).all()
+    # Its spread is that of the negative second derivative there, carried over to times.
+    step = 1e-3 * np.eye(2)
+    hessian = np.array(
+        [[(log_prob(top + a + b) - log_prob(top + a - b) - log_prob(top - a + b) + log_prob(top - a - b)) / 4e-6
+          for a in step] for b in step]
+    )  # fmt: skip
+    jacobian = (increments.times(top + step) - increments.times(top - step))[:, 1:-1].T / 2e-3
+    covariance = jacobian @ np.linalg.inv(-hessian) @ jacobian.T
+    np.testing.assert_allclose(found.std[1:-1], np.sqrt(np.diag(covariance)), rtol=0.15)
+
+
+def test_laplace_is_near_the_passes_where_frames_are_told_apart():
+    profiles, increments = parabolas((0.3, 0.5, 0.7), (0.02, 0.03, 0.02), 401), free_times(5)
+    exact = exact_times(profiles, increments)
+    found = laplace_times(profiles, increments, exact.quantile(0.5))
+    np.testing.assert_allclose(found.std, exact.std(), rtol=0.05, atol=1e-12)
+    assert (np.diff(found.sample(500)) > 0).all()

@@ -1,0 +1,110 @@
+"""How much of the residuals' evidence counts: theory where there is one, simulation where not."""
+
+import numpy as np
+import pytest
+import scipy.ndimage
+
+from foldgauss.uncertainty import FrameNoise
+from foldgauss.uncertainty.noise import autocorrelation, effective_share, rings, score_share
+
+SHAPE = (3, 160, 200)
+
+
+def smoothed(spread: float, seed: int = 0, shape=SHAPE) -> np.ndarray:
+    """White noise smoothed by a Gaussian, on a torus; of variance 1."""
+    white = np.random.default_rng(seed).standard_normal(shape)
+    noise = scipy.ndimage.gaussian_filter(white, (0, spread, spread), mode="wrap")
+    return noise / noise.std()
+
+
+def kernel_correlation(spread: float, most: int) -> np.ndarray:
+    """Of what a Gaussian of `spread` makes of white noise: the kernel's own correlation, by lag in one direction."""
+    impulse = np.zeros(201)
+    impulse[100] = 1
+    kernel = scipy.ndimage.gaussian_filter1d(impulse, spread)
+    lagged = np.correlate(kernel, kernel, "full")[200 - most : 201 + most]
+    return lagged / lagged.max()
+
+
+def test_white_noise_counts_in_full():
+    noise = smoothed(0.01)
+    assert effective_share(noise) == pytest.approx(1, abs=0.05)
+    assert score_share(noise, np.ones(SHAPE), 2) == pytest.approx(1, abs=0.1)
+    np.testing.assert_allclose(rings(autocorrelation(noise, 5)), [1, 0, 0, 0, 0, 0], atol=0.01)
+
+
+@pytest.mark.parametrize("spread", [0.8, 1.5, 3.0])
+def test_smoothed_noise_counts_as_theory_says(spread):
+    along = kernel_correlation(spread, 30)
+    theory = 1 / along.sum() ** 2
+    found = np.mean([effective_share(smoothed(spread, seed)) for seed in range(4)])
+    assert found == pytest.approx(theory, rel=0.15)
+
+
+def test_channels_that_are_one_count_as_one():
+    one = smoothed(0.01)[:1]
+    assert effective_share(np.repeat(one, 3, axis=0)) == pytest.approx(1 / 3, rel=0.05)
+
+
+def test_autocorrelation_is_that_of_the_kernel():
+    found = autocorrelation(smoothed(1.5), 8)
+    along = kernel_correlation(1.5, 8)
+    np.testing.assert_allclose(found, along[:, None] * along[None, :], atol=0.05)
+
+
+def test_autocorrelation_is_the_sum_it_says():
+    values = np.random.default_rng(0).normal(size=(2, 7, 9))
+    found = autocorrelation(values, 2)
+    for dy, dx in ((0, 0), (1, 0), (2, -1), (-1, 2)):
+        rows, columns = slice(max(dy, 0), 7 + min(dy, 0)), slice(max(dx, 0), 9 + min(dx, 0))
+        back_rows, back_columns = slice(max(-dy, 0), 7 + min(-dy, 0)), slice(max(-dx, 0), 9 + min(-dx, 0))
+        mean = (values[:, rows, columns] * values[:, back_rows, back_columns]).mean()
+        assert found[2 + dy, 2 + dx] == pytest.approx(mean / (values**2).mean())
+
+
+def test_rings_are_means_around_the_middle():
+    lags = np.arange(-4, 5)
+    distance = np.hypot(lags[:, None], lags[None, :])
+    found = rings(np.rint(distance))
+    np.testing.assert_array_equal(found, [0, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("spread", [0.01, 1.0, 2.0])
+def test_score_share_is_the_scores_own_variance(spread):
+    # The score of a time is the sum over pixels of residual times slope: its variance over many noises is known.
+    y, x = np.mgrid[:160, :200]
+    bump = np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / 1800) * np.sin(x / 6)
+    slope = np.stack([bump, 0.5 * bump, -0.2 * bump])
+    noises = np.stack([smoothed(spread, seed) for seed in range(300)])
+    variance = (noises * slope).sum((1, 2, 3)).var()
+    truth = min(1.0, (slope**2).sum() / variance)
+    found = np.mean([1 / score_share(noise, slope, max(2, int(8 * spread))) for noise in noises[:20]])
+    # 300 noises tell a variance to 8%.
+    assert 1 / found == pytest.approx(truth, rel=0.25)
+
+
+def test_no_residual_at_all_counts_in_full():
+    nothing = np.zeros(SHAPE)
+    assert effective_share(nothing) == 1 and score_share(nothing, np.ones(SHAPE), 3) == 1
+    found = autocorrelation(nothing, 2)
+    assert found[2, 2] == 1 and found.sum() == 1
+
+
+def test_shares_are_never_above_one():
+    # Residuals that alternate cancel: no evidence is worth more than it says.
+    y, x = np.mgrid[:40, :40]
+    board = np.where((x + y) % 2, 1.0, -1.0)[None]
+    assert effective_share(board) <= 1 and score_share(board, np.ones((1, 40, 40)), 3) <= 1
+
+
+def test_frame_noise_is_checked_and_widened():
+    noise = FrameNoise(0.1, 0.5).of(3)
+    np.testing.assert_allclose(noise.weight, 0.5 / 0.02)
+    assert noise.weight.shape == (3,)
+    for scale, share, word in ((0, 1, "scale"), (np.nan, 1, "scale"), (0.1, 1.5, "share"), (0.1, 0, "share")):
+        with pytest.raises(ValueError, match=word):
+            FrameNoise(scale, share)
+    with pytest.raises(ValueError, match="scale"):
+        FrameNoise(np.full(2, 0.1), 1.0).of(3)
+    with pytest.raises(ValueError, match="most"):
+        autocorrelation(np.zeros((1, 5, 5)), 5)

@@ -1,0 +1,177 @@
+"""Profiles: looked-up log-likelihoods are those of pictures drawn at the same times."""
+
+import numpy as np
+import pytest
+import scipy.interpolate
+from soft_models import soft_model
+from time_clips import NUM_FRAMES, SCALE, SIZE, clip, model, parabolas, uneven, white
+
+from foldgauss.uncertainty import (
+    Evidence,
+    FrameNoise,
+    FrameTimeLogProb,
+    Increments,
+    Profiles,
+    drawn_log_likelihood,
+    evidence,
+    exact_times,
+    frame_time_log_prob,
+)
+
+
+@pytest.fixture(scope="module")
+def seen() -> Evidence:
+    return evidence(model(), clip(uneven()), noise=white())
+
+
+def test_between_nodes_a_profile_is_the_cubic_with_its_slopes():
+    rng = np.random.default_rng(0)
+    nodes = np.sort(rng.uniform(size=(2, 9)), axis=1)
+    profiles = Profiles.of(nodes, np.sin(5 * nodes))
+    t = rng.uniform(nodes[:, :1], nodes[:, -1:], (2, 50)).T
+    for k in range(2):
+        slopes = np.gradient(np.sin(5 * nodes[k]), nodes[k], edge_order=2)
+        expected = scipy.interpolate.CubicHermiteSpline(nodes[k], np.sin(5 * nodes[k]), slopes)(t[:, k])
+        np.testing.assert_allclose(profiles(t)[:, k], expected, rtol=1e-10, atol=1e-12)
+
+
+def test_parabolas_are_looked_up_exactly():
+    profiles = parabolas([0.3, 0.6], [0.05, 0.1], 31)
+    t = np.random.default_rng(1).uniform(size=(100, 4))
+    expected = -((t[:, 1] - 0.3) ** 2) / 0.005
+    np.testing.assert_allclose(profiles(t)[:, 1], expected, atol=1e-9)
+
+
+def test_outside_of_the_nodes_is_impossible_and_so_is_nan():
+    profiles = Profiles.of([np.linspace(0.2, 0.4, 5)], [np.zeros(5)])
+    found = profiles(np.array([0.2, 0.4, 0.19, 0.41, np.nan])[:, None])[:, 0]
+    np.testing.assert_array_equal(found, [0, 0, -np.inf, -np.inf, -np.inf])
+
+
+def test_looked_up_is_drawn(seen):
+    # Within the frames' posterior, to what profiles promise: MISS nats, and its share of the depth.
+    rng, times = np.random.default_rng(0), uneven()
+    modes = seen.profiles.modes()
+    modes[[0, -1]] = times[[0, -1]]
+    best = drawn_log_likelihood(model(), clip(times), modes, white())
+    noise = seen.noise
+    std = exact_times(seen.profiles, Increments.among(np.linspace(0, 1, NUM_FRAMES))).std()
+    for _ in range(10):
+        t = np.clip(modes + 2.5 * std * rng.standard_normal(NUM_FRAMES), 0, 1)
+        drawn = drawn_log_likelihood(model(), clip(times), t, noise) - best
+        looked_up = seen.profiles(t) - seen.profiles(modes)
+        depth = np.maximum(-drawn, 0)
+        assert (np.abs(looked_up - drawn)[1:-1] < 0.1 + 0.05 * depth[1:-1]).all()
+
+
+def test_log_prob_is_the_sum_over_frames(seen):
+    log_prob = FrameTimeLogProb(seen.profiles, Increments.among(np.linspace(0, 1, NUM_FRAMES)))
+    z = log_prob.increments.coordinates(uneven())
+    total = drawn_log_likelihood(model(), clip(uneven()), uneven(), white()).sum()
+    best = drawn_log_likelihood(model(), clip(uneven()), seen.profiles.modes(), white()).sum()
+    assert log_prob(z) - log_prob.increments.log_prior(z) == pytest.approx(total - best, abs=1.0)
+
+
+def test_a_frame_half_way_between_two_coarse_nodes_is_drawn_between_them():
+    # Both nodes are as far below the maximum as each other: their difference says nothing.
+    nodes = np.linspace(0, 1, 25)
+    times = np.array([0, (nodes[5] + nodes[6]) / 2, (nodes[12] + nodes[13]) / 2, 1])
+    seen = evidence(model(), clip(times, scale=0.0), noise=white(0.01))
+    for k in (1, 2):
+        at, _ = seen.profiles.one(k)
+        assert np.abs(at - times[k]).min() < 0.002
+
+
+def test_evidence_finds_the_scale_and_the_times(seen):
+    measured = evidence(model(), clip(uneven()), noise="independent")
+    np.testing.assert_allclose(measured.noise.scale, SCALE, rtol=0.1)
+    spread = exact_times(seen.profiles, Increments.among(np.linspace(0, 1, NUM_FRAMES)))
+    miss = (spread.mean() - uneven())[1:-1] / spread.std()[1:-1]
+    assert np.abs(miss).max() < 4 and (miss**2).mean() < 2.5
+    assert (
+        measured.residual_correlation[0] == pytest.approx(1) and np.abs(measured.residual_correlation[2:]).max() < 0.1
+    )
+
+
+def test_alpha_is_blended_with_black():
+    frames = clip(uneven())
+    opaque = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], axis=3)
+    one, other = (drawn_log_likelihood(model(), each, uneven(), white()) for each in (frames, opaque))
+    np.testing.assert_allclose(one, other, rtol=1e-4)
+
+
+def test_a_frame_that_shows_nothing_keeps_its_prior():
+    profiles = parabolas([0.25, 0.5, 0.75], [0.02, 10.0, 0.02])
+    found = exact_times(profiles, Increments.among(np.linspace(0, 1, 5)))
+    assert found.std()[2] > 0.8 * 0.5 / np.sqrt(12)
+    assert found.std()[1] == pytest.approx(0.02, rel=0.02)
+
+
+def test_frames_held_stay_where_they_are(seen):
+    log_prob = frame_time_log_prob(model(), seen=seen, frames=[2, 3, 7])
+    medians = exact_times(seen.profiles, Increments.among(np.linspace(0, 1, NUM_FRAMES))).quantile(0.5)
+    times = log_prob.increments.times(np.zeros(3))
+    held = np.setdiff1d(np.arange(NUM_FRAMES), [2, 3, 7])
+    np.testing.assert_allclose(times[held], medians[held])
+    with pytest.raises(ValueError, match="held"):
+        frame_time_log_prob(model(), seen=seen, held=np.linspace(0, 1, 4))
+
+
+def test_a_clip_of_another_size_or_type_is_refused():
+    frames = clip(uneven())
+    for wrong in (frames[:, :-1], frames[..., :2], frames.astype(np.float32), frames[0]):
+        with pytest.raises(ValueError, match="video"):
+            evidence(model(), wrong)
+    with pytest.raises(ValueError, match="3 frames"):
+        evidence(model(), frames[:2])
+    with pytest.raises(ValueError, match="video"):
+        frame_time_log_prob(model())
+
+
+def test_a_model_of_another_video_is_refused():
+    other = np.random.default_rng(0).integers(0, 256, (NUM_FRAMES, *SIZE, 3), np.uint8)
+    with pytest.raises(ValueError, match="explains"):
+        evidence(model(), other)
+
+
+def test_a_constant_video_has_no_times():
+    still = np.repeat(clip(np.array([0.0, 0.5, 1.0]))[:1], 6, axis=0)
+    with pytest.raises(ValueError, match="nothing changes"):
+        evidence(model(), still)
+
+
+def test_noise_too_great_for_any_time_is_said():
+    with pytest.raises(ValueError, match="not identified"):
+        evidence(model(), clip(uneven()), noise=FrameNoise(100.0, 1.0))
+
+
+def test_frames_backwards_are_refused():
+    with pytest.raises(ValueError, match="order"):
+        frame_time_log_prob(model(), clip(uneven(), scale=0.0)[::-1], noise=white(0.0012), frames=[3])
+
+
+@pytest.mark.parametrize("noise", ["loud", "", None, 1.0])
+def test_unknown_noise_is_refused(noise):
+    with pytest.raises(ValueError, match="noise"):
+        evidence(model(), clip(uneven()), noise=noise)
+
+
+def test_profiles_refuse_what_is_none():
+    t = np.linspace(0, 1, 5)
+    for nodes, values, word in (
+        ([t[:2]], [t[:2]], "three"),
+        ([t], [t[:4]], "rising"),
+        ([t[::-1]], [t], "rising"),
+        ([t], [np.where(t > 0.5, np.nan, t)], "finite"),
+        ([t, t], [t], "as many"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            Profiles.of(nodes, values)
+    with pytest.raises(ValueError, match="shape"):
+        parabolas([0.5], [0.1])(np.zeros(2))
+
+
+def test_another_seeded_model_is_another_scene():
+    frames = clip(uneven(), of=soft_model(size=SIZE, seed=5))
+    with pytest.raises(ValueError, match="video"):
+        frame_time_log_prob(model(), frames)

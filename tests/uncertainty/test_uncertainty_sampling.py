@@ -1,0 +1,228 @@
+"""emcee's draws of frame times: a posterior that is known, seeds, files, and what is refused."""
+
+import dataclasses
+
+import emcee
+import numpy as np
+import pytest
+import scipy.stats
+from time_clips import clip, free_times, model, parabolas, uneven, white
+
+from foldgauss.uncertainty import FrameTimeLogProb, Increments, Profiles, exact_times, frame_time_posterior
+from foldgauss.uncertainty.moves import BlockSweep
+
+#: Two of the three so near that their order ties them.
+NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
+#: A toy whose posterior is Gaussian: 0.08 apart at 10 standard deviations.
+MANY = np.linspace(0, 1, 16)[1:-1], np.full(14, 0.006)
+
+
+def toy(means, widths, concentration: float = 1.0, nodes: int = 401) -> FrameTimeLogProb:
+    return FrameTimeLogProb(parabolas(means, widths, nodes), free_times(len(means) + 2, concentration))
+
+
+def sampled(log_prob, **settings):
+    return frame_time_posterior(log_prob=log_prob, progress=False, **{"steps": 6000, **settings})
+
+
+def worst_ks(found, cdfs) -> float:
+    """The least p-value over frames, of draws thinned until they count as independent."""
+    free = found.free
+    flat = found.draws
+    every = max(1, int(np.ceil(len(flat) / found.ess.min())))
+    rng = np.random.default_rng(0)
+    some = flat[rng.choice(len(flat), len(flat) // (2 * every), replace=False)]
+    return min(scipy.stats.kstest(some[:, k], cdf).pvalue for k, cdf in zip(free, cdfs, strict=True))
+
+
+def exact_cdfs(found):
+    for grid, density in zip(found.exact.grids, found.exact.densities, strict=True):
+        steps = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(grid))])
+        yield lambda t, grid=grid, steps=steps: np.interp(t, grid, steps)
+
+
+def agrees(found, tolerance: float = 5.0) -> bool:
+    """Means and standard deviations meet the exact ones, within so many Monte Carlo standard errors."""
+    free, exact = found.free, found.exact
+    error = exact.std()[free] / np.sqrt(found.ess)
+    mean = np.abs(found.mean() - exact.mean())[free] / error
+    std = np.abs(found.std() / np.where(exact.std() > 0, exact.std(), 1) - 1)[free] * np.sqrt(found.ess)
+    return bool(mean.max() < tolerance and std.max() < tolerance)
+
+
+@pytest.fixture(scope="module")
+def near():
+    return sampled(toy(*NEAR))
+
+
+def test_few_frames_draw_the_known_posterior(near):
+    assert near.converged and near.message.startswith("Converged")
+    assert (near.r_hat < 1.01).all() and (near.ess > 400).all() and (near.tau >= 1).all()
+    assert ((near.acceptance > 0.1) & (near.acceptance < 0.9)).all() and near.acceptance.shape == (4,)
+    assert agrees(near)
+    np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
+    assert worst_ks(near, exact_cdfs(near)) > 1e-3
+    wide = toy(NEAR[0], np.array(NEAR[1]) * 1.2)
+    assert (
+        worst_ks(near, exact_cdfs(dataclasses.replace(near, exact=exact_times(wide.profiles, wide.increments)))) < 1e-3
+    )
+
+
+def test_a_wrong_jacobian_is_found(monkeypatch):
+    # A whole power too much of every increment, in the density that emcee sees and not in the passes.
+    right = Increments.log_prior
+
+    def wrong(self, coordinates):
+        return right(Increments(self.held, self.free, self.concentration + 1), coordinates)
+
+    monkeypatch.setattr(Increments, "log_prior", wrong)
+    assert not agrees(sampled(toy(*NEAR)))
+
+
+def test_draws_keep_their_order_and_their_ends(near):
+    assert (np.diff(near.times) > 0).all()
+    assert (near.times[..., 0] == 0).all() and (near.times[..., -1] == 1).all()
+    np.testing.assert_allclose(near.logits.mean(-1), 0, atol=1e-10)
+    assert near.draws.shape == (near.times[..., 0].size, 5)
+
+
+@pytest.mark.parametrize("concentration", [0.5, 3.0])
+def test_blocks_draw_the_known_posterior(concentration):
+    log_prob = toy((0.2, 0.25, 0.4, 0.42, 0.75), (0.03, 0.04, 0.03, 0.05, 0.06), concentration)
+    found = sampled(log_prob, moves=BlockSweep(log_prob, block=2), walkers=16)
+    assert found.converged
+    assert agrees(found)
+
+
+@pytest.mark.slow
+def test_many_frames_draw_a_gaussian():
+    found = sampled(toy(*MANY, nodes=2001), steps=20_000)
+    assert found.converged
+    assert agrees(found)
+    np.testing.assert_allclose(found.mean()[1:-1], MANY[0], atol=5e-4)
+    np.testing.assert_allclose(found.std()[1:-1], MANY[1], rtol=0.06)
+    correlation = np.corrcoef(found.draws[:, 1:-1].T) - np.eye(14)
+    assert np.abs(correlation).max() < 0.12
+    assert worst_ks(found, [scipy.stats.norm(m, w).cdf for m, w in zip(*MANY, strict=True)]) > 1e-3
+
+
+def test_another_hill_is_reached():
+    # Two hills of the middle frame, 12 standard deviations apart, of equal mass.
+    nodes = np.linspace(0, 1, 401)
+    hills = np.logaddexp(-((nodes - 0.4) ** 2) / (2 * 0.015**2), -((nodes - 0.58) ** 2) / (2 * 0.015**2))
+    flat = np.zeros_like(nodes)
+    log_prob = FrameTimeLogProb(Profiles.of([nodes] * 3, [flat, hills, flat]), free_times(3))
+    found = sampled(log_prob, moves=BlockSweep(log_prob), walkers=16)
+    left = (found.draws[:, 1] < 0.5).mean()
+    if found.converged:
+        assert left == pytest.approx(0.5, abs=0.1)
+    else:
+        assert found.message.startswith("Not converged")
+
+
+def test_seeds_reproduce_to_the_bit():
+    one, again, other = (sampled(toy(*NEAR), steps=400, seed=seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.times, again.times)
+    assert not np.array_equal(one.times[0, -1], other.times[0, -1])
+    assert len({each.tobytes() for each in one.times}) == 4
+
+
+def test_too_few_steps_say_that_they_are():
+    found = sampled(toy(*NEAR), steps=200)
+    assert not found.converged and found.message.startswith("Not converged after 200 steps")
+    assert "autocorrelation times" in found.message
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, blocks):
+    log_prob = toy(*NEAR)
+    moves = BlockSweep(log_prob, block=2) if blocks else None
+    settings = {"steps": 1000, "moves": moves, "seed": 5}
+    whole = sampled(log_prob, **settings)
+    sampled(log_prob, **{**settings, "steps": 500}, backend=tmp_path / "run.h5")
+    found = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
+    np.testing.assert_array_equal(found.times, whole.times)
+    again = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
+    np.testing.assert_array_equal(again.times, whole.times)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_another_runs_file_is_refused(tmp_path):
+    path = tmp_path / "run.h5"
+    sampled(toy(*NEAR), steps=100, backend=path)
+    before = path.read_bytes()
+    for change in ({"seed": 1}, {"log_prob": toy(NEAR[0], (0.03, 0.05, 0.041))}, {"ensembles": 3}, {"walkers": 34}):
+        with pytest.raises(ValueError, match="backend"):
+            sampled(**{"log_prob": toy(*NEAR), "steps": 100, "backend": path, **change})
+    assert path.read_bytes() == before
+    (tmp_path / "text.h5").write_text("no such file")
+    with pytest.raises(ValueError, match="backend"):
+        sampled(toy(*NEAR), steps=100, backend=tmp_path / "text.h5")
+
+
+@pytest.mark.parametrize("num", [1, 2, 8, 9, 11, 12, 13])
+def test_the_walkers_that_are_chosen_are_enough(num):
+    means = np.linspace(0, 1, num + 2)[1:-1]
+    found = sampled(toy(means, np.full(num, 0.2 / num), nodes=101), steps=20, ensembles=2)
+    assert found.times.shape[2] % 2 == 0 and found.times.shape[3] == num + 2
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"walkers": 4}, "walkers"),
+        ({"walkers": 33}, "walkers"),
+        ({"ensembles": 1}, "ensembles"),
+        ({"thin_by": 0}, "thin_by"),
+        ({"steps": 5}, "steps"),
+        ({"moves": emcee.moves.DESnookerMove()}, "DESnookerMove"),
+        ({"moves": [(emcee.moves.StretchMove(), 0.5), (emcee.moves.DESnookerMove(), 0.5)]}, "DESnookerMove"),
+    ],
+)
+def test_what_is_refused(change, word):
+    with pytest.raises(ValueError, match=word):
+        sampled(toy(*NEAR), **change)
+
+
+def test_a_nan_in_the_density_is_an_error():
+    log_prob = toy(*NEAR)
+    values = log_prob.profiles.values.copy()
+    values[1, 100:140] = np.nan
+    broken = FrameTimeLogProb(dataclasses.replace(log_prob.profiles, values=values), log_prob.increments)
+    with pytest.raises(ValueError, match="NaN"):
+        sampled(broken, steps=100)
+
+
+def test_neither_model_nor_density_is_an_error():
+    with pytest.raises(ValueError, match="model"):
+        frame_time_posterior(progress=False)
+
+
+def test_some_frames_of_a_clip():
+    found = frame_time_posterior(model(), clip(uneven()), frames=[3, 4], noise=white(), progress=False)
+    assert found.converged
+    assert agrees(found)
+    np.testing.assert_array_equal(found.free, [3, 4])
+    assert (found.std()[[1, 2, 5, 6]] < 1e-12).all()
+    miss = (found.mean() - uneven())[[3, 4]] / found.std()[[3, 4]]
+    assert np.abs(miss).max() < 4
+    assert found.identified().all()
+
+
+def test_progress_is_told():
+    told = []
+    settings = {"noise": white(), "steps": 20, "ensembles": 2}
+    frame_time_posterior(model(), clip(uneven()), frames=[3], **settings, progress=lambda *each: told.append(each))
+    assert {what for what, _, _ in told} == {"pictures", "steps"}
+    assert all(0 < done <= total for _, done, total in told)
+
+
+def test_arviz_has_them_all():
+    found = sampled(toy(*NEAR), steps=100, ensembles=2)
+    data = found.to_arviz()
+    ensembles, steps, walkers, frames = found.times.shape
+    assert data.posterior["t"].shape == (ensembles, steps * walkers, frames)
+    assert data.posterior["w"].shape == (ensembles, steps * walkers, frames - 1)
+    assert data.sample_stats["lp"].shape == (ensembles, steps * walkers)
+    np.testing.assert_array_equal(data.posterior["t"].values[1, :walkers], found.times[1, 0])
+    assert data.attrs["message"] == found.message
