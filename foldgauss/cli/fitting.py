@@ -18,6 +18,7 @@ from foldgauss.cli._shared import (
     Frames,
     Overwrite,
     Size,
+    Stopped,
     WrongUse,
     app,
     as_option,
@@ -47,10 +48,6 @@ CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
-
-
-class Stopped(Exception):
-    """The user asked a fit to stop; the message says how to go on."""
 
 
 @app.command()
