@@ -251,11 +251,8 @@ def plot_correlation(seen: Evidence, ax: "Axes | None" = None) -> "Axes":
     ax.axhline(LAST_CORRELATION, color=_RED, linewidth=0.8, linestyle="--")
     ax.text(last - 1, LAST_CORRELATION, f"{LAST_CORRELATION:g}: taken for none", color=_RED, fontsize="small",
             ha="right", va="bottom")  # fmt: skip
-    share, scale = np.median(seen.noise.share), 255 * np.median(seen.noise.scale)
-    counted = "all values count" if share == 1 else f"one value in {1 / share:,.0f} counts"
-    low, high = seen.noise.share.min(), seen.noise.share.max()
-    between = "" if low == high else f" (frames: 1 in {1 / high:,.0f} to {1 / low:,.0f})"
-    ax.set_title(f"Residuals of {scale:.2g} grey levels: {counted}{between}", fontsize="medium")
+    told = seen.noise.told()
+    ax.set_title(told[0].upper() + told[1:], fontsize="medium")
     ax.set(xlabel="distance (pixels)", ylabel="correlation of residuals", xlim=(-0.02 * last, last - 1))
     ax.grid(alpha=0.25)
     return ax
@@ -267,7 +264,7 @@ def _axes(ax, caller: str, size: tuple[float, float]):
 
 def _bar_width(num: int) -> float:
     """Of bars side by side in a picture of 9 inches, in points."""
-    return float(np.clip(360 / num, 0.6, 6))
+    return float(np.clip(360 / num, 0.6, 4))
 
 
 def _drawn_frames(posterior: FrameTimePosterior, frames: Sequence[int]) -> list[int]:

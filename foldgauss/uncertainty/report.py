@@ -140,13 +140,7 @@ def _conditions(posterior: FrameTimePosterior) -> str:
         "taken up does not show: intervals are those of times given the folds."
     ]
     if posterior.seen is not None:
-        noise = posterior.seen.noise
-        low, high = 1 / noise.share.max(), 1 / noise.share.min()
-        lines.append(
-            f"- The noise: residuals of {255 * np.median(noise.scale):.2g} grey levels (median of the frames), of which "
-            f"one value in {1 / np.median(noise.share):,.0f} counts as independent (frames: one in {low:,.0f} to "
-            f"{high:,.0f})."
-        )
+        lines.append(f"- The noise: {posterior.seen.noise.told()} as independent.")
     lines.append(f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.")
     held = np.flatnonzero(~increments.free)[1:-1]
     text = "- The first frame at 0 and the last at 1"
