@@ -16,14 +16,11 @@ from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 from foldgauss.io import save_video_model
 from foldgauss.video import edit
 
-arviz_missing = "the extra uncertainty is optional"
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
-    pytest.importorskip(name, reason=arviz_missing)
+    pytest.importorskip(name, reason="an optional extra")
 
-FILES = {
-    "chains.h5", "corner.png", "correlation.png", "frame_times.csv", "increments.png", "posterior.nc", "summary.md",
-    "times.png", "trace.png",
-}  # fmt: skip
+PICTURES = {"corner.png", "correlation.png", "increments.png", "times.png", "trace.png"}
+FILES = {"chains.h5", "evidence.npz", "frame_times.csv", "posterior.nc", "summary.md"} | PICTURES
 #: Enough for two looks at convergence, of which one may be killed in between.
 SHORT = ["--steps", "700", "--ensembles", "2", "--only", "5:9"]
 
@@ -74,9 +71,8 @@ def test_everything_is_there(done):
     assert f"| {TWICE}, {TWICE + 1} | duplicated |" in told
     assert "The splats, held" in told
     assert "frames 1 to 4, 9 to 10, held" in told
-    for name in FILES:
-        if name.endswith(".png"):
-            assert cv2.imread(str(done / name)).std() > 5
+    for name in PICTURES:
+        assert cv2.imread(str(done / name)).std() > 5
 
 
 def test_arviz_reads_the_draws(done):
@@ -136,6 +132,18 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys):
     assert {path.name for path in target.iterdir()} == FILES
 
 
+def test_without_colours_less_is_known(work, done, tmp_path):
+    target = tmp_path / "results"
+    assert run(*arguments(work, target, *SHORT, "--level", "colors")) == 0
+    told = (target / "summary.md").read_text()
+    assert "their colours are integrated out" in told
+    assert "their colours" not in (done / "summary.md").read_text()
+    wider = [float(one["exact_std"]) / float(other["exact_std"]) for one, other in zip(
+        table_of(target)[5:9], table_of(done)[5:9], strict=True)]  # fmt: skip
+    assert min(wider) > 0.9
+    assert max(wider) > 1.02
+
+
 def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys):
     target = tmp_path / "results"
     few = ["--steps", "60", "--ensembles", "2", "--only", "6,7"]
@@ -164,7 +172,8 @@ def test_wrong_use(work, tmp_path, capsys):
         ([model, clip, "--out", target, "--only", "0,3"], 2, "--only: expected whole numbers from 1 to 10"),
         ([model, clip, "--out", target, "--only", "3-5"], 2, "--only: expected frames as 3,5,10:20"),
         ([model, clip, "--out", target, "--only", "5:5"], 2, "--only: expected at least one frame"),
-        ([model, clip, "--out", target, "--noise", "white"], 2, "--noise: expected one of effective, score"),
+        ([model, clip, "--out", target, "--noise", "white"], 2, "--noise: expected one of score, effective"),
+        ([model, clip, "--out", target, "--level", "c"], 2, "--level: expected one of splats, colors"),
         ([model, clip, "--out", target, "--concentration", "0"], 2, "--concentration: expected a number > 0"),
         ([model, clip, "--out", target, "--walkers", "7"], 2, "--walkers: expected an even number"),
         ([model, clip, "--out", target, "--ensembles", "1"], 2, "--ensembles: expected at least 2"),

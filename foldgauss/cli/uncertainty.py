@@ -2,6 +2,9 @@
 
 import csv
 import dataclasses
+import hashlib
+import json
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +14,7 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from foldgauss import __version__
 from foldgauss._checks import invalid
 from foldgauss.cli._shared import (
     Overwrite,
@@ -19,11 +23,22 @@ from foldgauss.cli._shared import (
     app,
     clip_of_model,
     err,
+    fingerprint,
     out,
 )
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable
+from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model
-from foldgauss.uncertainty import evidence, frame_time_log_prob, frame_time_posterior, plots
+from foldgauss.uncertainty import (
+    Evidence,
+    FrameNoise,
+    Profiles,
+    evidence,
+    evidence_without_colors,
+    frame_time_log_prob,
+    frame_time_posterior,
+    plots,
+)
 from foldgauss.uncertainty.increments import Increments
 from foldgauss.uncertainty.noise import NOISES
 from foldgauss.uncertainty.pace import irregularities
@@ -31,11 +46,13 @@ from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, 
 from foldgauss.uncertainty.report import frame_table, summary
 from foldgauss.video.model import VideoModel
 
-CHAINS = "chains.h5"
+CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
+LEVELS = ("splats", "colors")
 PICTURES = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PICTURES)
 #: Draws of each ensemble that posterior.nc holds, evenly spaced: of all there would be gigabytes.
 MOST_DRAWS = 4000
+_PROFILES = ("nodes", "values", "slopes", "count")
 
 
 @app.command(name="uncertainty")
@@ -59,6 +76,9 @@ def uncertainty_command(
     noise: Annotated[
         str, typer.Option(help=f"What of the residuals counts: {', '.join(NOISES)}; see docs/uncertainty.md.")
     ] = "score",
+    level: Annotated[
+        str, typer.Option(help="What is given: splats, all of them; colors: all but their colours, which takes longer.")
+    ] = "splats",
     concentration: Annotated[
         float, typer.Option(help="Of the Dirichlet prior on increments: 1 is uniform, more is towards an even pace.")
     ] = 1.0,
@@ -77,6 +97,8 @@ def uncertainty_command(
         needed(name)
     if noise not in NOISES:
         raise WrongUse(str(invalid("--noise", expected="one of " + ", ".join(NOISES), got=noise)))
+    if level not in LEVELS:
+        raise WrongUse(str(invalid("--level", expected="one of " + ", ".join(LEVELS), got=level)))
     _check_folder(out_dir, video, overwrite)
     wanted = _parse_only(only)
     model = load_video_model(model_path)
@@ -85,14 +107,18 @@ def uncertainty_command(
         raise WrongUse(str(invalid("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)))
     clip = clip_of_model(model, model_path, video, frames, as_many=False)
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
+    key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
+    seen = _kept_evidence(out_dir, key, overwrite)
     with _bars() as bars:
-        seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
+        if seen is None:
+            seen = _evidence(model, clip, noise, level, wanted, bars)
+            _make_folder(out_dir)
+            _keep_evidence(out_dir / EVIDENCE, key, seen)
         log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, seen=seen)
         settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
-        _make_folder(out_dir)
         posterior = _drawn(out_dir / CHAINS, overwrite, bars, seen=seen, log_prob=log_prob, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
-    _write(out_dir, posterior, fitted, f"{model_path.name}, by {Path(clip.source).name}")
+    _write(out_dir, posterior, fitted, f"{model_path.name}, by {Path(clip.source).name}", level)
     _tell(out_dir, posterior)
 
 
@@ -149,13 +175,61 @@ def _check_settings(num_frames: int, only, concentration: float, walkers, ensemb
     check_settings(found.num_free, walkers=walkers, ensembles=ensembles, steps=steps)
 
 
+def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] | None) -> str:
+    """Of all that the evidence depends on."""
+    about = fingerprint(clip) | {"noise": noise, "level": level, "only": only, "version": __version__}
+    digest = hashlib.blake2b(model_path.read_bytes(), digest_size=16)
+    digest.update(json.dumps(about, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _evidence(model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars) -> Evidence:
+    seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
+    if level == "splats":
+        return seen
+    profiles = evidence_without_colors(
+        model, clip.frames, seen, frames=only, on_frame=lambda done, total: bars("frames", done, total)
+    )
+    return dataclasses.replace(seen, profiles=profiles)
+
+
+def _keep_evidence(path: Path, key: str, seen: Evidence) -> None:
+    """So that a run that goes on draws no pictures again."""
+    arrays = {name: getattr(seen.profiles, name) for name in _PROFILES}
+    arrays |= {"scale": seen.noise.scale, "share": seen.noise.share, "correlation": seen.residual_correlation}
+    with atomic_path(path) as temporary:
+        np.savez(temporary, key=key, num_drawn=seen.num_drawn, **arrays)
+
+
+def _kept_evidence(folder: Path, key: str, overwrite: bool) -> Evidence | None:
+    """What an earlier run has kept, or None. Refuses the folder of another run, before any work."""
+    try:
+        with np.load(folder / EVIDENCE) as kept:
+            kept = dict(kept)
+            if str(kept["key"]) == key:
+                profiles = Profiles(*(kept[name] for name in _PROFILES))
+                noise = FrameNoise(kept["scale"], kept["share"])
+                return Evidence(profiles, noise, kept["correlation"], int(kept["num_drawn"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # none, or not one of ours: drawn anew
+        return None
+    if (folder / CHAINS).exists() and not overwrite:
+        raise _of_another(folder / CHAINS)
+    return None
+
+
+def _of_another(path: Path) -> WrongUse:
+    cure = "Choose another folder, or add --overwrite to give them up."
+    expected = "the draws of this model, clip and settings"
+    return WrongUse(str(invalid("--out", expected=expected, got=f"others in {path}", cure=cure)))
+
+
 @contextmanager
 def _bars() -> Iterator[Callable[[str, int, int], None]]:
     """A bar for the pictures and one for the steps, where somebody looks."""
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[told]}")
     with Progress(*columns, TimeElapsedColumn(), console=err, disable=not err.is_terminal) as progress:
         tasks: dict[str, Any] = {}
-        titles = {"pictures": "Drawing pictures", "steps": "Sampling, at most"}
+        titles = {"pictures": "Drawing pictures", "frames": "Without colours", "steps": "Sampling, at most"}
 
         def show(what: str, done: int, total: int) -> None:
             if what not in tasks:
@@ -185,9 +259,7 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
             if not str(error).startswith("backend:"):
                 raise
             if not overwrite:
-                cure = "Choose another folder, or add --overwrite to give it up."
-                expected = "the draws of this model, clip and settings"
-                raise WrongUse(str(invalid("--out", expected=expected, got=f"others in {path}", cure=cure))) from error
+                raise _of_another(path) from error
             path.unlink()
             existed, posterior = False, sample()
     except KeyboardInterrupt as error:
@@ -198,12 +270,13 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
     return posterior
 
 
-def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str) -> None:
+def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> None:
     """Every file whole, and the one that counts most first."""
     flagged = irregularities(posterior)
     _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
     with atomic_path(folder / "summary.md") as temporary:
-        temporary.write_text(f"# Frame times of {title}\n\n{summary(posterior, fitted, flagged=flagged)}")
+        text = summary(posterior, fitted, flagged=flagged, level=level)
+        temporary.write_text(f"# Frame times of {title}\n\n{text}")
     _write_netcdf(folder / "posterior.nc", posterior)
     _draw(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
     _draw(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)

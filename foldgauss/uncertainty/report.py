@@ -1,6 +1,7 @@
 """A posterior of frame times in words and as a table."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -49,10 +50,12 @@ def summary(
     fitted: Float[np.ndarray, "num_frames"] | None = None,
     *,
     flagged: Sequence[Irregularity] | None = None,
+    level: Literal["splats", "colors"] = "splats",
 ) -> str:
     """What was found, how far to trust it, and what it is conditioned on, in Markdown.
 
-    `fitted`: the model's own times, which are compared. `flagged`: default `irregularities(posterior)`.
+    `fitted`: the model's own times, which are compared. `flagged`: default `irregularities(posterior)`. `level`: what
+    the posterior is given, all of the splats, or all but their colours (`evidence_without_colors`).
 
     **Example:** `print(summary(posterior, model.frame_times.times()))`.
     """
@@ -63,7 +66,7 @@ def summary(
         "## How sure\n\n" + _sureness(posterior),
         "## Pace\n\n" + _pace(flagged),
         "## Against other times\n\n" + _against(posterior, fitted),
-        "## What this is conditioned on\n\n" + _conditions(posterior),
+        "## What this is conditioned on\n\n" + _conditions(posterior, level),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -133,11 +136,12 @@ def _against(posterior: FrameTimePosterior, fitted) -> str:
     return _table(("times", "log-likelihood (nats; 0: each frame about its best)"), rows)
 
 
-def _conditions(posterior: FrameTimePosterior) -> str:
+def _conditions(posterior: FrameTimePosterior, level: str) -> str:
     increments = posterior.log_prob.increments
+    held = "durations, colours" if level == "splats" else "durations; their colours are integrated out"
     lines = [
-        "- The splats, held as they were fitted: places, folds, durations, colours. A warp of time that the folds have "
-        "taken up does not show: intervals are those of times given the folds."
+        f"- The splats, held as they were fitted: places, folds, {held}. A warp of time that the folds have taken up "
+        "does not show: intervals are those of times given the folds."
     ]
     if posterior.seen is not None:
         lines.append(f"- The noise: {posterior.seen.noise.told()} as independent.")
