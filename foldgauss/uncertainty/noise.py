@@ -52,10 +52,10 @@ class FrameNoise:
 
     def told(self) -> str:
         """In words: how great residuals are, and how many of them count."""
-        low, middle, high = 1 / np.quantile(self.share, [1, 0.5, 0])
-        counted = "all values count" if middle < 1.05 else f"one value in {middle:.3g} counts"
-        between = f" (frames: one in {low:.3g} to {high:.3g})" if high > 1.05 * low else ""
-        return f"residuals of {255 * np.median(self.scale):.2g} grey levels: {counted}{between}"
+        low, middle, high = (f"{n:,.0f}" if n >= 10 else f"{n:.2g}" for n in 1 / np.quantile(self.share, [1, 0.5, 0]))
+        counted = "all values count" if middle == "1" else f"one value in {middle} counts"
+        between = "" if low == high else f" (frames: one in {low} to {high})"
+        return f"residuals of {255 * np.median(self.scale):.2g} grey levels, {counted}{between}"
 
     @property
     def weight(self) -> Float64[np.ndarray, "num_frames"]:

@@ -74,17 +74,17 @@ def irregularities(
     duplicate: float = 0.25,
     dropped: float = 1.75,
     *,
-    probability: float = 0.9,
+    probability: float = 0.5,
     reach: int = REACH,
 ) -> list[Irregularity]:
-    """Intervals that are surely no part of an even pace: below `duplicate`, or above `dropped`, times the local median.
+    """Intervals that are no part of an even pace: below `duplicate`, or above `dropped`, times the local median.
 
-    Surely: with at least `probability`, by the draws. The local median is that of the `reach` intervals before and
-    after, as far as the shot goes, in the same draw: a pace that changes smoothly, in the clip or as learned, is even.
-    Cuts (`foldgauss.video.shots.is_cut`) are not flagged, and end the neighbourhood. Intervals between two frames whose
-    times were held are not judged.
+    Told are those that are so in at least the share `probability` of the draws. The local median is that of the `reach`
+    intervals before and after, as far as the shot goes, in the same draw: a pace that changes smoothly, in the clip or
+    as learned, is even. Cuts (`foldgauss.video.shots.is_cut`) are not flagged, and end the neighbourhood. Intervals
+    between two frames whose times were held are not judged.
 
-    Where times are not identified the prior decides, and it is not sure of anything: nothing is found.
+    Where times are not identified the prior decides, under which neither is likely: nothing is found.
 
     Raises ValueError for bounds that are not 0 < duplicate < 1 < dropped, a probability out of (0, 1], reach < 1.
 

@@ -121,8 +121,8 @@ def plot_increments(
         ax.plot(k + 0.5, found.mean[k], marker, color=color, markersize=7, label=f"{kind}: {len(those)}")
         for one in those[:20]:
             ax.annotate(
-                "{}-{}".format(*one.frames), (one.frames[0] + 0.5, found.mean[one.frames[0]]), (0, 7),
-                textcoords="offset points", ha="center", fontsize="x-small", color=color,
+                "{}-{}".format(*one.frames), (one.frames[0] + 0.5, found.mean[one.frames[0]]), (-2, 6),
+                textcoords="offset points", ha="left", rotation=35, fontsize="x-small", color=color,
             )  # fmt: skip
     ax.set_ylim(min(-0.05, ax.get_ylim()[0]), 0.1 + 1.06 * max(found.high[shown].max(), found.mean[shown].max()))
     ax.set(xlabel="interval (its first frame + 1/2)", ylabel="increment / median increment", title="Pace of the clip")

@@ -110,7 +110,7 @@ def _sureness(posterior: FrameTimePosterior) -> str:
 
 def _pace(flagged: Sequence[Irregularity]) -> str:
     if not flagged:
-        return "No interval is surely that of a duplicated frame, or of frames left out."
+        return "No interval looks like that of a duplicated frame, or of frames left out."
     rows = [
         (
             "{}, {}".format(*one.frames),
@@ -121,7 +121,15 @@ def _pace(flagged: Sequence[Irregularity]) -> str:
         )
         for one in flagged
     ]
-    return _table(("frames", "kind", "probability", "increment / local median", "90%"), rows)
+    text = _table(("frames", "kind", "probability", "increment / local median", "90%"), rows)
+    twice = {one.frames for one in flagged if one.kind == "duplicated"}
+    beside = {(first + step, last + step) for first, last in twice for step in (-1, 1)}
+    if any(one.kind == "dropped" and one.frames in beside for one in flagged):
+        text += (
+            "\n\nA long step beside a duplicated frame: that frame stands in the place of one that was left out; or "
+            "the splats themselves stand still there, since they were fitted to it, and it may lie anywhere in that rest."
+        )
+    return text
 
 
 def _against(posterior: FrameTimePosterior, fitted) -> str:
@@ -144,7 +152,7 @@ def _conditions(posterior: FrameTimePosterior, level: str) -> str:
         "does not show: intervals are those of times given the folds."
     ]
     if posterior.seen is not None:
-        lines.append(f"- The noise: {posterior.seen.noise.told()} as independent.")
+        lines.append(f"- The noise: {posterior.seen.noise.told()}.")
     lines.append(f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.")
     held = np.flatnonzero(~increments.free)[1:-1]
     text = "- The first frame at 0 and the last at 1"

@@ -66,6 +66,16 @@ def test_held_frames_are_not_judged():
     assert kinds(irregularities(posterior)) == [(14, "duplicated")]
 
 
+def test_a_long_step_beside_a_duplicate_is_explained():
+    from foldgauss.uncertainty import summary
+
+    steps = np.ones(20)
+    steps[[8, 9]] = 0.01, 2.0
+    assert "A long step beside a duplicated frame" in summary(posterior_about(times_of(steps)))
+    steps[[9, 14]] = 1.0, 2.0
+    assert "A long step" not in summary(posterior_about(times_of(steps)))
+
+
 def test_intervals_cover():
     """Over 5 clips of 29 intervals, 90% intervals hold the truth 90% of the time, give or take 4 standard errors.
 
@@ -137,7 +147,7 @@ def test_summary_says_what_is_not_known():
     posterior = posterior_about(times, std)
     text = summary(posterior, times)
     assert "Not identified: frame 5.**" in text
-    assert "No interval is surely" in text
+    assert "No interval looks like" in text
     assert "20" not in text.split("grey")[0].rsplit("residuals", 1)[1]
     unsure = dataclasses.replace(posterior, converged=False, message="Not converged after 9 steps.")
     assert summary(unsure).startswith("Not converged")
