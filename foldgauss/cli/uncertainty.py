@@ -34,12 +34,12 @@ from foldgauss.uncertainty import (
     FrameNoise,
     Profiles,
     evidence,
-    evidence_without_colors,
     frame_time_log_prob,
     frame_time_posterior,
     plots,
 )
 from foldgauss.uncertainty.increments import Increments
+from foldgauss.uncertainty.log_prob import LEVELS, at_level
 from foldgauss.uncertainty.noise import NOISES
 from foldgauss.uncertainty.pace import irregularities
 from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, needed
@@ -47,7 +47,6 @@ from foldgauss.uncertainty.report import frame_table, summary
 from foldgauss.video.model import VideoModel
 
 CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
-LEVELS = ("splats", "colors")
 PICTURES = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PICTURES)
 #: Draws of each ensemble that posterior.nc holds, evenly spaced: of all there would be gigabytes.
@@ -185,12 +184,7 @@ def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] |
 
 def _evidence(model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars) -> Evidence:
     seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
-    if level == "splats":
-        return seen
-    profiles = evidence_without_colors(
-        model, clip.frames, seen, frames=only, on_frame=lambda done, total: bars("frames", done, total)
-    )
-    return dataclasses.replace(seen, profiles=profiles)
+    return at_level(level, model, clip.frames, seen, only, lambda done, total: bars("frames", done, total))
 
 
 def _keep_evidence(path: Path, key: str, seen: Evidence) -> None:
@@ -229,7 +223,7 @@ def _bars() -> Iterator[Callable[[str, int, int], None]]:
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[told]}")
     with Progress(*columns, TimeElapsedColumn(), console=err, disable=not err.is_terminal) as progress:
         tasks: dict[str, Any] = {}
-        titles = {"pictures": "Drawing pictures", "frames": "Without colours", "steps": "Sampling, at most"}
+        titles = {"pictures": "Drawing pictures", "frames": "Without colours", "steps": "Sampling"}
 
         def show(what: str, done: int, total: int) -> None:
             if what not in tasks:

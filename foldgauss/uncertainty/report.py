@@ -127,7 +127,7 @@ def _pace(flagged: Sequence[Irregularity]) -> str:
     if any(one.kind == "dropped" and one.frames in beside for one in flagged):
         text += (
             "\n\nA long step beside a duplicated frame: that frame stands in the place of one that was left out; or "
-            "the splats themselves stand still there, since they were fitted to it, and it may lie anywhere in that rest."
+            "the splats themselves stand still there, since they were fitted to it, and it may lie anywhere there."
         )
     return text
 
