@@ -24,6 +24,8 @@ WHOLE = 0.05
 SINGLES = 0.5
 #: A frame stays where its likelihood between its neighbours is less than this share of all: float64 cannot tell.
 LEAST_MASS = 1e-9
+#: No two times are nearer than this share of all the time: below, float64 does not tell them apart.
+LEAST_GAP = 1e-14
 _stretch = 2.0  # a of Goodman and Weare
 
 
@@ -185,12 +187,12 @@ def _sweep(
             for m in range(size):
                 change += alpha * (new[m] - normal)
                 after = t + (end - start) * np.exp(new[m] - normal)
-                ordered = ordered and after > t
+                ordered = ordered and after > t + LEAST_GAP
                 t = after
                 logs[m] = t
                 k = low + m
                 change += value_at(t, nodes[k], values[k], slopes[k], count[k] - 1)
-            ordered = ordered and t < end
+            ordered = ordered and t < end - LEAST_GAP
             if ordered and change > threshold[n, b]:
                 for m in range(size):
                     times[walker, low + m] = logs[m]
@@ -258,7 +260,7 @@ def _single(times, frames, grids, likelihoods, summed, counts, chance, threshold
                 continue
             new = _time_of(low + (high - low) * chance[walker, f], grid, likelihood, sums, last)
             there = _density(new, grid, likelihood, last)
-            if not (new > start and new < end and there > 0):
+            if not (new > start + LEAST_GAP and new < end - LEAST_GAP and there > 0):
                 continue
             change = value_at(new, nodes[k], values[k], slopes[k], count[k] - 1) - np.log(there)
             change -= value_at(now, nodes[k], values[k], slopes[k], count[k] - 1) - np.log(here)

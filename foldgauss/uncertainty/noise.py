@@ -8,6 +8,7 @@ import dataclasses
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 from jaxtyping import Float, Float64
 
 from foldgauss._checks import invalid
@@ -16,6 +17,8 @@ from foldgauss._checks import invalid
 NOISES = ("score", "effective", "independent")
 #: Lags are summed until the mean correlation around a ring falls below this.
 LAST_CORRELATION = 0.02
+#: Pixels over which the size of residuals is taken: they are greatest at edges, which is where pictures tell time.
+LOCAL = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,38 +66,53 @@ class FrameNoise:
         return self.share / (2 * self.scale**2)
 
 
-def autocorrelation(
-    residual: Float[np.ndarray, "*channels height width"], most: int | None = None
-) -> Float64[np.ndarray, "rows columns"]:
-    """Correlation of residuals with their neighbours', by lag in y and x; (2 most + 1, 2 most + 1), 1 in the middle.
+_Covariance = Float64[np.ndarray, "channels channels rows columns"]
 
-    The mean over channels, and over any other leading axes, is taken off nothing: residuals of a fit have mean 0, and
-    what is left of it is part of what is correlated. Each lag is divided by the number of pairs it has. `most` defaults
-    to a third of the shorter side. A residual that is 0 everywhere has correlation 0 but in the middle.
+
+def covariances(
+    residual: Float[np.ndarray, "channels height width"], most: int | None = None
+) -> _Covariance:
+    """Means of r_c(p) r_d(p + lag) for all pairs of channels, lags up to `most` in y and x; 0 in the middle.
+
+    No mean is taken off: residuals of a fit have mean 0, and what is left of it is part of what is correlated. Each lag
+    is divided by the number of pairs it has. `most` defaults to a third of the shorter side.
     """
     height, width = residual.shape[-2:]
     most = max(1, min(height, width) // 3) if most is None else most
     if not 0 < most < min(height, width):
         raise invalid("most", expected=f"lags from 1 to {min(height, width) - 1}", got=most)
-    planes = np.asarray(residual, np.float64).reshape(-1, height, width)
-    sums = _lagged_products(planes, planes, most)
     lags = np.abs(np.arange(-most, most + 1))
-    covariance = sums / ((height - lags)[:, None] * (width - lags)[None, :] * len(planes))
-    middle = covariance[most, most]
-    if middle == 0:
-        correlation = np.zeros_like(covariance)
+    return _lagged_products(residual, most) / ((height - lags)[:, None] * (width - lags)[None, :])
+
+
+def _lagged_products(planes: np.ndarray, most: int) -> np.ndarray:
+    """Sums over pixels of one(p) other(p + lag), for all pairs of planes and lags up to `most` to each side."""
+    height, width = planes.shape[-2:]
+    size = [scipy.fft.next_fast_len(side + most, real=True) for side in (height, width)]
+    waves = scipy.fft.rfft2(np.asarray(planes, np.float64), size)
+    num, lags = len(planes), 2 * most + 1
+    sums = np.empty((num, num, lags, lags))
+    for c in range(num):
+        for d in range(c, num):
+            product = np.roll(scipy.fft.irfft2(waves[c].conj() * waves[d], size), (most, most), (0, 1))[:lags, :lags]
+            sums[c, d], sums[d, c] = product, product[::-1, ::-1]
+    return sums
+
+
+def autocorrelation(
+    covariance: _Covariance,
+) -> Float64[np.ndarray, "rows columns"]:
+    """Correlation of residuals with their neighbours', of `covariances`: the mean over channels, 1 in the middle.
+
+    Where there is no residual at all it is 0 but in the middle.
+    """
+    same = np.einsum("ccyx->yx", covariance)
+    most = len(same) // 2
+    if same[most, most] == 0:
+        correlation = np.zeros_like(same)
         correlation[most, most] = 1.0
         return correlation
-    return covariance / middle
-
-
-def _lagged_products(one, other, most: int) -> np.ndarray:
-    """Sums over planes and pixels of one(p) other(p + lag), lags up to `most` to each side."""
-    height, width = one.shape[-2:]
-    size = [scipy.fft.next_fast_len(side + most, real=True) for side in (height, width)]
-    transformed = [scipy.fft.rfft2(each, size) for each in (one, other)]
-    sums = scipy.fft.irfft2((transformed[0].conj() * transformed[1]).sum(0), size)
-    return np.roll(sums, (most, most), (0, 1))[: 2 * most + 1, : 2 * most + 1]
+    return same / same[most, most]
 
 
 def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "lags"]:
@@ -106,55 +124,76 @@ def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarra
     return np.bincount(distance[inside], correlation[inside]) / np.bincount(distance[inside])
 
 
-def effective_share(residual: Float[np.ndarray, "channels height width"]) -> float:
-    r"""Independent values per value: 1 / (sum of correlations over lags, and over pairs of channels), at most 1.
+def correlated_reach(covariance: _Covariance) -> int:
+    """The first ring of lags, in pixels, whose mean correlation is below `LAST_CORRELATION`."""
+    correlation = rings(autocorrelation(covariance))
+    below = np.flatnonzero(correlation < LAST_CORRELATION)
+    return int(below[0]) if below.size else len(correlation)
 
-    It is exact for what depends on the mean of many neighbouring residuals, and cautious for what depends on details.
-    The sum ends at the first ring of lags whose mean correlation is below `LAST_CORRELATION`.
+
+def effective_share(covariance: _Covariance) -> float:
+    r"""Independent values per value, at most 1: 1 over the greatest sum of correlations that any colour has.
+
+    With the residuals' `covariances`, summed over lags to a matrix over channels, it is the mean variance over the
+    matrix's greatest eigenvalue. Exact for what depends on the mean of many neighbouring residuals of that colour,
+    and cautious for what depends on details. The sum ends at `correlated_reach`.
 
     **Source:** the variance of the mean of a stationary process; e.g. Priestley 1981, section 5.3.
     """
-    residual = np.asarray(residual, np.float64)
-    power = (residual**2).mean()
+    most = covariance.shape[-1] // 2
+    power = np.einsum("cc->", covariance[..., most, most]) / len(covariance)
     if power == 0:
         return 1.0
-    together = residual.sum(0)  # the covariance of this is that over all pairs of channels
-    correlation = autocorrelation(together)
-    reach = rings(correlation)
-    below = np.flatnonzero(reach < LAST_CORRELATION)
-    last = below[0] if below.size else len(reach)
-    most = len(correlation) // 2
     lags = np.arange(-most, most + 1)
-    inside = np.rint(np.hypot(lags[:, None], lags[None, :])) < last
-    inflation = (together**2).mean() / (len(residual) * power) * correlation[inside].sum()
-    return float(min(1.0, 1.0 / inflation)) if inflation > 0 else 1.0
+    inside = np.rint(np.hypot(lags[:, None], lags[None, :])) < correlated_reach(covariance)
+    together = covariance[..., inside].sum(-1)
+    inflation = float(np.linalg.eigvalsh((together + together.T) / 2)[-1] / power)
+    return min(1.0, 1.0 / inflation) if inflation > 0 else 1.0
 
 
 def score_share(
-    residual: Float[np.ndarray, "channels height width"], slope: Float[np.ndarray, "channels height width"], reach: int
+    residual: Float[np.ndarray, "channels height width"],
+    slope: Float[np.ndarray, "channels height width"],
+    covariance: _Covariance,
 ) -> float:
     r"""The share with which the likelihood of a time is as sure as its score is steady, at most 1.
 
-    With the residual r and the slope g = dR/dt, scores s_p = r_p g_p have the sum whose variance V is estimated with
-    their covariances up to `reach` pixels (those up to half of it in full, then less and less), where the plain
-    likelihood takes J = scale^2 sum g^2 for granted: share = J / V. Exact where residuals are as correlated in seen
-    frames as noise is; a fit that has learned the noise leaves residuals whose scores cancel, and then it is too sure.
+    The score is the sum over pixels of r g, with the residual r and the slope g = dR/dt. The plain likelihood takes its
+    variance for J = scale^2 sum g^2. Here it is V, the greater of two estimates, and the share is J / V:
+
+    .. math:: V_1 = \sum_{p, h} \rho(h)\, s_p g_p\, s_{p + h} g_{p + h}, \qquad
+       V_2 = \sum_{p, h} r_p g_p\, r_{p + h} g_{p + h}
+
+    summed over channels, too, over lags h up to twice the `correlated_reach` (in full up to half of it, then less and
+    less). The first, with the residual's size s around p and the correlations rho of `covariance`, best those of many
+    frames, is that of noise which knows nothing of the slope. The second is that of residuals as they are, which lie
+    along edges as slopes do; but at the best time they cancel over few pixels. A fit that has learned the noise
+    leaves less of both than noise is, and then this is too sure.
 
     **Source:** the sandwich of Huber 1967; covariances over two dimensions as Conley 1999, with the flat-topped weights
-    of Politis and Romano 1995: Bartlett's would miss a quarter of V at the reach that profiles use.
+    of Politis and Romano 1995.
     """
     residual, slope = (np.asarray(each, np.float64) for each in (residual, slope))
-    expected = (residual**2).mean() * (slope**2).sum()
-    score = (residual * slope).sum(0)
-    score -= score.mean()
-    lags = np.abs(np.arange(-reach, reach + 1))
-    flat = np.clip(2 - 2 * lags / (reach + 1), 0, 1)
-    weights = flat[:, None] * flat[None, :]
-    variance = (weights * _lagged_products(score[None], score[None], reach)).sum()
-    # Taking off the mean makes all covariances together 0: what that takes from those that are summed.
-    height, width = score.shape
-    pairs = np.maximum(height - lags, 0)[:, None] * np.maximum(width - lags, 0)[None, :]
-    variance /= max(1 - (weights * pairs).sum() / score.size**2, 0.1)
-    if not (expected > 0 and variance > 0):
+    middle = covariance.shape[-1] // 2
+    power = np.einsum("cc->", covariance[..., middle, middle]) / len(covariance)
+    plain = (residual**2).mean() * (slope**2).sum()
+    if not (power > 0 and plain > 0):
         return 1.0
-    return float(min(1.0, expected / variance))
+    reach = min(max(2 * correlated_reach(covariance), 1), middle)
+    near = slice(middle - reach, middle + reach + 1)
+    flat = np.clip(2 - 2 * np.abs(np.arange(-reach, reach + 1)) / (reach + 1), 0, 1)
+    weights = flat[:, None] * flat[None, :]
+    local = np.sqrt(scipy.ndimage.gaussian_filter((residual**2).mean(0), LOCAL))
+    variance = float((weights * covariance[..., near, near] * _lagged_products(local * slope, reach)).sum() / power)
+    variance = max(variance, _own_variance((residual * slope).sum(0), weights))
+    return min(1.0, plain / variance) if variance > 0 else effective_share(covariance)
+
+
+def _own_variance(score: np.ndarray, weights: np.ndarray) -> float:
+    """Of a sum over pixels, by the pixels' own covariances about their mean; `weights` by lag."""
+    reach, (height, width) = len(weights) // 2, score.shape
+    lags = np.abs(np.arange(-reach, reach + 1))
+    variance = float((weights * _lagged_products((score - score.mean())[None], reach)[0, 0]).sum())
+    # Taking off the mean makes all covariances together 0: what that takes from those that are summed.
+    pairs = np.maximum(height - lags, 0)[:, None] * np.maximum(width - lags, 0)[None, :]
+    return variance / max(1 - float((weights * pairs).sum()) / score.size**2, 0.1)

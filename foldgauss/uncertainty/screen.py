@@ -18,6 +18,7 @@ from foldgauss.video.playback import Playback
 _f, _d = nb.float32, nb.float64
 _level = np.float32(1 / 255)
 _behind = np.asarray(BLACK, np.float32)
+BINS = 512
 TOGETHER = 8  # pictures drawn at once: fewer waits for threads
 
 
@@ -88,6 +89,29 @@ class Screen:
     def residual(self, k: int, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, "3 height width"]:
         """Frame k less the picture."""
         return np.moveaxis(self.frames[k], -1, 0) * _level - picture
+
+
+class Sketches:
+    """Short vectors whose distances are those of pictures, to some 6%: values summed into bins with random signs.
+
+    **Source:** count sketch, Charikar, Chen and Farach-Colton 2002.
+    """
+
+    def __init__(self, num_values: int):
+        rng = np.random.default_rng(0)
+        self._bins = rng.integers(0, BINS, num_values, dtype=np.int16)
+        self._signs = rng.choice(np.array([-1, 1], np.float32), num_values)
+
+    def of(self, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, "bins"]:
+        sketch = np.zeros(BINS)
+        _sum_into(sketch, picture.reshape(-1), self._bins, self._signs)
+        return sketch.astype(np.float32)
+
+
+@kernel
+def _sum_into(sketch, values, bins, signs):
+    for n in range(len(values)):
+        sketch[bins[n]] += values[n] * signs[n]
 
 
 @kernel

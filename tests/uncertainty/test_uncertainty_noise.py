@@ -5,7 +5,8 @@ import pytest
 import scipy.ndimage
 
 from foldgauss.uncertainty import FrameNoise
-from foldgauss.uncertainty.noise import autocorrelation, effective_share, rings, score_share
+from foldgauss.uncertainty import noise as module
+from foldgauss.uncertainty.noise import covariances, rings
 
 SHAPE = (3, 160, 200)
 
@@ -15,6 +16,18 @@ def smoothed(spread: float, seed: int = 0, shape=SHAPE) -> np.ndarray:
     white = np.random.default_rng(seed).standard_normal(shape)
     noise = scipy.ndimage.gaussian_filter(white, (0, spread, spread), mode="wrap")
     return noise / noise.std()
+
+
+def autocorrelation(residual: np.ndarray, most: int | None = None) -> np.ndarray:
+    return module.autocorrelation(covariances(residual, most))
+
+
+def effective_share(residual: np.ndarray) -> float:
+    return module.effective_share(covariances(residual))
+
+
+def score_share(residual: np.ndarray, slope: np.ndarray) -> float:
+    return module.score_share(residual, slope, covariances(residual))
 
 
 def kernel_correlation(spread: float, most: int) -> np.ndarray:
@@ -29,7 +42,7 @@ def kernel_correlation(spread: float, most: int) -> np.ndarray:
 def test_white_noise_counts_in_full():
     noise = smoothed(0.01)
     assert effective_share(noise) == pytest.approx(1, abs=0.05)
-    assert score_share(noise, np.ones(SHAPE), 2) == pytest.approx(1, abs=0.1)
+    assert score_share(noise, np.ones(SHAPE)) == pytest.approx(1, abs=0.1)
     np.testing.assert_allclose(rings(autocorrelation(noise, 5)), [1, 0, 0, 0, 0, 0], atol=0.01)
 
 
@@ -44,6 +57,14 @@ def test_smoothed_noise_counts_as_theory_says(spread):
 def test_channels_that_are_one_count_as_one():
     one = smoothed(0.01)[:1]
     assert effective_share(np.repeat(one, 3, axis=0)) == pytest.approx(1 / 3, rel=0.05)
+
+
+@pytest.mark.parametrize("mixture", [(1, 1, 1), (1, -1, 0), (0.6, 0.8, -1)])
+def test_channels_that_go_together_count_as_one_whatever_their_signs(mixture):
+    one = smoothed(2.0)[:1]
+    shares = [effective_share(one * np.array(each)[:, None, None]) for each in (mixture, (1, 0, 0))]
+    assert shares[0] == pytest.approx(shares[1], rel=0.05)
+    assert shares[0] < 0.02
 
 
 def test_autocorrelation_is_that_of_the_kernel():
@@ -78,14 +99,26 @@ def test_score_share_is_the_scores_own_variance(spread):
     noises = np.stack([smoothed(spread, seed) for seed in range(300)])
     variance = (noises * slope).sum((1, 2, 3)).var()
     truth = min(1.0, (slope**2).sum() / variance)
-    found = np.mean([1 / score_share(noise, slope, max(2, int(8 * spread))) for noise in noises[:20]])
+    found = np.mean([1 / score_share(noise, slope) for noise in noises[:20]])
     # 300 noises tell a variance to 8%.
     assert 1 / found == pytest.approx(truth, rel=0.25)
 
 
+def test_scores_that_cancel_are_no_evidence():
+    """At the best time the residual is at a right angle to the slope: its own scores say less than noise would."""
+    y, x = np.mgrid[:160, :200]
+    slope = np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / 50) * np.ones((3, 1, 1))
+    found, truth = [], []
+    for seed in range(60):
+        noise = smoothed(3.0, seed)
+        truth.append((noise * slope).sum())
+        found.append(1 / score_share(noise - slope * (noise * slope).sum() / (slope**2).sum(), slope))
+    assert np.mean(found) == pytest.approx(np.var(truth) / (slope**2).sum(), rel=0.4)
+
+
 def test_no_residual_at_all_counts_in_full():
     nothing = np.zeros(SHAPE)
-    assert effective_share(nothing) == 1 and score_share(nothing, np.ones(SHAPE), 3) == 1
+    assert effective_share(nothing) == 1 and score_share(nothing, np.ones(SHAPE)) == 1
     found = autocorrelation(nothing, 2)
     assert found[2, 2] == 1 and found.sum() == 1
 
@@ -94,7 +127,7 @@ def test_shares_are_never_above_one():
     # Residuals that alternate cancel: no evidence is worth more than it says.
     y, x = np.mgrid[:40, :40]
     board = np.where((x + y) % 2, 1.0, -1.0)[None]
-    assert effective_share(board) <= 1 and score_share(board, np.ones((1, 40, 40)), 3) <= 1
+    assert effective_share(board) <= 1 and score_share(board, np.ones((1, 40, 40))) <= 1
 
 
 def test_frame_noise_is_checked_and_widened():
