@@ -1,11 +1,12 @@
 """What drawn frame times say of a clip: its pace, frames shown twice or left out; and a comparison of models' times."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
 from foldgauss._checks import invalid, within
 from foldgauss.uncertainty.drawing import Evidence, evidence
@@ -64,7 +65,7 @@ def intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementInt
     if not within(level, "(0, 1)"):
         raise invalid("level", expected="a number in (0, 1)", got=level)
     steps = np.diff(_some(posterior), axis=1)
-    steps /= np.median(steps[:, ~_cuts(posterior)], axis=1, keepdims=True)
+    steps /= np.median(steps[:, ~cuts(posterior)], axis=1, keepdims=True)
     low, high = np.quantile(steps, [(1 - level) / 2, (1 + level) / 2], axis=0)
     return IncrementIntervals(steps.mean(0), low, high, level)
 
@@ -100,7 +101,7 @@ def irregularities(
         raise invalid("reach", expected="a whole number >= 1", got=reach)
     steps, free = np.diff(_some(posterior), axis=1), posterior.log_prob.increments.free
     found = []
-    for k, near in _neighbours(_cuts(posterior), reach):
+    for k, near in _neighbours(cuts(posterior), reach):
         if not (free[k] or free[k + 1]):
             continue
         size = steps[:, k] / np.median(steps[:, near], axis=1)
@@ -180,15 +181,29 @@ def _some(posterior: FrameTimePosterior) -> Float64[np.ndarray, "draws num_frame
     return draws[np.unique(np.linspace(0, len(draws) - 1, ENOUGH).astype(int))]
 
 
-def _cuts(posterior: FrameTimePosterior) -> np.ndarray:
+def cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
+    """Which intervals are cuts, by the posterior means (`foldgauss.video.shots.is_cut`)."""
     return np.asarray(is_cut(posterior.mean().astype(np.float32)))
 
 
-def _neighbours(cuts: np.ndarray, reach: int) -> Iterator[tuple[int, list[int]]]:
+def even_pace(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, "num_frames"], float]:
+    """Evenly spaced times between the first and the last frame of every shot, and what one frame is: their mean step.
+
+    Without cuts: k / (num_frames - 1), and 1 / (num_frames - 1).
+    """
+    mean, cut = posterior.mean(), cuts(posterior)
+    even = mean.copy()
+    ends = np.concatenate([[-1], np.flatnonzero(cut), [len(mean) - 1]])
+    for before, last in itertools.pairwise(ends):
+        even[before + 1 : last + 1] = np.linspace(mean[before + 1], mean[last], last - before)
+    return even, float(np.diff(mean)[~cut].mean())
+
+
+def _neighbours(cut: np.ndarray, reach: int) -> Iterator[tuple[int, list[int]]]:
     """Each interval that is no cut, with those near it in the same shot, of which there are two at least."""
-    shot = np.cumsum(cuts)
-    for k in np.flatnonzero(~cuts):
-        around = range(max(k - reach, 0), min(k + reach + 1, len(cuts)))
-        near = [j for j in around if j != k and not cuts[j] and shot[j] == shot[k]]
+    shot = np.cumsum(cut)
+    for k in np.flatnonzero(~cut):
+        around = range(max(k - reach, 0), min(k + reach + 1, len(cut)))
+        near = [j for j in around if j != k and not cut[j] and shot[j] == shot[k]]
         if len(near) >= 2:
             yield int(k), near

@@ -1,6 +1,7 @@
 """Pictures of a posterior of frame times; matplotlib is imported when one is drawn.
 
-Times are shown in frames: one is the mean distance between neighbours, 1 / (num_frames - 1) of the model's time.
+Times are shown in frames: one is the mean distance between neighbours, cuts left out; without cuts 1 / (num_frames - 1)
+of the model's time.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from foldgauss._checks import invalid
 from foldgauss.plot import needed_pyplot
 from foldgauss.uncertainty.drawing import Evidence
 from foldgauss.uncertainty.noise import LAST_CORRELATION
-from foldgauss.uncertainty.pace import Irregularity, intervals, irregularities
+from foldgauss.uncertainty.pace import Irregularity, cuts, even_pace, intervals, irregularities
 from foldgauss.uncertainty.posterior import FrameTimePosterior
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def plot_times(
     fitted: Float[np.ndarray, "num_frames"] | None = None,
     flagged: Sequence[Irregularity] | None = None,
 ) -> np.ndarray:
-    """Where each frame is, above: its time's deviation from even spacing. How sure that is, below: intervals about it.
+    """Above where each frame is: its time less even spacing within its shot. Below how sure that is: half widths.
 
     Above, in frames: the posterior mean, its central 50 and 90% as bands, `fitted` (the model's own times) as a dotted
     line, and flagged intervals marked (default: `irregularities(posterior)`). Below, on a logarithmic scale: half the
@@ -53,15 +54,15 @@ def plot_times(
         pyplot = needed_pyplot("plot_times")
         axes = pyplot.subplots(2, 1, sharex=True, layout="constrained", figsize=(9, 6))[1]
     flagged = irregularities(posterior) if flagged is None else flagged
-    frames, unit = np.arange(num_frames), num_frames - 1
-    mean = posterior.mean() * unit - frames
-    inner, outer = (posterior.interval(level) * unit - frames for level in (0.5, 0.9))
+    frames, (even, unit) = np.arange(num_frames), even_pace(posterior)
+    mean = (posterior.mean() - even) / unit
+    inner, outer = ((posterior.interval(level) - even) / unit for level in (0.5, 0.9))
     upper, lower = axes
     upper.fill_between(frames, *outer, color=_BLUE, alpha=0.25, linewidth=0, label="90%")
     upper.fill_between(frames, *inner, color=_BLUE, alpha=0.45, linewidth=0, label="50%")
     upper.plot(frames, mean, color=_BLUE, linewidth=1.2, label="posterior mean")
     if fitted is not None:
-        shown = np.asarray(fitted, np.float64) * unit - frames
+        shown = (np.asarray(fitted, np.float64) - even) / unit
         upper.plot(frames, shown, ":", color=_GREY, linewidth=1.4, label="as fitted")
     for kind, (color, marker) in _FLAG.items():
         at = np.array([one.frames for one in flagged if one.kind == kind])
@@ -76,8 +77,8 @@ def plot_times(
     for part, alpha, level in ((outer, 0.35, 90), (inner, 0.8, 50)):
         half = (part[1] - part[0])[free] / 2
         lower.vlines(free, 0, half, color=_BLUE, alpha=alpha, linewidth=_bar_width(num_frames), label=f"{level}%")
-    laplace = 1.6449 * posterior.laplace.std[free] * unit
-    exact = np.diff(posterior.exact.interval(0.9), axis=0)[0, free] / 2 * unit
+    laplace = 1.6449 * posterior.laplace.std[free] / unit
+    exact = np.diff(posterior.exact.interval(0.9), axis=0)[0, free] / (2 * unit)
     lower.plot(free, laplace, "x", color=_ORANGE, markersize=4, markeredgewidth=1, label="Laplace, 90%")
     lower.plot(free, exact, "_", color="black", markersize=6, markeredgewidth=1, label="exact, 90%")
     unknown = np.flatnonzero(~posterior.identified())
@@ -87,7 +88,11 @@ def plot_times(
     lower.set_yscale("log")
     least = min(((inner[1] - inner[0])[free] / 2).min(), exact.min(), laplace.min())
     lower.set_ylim(bottom=0.6 * least)
-    lower.set(xlabel="frame", ylabel="half width of the interval\n(frames)", xlim=(-0.01 * num_frames, 1.01 * unit))
+    lower.set(
+        xlabel="frame",
+        ylabel="half width of the interval\n(frames)",
+        xlim=(-0.01 * num_frames, 1.01 * (num_frames - 1)),
+    )
     lower.legend(ncols=5, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), frameon=False)
     for ax in axes:
         ax.grid(alpha=0.25)
@@ -108,7 +113,7 @@ def plot_increments(
     ax = _axes(ax, "plot_increments", (9, 4))
     flagged = irregularities(posterior) if flagged is None else flagged
     found = intervals(posterior, level)
-    shown = np.flatnonzero(found.mean <= max(3.0, 2 * np.median(found.mean), *(one.size for one in flagged), 0.0))
+    shown = np.flatnonzero(~cuts(posterior))
     at = shown + 0.5
     ax.axhline(1, color=_GREY, linewidth=0.6)
     ax.vlines(at, found.low[shown], found.high[shown], color=_BLUE, alpha=0.45, linewidth=_bar_width(len(found.mean)))
@@ -149,10 +154,10 @@ def plot_pairs(
         pyplot = needed_pyplot("plot_pairs")
         size = max(1.9 * num, 3.5)
         axes = pyplot.subplots(num, num, sharex="col", layout="constrained", figsize=(size, size), squeeze=False)[1]
-    unit, draws = posterior.times.shape[-1] - 1, posterior.draws
+    (_, unit), draws = even_pace(posterior), posterior.draws
     mean = posterior.mean()
-    shown = (draws - mean)[np.unique(np.linspace(0, len(draws) - 1, _POINTS).astype(int))] * unit
-    everything = (draws[:, frames] - mean[frames]) * unit
+    shown = (draws - mean)[np.unique(np.linspace(0, len(draws) - 1, _POINTS).astype(int))] / unit
+    everything = (draws[:, frames] - mean[frames]) / unit
     correlation = np.atleast_2d(np.corrcoef(everything, rowvar=False))
     reach = np.abs(np.quantile(everything, [0.0015, 0.9985], axis=0)).max(0) * 1.15
     for row, k in enumerate(frames):
@@ -208,10 +213,10 @@ def plot_trace(
             len(frames), 2, sharex="col", sharey="row", layout="constrained", squeeze=False,
             figsize=(9, 0.6 + 2.2 * len(frames)), width_ratios=(4, 1),
         )[1]  # fmt: skip
-    unit, mean = posterior.times.shape[-1] - 1, posterior.mean()
+    (_, unit), mean = even_pace(posterior), posterior.mean()
     order = posterior.free.tolist()
     for k, (left, right) in zip(frames, axes, strict=True):
-        drawn = (posterior.times[..., k] - mean[k]) * unit
+        drawn = (posterior.times[..., k] - mean[k]) / unit
         stride = max(drawn.shape[1] // _STEPS_DRAWN, 1)
         edges = np.linspace(*np.quantile(drawn, [0.001, 0.999]), 41)
         for n, walkers in enumerate(drawn):
@@ -282,12 +287,12 @@ def _around_widest(posterior: FrameTimePosterior) -> list[int]:
     return free[first : first + 4].tolist()
 
 
-def _marginal(posterior: FrameTimePosterior, ax, k: int, drawn: np.ndarray, unit: int, reach: float) -> None:
+def _marginal(posterior: FrameTimePosterior, ax, k: int, drawn: np.ndarray, unit: float, reach: float) -> None:
     n = posterior.free.tolist().index(k)
     mean, grid = posterior.mean()[k], posterior.exact.grids[n]
     ax.hist(drawn, np.linspace(-reach, reach, 41), density=True, color=_BLUE, alpha=0.35, label="emcee")
-    ax.plot((grid - mean) * unit, posterior.exact.densities[n] / unit, color="black", linewidth=1, label="exact")
-    mode, std = (posterior.laplace.mode[k] - mean) * unit, posterior.laplace.std[k] * unit
+    ax.plot((grid - mean) / unit, posterior.exact.densities[n] * unit, color="black", linewidth=1, label="exact")
+    mode, std = (posterior.laplace.mode[k] - mean) / unit, posterior.laplace.std[k] / unit
     at = np.linspace(-reach, reach, 201)
     bell = np.exp(-0.5 * ((at - mode) / std) ** 2) / (std * np.sqrt(2 * np.pi))
     ax.plot(at, bell, "--", color=_ORANGE, linewidth=1, label="Laplace")

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._checks import invalid
-from foldgauss.uncertainty.pace import Irregularity, irregularities
+from foldgauss.uncertainty.pace import Irregularity, even_pace, irregularities
 from foldgauss.uncertainty.posterior import FrameTimePosterior
 
 
@@ -89,13 +89,13 @@ def _sampling(posterior: FrameTimePosterior) -> str:
 
 def _sureness(posterior: FrameTimePosterior) -> str:
     """Spreads in frames, and whether the three ways to find them agree."""
-    free, unit = posterior.free, posterior.times.shape[-1] - 1
+    free, (_, unit) = posterior.free, even_pace(posterior)
     std = posterior.std()[free]
-    drawn, exact, laplace = std * unit, posterior.exact.std()[free] * unit, posterior.laplace.std[free] * unit
-    widest, apart = drawn.argmax(), np.abs(posterior.mean() - posterior.exact.mean())[free] / exact * unit
+    drawn, exact, laplace = std / unit, posterior.exact.std()[free] / unit, posterior.laplace.std[free] / unit
+    widest, apart = drawn.argmax(), np.abs(posterior.mean() - posterior.exact.mean())[free] / exact / unit
     lines = [
         f"Standard deviation of a time: median {np.median(drawn):.3g} frames, greatest {drawn[widest]:.3g} "
-        f"(frame {free[widest]}). One frame is 1 / {unit} of the model's time.",
+        f"(frame {free[widest]}). One frame is 1 / {1 / unit:.4g} of the model's time.",
         f"emcee beside the exact passes: means differ by at most {apart.max():.2g} standard deviations; spreads are "
         f"{_factor(drawn, exact)} times as great. Laplace's approximation: {_factor(laplace, exact)} times.",
     ]

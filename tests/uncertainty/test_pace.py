@@ -8,6 +8,7 @@ from drawn_times import posterior_about
 from tiny_clips import NUM_FRAMES, TWICE, clip_of, model_of_12
 
 from foldgauss.uncertainty import FrameNoise, compare_times, drawn_log_likelihood, intervals, irregularities
+from foldgauss.uncertainty.pace import even_pace
 from foldgauss.video import FrameTimes, VideoModel
 
 
@@ -157,3 +158,13 @@ def test_summary_says_what_is_not_known():
     assert np.isnan(table["r_hat"][[0, 11]]).all()
     with pytest.raises(ValueError, match="fitted: expected 12 times"):
         frame_table(posterior, times[:3])
+
+
+def test_even_pace_within_shots():
+    even, unit = even_pace(posterior_about(np.linspace(0, 1, 9)))
+    np.testing.assert_allclose(even, np.linspace(0, 1, 9), atol=2e-2 / 8)
+    assert unit == pytest.approx(1 / 8)
+    steps = np.concatenate([np.ones(5), [40.0], np.full(4, 2.0)])
+    even, unit = even_pace(posterior_about(times_of(steps), 0.002))
+    np.testing.assert_allclose(np.diff(even), steps / steps.sum(), rtol=1e-2)
+    assert unit == pytest.approx(13 / 9 / steps.sum(), rel=1e-2)

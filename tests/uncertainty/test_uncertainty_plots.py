@@ -83,3 +83,14 @@ def test_correlation_says_what_counts(posterior):
     ax = plots.plot_correlation(posterior.seen)
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 0.7 ** np.arange(12))
     assert ax.get_title() == "Residuals of 5.1 grey levels, one value in 10 counts"
+
+
+def test_cuts_are_left_out():
+    steps = np.ones(20)
+    steps[9] = 60.0
+    times = np.concatenate([[0], np.cumsum(steps)])
+    posterior = posterior_about(times / times[-1], 0.005)
+    upper, _ = plots.plot_times(posterior)
+    line = next(line for line in upper.lines if line.get_label() == "posterior mean")
+    assert np.abs(line.get_ydata()).max() < 0.5
+    assert 9.5 not in plots.plot_increments(posterior).lines[1].get_xdata()
