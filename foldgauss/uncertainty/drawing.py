@@ -276,7 +276,9 @@ def _check_explained(frames: np.ndarray, drawn: Drawn) -> None:
         )
     if left > WORSE_THAN_MEAN * over_time:
         worse = left / over_time if over_time else np.inf
-        text = f"The model's errors are {worse:.1f} times those of the clip's mean frame. Is it of another video? {cure}"
+        text = (
+            f"The model's errors are {worse:.1f} times those of the clip's mean frame. Is it of another video? {cure}"
+        )
         warnings.warn(text, UserWarning, stacklevel=3)
 
 
@@ -296,7 +298,7 @@ def _check_ends(profiles: Profiles, model_times: np.ndarray) -> None:
         lost = -float(profiles[k](np.array([end]))[0])
         if lost > PINNED and abs(best - end) > AWAY * step:
             text = (
-                f"Frame {k} is held at time {end:g}, but looks like time {best:.4f}, {abs(best - end) / step:.1f} frames"
-                f" away, by {lost:.0f} nats: a video begins and ends where its model does. Times near it will be wrong."
+                f"Frame {k} is held at time {end:g}, but {best:.4f}, {abs(best - end) / step:.1f} frames away, is better by"
+                f" {lost:.0f} nats: a video begins and ends where its model does. Times near it will be wrong."
             )
             warnings.warn(text, UserWarning, stacklevel=3)

@@ -69,9 +69,7 @@ class FrameNoise:
 _Covariance = Float64[np.ndarray, "channels channels rows columns"]
 
 
-def covariances(
-    residual: Float[np.ndarray, "channels height width"], most: int | None = None
-) -> _Covariance:
+def covariances(residual: Float[np.ndarray, "channels height width"], most: int | None = None) -> _Covariance:
     """Means of r_c(p) r_d(p + lag) for all pairs of channels, lags up to `most` in y and x; 0 in the middle.
 
     No mean is taken off: residuals of a fit have mean 0, and what is left of it is part of what is correlated. Each lag
