@@ -88,7 +88,8 @@ def simulated_ranks(
 
     Pictures are kept between replicates, up to 1 GB: small models take milliseconds a replicate by exact passes.
 
-    **Source:** Talts, Betancourt, Simpson, Vehtari and Gelman 2018; the log-likelihood as a quantity, Modrak et al. 2023.
+    **Source:** Talts, Betancourt, Simpson, Vehtari and Gelman 2018; the log-likelihood as one of the quantities, Modrak
+    et al. 2023.
     **Raises:** ValueError for settings out of range, and what the posterior raises.
 
     **Example:** `simulated_ranks(model, FrameNoise(0.02, 1.0), num_frames=10, replicates=300).inside()`.

@@ -19,8 +19,10 @@ def ranks(**settings):
 @pytest.mark.parametrize("concentration", [0.5, 1.0, 3.0])
 def test_exact_passes_are_calibrated(concentration):
     found = ranks(concentration=concentration)
-    assert found.inside(0.99).all() and found.converged == 1
-    assert found.ranks.shape == (REPLICATES, FRAMES) and found.names[-2:] == ["any frame", "log-likelihood"]
+    assert found.inside(0.99).all()
+    assert found.converged == 1
+    assert found.ranks.shape == (REPLICATES, FRAMES)
+    assert found.names[-2:] == ["any frame", "log-likelihood"]
     for level in (0.5, 0.9):
         # All frames of a replicate together, as if each were a half of one alone.
         error = np.sqrt(level * (1 - level) / (REPLICATES * 2))
@@ -41,8 +43,10 @@ def test_noise_that_is_measured_is_calibrated():
 
 def test_smoothed_noise_needs_a_share():
     plain, fair = (ranks(assumed_noise=kind, correlation=1.0) for kind in ("independent", "effective"))
-    assert not plain.inside(0.99).any() and plain.coverage(0.9)[-2] < 0.6
-    assert fair.inside(0.99)[:-1].all() and fair.coverage(0.9)[-2] > 0.85
+    assert not plain.inside(0.99).any()
+    assert plain.coverage(0.9)[-2] < 0.6
+    assert fair.inside(0.99)[:-1].all()
+    assert fair.coverage(0.9)[-2] > 0.85
 
 
 def test_a_wrong_prior_is_found(monkeypatch):
@@ -79,13 +83,16 @@ def test_seeds_reproduce_and_replicates_do_not_depend_on_how_many():
 
 def test_emcee_draws_are_ranked_too():
     found = ranks(sampler="emcee", num_frames=3, replicates=2, draws=19)
-    assert found.num_ranks == 20 and ((found.ranks >= 0) & (found.ranks < 20)).all()
+    assert found.num_ranks == 20
+    assert ((found.ranks >= 0) & (found.ranks < 20)).all()
 
 
 @pytest.mark.parametrize("level", [0.8, 0.99])
 def test_the_envelope_holds_what_it_says(level):
     low, high = ecdf_band(50, 20, level)
-    assert low.shape == (20,) and (low <= high).all() and low[-1] == high[-1] == 1
+    assert low.shape == (20,)
+    assert (low <= high).all()
+    assert low[-1] == high[-1] == 1
     found = np.random.default_rng(1).integers(0, 20, (4000, 50))
     shares = (found[:, :, None] < np.arange(1, 21)).mean(1)
     inside = ((shares >= low - 1e-12) & (shares <= high + 1e-12)).all(1).mean()
@@ -129,5 +136,5 @@ def test_levels_without_whole_ranks_are_refused():
         with pytest.raises(ValueError, match="level"):
             coverage(np.zeros((3, 1), int), 20, wrong)
     for settings in ((0, 10), (10, 1), (10, 10, 1.0)):
-        with pytest.raises(ValueError, match="replicates|level"):
+        with pytest.raises(ValueError, match=r"replicates|level"):
             ecdf_band(*settings)

@@ -27,7 +27,8 @@ def test_times_and_coordinates_are_inverse(z, frames):
 
 def test_runs_are_stretches_of_free_frames():
     increments = Increments.among(HELD, [1, 2, 4])
-    assert increments.runs == [(1, 2), (4, 4)] and increments.num_free == 3
+    assert increments.runs == [(1, 2), (4, 4)]
+    assert increments.num_free == 3
     z = np.array([0.3, -0.2, 1.0])
     shares = np.exp([0.3, -0.2, 0.0]) / np.exp([0.3, -0.2, 0.0]).sum()
     expected = HELD.copy()

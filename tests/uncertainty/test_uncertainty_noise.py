@@ -85,16 +85,19 @@ def test_score_share_is_the_scores_own_variance(spread):
 
 def test_no_residual_at_all_counts_in_full():
     nothing = np.zeros(SHAPE)
-    assert effective_share(nothing) == 1 and score_share(nothing, np.ones(SHAPE), 3) == 1
+    assert effective_share(nothing) == 1
+    assert score_share(nothing, np.ones(SHAPE), 3) == 1
     found = autocorrelation(nothing, 2)
-    assert found[2, 2] == 1 and found.sum() == 1
+    assert found[2, 2] == 1
+    assert found.sum() == 1
 
 
 def test_shares_are_never_above_one():
     # Residuals that alternate cancel: no evidence is worth more than it says.
     y, x = np.mgrid[:40, :40]
     board = np.where((x + y) % 2, 1.0, -1.0)[None]
-    assert effective_share(board) <= 1 and score_share(board, np.ones((1, 40, 40)), 3) <= 1
+    assert effective_share(board) <= 1
+    assert score_share(board, np.ones((1, 40, 40)), 3) <= 1
 
 
 def test_frame_noise_is_checked_and_widened():

@@ -87,10 +87,10 @@ def test_evidence_finds_the_scale_and_the_times(seen):
     np.testing.assert_allclose(measured.noise.scale, SCALE, rtol=0.1)
     spread = exact_times(seen.profiles, Increments.among(np.linspace(0, 1, NUM_FRAMES)))
     miss = (spread.mean() - uneven())[1:-1] / spread.std()[1:-1]
-    assert np.abs(miss).max() < 4 and (miss**2).mean() < 2.5
-    assert (
-        measured.residual_correlation[0] == pytest.approx(1) and np.abs(measured.residual_correlation[2:]).max() < 0.1
-    )
+    assert np.abs(miss).max() < 4
+    assert (miss**2).mean() < 2.5
+    assert measured.residual_correlation[0] == pytest.approx(1)
+    assert np.abs(measured.residual_correlation[2:]).max() < 0.1
 
 
 def test_alpha_is_blended_with_black():

@@ -56,9 +56,13 @@ def near():
 
 
 def test_few_frames_draw_the_known_posterior(near):
-    assert near.converged and near.message.startswith("Converged")
-    assert (near.r_hat < 1.01).all() and (near.ess > 400).all() and (near.tau >= 1).all()
-    assert ((near.acceptance > 0.1) & (near.acceptance < 0.9)).all() and near.acceptance.shape == (4,)
+    assert near.converged
+    assert near.message.startswith("Converged")
+    assert (near.r_hat < 1.01).all()
+    assert (near.ess > 400).all()
+    assert (near.tau >= 1).all()
+    assert ((near.acceptance > 0.1) & (near.acceptance < 0.9)).all()
+    assert near.acceptance.shape == (4,)
     assert agrees(near)
     np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
     assert worst_ks(near, exact_cdfs(near)) > 1e-3
@@ -81,7 +85,8 @@ def test_a_wrong_jacobian_is_found(monkeypatch):
 
 def test_draws_keep_their_order_and_their_ends(near):
     assert (np.diff(near.times) > 0).all()
-    assert (near.times[..., 0] == 0).all() and (near.times[..., -1] == 1).all()
+    assert (near.times[..., 0] == 0).all()
+    assert (near.times[..., -1] == 1).all()
     np.testing.assert_allclose(near.logits.mean(-1), 0, atol=1e-10)
     assert near.draws.shape == (near.times[..., 0].size, 5)
 
@@ -129,7 +134,8 @@ def test_seeds_reproduce_to_the_bit():
 
 def test_too_few_steps_say_that_they_are():
     found = sampled(toy(*NEAR), steps=200)
-    assert not found.converged and found.message.startswith("Not converged after 200 steps")
+    assert not found.converged
+    assert found.message.startswith("Not converged after 200 steps")
     assert "autocorrelation times" in found.message
 
 
@@ -164,7 +170,8 @@ def test_another_runs_file_is_refused(tmp_path):
 def test_the_walkers_that_are_chosen_are_enough(num):
     means = np.linspace(0, 1, num + 2)[1:-1]
     found = sampled(toy(means, np.full(num, 0.2 / num), nodes=101), steps=20, ensembles=2)
-    assert found.times.shape[2] % 2 == 0 and found.times.shape[3] == num + 2
+    assert found.times.shape[2] % 2 == 0
+    assert found.times.shape[3] == num + 2
 
 
 @pytest.mark.parametrize(
