@@ -1,7 +1,8 @@
 """How sure frame times are, and whether that is true: seconds, calibration, and clips re-timed on purpose.
 
-    python -m benchmarks.uncertainty [--json FILE] [--parts clip unseen calibration retimed] [--model FILE] [--clip NAME|PATH]
-                                     [--gaussians N] [--minutes M] [--replicates N] [--plot FILE] [--seed S]
+    python -m benchmarks.uncertainty [--json FILE] [--parts clip unseen calibration retimed] [--model FILE]
+                                     [--clip NAME|PATH] [--gaussians N] [--minutes M] [--replicates N] [--plot FILE]
+                                     [--seed S]
 
 - clip: the posterior of all frame times of *bunny* (160x320) given the splats of a model (`--model`, or fitted for
   `--minutes`): seconds of each part, R-hat, autocorrelation times, and how far emcee is from forward and backward

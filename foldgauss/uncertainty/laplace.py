@@ -44,7 +44,8 @@ class LaplaceTimes:
 def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.ndarray, "num_frames"]) -> LaplaceTimes:
     """Newton's method from `start`, rising times, in the density of the log-ratios.
 
-    Slopes and curvatures are differences over a tenth of a standard deviation, as far as it is known.
+    Slopes and curvatures are differences over a standard deviation, as far as it is known: profiles of real clips have
+    steps of some tenths of a nat, where splats are no longer drawn, and nearer by there would be nothing else.
     """
     mode, std, precision = np.array(start, np.float64), np.zeros(len(start)), []
     for first, last in increments.runs:
@@ -69,7 +70,7 @@ def _climb(profiles: Profiles, times: np.ndarray, first: int, last: int, alpha: 
     now = height(times[part])
     for _ in range(STEPS):
         slope, bands = _derivatives(profiles, times, first, last, alpha, step)
-        step = 0.1 / np.sqrt(bands[0])
+        step = 1 / np.sqrt(bands[0])
         # Not `solveh_banded`, which SciPy cannot do for one unknown.
         move = scipy.linalg.cho_solve_banded((scipy.linalg.cholesky_banded(_banded(bands)), False), slope)
         for _ in range(40):
