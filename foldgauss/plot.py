@@ -49,7 +49,7 @@ def plot_density(
     `dist` is not a single distribution in the plane.
     """
     _check_plane(dist)
-    pyplot = _pyplot("plot_density")
+    pyplot = needed_pyplot("plot_density")
     ax = pyplot.subplots()[1] if ax is None else ax
     loc, scale = float(dist.time_loc), float(dist.time_scale)
     t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
@@ -88,7 +88,7 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
     if not len(history):
         raise invalid("history", expected="at least one step", got="none")
     if axes is None:
-        axes = _pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
+        axes = needed_pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
     drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
     steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
     for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
@@ -172,7 +172,7 @@ def _check_plane(dist) -> None:
         raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
 
 
-def _pyplot(caller: str):
+def needed_pyplot(caller: str):
     try:
         from matplotlib import pyplot
     except ImportError as error:

@@ -97,3 +97,13 @@ def test_formats(tmp_path, monkeypatch):
     assert names["vertices"].shape[1:] == (3, 3)
     made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply"}
     assert {path.name for path in tmp_path.iterdir()} == made
+
+
+@pytest.mark.slow
+def test_uncertainty():
+    pytest.importorskip("emcee", reason="emcee is an optional extra")
+    names = _run("uncertainty.md")
+    assert names["posterior"].converged
+    assert [(one.frames, one.kind) for one in names["found"]] == [((4, 5), "duplicated"), ((11, 12), "dropped")]
+    assert names["some"].free.tolist() == [4, 5, 6]
+    assert names["row"].name == "even"

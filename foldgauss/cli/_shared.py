@@ -17,6 +17,7 @@ from rich.table import Table
 
 from foldgauss._checks import invalid
 from foldgauss.io._atomic import atomic_path
+from foldgauss.io.model_file import read_header
 from foldgauss.io.video_file import (
     ANIMATION_SUFFIXES,
     MAX_FPS,
@@ -24,6 +25,7 @@ from foldgauss.io.video_file import (
     VIDEO_SUFFIXES,
     Clip,
     memory_limit,
+    read_video,
     write_image,
     write_video,
 )
@@ -36,7 +38,7 @@ from foldgauss.video.model import VideoModel
 class _InOrderOfUse(typer.core.TyperGroup):
     """The commands as one comes to need them; typer has them as they were registered."""
 
-    _ORDER = ("fit", "render", "evaluate", "info", "edit", "export", "import", "demo")
+    _ORDER = ("fit", "render", "evaluate", "info", "uncertainty", "edit", "export", "import", "demo")
 
     def list_commands(self, ctx: typer.Context) -> list[str]:
         others = set(self.commands).difference(self._ORDER)
@@ -62,6 +64,10 @@ Frames = Annotated[
 
 class WrongUse(ValueError):
     """The command was called with arguments that cannot be right."""
+
+
+class Stopped(Exception):
+    """The user asked a fit, or a sampler, to stop; the message says how to go on."""
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
@@ -157,6 +163,37 @@ def fingerprint(clip: Clip) -> dict[str, Any]:
     """What a resumed fit must find again: the frames themselves, whatever they are called now."""
     digest = hashlib.blake2b(clip.frames, digest_size=16).hexdigest()
     return {"num_frames": clip.num_frames, "size": list(clip.size), "frames_digest": digest}
+
+
+def clip_of_model(
+    model: VideoModel | EditedVideo, model_path: Path, video: Path, frames: str | None, *, as_many: bool = True
+) -> Clip:
+    """The frames that a model was fitted to, at its size, or those named; says so where they are others.
+
+    Raises WrongUse, with `as_many`, for another number of frames than the model's.
+    """
+    about = read_header(model_path)["metadata"]
+    kept = about.get("frames")
+    wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
+    clip = read_video(video, frames=wanted, size=model.size)
+    if as_many and clip.num_frames != model.num_frames:
+        raise WrongUse(
+            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
+            f"Name those that it was fitted to, as 0:{model.num_frames}."
+        )
+    _say_other_frames(about, clip)
+    return clip
+
+
+def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
+    """Any clip of the right size may be compared with a model, but not unawares."""
+    digest = about.get("frames_digest")  # files from before it was kept have none
+    if digest is not None and digest != fingerprint(clip)["frames_digest"]:
+        err.print(
+            f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
+            "another clip or range, or the same one decoded by another version of OpenCV.",
+            soft_wrap=True,
+        )
 
 
 _LABELS = {

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -16,14 +16,13 @@ from foldgauss.cli._shared import (
     WrongUse,
     app,
     check_picture_path,
+    clip_of_model,
     draw,
     err,
     evaluate_with_progress,
     figures_of,
-    fingerprint,
     out,
     parse_color,
-    parse_frames,
     parse_size,
     parse_times,
     print_figures,
@@ -35,7 +34,7 @@ from foldgauss.cli._shared import (
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.model_file import read_header
-from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, Clip, read_video
+from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS
 from foldgauss.io.video_model import load_video_model
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
@@ -175,16 +174,7 @@ def evaluate_command(
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
     model = load_video_model(model_path)
-    about = read_header(model_path)["metadata"]
-    kept = about.get("frames")
-    wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
-    clip = read_video(video, frames=wanted, size=model.size)
-    if clip.num_frames != model.num_frames:
-        raise WrongUse(
-            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
-            f"Name those that it was fitted to, as 0:{model.num_frames}."
-        )
-    _say_other_frames(about, clip)
+    clip = clip_of_model(model, model_path, video, frames)
     scores = evaluate_with_progress(model, clip.frames)
     num_bytes = model_path.stat().st_size
     figures = figures_of(model, scores) | {"file_bytes": num_bytes}
@@ -221,17 +211,6 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
         table.add_row(name, value)
     out.print(table)
-
-
-def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
-    """Any clip of the right size may be compared with a model, but not unawares."""
-    digest = about.get("frames_digest")  # files from before it was kept have none
-    if digest is not None and digest != fingerprint(clip)["frames_digest"]:
-        err.print(
-            f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
-            "another clip or range, or the same one decoded by another version of OpenCV.",
-            soft_wrap=True,
-        )
 
 
 def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:

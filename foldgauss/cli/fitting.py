@@ -18,6 +18,7 @@ from foldgauss.cli._shared import (
     Frames,
     Overwrite,
     Size,
+    Stopped,
     WrongUse,
     app,
     as_option,
@@ -49,15 +50,11 @@ DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metr
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
 
 
-class Stopped(Exception):
-    """The user asked a fit to stop; the message says how to go on."""
-
-
 @app.command()
 def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
 ) -> None:
-    """Fit 24 frames of the sample clip Bunny and show what comes out.
+    """Fit 24 frames of the clip Bunny and show what comes out.
 
     The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files in it is
     left alone.
@@ -149,7 +146,7 @@ def fit(
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings and errors.")] = False,
     log_json: Annotated[bool, typer.Option("--log-json", help="Tell progress and figures as lines of JSON.")] = False,
 ) -> None:
-    """Fit a model to a clip; the first of the given budgets ends it.
+    """Fit a model to a clip; the first of its budgets ends it.
 
     A stopped fit is kept and goes on with --resume.
     """

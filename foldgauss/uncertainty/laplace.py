@@ -10,6 +10,9 @@ from foldgauss.uncertainty.increments import Increments
 from foldgauss.uncertainty.profiles import Profiles
 
 STEPS, ENOUGH = 60, 1e-9
+#: Slopes and curvatures are differences over so many standard deviations: profiles are rough on smaller scales, where
+#: Gaussians come and go.
+REACH = 1.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +47,7 @@ class LaplaceTimes:
 def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.ndarray, "num_frames"]) -> LaplaceTimes:
     """Newton's method from `start`, rising times, in the density of the log-ratios.
 
-    Slopes and curvatures are differences over a standard deviation, as far as it is known: profiles of real clips have
-    steps of some tenths of a nat, where splats are no longer drawn, and nearer by there would be nothing else.
+    Slopes and curvatures of profiles are differences over `REACH` standard deviations to both sides.
     """
     mode, std, precision = np.array(start, np.float64), np.zeros(len(start)), []
     for first, last in increments.runs:
@@ -61,7 +63,7 @@ def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.nd
 def _climb(profiles: Profiles, times: np.ndarray, first: int, last: int, alpha: float) -> np.ndarray:
     """Climb in place; returns the bands of the negative second derivative at the top."""
     part = slice(first, last + 1)
-    step = np.diff(times)[first - 1 : last].copy() * 1e-2
+    step = np.diff(times)[first - 1 : last].copy() * 0.1
 
     def height(inner: np.ndarray) -> float:
         gaps = np.diff(np.concatenate([[times[first - 1]], inner, [times[last + 1]]]))
@@ -70,7 +72,7 @@ def _climb(profiles: Profiles, times: np.ndarray, first: int, last: int, alpha: 
     now = height(times[part])
     for _ in range(STEPS):
         slope, bands = _derivatives(profiles, times, first, last, alpha, step)
-        step = 1 / np.sqrt(bands[0])
+        step = REACH / np.sqrt(bands[0])
         # Not `solveh_banded`, which SciPy cannot do for one unknown.
         move = scipy.linalg.cho_solve_banded((scipy.linalg.cholesky_banded(_banded(bands)), False), slope)
         for _ in range(40):

@@ -50,6 +50,13 @@ class FrameNoise:
                 raise invalid(f"noise.{name}", expected=f"a number or {num_frames} of them", got=got)
         return FrameNoise(*(np.broadcast_to(value, num_frames).copy() for value in (self.scale, self.share)))
 
+    def told(self) -> str:
+        """In words: how great residuals are, and how many of them count."""
+        low, middle, high = (f"{n:,.0f}" if n >= 10 else f"{n:.2g}" for n in 1 / np.quantile(self.share, [1, 0.5, 0]))
+        counted = "all values count" if middle == "1" else f"one value in {middle} counts"
+        between = "" if low == high else f" (frames: one in {low} to {high})"
+        return f"residuals of {255 * np.median(self.scale):.2g} grey levels, {counted}{between}"
+
     @property
     def weight(self) -> Float64[np.ndarray, "num_frames"]:
         """What a squared error is multiplied by: share / (2 scale^2)."""

@@ -107,7 +107,7 @@ class FrameTimePosterior:
 
         Posterior: `t` (chain, draw, frame) and `w` (chain, draw, interval), centred. Sample statistics: `lp`.
         """
-        arviz = _needed("arviz")
+        arviz = needed("arviz")
         ensembles, steps, walkers, num_frames = self.times.shape
         flat = self.times.reshape(ensembles, steps * walkers, num_frames)
         increments = self.log_prob.increments
@@ -156,11 +156,8 @@ def frame_time_posterior(
 
     Example: `frame_time_posterior(model, frames).interval(0.9)`.
     """
-    _needed("emcee")
-    if thin_by < 1:
-        raise invalid("thin_by", expected="a whole number >= 1", got=thin_by)
-    if steps < thin_by:
-        raise invalid("steps", expected=f"at least thin_by = {thin_by}", got=steps)
+    needed("emcee")
+    _check_steps(steps, thin_by)
     with _shown(progress) as show:
         if log_prob is None:
             if model is None:
@@ -175,21 +172,49 @@ def frame_time_posterior(
         return run.until_converged(steps // thin_by, show, seen)
 
 
+def check_settings(
+    num_free: int,
+    walkers: int | None = None,
+    *,
+    ensembles: int = 4,
+    steps: int | None = None,
+    thin_by: int = THIN,
+    together: bool = False,
+) -> int:
+    """The number of walkers, or its default, for `num_free` frames whose settings can be right.
+
+    `together`: all frames move at once. Raises ValueError as `frame_time_posterior` does, before any work.
+    """
+    from foldgauss.uncertainty.moves import BLOCK
+
+    at_once = num_free if together or num_free <= AT_ONCE else BLOCK
+    found = max(32, 4 * at_once + at_once % 2) if walkers is None else walkers
+    if found < 2 * at_once or found < 4 or found % 2:
+        expected = f"an even number, at least {max(2 * at_once, 4)}: twice the frames that move at once"
+        raise invalid("walkers", expected=expected, got=walkers, cure="Leave it out, or choose fewer frames.")
+    if ensembles < 2:
+        raise invalid("ensembles", expected="at least 2, better 4: R-hat compares them", got=ensembles)
+    if steps is not None:
+        _check_steps(steps, thin_by)
+    return found
+
+
+def _check_steps(steps: int, thin_by: int) -> None:
+    if thin_by < 1:
+        raise invalid("thin_by", expected="a whole number >= 1", got=thin_by)
+    if steps < thin_by:
+        raise invalid("steps", expected=f"at least thin_by = {thin_by}", got=steps)
+
+
 class _Run:
     """Some independent ensembles, and what they have kept."""
 
     def __init__(self, log_prob: FrameTimeLogProb, walkers, moves, seed: int, ensembles: int, thin_by: int, backend):
-        from foldgauss.uncertainty.moves import BLOCK, BlockSweep
+        from foldgauss.uncertainty.moves import BlockSweep
 
         self.log_prob, self.thin_by, self.seed = log_prob, thin_by, seed
         num = log_prob.num_free
-        at_once = num if moves is not None or num <= AT_ONCE else BLOCK
-        self.walkers = max(32, 4 * at_once + at_once % 2) if walkers is None else walkers
-        if self.walkers < 2 * at_once or self.walkers < 4 or self.walkers % 2:
-            expected = f"an even number, at least {max(2 * at_once, 4)}: twice the frames that move at once"
-            raise invalid("walkers", expected=expected, got=walkers, cure="Leave it out, or choose fewer frames.")
-        if ensembles < 2:
-            raise invalid("ensembles", expected="at least 2, better 4: R-hat compares them", got=ensembles)
+        self.walkers = check_settings(num, walkers, ensembles=ensembles, together=moves is not None)
         if "DESnookerMove" in ([] if moves is None else _kinds(moves)) and _version("emcee") < (3, 1, 7):
             cure = "Its proposals are scaled wrongly (emcee pull request 531): take DEMove, or a later emcee."
             raise invalid(
@@ -307,7 +332,7 @@ class _Run:
 
 def _r_hat(drawn: Float64[np.ndarray, "ensembles steps walkers frames"]) -> Float64[np.ndarray, "frames"]:
     """Split rank R-hat, an ensemble a chain."""
-    arviz = _needed("arviz")
+    arviz = needed("arviz")
     ensembles, steps, walkers, frames = drawn.shape
     chains = drawn.reshape(ensembles, steps * walkers, frames)
     return np.array([float(arviz.rhat(np.ascontiguousarray(chains[..., n]), method="rank")) for n in range(frames)])
@@ -329,7 +354,7 @@ class _Kept:
     """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced."""
 
     def __init__(self, path: str | os.PathLike, fingerprint: str):
-        h5py = _needed("h5py")
+        h5py = needed("h5py")
         self.path = Path(path)
         self.live = self.path.with_name(f".{self.path.name}.running")
         if self.path.exists():
@@ -366,7 +391,7 @@ class _Kept:
         self.live.unlink()
 
 
-def _needed(name: str):
+def needed(name: str):
     """An optional package, or what to install."""
     try:
         with warnings.catch_warnings():

@@ -1,0 +1,324 @@
+"""The command that says how sure the learned frame times are: `uncertainty`."""
+
+import csv
+import dataclasses
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from foldgauss import __version__
+from foldgauss._checks import invalid
+from foldgauss.cli._shared import (
+    Overwrite,
+    Stopped,
+    WrongUse,
+    app,
+    clip_of_model,
+    err,
+    fingerprint,
+    out,
+)
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable
+from foldgauss.io.video_file import Clip
+from foldgauss.io.video_model import load_video_model
+from foldgauss.uncertainty import (
+    Evidence,
+    FrameNoise,
+    Profiles,
+    evidence,
+    frame_time_log_prob,
+    frame_time_posterior,
+    plots,
+)
+from foldgauss.uncertainty.increments import Increments
+from foldgauss.uncertainty.log_prob import LEVELS, at_level
+from foldgauss.uncertainty.noise import NOISES
+from foldgauss.uncertainty.pace import irregularities
+from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, needed
+from foldgauss.uncertainty.report import frame_table, summary
+from foldgauss.video.model import VideoModel
+
+CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
+PICTURES = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
+FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PICTURES)
+#: Draws of each ensemble that posterior.nc holds, evenly spaced: of all there would be gigabytes.
+MOST_DRAWS = 4000
+_PROFILES = ("nodes", "values", "slopes", "count")
+
+
+@app.command(name="uncertainty")
+def uncertainty_command(
+    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
+    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for tables, pictures and draws.")],
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A:B", help="Frames A up to, not including, B of the clip [default: those that it was fitted to]."
+        ),
+    ] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K,A:B,..",
+            help="Draw the times of these frames, the others held [default: of all between the ends].",
+        ),
+    ] = None,
+    noise: Annotated[
+        str, typer.Option(help=f"What of the residuals counts: {', '.join(NOISES)}; see docs/uncertainty.md.")
+    ] = "score",
+    level: Annotated[
+        str, typer.Option(help="What is given: splats, all of them; colors: all but their colours, which takes longer.")
+    ] = "splats",
+    concentration: Annotated[
+        float, typer.Option(help="Of the Dirichlet prior on increments: 1 is uniform, more is towards an even pace.")
+    ] = 1.0,
+    walkers: Annotated[int | None, typer.Option(help="Walkers of each ensemble [default: as many as suffice].")] = None,
+    ensembles: Annotated[int, typer.Option(help="Independent ensembles, which R-hat compares.")] = 4,
+    steps: Annotated[int, typer.Option(help="Most steps; fewer once it has converged.")] = 20_000,
+    seed: Annotated[int, typer.Option(help="Seed of all draws.")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Say how sure the frame times are, given the splats.
+
+    Tells error bars of every frame, duplicated and dropped frames, and whether sampling has converged. A run that was
+    stopped goes on when called again with the same arguments; more --steps go on from fewer.
+    """
+    for name in ("emcee", "arviz", "h5py", "h5netcdf", "matplotlib"):
+        needed(name)
+    if noise not in NOISES:
+        raise WrongUse(str(invalid("--noise", expected="one of " + ", ".join(NOISES), got=noise)))
+    if level not in LEVELS:
+        raise WrongUse(str(invalid("--level", expected="one of " + ", ".join(LEVELS), got=level)))
+    _check_folder(out_dir, video, overwrite)
+    wanted = _parse_only(only)
+    model = load_video_model(model_path)
+    if not isinstance(model, VideoModel):
+        cure = "Take the model that was edited, and the clip that it was fitted to."
+        raise WrongUse(str(invalid("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)))
+    clip = clip_of_model(model, model_path, video, frames, as_many=False)
+    _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
+    key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
+    seen = _kept_evidence(out_dir, key, overwrite)
+    with _bars() as bars:
+        if seen is None:
+            seen = _evidence(model, clip, noise, level, wanted, bars)
+            _make_folder(out_dir)
+            _keep_evidence(out_dir / EVIDENCE, key, seen)
+        log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, seen=seen)
+        settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
+        posterior = _drawn(out_dir / CHAINS, overwrite, bars, seen=seen, log_prob=log_prob, **settings)
+    fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
+    _write(out_dir, posterior, fitted, f"{model_path.name}, by {Path(clip.source).name}", level)
+    _tell(out_dir, posterior)
+
+
+def _parse_only(text: str | None) -> list[int] | None:
+    """Frames as 3,5,10:20."""
+    if text is None:
+        return None
+    found: list[int] = []
+    for part in text.split(","):
+        first, colon, last = part.strip().partition(":")
+        if not first.isdecimal() or (colon and not last.isdecimal()) or (colon and int(last) - int(first) > 100_000):
+            expected = "frames as 3,5,10:20 (20 not included)"
+            raise WrongUse(str(invalid("--only", expected=expected, got=repr(text))))
+        found += range(int(first), int(last)) if colon else [int(first)]
+    if not found:
+        raise WrongUse(str(invalid("--only", expected="at least one frame", got=repr(text))))
+    return sorted(set(found))
+
+
+def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
+    """Refuse a folder that cannot be right, before any work; it is made when there is something to put into it."""
+    if folder.exists() and not folder.is_dir():
+        raise WrongUse(str(invalid("--out", expected="a folder", got=f"the file {folder}")))
+    if video.is_dir() and folder.resolve() == video.resolve():
+        cure = "Pictures would be frames there."
+        raise WrongUse(str(invalid("--out", expected="a folder other than the clip's", got=folder, cure=cure)))
+    there = [name for name in FILES if (folder / name).exists()]
+    if there and not (folder / CHAINS).exists() and not overwrite:
+        raise WrongUse(f"--out: {folder / there[0]} exists. Choose another folder, or add --overwrite.")
+    if folder.is_dir():
+        check_writable(folder / FILES[0])
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
+    check_writable(path / FILES[0])
+
+
+def _check_settings(num_frames: int, only, concentration: float, walkers, ensembles: int, steps: int) -> None:
+    """All that can be known to be wrong before pictures are drawn."""
+    try:
+        found = Increments.among(np.linspace(0.0, 1.0, num_frames), only, concentration)
+    except ValueError as error:
+        if str(error).startswith("concentration"):
+            raise
+        if num_frames < 3:
+            text = str(invalid("--frames", expected="at least 3 frames", got=num_frames))
+        else:
+            text = str(error).replace("frames:", "--only:", 1)
+        raise WrongUse(text) from error
+    check_settings(found.num_free, walkers=walkers, ensembles=ensembles, steps=steps)
+
+
+def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] | None) -> str:
+    """Of all that the evidence depends on."""
+    about = fingerprint(clip) | {"noise": noise, "level": level, "only": only, "version": __version__}
+    digest = hashlib.blake2b(model_path.read_bytes(), digest_size=16)
+    digest.update(json.dumps(about, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _evidence(model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars) -> Evidence:
+    seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
+    return at_level(level, model, clip.frames, seen, only, lambda done, total: bars("frames", done, total))
+
+
+def _keep_evidence(path: Path, key: str, seen: Evidence) -> None:
+    """So that a run that goes on draws no pictures again."""
+    arrays = {name: getattr(seen.profiles, name) for name in _PROFILES}
+    arrays |= {"scale": seen.noise.scale, "share": seen.noise.share, "correlation": seen.residual_correlation}
+    with atomic_path(path) as temporary:
+        np.savez(temporary, key=key, num_drawn=seen.num_drawn, **arrays)
+
+
+def _kept_evidence(folder: Path, key: str, overwrite: bool) -> Evidence | None:
+    """What an earlier run has kept, or None. Refuses the folder of another run, before any work."""
+    try:
+        with np.load(folder / EVIDENCE) as kept:
+            kept = dict(kept)
+            if str(kept["key"]) == key:
+                profiles = Profiles(*(kept[name] for name in _PROFILES))
+                noise = FrameNoise(kept["scale"], kept["share"])
+                return Evidence(profiles, noise, kept["correlation"], int(kept["num_drawn"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # none, or not one of ours: drawn anew
+        return None
+    if (folder / CHAINS).exists() and not overwrite:
+        raise _of_another(folder / CHAINS)
+    return None
+
+
+def _of_another(path: Path) -> WrongUse:
+    cure = "Choose another folder, or add --overwrite to give them up."
+    expected = "the draws of this model, clip and settings"
+    return WrongUse(str(invalid("--out", expected=expected, got=f"others in {path}", cure=cure)))
+
+
+@contextmanager
+def _bars() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar for the pictures and one for the steps, where somebody looks."""
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[told]}")
+    with Progress(*columns, TimeElapsedColumn(), console=err, disable=not err.is_terminal) as progress:
+        tasks: dict[str, Any] = {}
+        titles = {"pictures": "Drawing pictures", "frames": "Without colours", "steps": "Sampling"}
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = progress.add_task(titles.get(what, what.capitalize()), total=total, told="")
+            progress.update(tasks[what], completed=done, total=total, told=f"{done:,}/{total:,}")
+
+        yield show
+
+
+def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePosterior:
+    """Sample, from where a stopped run is kept; with `overwrite`, instead of another run."""
+    existed, course = path.exists(), []
+
+    def show(what: str, done: int, total: int) -> None:
+        course[1:] = [done]
+        if not course:
+            course.append(done)
+        bars(what, done, total)
+
+    def sample() -> FrameTimePosterior:
+        return frame_time_posterior(progress=show, backend=path, **arguments)
+
+    try:
+        try:
+            posterior = sample()
+        except ValueError as error:
+            if not str(error).startswith("backend:"):
+                raise
+            if not overwrite:
+                raise _of_another(path) from error
+            path.unlink()
+            existed, posterior = False, sample()
+    except KeyboardInterrupt as error:
+        raise Stopped(f"stopped by Ctrl-C; what {path} holds goes on when called again.") from error
+    if existed:
+        text = "had finished: nothing was drawn anew" if not course else "went on from where it was stopped"
+        out.print(f"{path}: {text}", soft_wrap=True)
+    return posterior
+
+
+def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> None:
+    """Every file whole, and the one that counts most first."""
+    flagged = irregularities(posterior)
+    _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
+    with atomic_path(folder / "summary.md") as temporary:
+        text = summary(posterior, fitted, flagged=flagged, level=level)
+        temporary.write_text(f"# Frame times of {title}\n\n{text}")
+    _write_netcdf(folder / "posterior.nc", posterior)
+    _draw(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
+    _draw(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
+    _draw(folder / "corner.png", plots.plot_pairs, posterior)
+    _draw(folder / "trace.png", plots.plot_trace, posterior)
+    if posterior.seen is not None:
+        _draw(folder / "correlation.png", plots.plot_correlation, posterior.seen)
+
+
+def _draw(path: Path, plot: Callable, *arguments: Any, **options: Any) -> None:
+    from matplotlib import pyplot
+
+    pyplot.switch_backend("Agg")  # which wants no screen
+    figure = np.ravel(plot(*arguments, **options))[0].figure
+    try:
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=120)
+    finally:
+        pyplot.close(figure)
+
+
+def _write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
+    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            writer.writerow([_cell(value) for value in row])
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, np.integer):
+        return str(value)
+    return "" if np.isnan(value) else f"{value:.9g}"
+
+
+def _write_netcdf(path: Path, posterior: FrameTimePosterior) -> None:
+    steps, walkers = posterior.times.shape[1:3]
+    stride = -(-steps * walkers // MOST_DRAWS)
+    thinned = dataclasses.replace(posterior, times=posterior.times[:, ::stride])
+    data = thinned.to_arviz()
+    data.attrs["kept_one_step_in"] = stride
+    with atomic_path(path) as temporary:
+        data.to_netcdf(str(temporary), engine="h5netcdf")
+
+
+def _tell(folder: Path, posterior: FrameTimePosterior) -> None:
+    out.print((folder / "summary.md").read_text(), soft_wrap=True)
+    if not posterior.converged:
+        err.print(f"warning: {posterior.message} The draws so far are in {folder}.", soft_wrap=True)

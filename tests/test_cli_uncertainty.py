@@ -1,0 +1,206 @@
+"""`foldgauss uncertainty`: what it leaves, what it refuses, and that a killed run loses nothing."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
+
+from foldgauss.io import save_video_model
+from foldgauss.video import edit
+
+for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
+    pytest.importorskip(name, reason="an optional extra")
+
+PICTURES = {"corner.png", "correlation.png", "increments.png", "times.png", "trace.png"}
+FILES = {"chains.h5", "evidence.npz", "frame_times.csv", "posterior.nc", "summary.md"} | PICTURES
+#: Enough for two looks at convergence, of which one may be killed in between.
+SHORT = ["--steps", "700", "--ensembles", "2", "--only", "5:9"]
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("uncertainty")
+    write_both(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(work):
+    """A run to the end of its steps."""
+    target = work / "results" / "short"
+    assert run("uncertainty", work / "model.safetensors", work / "clip", "--out", target, *SHORT) == 0
+    return target
+
+
+def arguments(work, target, *options):
+    return ["uncertainty", work / "model.safetensors", work / "clip", "--out", target, *options]
+
+
+def table_of(folder):
+    with open(folder / "frame_times.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def draws_of(folder):
+    import h5py
+
+    with h5py.File(folder / "chains.h5") as file:
+        return [file[name]["chain"][: file[name].attrs["iteration"]] for name in sorted(file)]
+
+
+def test_everything_is_there(done):
+    assert {path.name for path in done.iterdir()} == FILES
+    rows = table_of(done)
+    assert [int(row["frame"]) for row in rows] == list(range(NUM_FRAMES))
+    assert float(rows[TWICE + 1]["mean"]) - float(rows[TWICE]["mean"]) < 0.01 / (NUM_FRAMES - 1) * 5
+    for row in rows[5:9]:
+        assert float(row["low_90"]) < float(row["low_50"]) < float(row["high_50"]) < float(row["high_90"])
+        assert float(row["std"]) == pytest.approx(float(row["exact_std"]), rel=0.4)
+        assert float(row["r_hat"]) < 1.2
+        assert row["identified"] == "yes"
+    assert rows[3]["r_hat"] == rows[3]["tau"] == ""  # held
+    told = (done / "summary.md").read_text()
+    assert f"| {TWICE}, {TWICE + 1} | duplicated |" in told
+    assert "The splats, held" in told
+    assert "frames 1 to 4, 9 to 10, held" in told
+    for name in PICTURES:
+        assert cv2.imread(str(done / name)).std() > 5
+
+
+def test_arviz_reads_the_draws(done):
+    from foldgauss.uncertainty.posterior import needed
+
+    data = needed("arviz").from_netcdf(str(done / "posterior.nc"))
+    t = data.posterior["t"]
+    assert t.sizes["chain"] == 2
+    assert t.sizes["frame"] == NUM_FRAMES
+    assert {"w"} < set(data.posterior)
+    rows = table_of(done)
+    np.testing.assert_allclose(t.mean(("chain", "draw")), [float(row["mean"]) for row in rows], atol=2e-4)
+    assert data.posterior.attrs.get("message", data.attrs.get("message"))
+
+
+def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys):
+    before = (done / "chains.h5").read_bytes()
+    assert run(*arguments(work, done, *SHORT)) == 0
+    assert "had finished: nothing was drawn anew" in capsys.readouterr().out
+    assert (done / "chains.h5").read_bytes() == before
+    for other in (["--seed", "1"], ["--concentration", "2"], ["--noise", "independent"]):
+        table = (done / "frame_times.csv").read_bytes()
+        assert run(*arguments(work, done, *SHORT, *other)) == 2
+        message = capsys.readouterr().err
+        assert "--out: expected the draws of this model, clip and settings, got others in" in message
+        assert "--overwrite" in message
+        assert (done / "frame_times.csv").read_bytes() == table
+        assert (done / "chains.h5").read_bytes() == before
+    assert {path.name for path in done.iterdir()} == FILES
+
+
+def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys):
+    """Killed without warning once something is kept; called again, it draws what it would have drawn."""
+    target = tmp_path / "killed"
+    code = (
+        "import os, signal, sys\n"
+        "from foldgauss.uncertainty import posterior\n"
+        "whole = posterior._Kept.keep\n"
+        "def keep(self):\n"
+        "    whole(self)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "posterior._Kept.keep = keep\n"
+        "from foldgauss import cli\n"
+        "cli.main(sys.argv[1:])\n"
+    )
+    words = [str(word) for word in arguments(work, target, *SHORT)]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    killed = subprocess.run([sys.executable, "-c", code, *words], env=environment, capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert len(draws_of(target)[0]) < 70
+    assert not (target / "frame_times.csv").exists()
+    assert run(*words) == 0
+    assert "went on from where it was stopped" in capsys.readouterr().out
+    for one, other in zip(draws_of(target), draws_of(done), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert table_of(target) == table_of(done)
+    assert {path.name for path in target.iterdir()} == FILES
+
+
+def test_without_colours_less_is_known(work, done, tmp_path):
+    target = tmp_path / "results"
+    assert run(*arguments(work, target, *SHORT, "--level", "colors")) == 0
+    told = (target / "summary.md").read_text()
+    assert "their colours are integrated out" in told
+    assert "their colours" not in (done / "summary.md").read_text()
+    wider = [float(one["exact_std"]) / float(other["exact_std"]) for one, other in zip(
+        table_of(target)[5:9], table_of(done)[5:9], strict=True)]  # fmt: skip
+    assert min(wider) > 0.9
+    assert max(wider) > 1.02
+
+
+def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys):
+    target = tmp_path / "results"
+    few = ["--steps", "60", "--ensembles", "2", "--only", "6,7"]
+    assert run(*arguments(work, target, *few)) == 0
+    assert "Not converged after 60 steps" in capsys.readouterr().err
+    first = draws_of(target)
+    assert run(*arguments(work, target, *few, "--steps", "100")) == 0
+    for one, other in zip(first, draws_of(target), strict=True):
+        assert len(one) == 6
+        assert len(other) == 10
+        np.testing.assert_array_equal(one, other[:6])
+    assert run(*arguments(work, target, *few, "--seed", "5", "--overwrite")) == 0
+    assert not np.array_equal(draws_of(target)[0], first[0])
+    (target / "chains.h5").unlink()
+    assert run(*arguments(work, target, *few)) == 2
+    assert "frame_times.csv exists" in capsys.readouterr().err
+
+
+def test_wrong_use(work, tmp_path, capsys):
+    model, clip, target = work / "model.safetensors", work / "clip", tmp_path / "out"
+    save_video_model(tmp_path / "edited.safetensors", edit(model_of_12()).move((0.1, 0), frame=3).video())
+    (tmp_path / "file").write_text("precious")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "chains.h5").write_text("precious")
+    cases = [
+        ([model, clip, "--out", target, "--only", "0,3"], 2, "--only: expected whole numbers from 1 to 10"),
+        ([model, clip, "--out", target, "--only", "3-5"], 2, "--only: expected frames as 3,5,10:20"),
+        ([model, clip, "--out", target, "--only", "5:5"], 2, "--only: expected at least one frame"),
+        ([model, clip, "--out", target, "--noise", "white"], 2, "--noise: expected one of score, effective"),
+        ([model, clip, "--out", target, "--level", "c"], 2, "--level: expected one of splats, colors"),
+        ([model, clip, "--out", target, "--concentration", "0"], 2, "--concentration: expected a number > 0"),
+        ([model, clip, "--out", target, "--walkers", "7"], 2, "--walkers: expected an even number"),
+        ([model, clip, "--out", target, "--ensembles", "1"], 2, "--ensembles: expected at least 2"),
+        ([model, clip, "--out", target, "--steps", "3"], 2, "--steps: expected at least"),
+        ([model, clip, "--out", target, "--frames", "0:2"], 2, "--frames: expected at least 3 frames"),
+        ([model, clip, "--out", clip], 2, "other than the clip's"),
+        ([model, clip, "--out", tmp_path / "file"], 2, "--out: expected a folder"),
+        ([model, clip, "--out", tmp_path / "bad"], 2, "--out: expected the draws of this model"),
+        ([tmp_path / "none", clip, "--out", target], 2, "missing"),
+        ([tmp_path / "edited.safetensors", clip, "--out", target], 2, "an edited one"),
+    ]
+    for words, code, message in cases:
+        assert run("uncertainty", *words) == code, words
+        assert message in (told := capsys.readouterr().err), told
+        assert len(told.strip().splitlines()) == 1, told
+        assert not target.exists(), words
+    assert (tmp_path / "file").read_text() == "precious"
+    assert (tmp_path / "bad" / "chains.h5").read_text() == "precious"
+
+
+def test_a_clip_of_something_else(work, tmp_path, capsys):
+    from foldgauss.io import write_image
+
+    clip = tmp_path / "clip"
+    clip.mkdir()
+    for k, frame in enumerate(np.random.default_rng(0).integers(0, 255, (12, 40, 64, 3))):
+        write_image(clip / f"{k:02}.png", frame.astype(np.uint8))
+    assert run("uncertainty", work / "model.safetensors", clip, "--out", tmp_path / "out") == 1
+    assert "video: expected frames of which the model explains 20%" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

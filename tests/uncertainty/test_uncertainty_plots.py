@@ -1,0 +1,85 @@
+"""The pictures of a posterior: what they show, of which frames, with labels."""
+
+import numpy as np
+import pytest
+from drawn_times import posterior_about
+
+from foldgauss.uncertainty import plots
+
+pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
+
+
+@pytest.fixture(autouse=True)
+def _no_screen():
+    pyplot.switch_backend("Agg")
+    yield
+    pyplot.close("all")
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    steps = np.ones(20)
+    steps[[4, 12]] = 0.01, 2.2
+    times = np.concatenate([[0], np.cumsum(steps)])
+    return posterior_about(times / times[-1], 0.03)
+
+
+def test_times_in_frames(posterior):
+    upper, lower = axes = plots.plot_times(posterior, fitted=np.linspace(0, 1, 21))
+    axes[0].figure.canvas.draw()
+    lines = {line.get_label(): line for line in (*upper.lines, *lower.lines)}
+    np.testing.assert_allclose(lines["posterior mean"].get_ydata(), posterior.mean() * 20 - np.arange(21))
+    np.testing.assert_allclose(lines["as fitted"].get_ydata(), 0, atol=1e-12)
+    assert lines["duplicated"].get_xdata().tolist() == [4.5]
+    assert lines["dropped"].get_xdata().tolist() == [12.5]
+    half = np.diff(posterior.exact.interval(0.9), axis=0)[0, 1:-1] * 10
+    np.testing.assert_allclose(lines["exact, 90%"].get_ydata(), half)
+    np.testing.assert_allclose(lines["Laplace, 90%"].get_ydata()[7:9], half[7:9], rtol=0.1)
+    assert "frames" in upper.get_ylabel()
+    own = pyplot.subplots(2, 1)[1]
+    assert plots.plot_times(posterior, own) is own
+    with pytest.raises(ValueError, match="fitted: expected 21 times"):
+        plots.plot_times(posterior, fitted=np.zeros(3))
+
+
+def test_increments(posterior):
+    ax = plots.plot_increments(posterior)
+    marked = {line.get_label(): list(line.get_xdata()) for line in ax.lines}
+    assert marked["duplicated: 1"] == [4.5]
+    assert marked["dropped: 1"] == [12.5]
+    low, high = ax.get_ylim()
+    assert low < 0
+    assert high > 2.2
+    assert plots.plot_increments(posterior, ax=ax, flagged=[]) is ax
+
+
+def test_pairs_of_frames(posterior):
+    axes = plots.plot_pairs(posterior, [3, 9])
+    axes[0, 0].figure.canvas.draw()
+    assert axes.shape == (2, 2)
+    grid, density = axes[0, 0].lines[0].get_data()
+    assert np.trapezoid(density, grid) == pytest.approx(1, abs=1e-6)
+    assert np.trapezoid(grid * density, grid) == pytest.approx(0, abs=3e-3)
+    assert axes[1, 0].get_xlabel() == "$t_{3}$ (frames)"
+    assert plots.plot_pairs(posterior).shape == (4, 4)
+    assert plots.plot_pairs(posterior, [5]).shape == (1, 1)
+    for wrong in ([0, 3], [3, 3], [], range(1, 9)):
+        with pytest.raises(ValueError, match="frames: expected"):
+            plots.plot_pairs(posterior, wrong)
+
+
+def test_trace_has_a_line_for_each_ensemble(posterior):
+    axes = plots.plot_trace(posterior, [7])
+    lines = [line for line in axes[0, 0].lines if line.get_label().startswith("ensemble")]
+    expected = (posterior.times[:, :, :, 7].mean(2) - posterior.mean()[7]) * 20
+    np.testing.assert_allclose([line.get_ydata() for line in lines], expected)
+    assert "R-hat 1.0010" in axes[0, 0].get_title()
+    assert plots.plot_trace(posterior).shape[1] == 2
+    with pytest.raises(ValueError, match="frames: expected"):
+        plots.plot_trace(posterior, [0])
+
+
+def test_correlation_says_what_counts(posterior):
+    ax = plots.plot_correlation(posterior.seen)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), 0.7 ** np.arange(12))
+    assert ax.get_title() == "Residuals of 5.1 grey levels, one value in 10 counts"
