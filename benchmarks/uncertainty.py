@@ -1,12 +1,16 @@
 """How sure frame times are, and whether that is true: seconds, calibration, and clips re-timed on purpose.
 
-    python -m benchmarks.uncertainty [--json FILE] [--parts clip calibration retimed] [--model FILE] [--clip NAME|PATH]
-                                     [--gaussians N] [--minutes M] [--replicates N] [--plot FILE] [--seed S]
+    python -m benchmarks.uncertainty [--json FILE] [--parts clip unseen calibration retimed] [--model FILE]
+                                     [--clip NAME|PATH] [--gaussians N] [--minutes M] [--replicates N] [--plot FILE]
+                                     [--seed S]
 
 - clip: the posterior of all frame times of *bunny* (160x320) given the splats of a model (`--model`, or fitted for
   `--minutes`): seconds of each part, R-hat, autocorrelation times, and how far emcee is from forward and backward
   passes. Then a smooth subset of its frames, every first to third, as a video of fewer frames whose times nobody knows:
-  is each frame found where the whole clip has it?
+  is each frame found where the whole clip has it? Its pictures and its splats are the same, so this tells only that
+  frames are found wherever they are.
+- unseen: every second frame of the clip is fitted, and the frames between are looked for: are they half way between
+  the times of their neighbours, as far as a clip's pace is even?
 - calibration: ranks of true times in simulated videos of a small synthetic scene, with right noise, noise assumed 1.5
   times too great and too small, and smoothed noise; coverage of 50% and 90% intervals; `--plot` draws the ranks.
 - retimed: that scene drawn at a smooth warp of times, with noise: are the warp's times in the intervals, given the
@@ -41,13 +45,14 @@ from foldgauss.uncertainty import (
 from foldgauss.uncertainty.screen import Screen
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, fit
 
-PARTS = "clip", "calibration", "retimed"
+PARTS = "clip", "unseen", "calibration", "retimed"
 SIZE, GAUSSIANS, MINUTES = (160, 320), 40_000, 2.0
 REPLICATES, LEVELS = 300, (0.5, 0.9)
 #: The synthetic scene: soft splats that move, and noise as of a good camera.
 SCENE_SIZE, SCENE_SPLATS, SCENE_SCALE, SCENE_FRAMES = (48, 64), 40, 0.02, 10
-#: The re-timed clips, drawn anew so many times given the true splats; and one fit.
-RETIMED_FRAMES, RETIMED_CLIPS, FIT_GAUSSIANS, FIT_STEPS = 24, 50, 400, 1500
+#: Clips re-timed, of so many frames: so many given the true splats, and given those fitted to a uniform clip.
+RETIMED_FRAMES, RETIMED_CLIPS, FRESH_CLIPS = 24, 50, 10
+FIT_GAUSSIANS, FIT_STEPS = 400, 1500
 
 
 def scene(seed: int = 0) -> VideoModel:
@@ -227,7 +232,10 @@ def retimed(seed: int, figures: dict[str, float]) -> None:
     fresh = drawn(model, truth, SCENE_SCALE, rng)
     config = FitConfig(num_gaussians=FIT_GAUSSIANS, steps=FIT_STEPS, seed=seed)
     fitted = fit(uniform, dataclasses.replace(config, learn_frame_times=False)).model
-    put(figures, "retimed.fitted to a uniform clip", measured(fitted, fresh, truth))
+    others = [drawn(model, truth, SCENE_SCALE, rng) for _ in range(FRESH_CLIPS)]
+    put(
+        figures, "retimed.fitted to a uniform clip", np.mean([measured(fitted, each, truth) for each in others], axis=0)
+    )
     fitted = fit(fresh, config).model
     learned = np.asarray(fitted.frame_times.times())
     figures["retimed.learned.miss.frames"] = np.abs(learned - truth).max() * (RETIMED_FRAMES - 1)
@@ -283,6 +291,8 @@ def main(arguments: list[str] | None = None) -> None:
     figures: dict[str, float] = {}
     if "clip" in options.parts:
         clip_part(options, figures)
+    if "unseen" in options.parts:
+        unseen_part(options, figures)
     if "calibration" in options.parts:
         calibration(options.replicates, options.seed, options.plot, figures)
     if "retimed" in options.parts:
@@ -303,6 +313,28 @@ def clip_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
     figures["clip.gaussians"] = model.num_gaussians
     whole = clip_posterior(model, frames, options.seed, figures)
     subset_of_clip(model, frames, whole, figures)
+
+
+def unseen_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
+    """Frames between those that were fitted: their times against the middle of their neighbours' learned times."""
+    path = Path(options.clip) if Path(options.clip).exists() else sample_clip(options.clip)
+    frames = read_video(path, size=SIZE).frames
+    frames = frames[: len(frames) - (len(frames) + 1) % 2]  # the first and the last are fitted
+    config = FitConfig(num_gaussians=options.gaussians, minutes=options.minutes, seed=options.seed)
+    model = fit(np.ascontiguousarray(frames[::2]), config).model
+    learned = np.asarray(model.frame_times.times(), np.float64)
+    truth = np.concatenate([[0.0], (learned[1:] + learned[:-1]) / 2, [1.0]])
+    numbers = [0, *range(1, len(frames), 2), len(frames) - 1]
+    seen = evidence(model, frames[numbers], noise="score")
+    found = exact_times(seen.profiles, Increments.among(np.linspace(0, 1, len(numbers))))
+    miss, median_std, z = errors(found, truth)
+    last = (len(frames) - 1) / (len(numbers) - 1)  # `errors` counts in steps of this video, two frames each
+    figures |= {
+        "unseen.miss.frames": miss * last,
+        "unseen.std.frames": median_std * last,
+        "unseen.z": z,
+        **{f"unseen.inside.{level:g}": inside(found.interval(level), truth) for level in LEVELS},
+    }
 
 
 if __name__ == "__main__":

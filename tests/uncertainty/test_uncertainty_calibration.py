@@ -16,7 +16,10 @@ def ranks(**settings):
     return simulated_ranks(model(), white(), **settings)
 
 
-@pytest.mark.parametrize("concentration", [0.5, 1.0, 3.0])
+slow = pytest.mark.slow
+
+
+@pytest.mark.parametrize("concentration", [pytest.param(0.5, marks=slow), 1.0, pytest.param(3.0, marks=slow)])
 def test_exact_passes_are_calibrated(concentration):
     found = ranks(concentration=concentration)
     assert found.inside(0.99).all()
@@ -29,7 +32,7 @@ def test_exact_passes_are_calibrated(concentration):
         assert abs(found.coverage(level)[:-2].mean() - level) < 3.3 * error
 
 
-@pytest.mark.parametrize("factor", [1.5, 1 / 1.5])
+@pytest.mark.parametrize("factor", [1.5, pytest.param(1 / 1.5, marks=slow)])
 def test_a_wrong_noise_level_is_found(factor):
     found = ranks(assumed_noise=FrameNoise(SCALE * factor, 1.0))
     assert not found.inside(0.99)[-2:].any()
@@ -37,10 +40,12 @@ def test_a_wrong_noise_level_is_found(factor):
     assert too_wide == (factor > 1)
 
 
+@slow
 def test_noise_that_is_measured_is_calibrated():
     assert ranks(assumed_noise="score").inside(0.99).all()
 
 
+@slow
 def test_smoothed_noise_needs_a_share():
     plain, fair = (ranks(assumed_noise=kind, correlation=1.0) for kind in ("independent", "effective"))
     assert not plain.inside(0.99).any()
@@ -49,6 +54,7 @@ def test_smoothed_noise_needs_a_share():
     assert fair.coverage(0.9)[-2] > 0.85
 
 
+@slow
 def test_a_wrong_prior_is_found(monkeypatch):
     right = Increments.draw_prior
 
@@ -62,13 +68,13 @@ def test_a_wrong_prior_is_found(monkeypatch):
     assert simulated_ranks(model(), white(4.0), **settings).inside(0.99).all()
 
 
-@pytest.mark.slow
+@slow
 def test_emcee_is_calibrated():
     found = ranks(sampler="emcee", num_frames=5)
     assert found.inside(0.99).all()
 
 
-@pytest.mark.slow
+@slow
 def test_emcee_with_a_wrong_noise_level_is_found():
     found = ranks(sampler="emcee", num_frames=5, replicates=100, assumed_noise=FrameNoise(SCALE * 1.5, 1.0))
     assert not found.inside(0.99).all()
@@ -136,5 +142,5 @@ def test_levels_without_whole_ranks_are_refused():
         with pytest.raises(ValueError, match="level"):
             coverage(np.zeros((3, 1), int), 20, wrong)
     for settings in ((0, 10), (10, 1), (10, 10, 1.0)):
-        with pytest.raises(ValueError, match="replicates|level"):
+        with pytest.raises(ValueError, match=r"replicates|level"):
             ecdf_band(*settings)
