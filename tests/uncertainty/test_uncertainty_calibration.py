@@ -47,7 +47,7 @@ def test_noise_that_is_measured_is_calibrated():
 
 @slow
 def test_smoothed_noise_needs_a_share():
-    plain, fair = (ranks(assumed_noise=kind, correlation=1.0) for kind in ("independent", "effective"))
+    plain, fair = (ranks(assumed_noise=kind, correlation=1.0) for kind in ("independent", "score"))
     assert not plain.inside(0.99).any()
     assert plain.coverage(0.9)[-2] < 0.6
     assert fair.inside(0.99)[:-1].all()

@@ -1,5 +1,8 @@
 """Profiles: looked-up log-likelihoods are those of pictures drawn at the same times."""
 
+import dataclasses
+import warnings
+
 import numpy as np
 import pytest
 import scipy.interpolate
@@ -12,11 +15,13 @@ from foldgauss.uncertainty import (
     FrameTimeLogProb,
     Increments,
     Profiles,
+    drawing,
     drawn_log_likelihood,
     evidence,
     exact_times,
     frame_time_log_prob,
 )
+from foldgauss.uncertainty.screen import Sketches
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +151,7 @@ def test_noise_too_great_for_any_time_is_said():
 
 
 def test_frames_backwards_are_refused():
-    with pytest.raises(ValueError, match="order"):
+    with pytest.warns(UserWarning, match="held at time"), pytest.raises(ValueError, match="order"):
         frame_time_log_prob(model(), clip(uneven(), scale=0.0)[::-1], noise=white(0.0012), frames=[3])
 
 
@@ -175,3 +180,67 @@ def test_another_seeded_model_is_another_scene():
     frames = clip(uneven(), of=soft_model(size=SIZE, seed=5))
     with pytest.raises(ValueError, match="video"):
         frame_time_log_prob(model(), frames)
+
+
+def test_a_clip_that_begins_later_than_its_model_is_told():
+    with pytest.warns(UserWarning, match="Frame 0 is held at time 0"):
+        evidence(model(), clip(0.3 + 0.7 * uneven()), noise=white(0.02))
+
+
+def test_another_clip_of_the_same_place_is_told():
+    frames = clip(uneven())
+    mean = frames.mean(0, keepdims=True)
+    moved = (frames - mean)[:, ::-1, ::-1]  # what moves does so somewhere else
+    other = np.clip(mean + moved, 0, 255).round().astype(np.uint8)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        evidence(model(), other, noise=white(0.02))
+    assert any("another video" in str(each.message) for each in caught)
+
+
+def test_a_reach_that_is_too_short_is_widened_or_refused(monkeypatch):
+    times = np.linspace(0, 1, 9) ** 3
+    whole = evidence(model(), clip(times), noise=white(0.02))
+    with pytest.raises(ValueError, match="reach"):
+        evidence(model(), clip(times), noise=white(0.02), reach=1)
+    monkeypatch.setattr(drawing, "MOST_EVERYWHERE", 3)
+    monkeypatch.setattr(drawing, "REACH", 1)
+    widened = evidence(model(), clip(times), noise=white(0.02))
+    np.testing.assert_allclose(widened.profiles.modes(), whole.profiles.modes(), atol=2e-3)
+
+
+def test_sketches_are_as_far_apart_as_pictures():
+    rng = np.random.default_rng(0)
+    sketches = Sketches(3 * 40 * 60)
+    pictures = rng.random((12, 3, 40, 60), np.float32) * (rng.random((12, 1, 40, 60)) < 0.1)
+    pictures = pictures.astype(np.float32)
+    made = np.stack([sketches.of(picture) for picture in pictures])
+    for one, other in ((0, 1), (2, 3), (4, 5), (6, 7), (8, 9), (10, 11)):
+        truth = np.square(pictures[one] - pictures[other]).sum()
+        assert np.square(made[one] - made[other]).sum() == pytest.approx(truth, rel=0.3)
+
+
+def fast_speck():
+    """A speck of 1 pixel that crosses a wide picture, 7 pixels to a quarter of a frame, over a still ground."""
+    soft = soft_model(size=(24, 200))
+    num = soft.num_gaussians
+    first, second = np.arange(num) == 0, np.arange(num) == 1
+    splats = dataclasses.replace(
+        soft.splats,
+        loc=np.zeros((num, 2), np.float32),
+        log_scale=np.log(np.where(first, 0.006, 0.4)).astype(np.float32)[:, None].repeat(2, 1),
+        time_loc_logit=np.zeros(num, np.float32),
+        log_time_scale=np.full(num, 3, np.float32),
+        coefficients=np.where(first[:, None, None], np.float32([[0.9, 0], [0, 0], [0, 0]]), np.float32(0)),
+        opacity_logit=np.where(first, 4, np.where(second, 0, -20)).astype(np.float32),
+        color_dc=np.where(first[:, None], 1.5, [-0.5, 0.0, 0.3]).astype(np.float32),
+    )
+    return dataclasses.replace(soft, splats=splats)
+
+
+def test_a_small_fast_thing_is_found_between_the_coarse_nodes():
+    """A speck that is somewhere else at every coarse node: only what lies between shows it in its place."""
+    speck = fast_speck()
+    truth = np.array([0.0, 0.155, 0.31, 0.47, 0.655, 0.81, 1.0])
+    found = evidence(speck, clip(truth, of=speck, scale=0.01), noise=white(0.01)).profiles
+    np.testing.assert_allclose(found.modes()[1:-1], truth[1:-1], atol=2e-3)
