@@ -299,6 +299,6 @@ def _check_ends(profiles: Profiles, model_times: np.ndarray) -> None:
         if lost > PINNED and abs(best - end) > AWAY * step:
             text = (
                 f"Frame {k} is held at time {end:g}, but {best:.4f}, {abs(best - end) / step:.1f} frames away, is"
-                f" better by {lost:.0f} nats: a video begins and ends where its model does. Times near it will be wrong."
+                f" better by {lost:.0f}: a video begins and ends where its model does; times beside it will be wrong."
             )
             warnings.warn(text, UserWarning, stacklevel=3)
