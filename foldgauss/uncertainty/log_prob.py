@@ -13,8 +13,7 @@ from foldgauss.uncertainty.exact import exact_times
 from foldgauss.uncertainty.increments import Increments
 from foldgauss.uncertainty.noise import NOISES, FrameNoise
 from foldgauss.uncertainty.profiles import Profiles
-from foldgauss.uncertainty.screen import Screen
-from foldgauss.video.edited import EditedVideo
+from foldgauss.uncertainty.screen import Screen, check_model
 from foldgauss.video.model import VideoModel
 
 #: What of the residuals counts, unless it is said.
@@ -67,7 +66,6 @@ def drawn_log_likelihood(
     A frame's profile is this less its value where it is greatest. Raises ValueError for a video of another size, times
     that are not one a frame in [0, 1], and noise that is no FrameNoise.
     """
-    check_model(model)
     if not isinstance(noise, FrameNoise):
         cure = "`evidence(..).noise` is what it was drawn with."
         raise invalid("noise", expected="a FrameNoise", got=short_repr(noise), cure=cure)
@@ -108,16 +106,6 @@ def check_level(level: str, video: np.ndarray | None) -> None:
         raise invalid("level", expected=" or ".join(map(repr, LEVELS)), got=short_repr(level), cure=cure)
     if level == "colors" and video is None:
         raise invalid("video", expected="frames, where colours are integrated out", got=None)
-
-
-def check_model(model: VideoModel) -> None:
-    """ValueError for anything but a VideoModel."""
-    if isinstance(model, VideoModel):
-        return
-    cure = ""
-    if isinstance(model, EditedVideo):
-        cure = "Take the model that was edited, and the clip that it was fitted to; or fit one to what is now shown."
-    raise invalid("model", expected="a VideoModel", got=short_repr(model), cure=cure)
 
 
 def check_seen(seen: Evidence, video: np.ndarray | None, noise: str | FrameNoise = DEFAULT_NOISE) -> int:
