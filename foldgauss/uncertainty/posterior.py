@@ -254,12 +254,12 @@ def check_settings(
         cure = "Leave it out, or choose fewer frames."
         raise invalid("walkers", expected=expected, got=short_repr(walkers), cure=cure)
     if not whole(ensembles, 2):
-        expected = "a whole number of at least 2, better 4: R-hat compares them"
+        expected = "at least 2 (a whole number), better 4: R-hat compares them"
         raise invalid("ensembles", expected=expected, got=short_repr(ensembles))
     if not whole(thin_by, 1):
         raise invalid("thin_by", expected="a whole number >= 1", got=short_repr(thin_by))
     if steps is not None and not whole(steps, int(thin_by)):
-        raise invalid("steps", expected=f"a whole number of at least thin_by = {thin_by}", got=short_repr(steps))
+        raise invalid("steps", expected=f"at least thin_by = {thin_by}, a whole number", got=short_repr(steps))
     return int(found)
 
 

@@ -175,3 +175,12 @@ def test_another_seeded_model_is_another_scene():
     frames = clip(uneven(), of=soft_model(size=SIZE, seed=5))
     with pytest.raises(ValueError, match="video"):
         frame_time_log_prob(model(), frames)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0, np.nan, np.inf, "a", [1.0, 2.0], [1.0, -1.0, 1.0]])
+def test_factors_of_likelihoods_are_above_0(factor):
+    nodes = np.linspace(0, 1, 5)
+    found = Profiles.of([nodes] * 3, [-nodes] * 3)
+    with pytest.raises(ValueError, match="factor"):
+        found.scaled(factor)
+    np.testing.assert_array_equal(found.scaled([1, 2, 3]).values, -nodes * [[1], [2], [3]])

@@ -156,7 +156,7 @@ def test_few_frames_go_from_hill_to_hill(two_hills):
 def test_ensembles_that_all_miss_a_hill_have_not_converged(two_hills):
     # emcee's own moves stay where they start: tau and R-hat see nothing of the other hill.
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.StretchMove(), 0.3)]
-    found = sampled(two_hills, moves=moves, steps=1500)
+    found = sampled(two_hills, moves=moves, steps=1500, ensembles=2)
     assert (found.r_hat < 1.01).all() and found.std()[2] < 0.005
     assert not found.converged and found.message.startswith("Not converged")
     assert "emcee and the exact passes disagree at frame 2" in found.message
@@ -212,9 +212,9 @@ def test_too_few_steps_say_that_they_are():
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, blocks):
     log_prob = toy(*NEAR)
     moves = BlockSweep(log_prob, block=2) if blocks else None
-    settings = {"steps": 1000, "moves": moves, "seed": 5}
+    settings = {"steps": 600, "moves": moves, "seed": 5}
     whole = sampled(log_prob, **settings)
-    sampled(log_prob, **{**settings, "steps": 500}, backend=tmp_path / "run.h5")
+    sampled(log_prob, **{**settings, "steps": 300}, backend=tmp_path / "run.h5")
     found = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
     np.testing.assert_array_equal(found.times, whole.times)
     again = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
@@ -373,16 +373,17 @@ def test_what_is_told_of_many_frames_is_that_of_all_draws():
     np.testing.assert_allclose(found.interval(0.5), np.quantile(flat, [0.25, 0.75], axis=0), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_draws_are_kept_twice_and_not_more():
     num = 40
     log_prob = toy(np.linspace(0, 1, num + 2)[1:-1], np.full(num, 0.005), nodes=101)
-    settings = {"steps": 200, "thin_by": 1, "ensembles": 2}
+    settings = {"steps": 400, "thin_by": 1, "ensembles": 2}
     sampled(log_prob, **{**settings, "steps": 2})  # what is compiled
     tracemalloc.start()
     found = sampled(log_prob, **settings)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    kept = 8 * 2 * 200 * found.times.shape[2] * (num + 2)
+    kept = 8 * 2 * 400 * found.times.shape[2] * (num + 2)
     assert 1.9 * kept < peak < 2.8 * kept
 
 
