@@ -86,7 +86,7 @@ def evidence(
         raise invalid("video", expected="at least 3 frames", got=num_frames, cure=cure)
     if isinstance(noise, FrameNoise):
         noise = noise.of(num_frames)
-    elif noise not in NOISES:
+    elif not isinstance(noise, str) or noise not in NOISES:
         raise invalid("noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=noise)
     _check_changes(screen.frames)
     drawn = Drawn(screen, reach, on_picture)

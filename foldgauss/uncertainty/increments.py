@@ -6,7 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from scipy.special import gammaln
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, short_repr, within
+
+#: Increments of less than this share of a run count as that: float64 has lost the smaller ones.
+LEAST_SHARE = 1e-16
 
 
 class Increments:
@@ -21,17 +24,18 @@ class Increments:
     times. A flat prior on the softmax weights would be improper: they do not notice a number added to all.
 
     **Source:** VeGaS eq:frame_fitting; additive log-ratios, Aitchison 1982.
-    **Raises:** ValueError for held times that do not rise, free first or last frames, a concentration not above 0.
+    **Raises:** ValueError for held times outside [0, 1] or not rising, free first or last frames, a concentration not
+    above 0.
     """
 
     def __init__(
         self, held: Float[np.ndarray, "num_frames"], free: Bool[np.ndarray, "num_frames"], concentration: float = 1.0
     ):
-        self.held, self.free = np.asarray(held, np.float64), np.asarray(free, bool)
-        self.concentration = float(concentration)
-        if not (np.isfinite(self.concentration) and self.concentration > 0):
+        self.held, self.free = _times(held), np.asarray(free, bool)
+        if not within(concentration, "(0, inf)"):
             cure = "1 is uniform over all ordered times; more draws them towards equal spacing."
-            raise invalid("concentration", expected="a number > 0", got=concentration, cure=cure)
+            raise invalid("concentration", expected="a number > 0", got=short_repr(concentration), cure=cure)
+        self.concentration = float(concentration)
         if self.held.ndim != 1 or self.free.shape != self.held.shape or len(self.held) < 3:
             raise invalid(
                 "held", expected="at least 3 times, and as many of `free`", got=f"{self.held.shape}, {self.free.shape}"
@@ -48,22 +52,43 @@ class Increments:
         self.runs = list(
             zip(np.flatnonzero(edge == 1).tolist(), (np.flatnonzero(edge == -1) - 1).tolist(), strict=True)
         )
-        for first, last in self.runs:
-            if not self.held[first - 1] < self.held[last + 1]:
-                got = f"{self.held[first - 1]} and {self.held[last + 1]} around frames {first} to {last}"
-                raise invalid("held", expected="rising times", got=got)
+        self._check_held()
+
+    def _check_held(self) -> None:
+        """What lies between held frames is their own; the times at free ones do not count."""
+        which = np.flatnonzero(~self.free)
+        times = self.held[which]
+        if not ((times >= 0) & (times <= 1)).all():
+            wrong = which[~((times >= 0) & (times <= 1))][0]
+            raise invalid("held", expected="times in [0, 1]", got=f"{self.held[wrong]:.6g} of frame {wrong}")
+        down = np.flatnonzero(~(np.diff(times) > 0))
+        if down.size:
+            one, other = which[down[0] : down[0] + 2]
+            got = f"{self.held[one]:.6g} of frame {one} and {self.held[other]:.6g} of frame {other}"
+            raise invalid("held", expected="rising times", got=got)
 
     @classmethod
     def among(
         cls, held: Float[np.ndarray, "num_frames"], frames: Sequence[int] | None = None, concentration: float = 1.0
     ) -> "Increments":
         """With `frames` free, or all but the first and the last; ValueError for frames that are not between these."""
-        num_frames, free = len(held), np.zeros(len(held), bool)
+        held = _times(held)
+        num_frames, free = held.size, np.zeros(held.size, bool)
         if frames is None:
             free[1:-1] = True
             return cls(held, free, concentration)
-        frames = np.asarray(list(frames))
-        if frames.size == 0 or frames.dtype.kind not in "iu" or (frames < 1).any() or (frames > num_frames - 2).any():
+        try:
+            frames = np.array(frames if isinstance(frames, np.ndarray) else list(frames))
+        except (TypeError, ValueError) as error:
+            expected = f"whole numbers from 1 to {num_frames - 2}, one or more"
+            raise invalid("frames", expected=expected, got=short_repr(frames), cure="One frame is `[k]`.") from error
+        if (
+            frames.ndim != 1
+            or frames.size == 0
+            or frames.dtype.kind not in "iu"
+            or (frames < 1).any()
+            or (frames > num_frames - 2).any()
+        ):
             cure = "The first frame is at 0 and the last at 1."
             raise invalid(
                 "frames", expected=f"whole numbers from 1 to {num_frames - 2}", got=frames.tolist(), cure=cure
@@ -94,11 +119,15 @@ class Increments:
         for part, first, last in self._slices():
             shares = np.exp(_log_shares(coordinates[..., part]))
             start, end = self.held[first - 1], self.held[last + 1]
-            times[..., first : last + 1] = start + (end - start) * np.cumsum(shares, axis=-1)[..., :-1]
+            found = start + (end - start) * np.cumsum(shares, axis=-1)[..., :-1]
+            times[..., first : last + 1] = np.minimum(found, end)  # what rounding adds
         return times
 
     def coordinates(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch num_free"]:
-        """The log-ratios of times that rise; the times of frames that are held are not looked at."""
+        """The log-ratios of times that rise; the times of frames that are held are not looked at.
+
+        Increments below `LEAST_SHARE` of a run, 0 included, count as that: draws of a low concentration have them.
+        """
         times = np.asarray(times, np.float64)
         if times.shape[-1:] != (self.num_frames,):
             raise invalid("times", expected=f"shape (..., {self.num_frames})", got=f"shape {times.shape}")
@@ -106,9 +135,10 @@ class Increments:
         for part, first, last in self._slices():
             start, end = (np.broadcast_to(self.held[k], times.shape[:-1])[..., None] for k in (first - 1, last + 1))
             steps = np.diff(np.concatenate([start, times[..., first : last + 1], end], axis=-1), axis=-1)
-            if not (steps > 0).all():
-                raise invalid("times", expected="times that rise", got=f"steps down to {np.nanmin(steps):.3g}")
-            logs = np.log(steps)
+            if not (steps >= 0).all():
+                got = "NaN" if np.isnan(steps).any() else f"steps down to {steps.min():.3g}"
+                raise invalid("times", expected="times that rise", got=got)
+            logs = np.log(np.maximum(steps, LEAST_SHARE * (end - start)))
             found[..., part] = logs[..., :-1] - logs[..., -1:]
         return found
 
@@ -122,8 +152,11 @@ class Increments:
         return total
 
     def logits(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch intervals"]:
-        """The model's softmax weights w, centred: their mean is 0, as a number added to all changes nothing."""
-        logs = np.log(np.diff(np.asarray(times, np.float64), axis=-1))
+        """The model's softmax weights w, centred: their mean is 0, as a number added to all changes nothing.
+
+        Of increments of at least `LEAST_SHARE`.
+        """
+        logs = np.log(np.maximum(np.diff(np.asarray(times, np.float64), axis=-1), LEAST_SHARE))
         return logs - logs.mean(-1, keepdims=True)
 
     def draw_prior(self, rng: np.random.Generator, num: int) -> Float64[np.ndarray, "num num_frames"]:
@@ -132,7 +165,8 @@ class Increments:
         for first, last in self.runs:
             shares = rng.dirichlet(np.full(last - first + 2, self.concentration), num)
             start, end = self.held[first - 1], self.held[last + 1]
-            times[:, first : last + 1] = start + (end - start) * np.cumsum(shares, axis=1)[:, :-1]
+            found = start + (end - start) * np.cumsum(shares, axis=1)[:, :-1]
+            times[:, first : last + 1] = np.minimum(found, end)
         return times
 
     def _checked(self, coordinates) -> np.ndarray:
@@ -140,6 +174,13 @@ class Increments:
         if coordinates.shape[-1:] != (self.num_free,):
             raise invalid("coordinates", expected=f"shape (..., {self.num_free})", got=f"shape {coordinates.shape}")
         return coordinates
+
+
+def _times(held) -> np.ndarray:
+    try:
+        return np.asarray(held, np.float64)
+    except (TypeError, ValueError) as error:
+        raise invalid("held", expected="times (num_frames,)", got=short_repr(held)) from error
 
 
 def _log_shares(coordinates: np.ndarray) -> np.ndarray:

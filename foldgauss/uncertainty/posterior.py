@@ -1,6 +1,7 @@
 """Frame times drawn from their posterior by emcee."""
 
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import importlib
@@ -16,11 +17,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from foldgauss._checks import invalid
+from foldgauss._checks import check_takes, invalid, short_repr, whole, within
 from foldgauss.uncertainty.drawing import Evidence, evidence
 from foldgauss.uncertainty.exact import ExactTimes, exact_times
+from foldgauss.uncertainty.increments import Increments
 from foldgauss.uncertainty.laplace import LaplaceTimes, laplace_times
-from foldgauss.uncertainty.log_prob import FrameTimeLogProb, at_level, frame_time_log_prob
+from foldgauss.uncertainty.log_prob import (
+    DEFAULT_NOISE,
+    FrameTimeLogProb,
+    at_level,
+    check_asked,
+    check_seen,
+    frame_time_log_prob,
+)
 from foldgauss.uncertainty.noise import FrameNoise
 from foldgauss.video.model import VideoModel
 
@@ -29,12 +38,16 @@ if TYPE_CHECKING:
 
 #: Sampling has converged with so many autocorrelation times kept, and split rank R-hat below this.
 TIMES_TAU, R_HAT = 50.0, 1.01
+#: Means of draws are at most so many standard deviations from the exact ones, and so many Monte Carlo errors.
+APART, ERRORS = 0.1, 5.0
 #: Thrown away at the start: so many autocorrelation times.
 BURN_IN = 10.0
 #: Steps per one that is kept; kept steps between two looks at convergence.
 THIN, LOOK = 10, 50
-#: Up to so many free frames emcee's own moves take all at once; beyond, blocks of frames do.
+#: Up to so many free frames emcee's own moves take all at once, besides blocks of frames; beyond, blocks alone do.
 AT_ONCE = 12
+#: Frames whose draws are looked at together: a copy of these is made, and not of all.
+TOGETHER = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +58,9 @@ class FrameTimePosterior:
     of proposals accepted; `tau`, `r_hat`, `ess` (num_free,) in the order of `free`: integrated autocorrelation time in
     steps of the sampler, split rank R-hat over the ensembles, and effective sample size.
 
-    `converged`: more than 50 tau of every frame, and every R-hat < 1.01. `message` says so, or what is missing.
+    `converged`: more than 50 tau of every frame, every R-hat < 1.01, and every mean within 0.1 + 5 / sqrt(ess) standard
+    deviations of the exact one: ensembles that all miss the same hill agree with each other. `message` says so, or what
+    is missing, and how many frames tell their time where some do not (`identified`).
     `laplace`, `exact`: the same posterior by Laplace's approximation and by forward and backward passes.
 
     **Source:** emcee, Foreman-Mackey et al. 2013; R-hat, Vehtari et al. 2021. The walkers of one ensemble depend on
@@ -80,16 +95,23 @@ class FrameTimePosterior:
         return self.log_prob.increments.logits(self.times)
 
     def mean(self) -> Float64[np.ndarray, "num_frames"]:
-        return self.draws.mean(0)
+        return self.times.mean((0, 1, 2))
 
     def std(self) -> Float64[np.ndarray, "num_frames"]:
-        return self.draws.std(0)
+        return self._by_frames(lambda draws: draws.std(0))
 
     def interval(self, level: float = 0.9) -> Float64[np.ndarray, "2 num_frames"]:
         """Ends of the central intervals that hold `level` of the draws."""
-        if not 0 < level < 1:
-            raise invalid("level", expected="a number in (0, 1)", got=level)
-        return np.quantile(self.draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
+        if not within(level, "(0, 1)"):
+            raise invalid("level", expected="a number in (0, 1)", got=short_repr(level))
+        ends = [(1 - level) / 2, (1 + level) / 2]
+        return self._by_frames(lambda draws: np.quantile(draws, ends, axis=0))
+
+    def _by_frames(self, found: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """What is `found` of draws (draws, frames), some frames at a time: no copy of all."""
+        num_frames = self.times.shape[-1]
+        parts = [self.times[..., first : first + TOGETHER] for first in range(0, num_frames, TOGETHER)]
+        return np.concatenate([found(part.reshape(-1, part.shape[-1])) for part in parts], axis=-1)
 
     def identified(self, share: float = 0.8) -> np.ndarray:
         """Which frames tell their time: bool (num_frames,); there the posterior is narrower than `share` of the prior.
@@ -131,7 +153,7 @@ def frame_time_posterior(
     moves: Any = None,
     seed: int = 0,
     progress: bool | Callable[[str, int, int], None] = True,
-    noise: str | FrameNoise = "score",
+    noise: str | FrameNoise = DEFAULT_NOISE,
     level: str = "splats",
     concentration: float = 1.0,
     ensembles: int = 4,
@@ -143,33 +165,71 @@ def frame_time_posterior(
     """Draw the times of `frames` (default: of all but the first and the last) from their posterior, given the splats.
 
     Independent emcee ensembles of `walkers` each, started from Laplace's approximation, run until more than 50
-    autocorrelation times of every frame are kept and split rank R-hat is below 1.01 for all, or for `steps` steps, of
-    which every `thin_by`-th is kept. A few frames move by emcee's differential evolution and stretch moves, many by
-    `BlockSweep`; or by `moves`, as `emcee.EnsembleSampler` takes them.
+    autocorrelation times of every frame are kept, split rank R-hat is below 1.01 for all and means agree with the exact
+    passes, or for `steps` steps, of which every `thin_by`-th is kept. Many frames move by `BlockSweep`, a few by that
+    and by emcee's differential evolution and stretch moves; or by `moves`, as `emcee.EnsembleSampler` takes them, all
+    frames at once.
 
-    `noise`, `level`, `concentration`, `video`: see `frame_time_log_prob`, whose result may be handed in as `log_prob`.
+    `noise`, `level`, `concentration`, `video`, `seen`: see `frame_time_log_prob`, whose result may be handed in as
+    `log_prob`, in place of these and of `model` and `frames`; beside it `seen` is only kept, for summaries.
     `progress`: a bar, or a function of (what, done, of how many). `backend`: an HDF5 file to which all is written as
     it goes; called again with the same arguments, sampling goes on where it stopped, to the same bits.
 
-    Raises ValueError for fewer walkers than twice the frames that move at once, settings out of range, a backend of
-    another run, a NaN log-probability, and whatever `frame_time_log_prob` refuses; ImportError without emcee.
+    **Memory:** 16 bytes a kept time, half of which stay: ensembles x (steps / thin_by) x walkers x frames. 2,000 frames
+    by 4 x 32 walkers, 1,000 kept steps: 4 GB, 2 GB of them to stay. A greater `thin_by` takes less; with a `backend`
+    the first half is on disk but for one ensemble at a time.
+
+    Raises ValueError, before any picture is drawn, for fewer walkers than twice the frames that move at once, settings
+    out of range or given beside what they would contradict, and a backend that cannot be written; later for a backend
+    of another run, a NaN log-probability, and whatever `frame_time_log_prob` refuses; ImportError without emcee.
 
     Example: `frame_time_posterior(model, frames).interval(0.9)`.
     """
     needed("emcee")
-    _check_steps(steps, thin_by)
+    needed("arviz")
+    given = {"model": model, "video": video, "frames": frames}
+    free = _free_of(log_prob, seen, given, noise, level, concentration)
+    _check_progress(progress)
+    moves = None if moves is None else _checked_moves(moves)
+    settings = _Settings(
+        check_settings(free.num_free, walkers, ensembles=ensembles, steps=steps, thin_by=thin_by, together=bool(moves)),
+        _checked_seed(seed),
+        int(ensembles),
+        int(thin_by),
+        moves,
+        _checked_backend(backend),
+    )
     with _shown(progress) as show:
         if log_prob is None:
-            if model is None:
-                raise invalid("model", expected="a VideoModel, or a `log_prob`", got=None)
             look = None if show is None else (lambda done, total: show("pictures", done, total))
             if seen is None:
                 seen = evidence(model, video, noise=noise, on_picture=look)
             look = None if show is None else (lambda done, total: show("frames", done, total))
             seen = at_level(level, model, video, seen, frames, look)
             log_prob = frame_time_log_prob(model, frames=frames, concentration=concentration, seen=seen)
-        run = _Run(log_prob, walkers, moves, seed, ensembles, thin_by, backend)
-        return run.until_converged(steps // thin_by, show, seen)
+        return _Run(log_prob, settings).until_converged(int(steps) // int(thin_by), show, seen)
+
+
+def _free_of(log_prob, seen: Evidence | None, given: dict[str, Any], noise, level: str, concentration) -> Increments:
+    """Which frames are free; ValueError for what contradicts, is missing or cannot be right."""
+    if log_prob is None:
+        if given["model"] is None:
+            raise invalid("model", expected="a VideoModel, or a `log_prob`", got=None)
+        return check_asked(given["model"], given["video"], noise, level, given["frames"], concentration, seen)
+    if not isinstance(log_prob, FrameTimeLogProb):
+        raise invalid("log_prob", expected="what `frame_time_log_prob` gives", got=short_repr(log_prob))
+    defaults = {"noise": (noise, DEFAULT_NOISE), "level": (level, "splats"), "concentration": (concentration, 1.0)}
+    beside = [name for name, value in given.items() if value is not None]
+    beside += [name for name, (value, usual) in defaults.items() if type(value) is not type(usual) or value != usual]
+    if beside:
+        cure = "Give them to `frame_time_log_prob`, or leave `log_prob` out."
+        raise invalid(
+            beside[0], expected="nothing beside `log_prob`, which has its own", got=", ".join(beside), cure=cure
+        )
+    if seen is not None and (num := check_seen(seen, None)) != log_prob.profiles.num_frames:
+        expected = f"what was seen of the {log_prob.profiles.num_frames} frames of `log_prob`"
+        raise invalid("seen", expected=expected, got=f"{num} frames")
+    return log_prob.increments
 
 
 def check_settings(
@@ -188,51 +248,110 @@ def check_settings(
     from foldgauss.uncertainty.moves import BLOCK
 
     at_once = num_free if together or num_free <= AT_ONCE else BLOCK
-    found = max(32, 4 * at_once + at_once % 2) if walkers is None else walkers
-    if found < 2 * at_once or found < 4 or found % 2:
+    found = max(32, 4 * at_once) if walkers is None else walkers
+    if not whole(found, max(2 * at_once, 4)) or found % 2:
         expected = f"an even number, at least {max(2 * at_once, 4)}: twice the frames that move at once"
-        raise invalid("walkers", expected=expected, got=walkers, cure="Leave it out, or choose fewer frames.")
-    if ensembles < 2:
-        raise invalid("ensembles", expected="at least 2, better 4: R-hat compares them", got=ensembles)
-    if steps is not None:
-        _check_steps(steps, thin_by)
-    return found
+        cure = "Leave it out, or choose fewer frames."
+        raise invalid("walkers", expected=expected, got=short_repr(walkers), cure=cure)
+    if not whole(ensembles, 2):
+        expected = "at least 2 (a whole number), better 4: R-hat compares them"
+        raise invalid("ensembles", expected=expected, got=short_repr(ensembles))
+    if not whole(thin_by, 1):
+        raise invalid("thin_by", expected="a whole number >= 1", got=short_repr(thin_by))
+    if steps is not None and not whole(steps, int(thin_by)):
+        raise invalid("steps", expected=f"at least thin_by = {thin_by}, a whole number", got=short_repr(steps))
+    return int(found)
 
 
-def _check_steps(steps: int, thin_by: int) -> None:
-    if thin_by < 1:
-        raise invalid("thin_by", expected="a whole number >= 1", got=thin_by)
-    if steps < thin_by:
-        raise invalid("steps", expected=f"at least thin_by = {thin_by}", got=steps)
+def _checked_seed(seed: int) -> int:
+    if not whole(seed, 0):
+        raise invalid("seed", expected="a whole number >= 0", got=short_repr(seed))
+    return int(seed)
+
+
+def _checked_moves(moves) -> list[tuple[Any, float]]:
+    """Copies of moves and their weights, from any of the forms that `emcee.EnsembleSampler` takes."""
+    expected = "an emcee move, a list of moves, or a list of (move, weight)"
+    if _is_move(moves):
+        pairs = [(moves, 1.0)]
+    elif isinstance(moves, list | tuple) and moves and all(map(_is_move, moves)):
+        pairs = [(move, 1.0) for move in moves]
+    elif isinstance(moves, list | tuple) and moves and all(map(_is_weighted, moves)):
+        pairs = [(move, float(weight)) for move, weight in moves]
+    else:
+        cure = "A class is called first: `StretchMove()`." if "class" in repr(moves) else ""
+        raise invalid("moves", expected=expected, got=short_repr(moves), cure=cure)
+    if not sum(weight for _, weight in pairs) > 0:
+        raise invalid("moves", expected="weights of which one is above 0", got=[weight for _, weight in pairs])
+    if any(type(move).__name__ == "DESnookerMove" for move, _ in pairs) and _version("emcee") < (3, 1, 7):
+        cure = "Its proposals are scaled wrongly (emcee pull request 531): take DEMove, or a later emcee."
+        expected = "moves that draw what they should"
+        raise invalid("moves", expected=expected, got="DESnookerMove of emcee 3.1", cure=cure)
+    # A move notes things of its run in itself, which are no settings.
+    return [(copy.copy(move), weight) for move, weight in pairs]
+
+
+def _is_move(value) -> bool:
+    return callable(getattr(value, "propose", None)) and not isinstance(value, type)
+
+
+def _is_weighted(value) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 2 and _is_move(value[0]) and within(value[1], "[0, inf)")
+
+
+def _checked_backend(backend) -> Path | None:
+    """A file that may be written; whose run it holds is seen later."""
+    if backend is None:
+        return None
+    needed("h5py")
+    if not isinstance(backend, str | os.PathLike) or not os.fspath(backend):
+        raise invalid("backend", expected="the path of an HDF5 file, or None", got=short_repr(backend))
+    path = Path(backend)
+    if not path.parent.is_dir():
+        raise invalid(
+            "backend", expected="a file in a folder that exists", got=str(path), cure="Make the folder first."
+        )
+    if path.is_dir():
+        raise invalid("backend", expected="a file", got=f"the folder {path}")
+    if not os.access(path.parent, os.W_OK):
+        raise invalid("backend", expected="a folder that can be written to", got=str(path.parent))
+    if path.exists():
+        _fingerprint_of(path)
+    return path
+
+
+@dataclasses.dataclass(frozen=True)
+class _Settings:
+    """Of sampling, checked; `moves` None: the usual ones."""
+
+    walkers: int
+    seed: int
+    ensembles: int
+    thin_by: int
+    moves: list[tuple[Any, float]] | None
+    backend: Path | None
 
 
 class _Run:
     """Some independent ensembles, and what they have kept."""
 
-    def __init__(self, log_prob: FrameTimeLogProb, walkers, moves, seed: int, ensembles: int, thin_by: int, backend):
-        from foldgauss.uncertainty.moves import BlockSweep
-
-        self.log_prob, self.thin_by, self.seed = log_prob, thin_by, seed
-        num = log_prob.num_free
-        self.walkers = check_settings(num, walkers, ensembles=ensembles, together=moves is not None)
-        if "DESnookerMove" in ([] if moves is None else _kinds(moves)) and _version("emcee") < (3, 1, 7):
-            cure = "Its proposals are scaled wrongly (emcee pull request 531): take DEMove, or a later emcee."
-            raise invalid(
-                "moves", expected="moves that draw what they should", got="DESnookerMove of emcee 3.1", cure=cure
-            )
-        if moves is None:
-            moves = _few_moves() if num <= AT_ONCE else BlockSweep(log_prob)
+    def __init__(self, log_prob: FrameTimeLogProb, settings: _Settings):
+        self.log_prob, self.thin_by, self.seed = log_prob, settings.thin_by, settings.seed
+        self.walkers, self.free = settings.walkers, np.flatnonzero(log_prob.increments.free)
+        moves = _usual_moves(log_prob) if settings.moves is None else settings.moves
         self.exact = exact_times(log_prob.profiles, log_prob.increments)
         self.laplace = laplace_times(log_prob.profiles, log_prob.increments, self.exact.quantile(0.5))
-        self.file = None if backend is None else _Kept(backend, self._fingerprint(ensembles, moves))
-        self.samplers = [self._sampler(n, moves) for n in range(ensembles)]
+        fingerprint = self._fingerprint(settings.ensembles, moves)
+        self.file = None if settings.backend is None else _Kept(settings.backend, fingerprint)
+        self.samplers = [self._sampler(n, moves) for n in range(settings.ensembles)]
 
-    def _fingerprint(self, ensembles: int, moves) -> str:
+    def _fingerprint(self, ensembles: int, moves: list[tuple[Any, float]]) -> str:
         """Of everything that the draws depend on."""
         found, increments = self.log_prob.profiles, self.log_prob.increments
         parts = [found.nodes, found.values, increments.held[~increments.free], increments.free]
         digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
-        settings = increments.concentration, self.walkers, self.seed, ensembles, self.thin_by, _kinds(moves)
+        described = [(_described(move), weight) for move, weight in moves]
+        settings = increments.concentration, self.walkers, self.seed, ensembles, self.thin_by, described
         digest.update(repr(settings).encode())
         return digest.hexdigest()
 
@@ -264,7 +383,8 @@ class _Run:
                         self.file.close()
                     return found
                 needed = 1.1 * (TIMES_TAU + BURN_IN) * found.tau.max() / self.thin_by
-                goal = min(max(int(min(needed, 2 * done)), done + LOOK), most)
+                goal = min(max(int(min(needed, 2 * done)), done + max(LOOK, done // 4)), most)
+                del found  # its draws, before there are more
             for n, sampler in enumerate(self.samplers):
                 for _ in self._steps(sampler, goal - sampler.iteration):
                     if show is not None:
@@ -283,88 +403,121 @@ class _Run:
             ):
                 sampler.start = state
                 yield
-        except RuntimeError as error:
+        except (RuntimeError, np.linalg.LinAlgError) as error:
             raise invalid("moves", expected="moves that these walkers can make", got=str(error)) from error
 
-    def result(self, seen: Evidence | None) -> FrameTimePosterior:
-        import emcee
+    def times(self) -> Float64[np.ndarray, "ensembles steps walkers num_frames"]:
+        """Of all that is kept, some steps at a time: a copy of all is made once."""
+        steps = min(sampler.iteration for sampler in self.samplers)
+        increments = self.log_prob.increments
+        times = np.empty((len(self.samplers), steps, self.walkers, increments.num_frames))
+        for sampler, found in zip(self.samplers, times, strict=True):
+            chain = sampler.get_chain()
+            for first in range(0, steps, LOOK):
+                part = slice(first, min(first + LOOK, steps))
+                found[part] = increments.times(chain[part])
+        return times
 
-        chains = np.stack([sampler.get_chain() for sampler in self.samplers])
-        times = self.log_prob.increments.times(chains)
-        free = np.flatnonzero(self.log_prob.increments.free)
+    def result(self, seen: Evidence | None) -> FrameTimePosterior:
+        times = self.times()
         steps = times.shape[1]
-        drawn = times[..., free]
-        tau = np.max([emcee.autocorr.integrated_time(each, quiet=True, tol=0) for each in drawn], axis=0)
-        tau = np.where(np.isfinite(tau), np.maximum(tau, 1.0), steps)
+        tau = np.array([max(_tau(one[..., k]) for one in times) for k in self.free])
         burn = int(min(np.ceil(BURN_IN * tau.max()), steps // 2))
-        drawn = drawn[:, burn:]
-        r_hat = _r_hat(drawn)
-        kept = drawn.shape[1]
-        ess = kept * self.walkers * len(self.samplers) / tau
-        lengths = kept / tau
-        wrong = []
-        if lengths.min() <= TIMES_TAU:
-            wrong.append(
-                f"{lengths.min():.0f} autocorrelation times kept of frame {free[lengths.argmin()]}, not {TIMES_TAU:.0f}"
-            )
-        if not r_hat.max() < R_HAT:
-            wrong.append(f"R-hat {r_hat.max():.3f} of frame {free[r_hat.argmax()]}, not below {R_HAT}")
-        message = (
-            f"Converged after {steps * self.thin_by:,} steps."
-            if not wrong
-            else (f"Not converged after {steps * self.thin_by:,} steps: {'; '.join(wrong)}. Give more steps.")
-        )
+        times = times[:, burn:]
+        kept = times.shape[1]
+        r_hat = np.array([_r_hat(times[..., k]) for k in self.free])
         acceptance = np.array([np.mean(sampler.acceptance_fraction) for sampler in self.samplers])
-        return FrameTimePosterior(
+        found = FrameTimePosterior(
             self.log_prob,
-            times[:, burn:],
+            times,
             acceptance,
             tau * self.thin_by,
             r_hat,
-            ess,
-            not wrong,
-            message,
+            kept * self.walkers * len(self.samplers) / tau,
+            False,
+            "",
             self.laplace,
             self.exact,
             seen,
         )
+        wrong = self._wrong(found, kept / tau)
+        done = f"onverged after {steps * self.thin_by:,} steps"
+        message = f"Not c{done}: {'; '.join(wrong)}. Give more steps." if wrong else f"C{done}."
+        told = int(found.identified()[self.free].sum())
+        if told < len(self.free):
+            message += f" {told} of {len(self.free)} frames {'tells its' if told == 1 else 'tell their'} time."
+        return dataclasses.replace(found, converged=not wrong, message=message)
+
+    def _wrong(self, found: FrameTimePosterior, lengths: Float64[np.ndarray, "num_free"]) -> list[str]:
+        """What is missing."""
+        wrong, free = [], self.free
+        if not lengths.min() > TIMES_TAU:
+            wrong.append(
+                f"{lengths.min():.0f} autocorrelation times kept of frame {free[lengths.argmin()]}, not {TIMES_TAU:.0f}"
+            )
+        if not found.r_hat.max() < R_HAT:
+            wrong.append(f"R-hat {found.r_hat.max():.3f} of frame {free[found.r_hat.argmax()]}, not below {R_HAT}")
+        std = np.maximum(self.exact.std()[free], np.finfo(np.float64).tiny)
+        apart = np.abs(found.mean() - self.exact.mean())[free] / std
+        over = apart - (APART + ERRORS / np.sqrt(found.ess))
+        if not over.max() <= 0:
+            worst = over.argmax()
+            wrong.append(
+                f"emcee and the exact passes disagree at frame {free[worst]}, by {apart[worst]:.2g} standard deviations"
+            )
+        return wrong
 
 
-def _r_hat(drawn: Float64[np.ndarray, "ensembles steps walkers frames"]) -> Float64[np.ndarray, "frames"]:
+def _tau(times: Float64[np.ndarray, "steps walkers"]) -> float:
+    """Integrated autocorrelation time in kept steps, at least 1; of what never moves, all of them."""
+    import emcee
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = float(emcee.autocorr.integrated_time(times[..., None], quiet=True, tol=0)[0])
+    return max(found, 1.0) if np.isfinite(found) else float(len(times))
+
+
+def _r_hat(times: Float64[np.ndarray, "ensembles steps walkers"]) -> float:
     """Split rank R-hat, an ensemble a chain."""
     arviz = needed("arviz")
-    ensembles, steps, walkers, frames = drawn.shape
-    chains = drawn.reshape(ensembles, steps * walkers, frames)
-    return np.array([float(arviz.rhat(np.ascontiguousarray(chains[..., n]), method="rank")) for n in range(frames)])
+    return float(arviz.rhat(np.ascontiguousarray(times).reshape(len(times), -1), method="rank"))
 
 
-def _few_moves() -> list[tuple[Any, float]]:
+def _usual_moves(log_prob: FrameTimeLogProb) -> list[tuple[Any, float]]:
     from emcee.moves import DEMove, StretchMove
 
-    return [(DEMove(), 0.7), (StretchMove(), 0.3)]
+    from foldgauss.uncertainty.moves import BlockSweep
+
+    sweep = BlockSweep(log_prob)
+    # emcee's moves alone stay on the hill on which they start; sweeps go from one to another.
+    return [(sweep, 0.5), (DEMove(), 0.3), (StretchMove(), 0.2)] if log_prob.num_free <= AT_ONCE else [(sweep, 1.0)]
 
 
-def _kinds(moves) -> list[str]:
-    """Names of moves, as `emcee.EnsembleSampler` takes them."""
-    each = moves if isinstance(moves, list | tuple) else [moves]
-    return [type(move[0] if isinstance(move, tuple) else move).__name__ for move in each]
+def _described(value, depth: int = 2) -> Any:
+    """A move's kind and its settings: numbers, texts and arrays, and those of what it is made of."""
+    if value is None or isinstance(value, bool | str | int | float):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    if isinstance(value, list | tuple):
+        return [_described(each, depth) for each in value]
+    kind = getattr(value, "__qualname__", type(value).__qualname__)
+    if depth == 0 or isinstance(value, FrameTimeLogProb):  # what is drawn from has its own part of the fingerprint
+        return kind
+    inner = getattr(value, "__dict__", {})
+    return kind, [(name, _described(each, depth - 1)) for name, each in sorted(inner.items())]
 
 
 class _Kept:
     """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced."""
 
-    def __init__(self, path: str | os.PathLike, fingerprint: str):
-        h5py = needed("h5py")
-        self.path = Path(path)
-        self.live = self.path.with_name(f".{self.path.name}.running")
-        if self.path.exists():
-            try:
-                with h5py.File(self.path) as file:
-                    kept = file.attrs.get("fingerprint", "")
-            except OSError as error:
-                raise invalid(
-                    "backend", expected="an HDF5 file, or none yet", got=str(self.path), cure="Choose another."
-                ) from error
+    def __init__(self, path: Path, fingerprint: str):
+        self.path = path
+        self.live = path.with_name(f".{path.name}.running")
+        if path.exists():
+            kept = _fingerprint_of(path)
             if kept != fingerprint:
                 cure = "Choose another file, or give the same model, video and settings."
                 raise invalid(
@@ -372,7 +525,7 @@ class _Kept:
                 )
             shutil.copyfile(self.path, self.live)
         else:
-            with h5py.File(self.live, "w") as file:
+            with needed("h5py").File(self.live, "w") as file:
                 file.attrs["fingerprint"] = fingerprint
 
     def of(self, n: int):
@@ -391,6 +544,15 @@ class _Kept:
         self.live.unlink()
 
 
+def _fingerprint_of(path: Path) -> str:
+    """Of the run that a file keeps."""
+    try:
+        with needed("h5py").File(path) as file:
+            return file.attrs.get("fingerprint", "")
+    except OSError as error:
+        raise invalid("backend", expected="an HDF5 file, or none yet", got=str(path), cure="Choose another.") from error
+
+
 def needed(name: str):
     """An optional package, or what to install."""
     try:
@@ -405,11 +567,22 @@ def _version(name: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", importlib.metadata.version(name))[:3])
 
 
+def _check_progress(progress) -> None:
+    if progress is None or isinstance(progress, bool):
+        return
+    if not callable(progress):
+        raise invalid("progress", expected="True, False or a function", got=short_repr(progress))
+    check_takes("progress", progress, "what", "done", "total")
+
+
 @contextlib.contextmanager
 def _shown(progress) -> Iterator[Callable[[str, int, int], None] | None]:
     """A function that shows how far things are, or None."""
-    if not progress or callable(progress):
-        yield progress or None
+    if progress is None or progress is False:
+        yield None
+        return
+    if progress is not True:
+        yield progress
         return
     from rich.progress import Progress
 

@@ -82,8 +82,17 @@ class Profiles:
         return Profiles(self.nodes[which], self.values[which], self.slopes[which], self.count[which])
 
     def scaled(self, factor: Float[np.ndarray, "num_frames"] | float) -> "Profiles":
-        """With all log-likelihoods times `factor`: for another noise of the same pictures."""
-        factor = np.broadcast_to(np.asarray(factor, np.float64), self.num_frames)[:, None]
+        """With all log-likelihoods times `factor`, a number > 0 or one a frame: for another noise of the same pictures.
+
+        Raises ValueError for factors that are not finite and above 0, and for another number of them.
+        """
+        factor = np.asarray(factor)
+        if factor.dtype.kind not in "iuf" or factor.shape not in ((), (1,), (self.num_frames,)):
+            expected, got = f"a number, or {self.num_frames} of them", f"{factor.dtype} of shape {factor.shape}"
+            raise invalid("factor", expected=expected, got=got)
+        if not (np.isfinite(factor) & (factor > 0)).all():
+            raise invalid("factor", expected="numbers > 0", got=f"one of {factor.min():.3g}")
+        factor = np.broadcast_to(factor.astype(np.float64), self.num_frames)[:, None]
         return dataclasses.replace(self, values=self.values * factor, slopes=self.slopes * factor)
 
 

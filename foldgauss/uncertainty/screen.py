@@ -7,11 +7,12 @@ import numba as nb
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, short_repr
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
 from foldgauss.render import cpu
 from foldgauss.video.alpha import BLACK, composited
+from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 from foldgauss.video.playback import Playback
 
@@ -29,6 +30,16 @@ def _batched(times: Iterable[float]) -> Iterator[tuple[float, ...]]:
         yield some
 
 
+def check_model(model: VideoModel) -> None:
+    """ValueError for anything but a VideoModel."""
+    if isinstance(model, VideoModel):
+        return
+    cure = ""
+    if isinstance(model, EditedVideo):
+        cure = "Take the model that was edited, and the clip that it was fitted to; or fit one to what is now shown."
+    raise invalid("model", expected="a VideoModel", got=short_repr(model), cure=cure)
+
+
 class Screen:
     """A model and the frames it is compared with, both over black.
 
@@ -37,6 +48,7 @@ class Screen:
     """
 
     def __init__(self, model: VideoModel, frames: UInt8[np.ndarray, "num_frames height width channels"]):
+        check_model(model)
         frames = np.asarray(frames)
         if (
             frames.dtype != np.uint8

@@ -90,7 +90,21 @@ def test_logits_are_centred_and_give_the_times_back():
         ({"frames": [0, 1]}, "frames"),
         ({"frames": [6]}, "frames"),
         ({"frames": [1.5]}, "frames"),
+        ({"frames": 3}, "frames"),
+        ({"frames": [[1], [2]]}, "frames"),
+        ({"frames": [[1], [2, 3]]}, "frames"),
+        ({"frames": "12"}, "frames"),
+        ({"frames": HELD > 0.5}, "frames"),
+        ({"concentration": "a"}, "concentration"),
+        ({"concentration": None}, "concentration"),
+        ({"concentration": np.inf}, "concentration"),
         ({"held": HELD[::-1].copy()}, "held"),
+        ({"held": HELD + 0.1}, "held: expected times in .*1.1 of frame 6"),
+        ({"held": HELD - 0.1}, "held"),
+        ({"held": np.where(HELD == 0.55, 0.9, HELD)}, "held: expected rising times.*frame 4 .*frame 5"),
+        ({"held": np.where(HELD == 0.55, 0.7, HELD)}, "held"),
+        ({"held": np.full(7, np.nan)}, "held"),
+        ({"held": "x"}, "held"),
         ({"held": HELD[:2], "frames": None}, "held"),
     ],
 )
@@ -107,6 +121,35 @@ def test_shapes_and_order_are_checked():
         increments.coordinates(np.zeros(4))
     with pytest.raises(ValueError, match="rise"):
         increments.coordinates(np.array([0, 0.5, 0.4, 0.6, 1.0]))
+
+
+def test_the_times_of_free_frames_do_not_count():
+    assert Increments.among([0, np.nan, -7, 0.3, 0.55, 0.7, 1.0], [1, 2]).runs == [(1, 2)]
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-300, 1e-17])
+def test_increments_that_float64_has_lost_count_as_the_least(gap):
+    increments = Increments.among(HELD, [1, 2])
+    times = HELD.copy()
+    times[1:3] = gap, 0.2
+    found = increments.coordinates(times)
+    np.testing.assert_allclose(found, np.log([0.3e-16 / 0.1, 0.2 / 0.1]), rtol=1e-12)
+    assert np.isfinite(increments.log_prior(found)) and np.isfinite(increments.logits(times)).all()
+    for wrong in (-1e-18, -0.1, np.nan):
+        times[1] = wrong
+        with pytest.raises(ValueError, match="times that rise"):
+            increments.coordinates(times)
+
+
+def test_low_concentrations_go_there_and_back():
+    increments = free_times(30, 0.05)
+    times = increments.draw_prior(np.random.default_rng(0), 2000)
+    assert (np.diff(times) >= 0).all() and (np.diff(times) == 0).any()
+    coordinates = increments.coordinates(times)
+    assert np.isfinite(coordinates).all()
+    again = increments.times(coordinates)
+    assert (np.diff(again) >= 0).all()
+    np.testing.assert_allclose(again, times, atol=1e-14)
 
 
 def test_nan_coordinates_are_an_error_and_not_a_density():

@@ -244,3 +244,12 @@ def test_another_clip_of_the_same_place_is_told():
         warnings.simplefilter("always")
         evidence(speck, other, noise=white(0.02))
     assert any("another video" in str(each.message) for each in caught)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0, np.nan, np.inf, "a", [1.0, 2.0], [1.0, -1.0, 1.0]])
+def test_factors_of_likelihoods_are_above_0(factor):
+    nodes = np.linspace(0, 1, 5)
+    found = Profiles.of([nodes] * 3, [-nodes] * 3)
+    with pytest.raises(ValueError, match="factor"):
+        found.scaled(factor)
+    np.testing.assert_array_equal(found.scaled([1, 2, 3]).values, -nodes * [[1], [2], [3]])

@@ -1,6 +1,7 @@
 """emcee's draws of frame times: a posterior that is known, seeds, files, and what is refused."""
 
 import dataclasses
+import tracemalloc
 
 import emcee
 import numpy as np
@@ -8,8 +9,20 @@ import pytest
 import scipy.stats
 from time_clips import clip, free_times, model, parabolas, uneven, white
 
-from foldgauss.uncertainty import FrameTimeLogProb, Increments, Profiles, exact_times, frame_time_posterior
+from foldgauss.uncertainty import (
+    Evidence,
+    FrameNoise,
+    FrameTimeLogProb,
+    Increments,
+    Profiles,
+    drawn_log_likelihood,
+    exact_times,
+    frame_time_log_prob,
+    frame_time_posterior,
+)
+from foldgauss.uncertainty.laplace import laplace_times
 from foldgauss.uncertainty.moves import BlockSweep
+from foldgauss.video.edited import EditedVideo, Layer
 
 #: Two of the three so near that their order ties them.
 NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
@@ -125,6 +138,68 @@ def test_another_hill_is_reached():
         assert found.message.startswith("Not converged")
 
 
+@pytest.fixture(scope="module")
+def two_hills():
+    """Of the second of three frames, of equal mass, 0.2 apart: the exact spread is 0.1, that of a hill 0.004."""
+    nodes = np.linspace(0, 1, 401)
+
+    def about(m, w):
+        return -((nodes - m) ** 2) / (2 * w**2)
+
+    two = np.maximum(np.logaddexp(about(0.4, 0.004), about(0.6, 0.004)), -2000)
+    values = [about(0, 0.01), about(0.2, 0.01), two, about(0.8, 0.01), about(1, 0.01)]
+    return FrameTimeLogProb(Profiles.of([nodes] * 5, values), free_times(5))
+
+
+def test_few_frames_go_from_hill_to_hill(two_hills):
+    found = sampled(two_hills)
+    assert found.converged and agrees(found)
+    assert (found.draws[:, 2] > 0.5).mean() == pytest.approx(0.5, abs=0.03)
+    assert found.std()[2] == pytest.approx(found.exact.std()[2], rel=0.02)
+
+
+def test_ensembles_that_all_miss_a_hill_have_not_converged(two_hills):
+    # emcee's own moves stay where they start: tau and R-hat see nothing of the other hill.
+    moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.StretchMove(), 0.3)]
+    found = sampled(two_hills, moves=moves, steps=1500, ensembles=2)
+    assert (found.r_hat < 1.01).all() and found.std()[2] < 0.005
+    assert not found.converged and found.message.startswith("Not converged")
+    assert "emcee and the exact passes disagree at frame 2" in found.message
+
+
+def test_how_many_frames_tell_their_time():
+    log_prob = toy((0.2, 0.5, 0.8), (0.02, 5.0, 0.02))
+    found = sampled(log_prob)
+    assert found.converged and found.identified().sum() == 4
+    assert found.message.endswith(" 2 of 3 frames tell their time.")
+
+
+@pytest.mark.parametrize(("num", "frames"), [(5, [3]), (7, [2, 4]), (7, [1, 3, 4]), (3, None)])
+def test_single_frames_between_held_ones(num, frames):
+    means = np.linspace(0, 1, num)
+    profiles = parabolas(means[1:-1], np.full(num - 2, 0.2 / num))
+    log_prob = FrameTimeLogProb(profiles, Increments.among(means, frames))
+    laplace = laplace_times(profiles, log_prob.increments, means)
+    free = log_prob.increments.free
+    np.testing.assert_allclose(laplace.mode, means, atol=1e-3)
+    np.testing.assert_allclose(laplace.std[free], exact_times(profiles, log_prob.increments).std()[free], rtol=0.05)
+    draws = laplace.sample(4000)
+    assert (np.diff(draws) > 0).all() and (draws[:, ~free] == means[~free]).all()
+    np.testing.assert_allclose(draws.std(0)[free], laplace.std[free], rtol=0.06)
+    found = sampled(log_prob)
+    assert found.converged and agrees(found)
+    np.testing.assert_array_equal(found.free, np.flatnonzero(free))
+
+
+def test_a_low_concentration_samples_gaps_that_float64_cannot_tell():
+    # A thousandth of increments are below 1e-16.
+    flat = [np.zeros(61)] * 16
+    log_prob = FrameTimeLogProb(Profiles.of([np.linspace(0, 1, 61)] * 16, flat), free_times(16, 0.2))
+    found = sampled(log_prob, steps=1000)
+    assert (np.diff(found.times) >= 0).all() and np.isfinite(found.logits).all()
+    assert np.isfinite(found.to_arviz().sample_stats["lp"].values).all()
+
+
 def test_seeds_reproduce_to_the_bit():
     one, again, other = (sampled(toy(*NEAR), steps=400, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.times, again.times)
@@ -143,9 +218,9 @@ def test_too_few_steps_say_that_they_are():
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, blocks):
     log_prob = toy(*NEAR)
     moves = BlockSweep(log_prob, block=2) if blocks else None
-    settings = {"steps": 1000, "moves": moves, "seed": 5}
+    settings = {"steps": 600, "moves": moves, "seed": 5}
     whole = sampled(log_prob, **settings)
-    sampled(log_prob, **{**settings, "steps": 500}, backend=tmp_path / "run.h5")
+    sampled(log_prob, **{**settings, "steps": 300}, backend=tmp_path / "run.h5")
     found = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
     np.testing.assert_array_equal(found.times, whole.times)
     again = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
@@ -157,13 +232,34 @@ def test_another_runs_file_is_refused(tmp_path):
     path = tmp_path / "run.h5"
     sampled(toy(*NEAR), steps=100, backend=path)
     before = path.read_bytes()
-    for change in ({"seed": 1}, {"log_prob": toy(NEAR[0], (0.03, 0.05, 0.041))}, {"ensembles": 3}, {"walkers": 34}):
+    changes = {"seed": 1}, {"log_prob": toy(NEAR[0], (0.03, 0.05, 0.041))}, {"ensembles": 3}, {"walkers": 34}
+    for change in (*changes, {"moves": emcee.moves.StretchMove()}):
         with pytest.raises(ValueError, match="backend"):
             sampled(**{"log_prob": toy(*NEAR), "steps": 100, "backend": path, **change})
     assert path.read_bytes() == before
     (tmp_path / "text.h5").write_text("no such file")
     with pytest.raises(ValueError, match="backend"):
         sampled(toy(*NEAR), steps=100, backend=tmp_path / "text.h5")
+
+
+def test_a_run_is_known_again_by_its_numbers(tmp_path):
+    path, settings = tmp_path / "run.h5", {"steps": 20, "ensembles": 2, "backend": tmp_path / "run.h5"}
+    log_prob = toy(*NEAR)
+    whole = sampled(log_prob, **settings, walkers=32, seed=1, thin_by=10)
+    numbers = {"walkers": np.int32(32), "seed": np.int64(1), "thin_by": np.int16(10)}
+    np.testing.assert_array_equal(sampled(log_prob, **settings, **numbers).times, whole.times)
+    path.unlink()
+    stretch, walk = emcee.moves.StretchMove(a=2.0), emcee.moves.DEMove()
+    sampled(log_prob, **settings, moves=[(stretch, 0.5), (walk, 0.5)])
+    sampled(log_prob, **settings, moves=[(stretch, 0.5), (walk, 0.5)])  # the same objects, which have run
+    others = [(emcee.moves.StretchMove(a=9.0), 0.5), (walk, 0.5)], [(stretch, 0.4), (walk, 0.6)]
+    for moves in (*others, [(stretch, 0.5), (emcee.moves.DEMove(sigma=1e-3), 0.5)]):
+        with pytest.raises(ValueError, match="backend"):
+            sampled(log_prob, **settings, moves=moves)
+    path.unlink()
+    sampled(log_prob, **settings, moves=emcee.moves.GaussianMove(0.1))
+    with pytest.raises(ValueError, match="backend"):
+        sampled(log_prob, **settings, moves=emcee.moves.GaussianMove(0.2))
 
 
 @pytest.mark.parametrize("num", [1, 2, 8, 9, 11, 12, 13])
@@ -182,13 +278,120 @@ def test_the_walkers_that_are_chosen_are_enough(num):
         ({"ensembles": 1}, "ensembles"),
         ({"thin_by": 0}, "thin_by"),
         ({"steps": 5}, "steps"),
+        *[({name: value}, name) for name in ("walkers", "ensembles", "thin_by", "steps") for value in (32.0, "9")],
+        *[({name: np.nan}, name) for name in ("walkers", "ensembles", "thin_by", "steps", "seed")],
+        *[({"seed": seed}, "seed") for seed in (-1, None, 1.5)],
+        *[({"moves": moves}, "moves") for moves in ("stretch", [], ["stretch"], 3, emcee.moves.StretchMove)],
+        ({"moves": (emcee.moves.StretchMove(), 0.5)}, "moves"),
+        ({"moves": [(emcee.moves.StretchMove(), 0.0)]}, "weights"),
+        ({"moves": [(emcee.moves.StretchMove(), np.nan)]}, "moves"),
+        ({"log_prob": 3}, "log_prob"),
+        ({"progress": "yes"}, "progress"),
+        ({"progress": lambda: None}, "progress"),
+        ({"backend": 3.0}, "backend"),
+        ({"model": 3}, "model.*beside `log_prob`"),
+        ({"video": np.zeros((5, 4, 4, 3), np.uint8)}, "video"),
+        ({"frames": [1]}, "frames"),
+        ({"noise": "effective"}, "noise"),
+        ({"noise": white()}, "noise"),
+        ({"level": "colors"}, "level"),
+        ({"concentration": 2.0}, "concentration"),
+        ({"seen": 3}, "seen"),
         ({"moves": emcee.moves.DESnookerMove()}, "DESnookerMove"),
         ({"moves": [(emcee.moves.StretchMove(), 0.5), (emcee.moves.DESnookerMove(), 0.5)]}, "DESnookerMove"),
     ],
 )
 def test_what_is_refused(change, word):
     with pytest.raises(ValueError, match=word):
-        sampled(toy(*NEAR), **change)
+        frame_time_posterior(**{"log_prob": toy(*NEAR), "progress": False, **change})
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Of another clip."""
+    profiles = parabolas((0.3, 0.6), (0.1, 0.1), 5)  # 4 frames
+    return Evidence(profiles, FrameNoise(np.full(4, 0.02), np.ones(4)), np.ones(3), 9)
+
+
+def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, seen):
+    def drawn(*_, **__):
+        raise AssertionError("pictures were drawn")
+
+    monkeypatch.setattr("foldgauss.uncertainty.posterior.evidence", drawn)
+    monkeypatch.setattr("foldgauss.uncertainty.log_prob.evidence", drawn)
+    frames = np.zeros((6, 4, 4, 3), np.uint8)
+    (tmp_path / "text.h5").write_text("no such file")
+    both = [
+        ({"model": None}, "model"),
+        ({"model": "x"}, "model"),
+        ({"model": EditedVideo((Layer(model()),))}, "model.*EditedVideo.*Take the model"),
+        ({"video": frames[:2]}, "video: expected at least 3 frames"),
+        ({"video": None}, "video"),
+        ({"frames": [9]}, "frames"),
+        ({"frames": 3}, "frames"),
+        ({"level": "everything"}, "level"),
+        ({"noise": "loud"}, "noise"),
+        ({"concentration": "a"}, "concentration"),
+        ({"concentration": -1}, "concentration"),
+        ({"seen": seen}, "video: expected the 4 frames that were `seen`"),
+        ({"seen": seen, "video": None, "noise": white()}, "noise"),
+        ({"seen": seen, "video": None, "level": "colors"}, "video"),
+    ]
+    alone = [
+        ({"walkers": 3}, "walkers"),
+        ({"seed": -1}, "seed"),
+        ({"backend": tmp_path / "none" / "run.h5"}, "backend.*folder"),
+        ({"backend": tmp_path}, "backend"),
+        ({"backend": tmp_path / "text.h5"}, "backend"),
+    ]
+    for change, word in both + alone:
+        with pytest.raises(ValueError, match=word):
+            frame_time_posterior(**{"model": model(), "video": frames, "progress": False, **change})
+    held = [({"held": np.linspace(0.2, 3, 6)}, "held"), ({"held": "x"}, "held"), ({"held": np.ones(2)}, "held")]
+    for change, word in both + held:
+        with pytest.raises(ValueError, match=word):
+            frame_time_log_prob(**{"model": model(), "video": frames, "frames": [2], **change})
+    with pytest.raises(ValueError, match="seen"):
+        frame_time_posterior(log_prob=toy(*NEAR), seen=seen, progress=False)
+
+
+def test_what_drawn_likelihoods_refuse():
+    frames = clip(uneven())
+    with pytest.raises(ValueError, match="noise"):
+        drawn_log_likelihood(model(), frames, uneven(), "score")
+    for times in (uneven()[:3], uneven() + 1, "x"):
+        with pytest.raises(ValueError, match="times"):
+            drawn_log_likelihood(model(), frames, times, white())
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, "a", np.nan])
+def test_levels_of_intervals(near, level):
+    with pytest.raises(ValueError, match="level"):
+        near.interval(level)
+
+
+def test_what_is_told_of_many_frames_is_that_of_all_draws():
+    shape = 2, 3, 4, 150
+    times = np.sort(np.random.default_rng(0).random(shape))
+    flat = times.reshape(-1, 150)
+    found = dataclasses.replace(sampled(toy(*NEAR), steps=10, ensembles=2), times=times)
+    np.testing.assert_allclose(found.mean(), flat.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(found.std(), flat.std(0), rtol=1e-12)
+    np.testing.assert_allclose(found.interval(0.5), np.quantile(flat, [0.25, 0.75], axis=0), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_draws_are_kept_twice_and_not_more():
+    num = 40
+    log_prob = toy(np.linspace(0, 1, num + 2)[1:-1], np.full(num, 0.005), nodes=101)
+    settings = {"steps": 400, "thin_by": 1, "ensembles": 2}
+    sampled(log_prob, **{**settings, "steps": 2})  # what is compiled
+    tracemalloc.start()
+    found = sampled(log_prob, **settings)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    kept = 8 * 2 * 400 * found.times.shape[2] * (num + 2)
+    assert 1.9 * kept < peak < 2.8 * kept
 
 
 def test_a_nan_in_the_density_is_an_error():
