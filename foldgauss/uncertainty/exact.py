@@ -159,8 +159,7 @@ def _regridded(grid: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, float
     first, last = max(some[0] - 1, 0), min(some[-1] + 1, len(mass) - 1)
     spread = np.sqrt(_moment(grid, density, _moment(grid, density, 0.0, 1), 2))
     cuts = np.ceil(np.maximum(POINTS * mass, np.diff(grid) / (WIDTH * spread))).astype(int)
-    points = [np.linspace(grid[n], grid[n + 1], cuts[n] + 1)[:-1] for n in range(first, last + 1)]
-    return np.unique(np.concatenate([*points, [grid[last + 1]]])), float(mass.max())
+    return np.unique(_cut(grid[first : last + 2], cuts[first : last + 1])), float(mass.max())
 
 
 def _passes(profiles: Profiles, frames: range, grids: list[np.ndarray], ends: tuple[float, float], alpha: float):
@@ -233,11 +232,14 @@ def profile_grid(
     hull = slice(max(some[0] - 1, 0), some[-1] + 2)
     here, heights = here[hull], heights[hull]
     near = heights > heights.max() - NEAR
-    points = [
-        np.linspace(a, b, (finer if close else 1) + 1)[:-1]
-        for a, b, close in zip(here[:-1], here[1:], near[:-1] | near[1:], strict=True)
-    ]
-    return np.concatenate([*points, here[-1:]])
+    return _cut(here, np.where(near[:-1] | near[1:], finer, 1))
+
+
+def _cut(grid: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+    """A grid with each of its pieces cut into so many."""
+    number = np.arange(cuts.sum()) - np.repeat(np.cumsum(cuts) - cuts, cuts)
+    points = np.repeat(grid[:-1], cuts) + number * np.repeat(np.diff(grid) / cuts, cuts)
+    return np.concatenate([points, grid[-1:]])
 
 
 def _on_grid(profiles: Profiles, k: int, grid: np.ndarray) -> np.ndarray:
