@@ -31,6 +31,9 @@ POINTS, WIDTH, NOTHING = 300, 1 / 12, 1e-13
 FIRST, ROUNDS, COARSE = 400, 6, 0.1
 #: Halvings of a grid's pieces beside held times where the density is infinite.
 HALVINGS = 40
+#: A frame's density may be infinite, or jump, where a near frame is that has less than NARROW of its spread;
+#: near: at most AROUND frames away.
+NARROW, AROUND = 0.1, 5
 #: Likelihoods so many nats below their maximum are 0 in float64.
 UNDERFLOW = 740.0
 #: Proposals for a draw within a piece, after which the last is taken.
@@ -122,11 +125,12 @@ def _run(profiles: Profiles, frames: range, ends: tuple[float, float], alpha: fl
         grids.append(_graded(grid, ends, alpha * (n + 1) < 1, alpha * (len(frames) - n) < 1))
     densities, *_ = _passes(profiles, frames, grids, ends, alpha)
     for _ in range(ROUNDS):
-        grids, coarse = zip(*(_regridded(*each) for each in zip(grids, densities, strict=True)), strict=True)
+        cut = [_regridded(*each) for each in zip(grids, densities, strict=True)]
+        grids, coarse = _around(grids, densities, [each[0] for each in cut], alpha), [each[1] for each in cut]
         densities, forward, log_evidence = _passes(profiles, frames, grids, ends, alpha)
         if max(coarse) < COARSE:
             break
-    return list(grids), densities, forward, log_evidence
+    return grids, densities, forward, log_evidence
 
 
 def _thinned(profiles: Profiles, k: int, grid: np.ndarray) -> np.ndarray:
@@ -160,6 +164,32 @@ def _regridded(grid: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, float
     spread = np.sqrt(_moment(grid, density, _moment(grid, density, 0.0, 1), 2))
     cuts = np.ceil(np.maximum(POINTS * mass, np.diff(grid) / (WIDTH * spread))).astype(int)
     return np.unique(_cut(grid[first : last + 2], cuts[first : last + 1])), float(mass.max())
+
+
+def _around(
+    grids: list[np.ndarray], densities: list[np.ndarray], cut: list[np.ndarray], alpha: float
+) -> list[np.ndarray]:
+    """Grids `cut` with points, ever further apart, around where frames are that are known far better than their own.
+
+    For concentrations up to 1: above a frame that is known the next one has a density of the distance's power
+    alpha - 1, and the j-th after it of alpha j - 1.
+    """
+    if alpha > 1:
+        return cut
+    means = [_moment(grid, density, 0.0, 1) for grid, density in zip(grids, densities, strict=True)]
+    moments = zip(grids, densities, means, strict=True)
+    spreads = [np.sqrt(_moment(grid, density, mean, 2)) for grid, density, mean in moments]
+    reach, found = min(int(1 / alpha), AROUND), []
+    for n, points in enumerate(cut):
+        parts = [points]
+        for j in range(max(n - reach, 0), min(n + reach + 1, len(cut))):
+            if 0 < spreads[j] < NARROW * spreads[n]:
+                halvings = np.arange(-2, np.log2((points[-1] - points[0]) / spreads[j]), 0.5)
+                steps = spreads[j] * 2.0**halvings
+                parts += [means[j] - steps, means[j] + steps]
+        every = np.unique(np.concatenate(parts))
+        found.append(every[(every >= points[0]) & (every <= points[-1])])
+    return found
 
 
 def _passes(profiles: Profiles, frames: range, grids: list[np.ndarray], ends: tuple[float, float], alpha: float):
