@@ -29,13 +29,15 @@ FINER, NEAR = 8, 30.0
 POINTS, WIDTH, NOTHING = 300, 1 / 12, 1e-13
 #: Points of a frame's grid at first; grids are cut again, at most ROUNDS times, while a piece has more than COARSE.
 FIRST, ROUNDS, COARSE = 400, 6, 0.1
-#: Halvings of a grid's pieces beside held times where the density is infinite.
-HALVINGS = 40
+#: Halvings of a grid's pieces beside held times where the density is infinite; each in so many steps.
+HALVINGS, STEPS = 40, 4
 #: A frame's density may be infinite, or jump, where a near frame is that has less than NARROW of its spread;
 #: near: at most AROUND frames away.
 NARROW, AROUND = 0.1, 5
 #: Likelihoods so many nats below their maximum are 0 in float64.
 UNDERFLOW = 740.0
+#: Cells whose logarithm is so much below another's are left out of sums.
+NEGLIGIBLE = 40.0
 #: Proposals for a draw within a piece, after which the last is taken.
 TRIES = 1000
 #: Gauss and Legendre's rule on [0, 1].
@@ -97,9 +99,16 @@ class ExactTimes:
 
 
 def exact_times(profiles: Profiles, increments: Increments) -> ExactTimes:
-    """The exact posterior given profiles, to the grids' precision (some 1e-3 of a standard deviation).
+    r"""The exact posterior given profiles, to the precision of grids of some 300 to 800 points a frame.
 
-    Raises ValueError where no ordered times have any likelihood that a float64 can hold.
+    **Precision:** means and 5 % quantiles to 5e-3 of a standard deviation, standard deviations to 3e-3 of their own,
+    the evidence to 1e-2 nats for some hundred frames; for concentrations from 0.2 to 20, whether frames are known far
+    better than they are apart, or not at all. Worst for the smallest concentrations, whose densities are infinite
+    beside frames that are known.
+    **Cost:** for n frames and concentration 1, O(n) with n grids; otherwise of the order of n 500^2 powers (150 frames
+    that nothing is known of: about 1 s, and 6 s).
+    **Raises:** ValueError where no ordered times have any likelihood: frames whose likelihoods are above exp(-740) of
+    their greatest only in the wrong order; NaN in profiles.
     """
     grids, densities, forwards, log_evidence = [], [], [], 0.0
     for first, last in increments.runs:
@@ -146,7 +155,7 @@ def _thinned(profiles: Profiles, k: int, grid: np.ndarray) -> np.ndarray:
 
 def _graded(grid: np.ndarray, ends: tuple[float, float], at_start: bool, at_end: bool) -> np.ndarray:
     """With the piece beside a held time halved again and again, if asked for and if the grid reaches as far."""
-    halves = 0.5 ** np.arange(HALVINGS, 0, -1)
+    halves = 0.5 ** (np.arange(STEPS * HALVINGS, 0, -1) / STEPS)
     parts = [grid]
     if at_start and grid[0] == ends[0]:
         parts.append(grid[0] + (grid[1] - grid[0]) * halves)
@@ -171,15 +180,15 @@ def _around(
 ) -> list[np.ndarray]:
     """Grids `cut` with points, ever further apart, around where frames are that are known far better than their own.
 
-    For concentrations up to 1: above a frame that is known the next one has a density of the distance's power
+    For concentrations below 2: above a frame that is known the next one has a density of the distance's power
     alpha - 1, and the j-th after it of alpha j - 1.
     """
-    if alpha > 1:
+    if alpha >= 2:
         return cut
     means = [_moment(grid, density, 0.0, 1) for grid, density in zip(grids, densities, strict=True)]
     moments = zip(grids, densities, means, strict=True)
     spreads = [np.sqrt(_moment(grid, density, mean, 2)) for grid, density, mean in moments]
-    reach, found = min(int(1 / alpha), AROUND), []
+    reach, found = min(max(int(1 / alpha), 1), AROUND), []
     for n, points in enumerate(cut):
         parts = [points]
         for j in range(max(n - reach, 0), min(n + reach + 1, len(cut))):
@@ -228,18 +237,18 @@ def _some(logs: np.ndarray, k: int) -> np.ndarray:
     return logs
 
 
-def _density(grid: np.ndarray, logs: np.ndarray, ends: tuple[float, float], shapes: tuple[float, float]) -> np.ndarray:
-    """A marginal: exp(logs) times the prior's Beta density, of these shapes, between the ends."""
+def _density(grid: np.ndarray, told: np.ndarray, ends: tuple[float, float], shapes: tuple[float, float]) -> np.ndarray:
+    """A marginal: exp(told) times the prior's Beta density, of these shapes, between the ends."""
     since, until = grid - ends[0], ends[1] - grid
     with np.errstate(divide="ignore", invalid="ignore"):
         since, until = ((shape - 1) * np.log(away) if shape != 1 else 0.0 for shape, away in
                         zip(shapes, (since, until), strict=True))  # fmt: skip
-        logs = logs + since + until
+        logs = told + since + until
     finite = np.where(logs < np.inf, logs, -np.inf)
     density = np.exp(finite - finite.max())
-    # Where it is infinite, what gives the piece beside the end its integral.
+    # Beside an end where it is infinite, or rises from 0 ever more slowly, what gives that piece its integral.
     for end, inner, shape in ((0, 1, shapes[0]), (-1, -2, shapes[1])):
-        if logs[end] == np.inf:
+        if grid[end] == ends[end] and shape < 2 and shape != 1 and np.isfinite(told[end]):
             density[end] = density[inner] * (2 / shape - 1)
     return density / _integral(grid, density)
 
@@ -439,9 +448,10 @@ def _terms(t, grid, logs, masses, means, variances, power, alpha, nodes, weights
     """
     num = min(np.searchsorted(grid, t), len(grid) - 1)
     second = (alpha - 1) * (alpha - 2) / 2
+    top = -np.inf
     for j in range(num):
         low, width = grid[j], grid[j + 1] - grid[j]
-        if masses[j] == -np.inf:
+        if masses[j] == -np.inf or (alpha > 1 and masses[j] + (alpha - 1) * np.log(t - low) < top - NEGLIGIBLE):
             terms[j] = -np.inf
         elif t - grid[j + 1] >= (4 + alpha) * width:
             away = t - means[j]
@@ -456,6 +466,7 @@ def _terms(t, grid, logs, masses, means, variances, power, alpha, nodes, weights
                     parts[n] = scale + (alpha - 1) * np.log(t - s) + _log_at(s / width, logs[j], logs[j + 1])
             _piece(t, middle, high, low, width, logs[j], logs[j + 1], power, alpha, nodes, weights, parts[count:])
             terms[j] = _log_total(parts, count + len(nodes))
+        top = max(top, terms[j])
     return num
 
 
