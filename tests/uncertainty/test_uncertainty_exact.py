@@ -8,10 +8,28 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from time_clips import free_times, parabolas
 
-from foldgauss.uncertainty import FrameTimeLogProb, Increments, exact_times, laplace_times
+from foldgauss.uncertainty import FrameTimeLogProb, Increments, Profiles, exact_times, laplace_times
 
 #: Far from each other, in standard deviations: the order ties nothing, and the posterior is Gaussian.
 FAR = np.array([0.2, 0.4, 0.55, 0.8]), np.array([0.01, 0.02, 0.015, 0.01])
+
+
+def knowing_only(num_frames: int, known: tuple[int, ...] = (), at: float = 0.4, width: float = 1e-6) -> Profiles:
+    """Flat profiles, but of the frames `known`, which are at `at` to within `width`."""
+    vague = np.linspace(0, 1, 4 * num_frames)
+    near = np.concatenate([[0], at + width * np.linspace(-40, 40, 801), [1]])
+    nodes = [near if k in known else vague for k in range(num_frames)]
+    values = [-(((near - at) / width) ** 2) / 2 if k in known else 0 * vague for k in range(num_frames)]
+    return Profiles.of(nodes, values)
+
+
+def assert_near(found, frames, priors, starts, lengths):
+    """Marginals of `frames` are Beta densities, each stretched to its length."""
+    for k, prior, start, length in zip(frames, priors, starts, lengths, strict=True):
+        std = prior.std() * length
+        assert found.mean()[k] == pytest.approx(start + length * prior.mean(), abs=5e-3 * std)
+        assert found.std()[k] == pytest.approx(std, rel=3e-3)
+        np.testing.assert_allclose(found.interval(0.9)[:, k], start + length * prior.ppf([0.05, 0.95]), atol=5e-3 * std)
 
 
 def by_quadrature(profiles, increments, far: float, points: int):
@@ -26,7 +44,7 @@ def by_quadrature(profiles, increments, far: float, points: int):
     return mean, covariance, np.log(weights.sum()) + heights.max() + num * np.log(z[1] - z[0])
 
 
-@pytest.mark.parametrize("concentration", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 4.0, 20.0])
 @pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
 def test_two_frames_agree_with_quadrature(concentration, means):
     # Also where frames are so near, or so far out of order, that only their order keeps them apart.
@@ -84,7 +102,7 @@ def test_draws_follow_the_known_marginals():
     assert (draws != found.sample(5000, 4)).any()
 
 
-@pytest.mark.parametrize("concentration", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 4.0, 20.0])
 def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
     found = exact_times(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
     draws = found.sample(4000, 0)
@@ -98,14 +116,64 @@ def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
         assert scipy.stats.kstest(draws[:, n + 1], cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("concentration", [0.5, 1.0, 4.0])
-def test_profiles_that_know_nothing_leave_the_prior(concentration):
-    found = exact_times(parabolas([0.5] * 3, [1e3] * 3, 201), free_times(5, concentration))
-    for k in (1, 2, 3):
-        prior = scipy.stats.beta(concentration * k, concentration * (4 - k))
-        assert found.mean()[k] == pytest.approx(prior.mean(), abs=3e-3)
-        assert found.std()[k] == pytest.approx(prior.std(), rel=1e-2)
-    assert found.log_evidence == pytest.approx(0, abs=0.02)
+LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (0.2, 1.0, 3.0, 20.0)]
+
+
+@pytest.mark.parametrize(("num", "concentration"), [*[(n, a) for n in (4, 30) for a in (0.2, 1.0, 3.0, 20.0)], *LONG])
+def test_profiles_that_know_nothing_leave_the_prior(num, concentration):
+    found = exact_times(knowing_only(num), free_times(num, concentration))
+    frames = sorted({1, 2, num // 3, num // 2, num - 2})
+    priors = [scipy.stats.beta(concentration * k, concentration * (num - 1 - k)) for k in frames]
+    assert_near(found, frames, priors, [0] * len(frames), [1] * len(frames))
+    assert found.log_evidence == pytest.approx(0, abs=5e-3 if num > 100 else 1e-3)
+
+
+@pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 3.0, 20.0])
+def test_a_frame_that_is_known_parts_the_prior_in_two(concentration):
+    # Its time is known to a millionth, and nothing of any other: Beta densities on both sides.
+    num, known = 12, 5
+    found = exact_times(knowing_only(num, (known,)), free_times(num, concentration))
+    before, after = [1, 2, known - 1], [known + 1, known + 2, num - 2]
+    priors = [scipy.stats.beta(concentration * k, concentration * (known - k)) for k in before]
+    assert_near(found, before, priors, [0] * 3, [0.4] * 3)
+    priors = [scipy.stats.beta(concentration * (k - known), concentration * (num - 1 - k)) for k in after]
+    assert_near(found, after, priors, [0.4] * 3, [0.6] * 3)
+    assert found.std()[known] == pytest.approx(1e-6, rel=2e-3)
+    evidence = scipy.stats.beta(concentration * known, concentration * (num - 1 - known)).logpdf(0.4)
+    assert found.log_evidence == pytest.approx(evidence + np.log(1e-6 * np.sqrt(2 * np.pi)), abs=3e-3)
+
+
+def test_many_frames_that_nothing_is_known_of_need_few_points():
+    found = exact_times(knowing_only(300), free_times(300))
+    assert max(map(len, found.grids)) < 1000
+    assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
+
+
+@pytest.mark.parametrize("concentration", [0.2, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("known", [(), (5,)])
+def test_increments_of_draws_are_of_the_prior(concentration, known):
+    num = 12
+    draws = exact_times(knowing_only(num, known), free_times(num, concentration)).sample(10_000, 5)
+    steps = np.diff(draws)
+    assert (steps > 0).all()
+    for k in (0, 1, 3, 7, 10):
+        if known:
+            start, stop = (0, 5) if k < 5 else (5, 11)
+        else:
+            start, stop = 0, 11
+        length = {(0, 5): 0.4, (5, 11): 0.6, (0, 11): 1.0}[start, stop]
+        prior = scipy.stats.beta(concentration, concentration * (stop - start - 1))
+        # float64 has times only to some 1e-16: no increments below 1e-13 are told apart.
+        below = prior.cdf(1e-13 / length)
+
+        def cdf(step, prior=prior, length=length):
+            return np.where(step > 1e-13, prior.cdf(step / length), 0.0)
+
+        assert (steps[:, k] < 1e-13).mean() == pytest.approx(below, abs=4 * np.sqrt(below / 10_000) + 1e-4)
+        assert scipy.stats.kstest(np.maximum(steps[:, k], 1e-13), cdf).pvalue > 1e-3
+        if not known:
+            marginal = scipy.stats.beta(concentration * (k + 1), concentration * (10 - k)) if k < 10 else None
+            assert marginal is None or scipy.stats.kstest(draws[:, k + 1], marginal.cdf).pvalue > 1e-3
 
 
 @settings(max_examples=15, deadline=None)
