@@ -134,7 +134,8 @@ def test_increments_that_float64_has_lost_count_as_the_least(gap):
     times[1:3] = gap, 0.2
     found = increments.coordinates(times)
     np.testing.assert_allclose(found, np.log([0.3e-16 / 0.1, 0.2 / 0.1]), rtol=1e-12)
-    assert np.isfinite(increments.log_prior(found)) and np.isfinite(increments.logits(times)).all()
+    assert np.isfinite(increments.log_prior(found))
+    assert np.isfinite(increments.logits(times)).all()
     for wrong in (-1e-18, -0.1, np.nan):
         times[1] = wrong
         with pytest.raises(ValueError, match="times that rise"):
@@ -144,7 +145,8 @@ def test_increments_that_float64_has_lost_count_as_the_least(gap):
 def test_low_concentrations_go_there_and_back():
     increments = free_times(30, 0.05)
     times = increments.draw_prior(np.random.default_rng(0), 2000)
-    assert (np.diff(times) >= 0).all() and (np.diff(times) == 0).any()
+    assert (np.diff(times) >= 0).all()
+    assert (np.diff(times) == 0).any()
     coordinates = increments.coordinates(times)
     assert np.isfinite(coordinates).all()
     again = increments.times(coordinates)

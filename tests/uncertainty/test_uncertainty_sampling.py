@@ -153,7 +153,8 @@ def two_hills():
 
 def test_few_frames_go_from_hill_to_hill(two_hills):
     found = sampled(two_hills)
-    assert found.converged and agrees(found)
+    assert found.converged
+    assert agrees(found)
     assert (found.draws[:, 2] > 0.5).mean() == pytest.approx(0.5, abs=0.03)
     assert found.std()[2] == pytest.approx(found.exact.std()[2], rel=0.02)
 
@@ -162,15 +163,18 @@ def test_ensembles_that_all_miss_a_hill_have_not_converged(two_hills):
     # emcee's own moves stay where they start: tau and R-hat see nothing of the other hill.
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.StretchMove(), 0.3)]
     found = sampled(two_hills, moves=moves, steps=1500, ensembles=2)
-    assert (found.r_hat < 1.01).all() and found.std()[2] < 0.005
-    assert not found.converged and found.message.startswith("Not converged")
+    assert (found.r_hat < 1.01).all()
+    assert found.std()[2] < 0.005
+    assert not found.converged
+    assert found.message.startswith("Not converged")
     assert "emcee and the exact passes disagree at frame 2" in found.message
 
 
 def test_how_many_frames_tell_their_time():
     log_prob = toy((0.2, 0.5, 0.8), (0.02, 5.0, 0.02))
     found = sampled(log_prob)
-    assert found.converged and found.identified().sum() == 4
+    assert found.converged
+    assert found.identified().sum() == 4
     assert found.message.endswith(" 2 of 3 frames tell their time.")
 
 
@@ -184,10 +188,12 @@ def test_single_frames_between_held_ones(num, frames):
     np.testing.assert_allclose(laplace.mode, means, atol=1e-3)
     np.testing.assert_allclose(laplace.std[free], exact_times(profiles, log_prob.increments).std()[free], rtol=0.05)
     draws = laplace.sample(4000)
-    assert (np.diff(draws) > 0).all() and (draws[:, ~free] == means[~free]).all()
+    assert (np.diff(draws) > 0).all()
+    assert (draws[:, ~free] == means[~free]).all()
     np.testing.assert_allclose(draws.std(0)[free], laplace.std[free], rtol=0.06)
     found = sampled(log_prob)
-    assert found.converged and agrees(found)
+    assert found.converged
+    assert agrees(found)
     np.testing.assert_array_equal(found.free, np.flatnonzero(free))
 
 
@@ -196,7 +202,8 @@ def test_a_low_concentration_samples_gaps_that_float64_cannot_tell():
     flat = [np.zeros(61)] * 16
     log_prob = FrameTimeLogProb(Profiles.of([np.linspace(0, 1, 61)] * 16, flat), free_times(16, 0.2))
     found = sampled(log_prob, steps=1000)
-    assert (np.diff(found.times) >= 0).all() and np.isfinite(found.logits).all()
+    assert (np.diff(found.times) >= 0).all()
+    assert np.isfinite(found.logits).all()
     assert np.isfinite(found.to_arviz().sample_stats["lp"].values).all()
 
 
