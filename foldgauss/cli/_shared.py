@@ -24,6 +24,7 @@ from foldgauss.io.video_file import (
     VIDEO_SUFFIXES,
     Clip,
     memory_limit,
+    read_video,
     write_image,
     write_video,
 )
@@ -36,7 +37,7 @@ from foldgauss.video.model import VideoModel
 class _InOrderOfUse(typer.core.TyperGroup):
     """The commands as one comes to need them; typer has them as they were registered."""
 
-    _ORDER = ("fit", "render", "evaluate", "info", "edit", "export", "import", "demo")
+    _ORDER = ("fit", "render", "evaluate", "info", "edit", "compress", "export", "import", "demo")
 
     def list_commands(self, ctx: typer.Context) -> list[str]:
         others = set(self.commands).difference(self._ORDER)
@@ -136,6 +137,31 @@ def evaluate_with_progress(
         return evaluate(model, frames, on_frame)
 
 
+def read_clip_of(
+    model: VideoModel | EditedVideo,
+    about: dict[str, Any],
+    video: Path,
+    frames: tuple[int | None, int | None] | None = None,
+) -> Clip:
+    """The frames of `video` that a model was fitted to, as its file says in `about`, or `frames`; warns of others."""
+    kept = about.get("frames")
+    clip = read_video(video, frames=frames or (tuple(kept) if kept else None), size=model.size)
+    if clip.num_frames != model.num_frames:
+        raise WrongUse(
+            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
+            f"Name those that it was fitted to, as 0:{model.num_frames}."
+        )
+    digest = about.get("frames_digest")  # files from before it was kept have none
+    if digest is not None and digest != fingerprint(clip)["frames_digest"]:
+        # Any clip of the right size may be compared with a model, but not unawares.
+        err.print(
+            f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
+            "another clip or range, or the same one decoded by another version of OpenCV.",
+            soft_wrap=True,
+        )
+    return clip
+
+
 def figures_of(model: VideoModel | EditedVideo, scores: Evaluation) -> dict[str, Any]:
     return {
         "mean_psnr": round(scores.mean_psnr, 3),
@@ -172,7 +198,11 @@ _LABELS = {
     "fit_seconds": ("time spent fitting", "{:.1f} s"),
     "steps": ("steps", "{:,}"),
     "stopped_by": ("stopped by", "{}"),
+    "loss_db": ("loss", "{:.3f} dB"),
+    "num_dropped": ("Gaussians left out", "{:,}"),
+    "bytes_before": ("before", "{:,} bytes"),
     "file_bytes": ("model file", "{:,} bytes"),
+    "ratio": ("smaller by a factor of", "{:.2f}"),
     "bits_per_pixel": ("bits per pixel", "{:.3f}"),
 }
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -20,7 +20,6 @@ from foldgauss.cli._shared import (
     err,
     evaluate_with_progress,
     figures_of,
-    fingerprint,
     out,
     parse_color,
     parse_frames,
@@ -28,18 +27,20 @@ from foldgauss.cli._shared import (
     parse_times,
     print_figures,
     print_frames,
+    read_clip_of,
     refuse_existing,
     refuse_huge,
     short,
     write_json,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.model_file import read_header
-from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, Clip, read_video
-from foldgauss.io.video_model import load_video_model
+from foldgauss.io.compact import is_compact
+from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS
+from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.metrics import evaluate
+from foldgauss.video.model import VideoModel
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
@@ -175,16 +176,8 @@ def evaluate_command(
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
     model = load_video_model(model_path)
-    about = read_header(model_path)["metadata"]
-    kept = about.get("frames")
-    wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
-    clip = read_video(video, frames=wanted, size=model.size)
-    if clip.num_frames != model.num_frames:
-        raise WrongUse(
-            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
-            f"Name those that it was fitted to, as 0:{model.num_frames}."
-        )
-    _say_other_frames(about, clip)
+    about = read_metadata(model_path)
+    clip = read_clip_of(model, about, video, parse_frames(frames))
     scores = evaluate_with_progress(model, clip.frames)
     num_bytes = model_path.stat().st_size
     figures = figures_of(model, scores) | {"file_bytes": num_bytes}
@@ -201,7 +194,7 @@ def evaluate_command(
 def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]) -> None:
     """Say what a model file holds."""
     model = load_video_model(model_path)
-    about = read_header(model_path)["metadata"]
+    about = read_metadata(model_path)
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
     times = np.asarray(model.frame_times.times())
     figures = {
@@ -211,7 +204,7 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
         "numbers stored": f"{model.num_floats:,}",
-        "file": f"{model_path.stat().st_size:,} bytes",
+        "file": _size_of(model_path, model),
     }
     if isinstance(model, EditedVideo):
         figures["edits"] = ", ".join(
@@ -223,15 +216,10 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     out.print(table)
 
 
-def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
-    """Any clip of the right size may be compared with a model, but not unawares."""
-    digest = about.get("frames_digest")  # files from before it was kept have none
-    if digest is not None and digest != fingerprint(clip)["frames_digest"]:
-        err.print(
-            f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
-            "another clip or range, or the same one decoded by another version of OpenCV.",
-            soft_wrap=True,
-        )
+def _size_of(path: Path, model: VideoModel | EditedVideo) -> str:
+    num_bytes, num_pixels = path.stat().st_size, model.num_frames * model.size[0] * model.size[1]
+    kind = "compact, " if is_compact(path) else ""
+    return f"{kind}{num_bytes:,} bytes, {8 * num_bytes / num_pixels:.3f} bits per pixel of the frames"
 
 
 def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:
