@@ -1,5 +1,6 @@
 """The command that makes a model's file small: `compress`."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -33,15 +34,18 @@ def compress_command(
     out_path: Annotated[
         Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
     ] = None,
+    passes: Annotated[
+        int, typer.Option(help="Passes over the frames that make up for what rounding costs; 0: only round.", min=0)
+    ] = 8,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model as a compact file, a fifth of its size or less.
+    """Write a model as a compact file: a fraction of its size.
 
-    It is rendered, evaluated, edited and exported as any other; its numbers are rounded, so its pictures differ a
-    little: by --max-loss-db at most. See docs/format.md.
+    It is rendered, evaluated, edited and exported as any other. Its pictures differ a little: by --max-loss-db at most.
+    See docs/format.md.
     """
     target = Path(f"{model_path.resolve().stem}{COMPACT_SUFFIX}") if out_path is None else out_path
     try:
@@ -65,10 +69,11 @@ def compress_command(
     told = told if within(told, "(0, 100]") else None
     with err.status("Compressing") as status:
 
-        def show(factor: float, loss: float) -> None:
-            status.update(f"Compressing: {loss:.3f} dB")
+        def show(what: str, loss: float) -> None:
+            status.update(f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost"))
 
-        made = compress(model, None if clip is None else clip.frames, max_loss_db=max_loss_db, psnr=told, on_try=show)
+        given = None if clip is None else clip.frames
+        made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
     about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
     known = clip is not None or told is not None
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
