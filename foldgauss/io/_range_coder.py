@@ -154,7 +154,7 @@ def _decode(data, contexts, nodes, most, states, values):
                 bit = _get(data, state, 32768)
             magnitude = 2 * magnitude + bit
         values[k] = -magnitude if negative else magnitude
-    return state[3] <= len(data) + 4
+    return state[3] == len(data) + 3  # the encoder ends with one byte where four are looked at
 
 
 def encode(values: Int32[np.ndarray, "num"], contexts: UInt8[np.ndarray, "num"]) -> bytes:

@@ -11,6 +11,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from foldgauss._checks import invalid, one_of, whole, within
@@ -18,6 +19,7 @@ from foldgauss.io import _range_coder
 from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.model_file import ModelFileError, plain, to_json
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.model import VideoModel
 from foldgauss.video.quantise import (
     FEATURES,
     MAX_DEGREE,
@@ -26,6 +28,7 @@ from foldgauss.video.quantise import (
     Rule,
     Unrolling,
     column_names,
+    dequantise,
 )
 
 COMPACT_SUFFIX = ".fgz"
@@ -105,6 +108,16 @@ def load_compact(path: str | os.PathLike) -> Quantised:
     """
     path = checked_path(path)
     return _unpacked(path, path.read_bytes())[0]
+
+
+def load_compact_model(path: str | os.PathLike) -> VideoModel:
+    """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
+    path = checked_path(path)
+    with np.errstate(over="ignore", invalid="ignore"):
+        model = dequantise(load_compact(path))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
+        raise _unreadable(path, "one with numbers beyond float32")
+    return model
 
 
 def compact_metadata(path: str | os.PathLike) -> dict:

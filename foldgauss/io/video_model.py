@@ -14,7 +14,7 @@ import numpy as np
 from foldgauss._checks import invalid, one_of, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import checked_path
-from foldgauss.io.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact
+from foldgauss.io.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
@@ -26,7 +26,6 @@ from foldgauss.video.growth import Statistics
 from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
-from foldgauss.video.quantise import dequantise
 
 MODEL_SUFFIX = ".safetensors"
 VIDEO, EDITED, CHECKPOINT = "video", "edited-video", "fit-checkpoint"
@@ -68,7 +67,7 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
     Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
     """
     path = checked_path(path)
-    return dequantise(load_compact(path)) if is_compact(path) else _load(path, VIDEO, EDITED)
+    return load_compact_model(path) if is_compact(path) else _load(path, VIDEO, EDITED)
 
 
 def read_metadata(path: str | os.PathLike) -> dict:

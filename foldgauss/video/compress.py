@@ -21,7 +21,7 @@ from foldgauss.video.alpha import BLACK, composited, random_background
 from foldgauss.video.finish import COLOR, PATH_AND_COLOR, refitted
 from foldgauss.video.light import LitModel
 from foldgauss.video.metrics import psnr as psnr_of
-from foldgauss.video.model import VideoModel, check_model
+from foldgauss.video.model import SH_C0, VideoModel, check_model
 from foldgauss.video.playback import Playback
 from foldgauss.video.quantise import (
     AXES,
@@ -45,7 +45,7 @@ ASSUMED_PSNR = 40.0
 #: Frames that a try is measured on; the one that is taken is measured on all.
 TRIED_FRAMES = 24
 #: Binary logarithms of the factor of all steps, in levels: the finest and the coarsest, and how close the search comes.
-_FINEST, _COARSEST, _CLOSE = -14.0, 9.0, 0.05
+_FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 #: A Gaussian is left out if that adds less error than this many times a number's own: its bits, times 2 ln 2.
 _WORTH = 40.0
 #: How much coarser the steps are, in powers of two, that mending is first tried with; and the loss by such a power.
@@ -55,6 +55,7 @@ _TRIES, _ENOUGH = 5, 0.9
 #: Fewer Gaussians than this tell nothing of how steps follow geometry.
 _FEW = 100
 _NOTHING = 1e-4  # of sensitivity: of Gaussians that no picture shows
+_SOLID = 0.03  # of light left: less is none
 _COLORS = ("luma", "blue", "green")
 
 
@@ -296,7 +297,10 @@ class _Plan:
         self._fit(sensitivity)
         opacity = 1 / (1 + np.exp(-self.described.values["opacity"]))
         # Without it: a change of -1 / (1 - opacity) in the logit, were the picture linear in it.
-        self._own = np.where(self._seen, sensitivity["opacity"] / np.maximum(1 - opacity, 1e-3) ** 2, 0)
+        own = sensitivity["opacity"] / np.maximum(1 - opacity, _SOLID) ** 2
+        # Where it is solid, logits tell nothing: as if it stood a tenth of the range from what it hides.
+        solid = np.where(opacity > 1 - _SOLID, sensitivity["luma"] * (0.1 / SH_C0) ** 2, 0)
+        self._own = np.where(self._seen, np.maximum(own, solid), 0)
 
     def _fit(self, sensitivity: dict[str, Float[np.ndarray, "num"]]) -> None:
         """Logarithms of sensitivities as lines in the features; classes hold what all columns of a Gaussian share."""
@@ -335,7 +339,8 @@ class _Plan:
         for name in self._names:
             exponent, *slopes = np.round(self._fits[name], 4).tolist()
             given = described.values.get(name)
-            origin = 0.0 if given is None else round(float(np.median(given)), 4)
+            # Stretch has its origin at 0, so that none is rounded below.
+            origin = 0.0 if given is None or name == "stretch" else round(float(np.median(given)), 4)
             slopes = () if name in FEATURES else tuple(-slope for slope in slopes)
             rules[name] = Rule(origin, round(factor - exponent, 4), (-1.0, *slopes))
         return quantise(described, self._classes[kept], rules)

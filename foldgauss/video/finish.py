@@ -33,7 +33,8 @@ def refitted(
 ) -> VideoModel:
     """The model after `passes` over its frames in random order, by least squares; only leaves `free` change.
 
-    `target(k, step)` gives what frame k is compared with. `free` None: all. Frame times stay. Deterministic; Adam as in the fit.
+    `target(k, step)` gives what frame k is compared with. `free` None: all. Frame times stay.
+    Deterministic; Adam as in the fit.
     """
     stage = Stage(model, model.size)
     rows, window, shape = stage.rows, stage.window, stage.shape

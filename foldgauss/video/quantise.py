@@ -135,7 +135,7 @@ def values_of(quantised: Quantised) -> dict[str, Float[np.ndarray, "num"]]:
 
 
 def in_clip(time: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
-    """m_t held where its logit is finite."""
+    """m_t, or an angle in turns, held where its logit is finite."""
     return np.minimum(np.maximum(time, 2.0**-24), 1 - 2.0**-24)
 
 
@@ -154,7 +154,7 @@ def dequantise(quantised: Quantised) -> VideoModel:
     splats = FoldedSplats(
         loc=single(place[:, 0]),
         log_scale=single(log_scale),
-        angle_logit=single(_logit(v["angle"])),
+        angle_logit=single(_logit(in_clip(v["angle"]))),
         time_loc_logit=single(_logit(time)),
         log_time_scale=single(v["duration"]),
         coefficients=single(place[:, 1:]),
@@ -340,6 +340,9 @@ def quantise(described: Described, classes: Int32[np.ndarray, "num"], rules: dic
         halves = unrolling.halves(name)
         numbers = (values[name] - rules[name].origin) / steps_of(halves, name)
         numbers = np.rint(numbers)
+        if name == "angle":  # held within its half turn, so that what is decoded is rounded to itself
+            low, high = (np.ceil((end - rules[name].origin) / steps_of(halves, name)) for end in (0.25, 0.75))
+            numbers = np.minimum(np.maximum(numbers, low), high - 1)
         if not (np.abs(numbers) <= LARGEST).all():
             worst = int(np.argmax(~(np.abs(numbers) <= LARGEST)))
             got = f"{name} {values[name][worst]:g} of Gaussian {worst}"
