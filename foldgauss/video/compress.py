@@ -141,11 +141,11 @@ def _rounded(plan: "_Plan", loss: "_Loss", most: float, on_step: Callable) -> _T
     while coarse - fine > _CLOSE:
         middle = (fine + coarse) / 2
         fine, coarse = (middle, coarse) if at(middle, tried).loss_db <= most else (fine, middle)
-    for _ in range(12):
+    for _ in range(8):
         made = at(fine, np.arange(loss.num_frames))
         if made.loss_db <= most:
             return made
-        fine -= _CLOSE if fine > _FINEST + 1 else 1.0
+        fine -= 2 * _CLOSE
     cure = "Allow a greater loss, or keep the .safetensors file, which is exact."
     raise invalid("max_loss_db", expected=f"at least {made.loss_db:.3g} for this model", got=most, cure=cure)
 

@@ -73,8 +73,8 @@ class Rule:
         return np.clip(np.floor(2 * total + 0.5), -_FARTHEST, _FARTHEST).astype(np.int32)
 
 
-def steps_of(halves: Int32[np.ndarray, "num"], name: str) -> Float[np.ndarray, "num"]:
-    """2^(halves / 2), exact but for one rounding."""
+def steps_of(halves: Int32[np.ndarray, "num"], name: str = "") -> Float[np.ndarray, "num"]:
+    """2^(halves / 2), exact but for one rounding, and no wider than a step of the column may be."""
     steps = np.ldexp(np.where(halves % 2, _SQRT2, 1.0), halves // 2)
     return np.minimum(steps, _WIDEST[name]) if name in _WIDEST else steps
 
@@ -192,7 +192,7 @@ def span_of(
     sigma_t is rounded to a power of sqrt(2), which needs no exponential.
     """
     halves = np.clip(np.floor(2 * (duration * (1 / _LN2)) + 0.5), -_FARTHEST, _FARTHEST).astype(np.int32)
-    wide = reach * steps_of(halves, "duration")
+    wide = reach * steps_of(halves)
     first, last = np.maximum(time - wide, 0.0), np.minimum(time + wide, 1.0)
     return (first + last) * 0.5, np.maximum((last - first) * 0.5, 2.0**-40)
 

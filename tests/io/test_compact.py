@@ -1,6 +1,9 @@
 """Compact files: within the loss they state, the same bits everywhere, and nothing breaks on bad ones."""
 
+import dataclasses
 import json
+import shutil
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -12,7 +15,7 @@ import pytest
 from soft_models import SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
+from foldgauss.io import ModelFileError, compact, load_compact, load_video_model, save_compact, save_video_model
 from foldgauss.io.compact import MAGIC, VERSION, packed
 from foldgauss.io.video_model import read_metadata
 from foldgauss.render import RenderOptions
@@ -31,8 +34,6 @@ from foldgauss.video.quantise import (
     quantise,
     span_of,
 )
-
-SAMPLE = Path(__file__).parent / "data" / "sample.fgz"
 
 
 def clip_of(model, noise=6.0):
@@ -197,6 +198,31 @@ def test_paths_are_legendre_series_over_the_span():
         by_matrix = (matrix * (u[:, None] ** np.arange(4))[:, :, None]).sum(1)
         expected = [np.polynomial.legendre.legval(w, np.eye(4)[k]) for k in range(4)]
         np.testing.assert_allclose(by_matrix, np.tile(expected, (len(u), 1)), atol=1e-8)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="the decoder for browsers is run by node")
+@pytest.mark.parametrize("how", [{"degree": 0}, {"degree": 3, "power": 1.0}, {"degree": 7}])
+def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
+    model = soft_model(options=RenderOptions(), **how)
+    path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantised)
+    decoder = Path(compact.__file__).with_suffix(".js")
+    (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
+    (tmp_path / "run.mjs").write_text(
+        """
+        import { readFileSync, writeFileSync } from "node:fs";
+        import { decode } from "./decoder.mjs";
+        const file = readFileSync("m.fgz");
+        const { header, leaves } = decode(file.buffer.slice(file.byteOffset, file.byteOffset + file.length));
+        for (const [name, own] of Object.entries(leaves)) writeFileSync(name, new Uint8Array(own.buffer));
+        """
+    )
+    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=60)
+    again = load_video_model(path)
+    leaves = {field.name: getattr(again.splats, field.name) for field in dataclasses.fields(again.splats)}
+    leaves = {name: leaf for name, leaf in leaves.items() if name != "envelope"}
+    for name, leaf in (leaves | {"frame_times": again.frame_times.logits}).items():
+        by_browser = np.fromfile(tmp_path / name, np.float32)
+        np.testing.assert_array_equal(by_browser.view(np.int32), np.asarray(leaf).ravel().view(np.int32), err_msg=name)
 
 
 # ------------------------------------------------------------------------------------ extremes
