@@ -62,8 +62,13 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
     assert run("render", "model.fgz", "--out", "slow.mp4", "--upsample", 2) == 0
     assert read_video("slow.mp4").num_frames == 9
     assert run("export", "model.fgz", "--format", "ply", "--out", "m.ply") == 0
-    (tmp_path / "edits.toml").write_text("[[edit]]\nselect = { box = [0, 0, 30, 30] }\nvanish = {}\n")
-    run("edit", "model.fgz", "edits.toml", "--out", "edited.safetensors")
+    (tmp_path / "edits.toml").write_text(
+        '[selections.left]\nbox = [0, 0, 24, 32]\nframe = 0\n[[edits]]\nselect = "left"\ndo = "vanish"\n'
+    )
+    assert run("edit", "model.fgz", "edits.toml", "--out", "edited.safetensors") == 0
+    assert load_video_model("edited.safetensors").num_gaussians < load_video_model("model.fgz").num_gaussians
+    with pytest.raises(ValueError, match="foldgauss compress"):
+        save_video_model("again.fgz", load_video_model("model.fgz"))
 
 
 def test_without_the_clip(work, tmp_path, capsys):

@@ -28,14 +28,14 @@ from foldgauss.video.model import VideoModel
 def compress_command(
     model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
     video: Annotated[
-        Path | None, typer.Argument(help="The clip it was fitted to: the loss is then measured, not estimated.")
+        Path | None, typer.Argument(help="The clip it was fitted to: for a smaller file, and a loss that is measured.")
     ] = None,
     max_loss_db: Annotated[float, typer.Option(help="How much of the mean PSNR it may cost, in dB.")] = 0.2,
     out_path: Annotated[
         Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
     ] = None,
     passes: Annotated[
-        int, typer.Option(help="Passes over the frames that make up for what rounding costs; 0: only round.", min=0)
+        int, typer.Option(help="Passes over VIDEO that make up for what rounding costs; 0: only round.", min=0)
     ] = 8,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
@@ -93,6 +93,6 @@ def compress_command(
         source = "that is noted in the file" if told is not None else "that is assumed"
         err.print(
             f"note: without the clip the loss is estimated, from the model's own pictures and a PSNR of "
-            f"{made.psnr:.2f} dB {source}. Give VIDEO to have it measured.",
+            f"{made.psnr:.2f} dB {source}. Give VIDEO for a smaller file, and a loss that is measured.",
             soft_wrap=True,
         )

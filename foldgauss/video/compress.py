@@ -3,7 +3,7 @@
 Each number's step is chosen by what its error does to the picture (`sensitivities`): in the optimum of coding theory,
 where bits and errors trade at one rate, every number adds the same error. One factor scales all steps; it is found by
 bisection, each try rendered and measured. Gaussians whose loss costs less than their bits are worth are left out, and
-what is not rounded yet is fitted anew (`finish`) to make up for what is.
+what is not rounded yet is fitted to the clip anew (`finish`), to make up for what is.
 """
 
 import dataclasses
@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from foldgauss._checks import invalid, whole, within
-from foldgauss.render import cpu
 from foldgauss.video.alpha import BLACK, composited, random_background
 from foldgauss.video.finish import COLOR, PATH_AND_COLOR, refitted
 from foldgauss.video.light import LitModel
@@ -48,7 +47,7 @@ TRIED_FRAMES = 24
 _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 #: A Gaussian is left out if that adds less error than this many times a number's own: its bits, times 2 ln 2.
 _WORTH = 40.0
-#: How much coarser the steps are, in powers of two, that mending is first tried with; and the loss by such a power.
+#: How much coarser the steps are, in powers of two, that mending is first tried with; and what such a power costs, dB.
 _COARSER, _SLOPE = 1.7, 0.7
 #: Tries with mending, each of passes / 2 + passes / 4 passes; and the share of the loss allowed that ends them.
 _TRIES, _ENOUGH = 5, 0.9
@@ -90,10 +89,10 @@ def compress(
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own pictures.
 
-    `passes` over the frames mend what is lost: all leaves once Gaussians have been left out; in half as many, paths and
-    colours once geometry is rounded; in a quarter, colours once paths are. What is gained so allows for coarser steps.
-    0: nothing is mended, every number is the model's own, rounded. `on_step(what, loss_db)` is called now and then,
-    with NaN where nothing has been measured yet.
+    With the clip, `passes` over its frames mend what is lost: all leaves once Gaussians have been left out; in half as
+    many, paths and colours once geometry is rounded; in a quarter, colours once paths are. What is gained so allows for
+    coarser steps. With 0 nothing is mended: every number is the model's own, rounded. `on_step(what, loss_db)` is called
+    now and then, with NaN where nothing has been measured yet.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for one with numbers that are not finite, with
     several envelopes or a degree above 15, for frames that do not fit, and for a loss out of reach.
@@ -111,8 +110,9 @@ def compress(
     loss = _Loss(model, frames, psnr)
     plan = _Plan(model)
     made = _rounded(plan, loss, max_loss_db, on_step)
-    if passes:
-        mended = _mended(model, plan.kept(made.factor + _COARSER), made, loss, max_loss_db, passes, on_step)
+    if passes and frames is not None:
+        factor = made.factor + _COARSER
+        mended = _mended(_some(model, plan.kept(factor)), factor, made.factor, loss, max_loss_db, passes, on_step)
         made = made if mended is None else mended
     dropped = model.num_gaussians - made.model.num_gaussians
     return Compressed(made.quantised, made.model, made.loss_db, loss.psnr, loss.measured_by, dropped)
@@ -152,14 +152,14 @@ def _rounded(plan: "_Plan", loss: "_Loss", most: float, on_step: Callable) -> _T
 
 def _mended(
     model: VideoModel,
-    kept: Bool[np.ndarray, "num"],
-    plain: _Try,
+    factor: float,
+    least: float,
     loss: "_Loss",
     most: float,
     passes: int,
     on_step: Callable,
 ) -> _Try | None:
-    """The coarsest steps found that lose no more than `most` once mended; None if they are no coarser than `plain`."""
+    """The coarsest steps found that lose no more than `most` once mended, `factor` first; None if not above `least`."""
 
     def mend(model: VideoModel, share: float, what: str, **how: object) -> VideoModel:
         def tell() -> None:
@@ -167,9 +167,9 @@ def _mended(
 
         return refitted(model, loss.target, math.ceil(share * passes), on_pass=tell, **how)
 
-    left = mend(_some(model, kept), 1, "fitting without those left out", seed=0)
+    left = mend(model, 1, "fitting without those left out", seed=0)
     plan, every = _Plan(left), np.arange(loss.num_frames)
-    best, factor, tried = None, plain.factor + _COARSER, {}
+    best, tried = None, {}
     for _ in range(_TRIES):
         quantised = plan.at(factor)
         described = plan.described
@@ -185,7 +185,7 @@ def _mended(
             best = _Try(factor, quantised, decoded, found)
             if found > _ENOUGH * most:
                 break
-        factor = _next(tried, most, plain.factor)
+        factor = _next(tried, most, least)
         if factor is None:
             break
     return best
@@ -239,7 +239,7 @@ def _settled(quantised: Quantised, again: VideoModel, *, path: bool, before: Des
 
 
 class _Loss:
-    """What quantisation costs, in dB; and the pictures that mending aims at."""
+    """What quantisation costs, in dB; and, given the clip, the pictures that mending aims at."""
 
     def __init__(self, model: VideoModel, frames: np.ndarray | None, reference: float | None):
         self._model, self._frames, self.num_frames = model, frames, model.num_frames
@@ -247,7 +247,6 @@ class _Loss:
         if frames is None:
             self.measured_by, self._shown = "model", pictures
             self.psnr = ASSUMED_PSNR if reference is None else reference
-            self._stage = LitModel(model)
             return
         expected = (model.num_frames, *model.size)
         if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4):
@@ -272,12 +271,8 @@ class _Loss:
     def target(self, k: int, step: int) -> tuple[Float32[np.ndarray, "3 height width"], Float32[np.ndarray, "3"]]:
         """Frame k over another colour in every step where it lets light through: see `finish.Target`."""
         summed = self._model.compositing == "sum"
-        opaque = self._frames is not None and self._frames.shape[-1] == 3
+        opaque = self._frames.shape[-1] == 3
         behind = np.zeros(3, np.float32) if summed or opaque else random_background(0, step)
-        if self._frames is None:
-            splats, drawn = self._stage.frame(k).splats, {"options": self._model.options}
-            leaves = splats.mean, splats.factor, splats.opacity, splats.color, behind
-            return cpu.forward(*leaves, self._model.size, compositing=self._model.compositing, **drawn).image, behind
         frame = self._frames[k]
         picture = frame if opaque else composited(frame, behind)
         return np.ascontiguousarray(np.moveaxis(picture, -1, 0) * np.float32(1 / 255)), behind

@@ -122,6 +122,25 @@ def test_loss_without_the_clip_is_that_of_an_independent_error():
     assert evaluate(model, clip).mean_psnr - evaluate(known.model, clip).mean_psnr == pytest.approx(0.3, abs=0.15)
 
 
+@pytest.mark.parametrize("how", ["opaque", "alpha", "sum"])
+def test_fitting_anew_pays(how):
+    """A model that is not at its best: what is gained pays for coarser steps, within the loss allowed."""
+    best = soft_model(options=RenderOptions(), compositing="sum" if how == "sum" else "over")
+    rng = np.random.default_rng(0)
+    color = best.splats.color_dc + 0.1 * rng.normal(size=best.splats.color_dc.shape).astype(np.float32)
+    model = eqx.tree_at(lambda m: m.splats.color_dc, best, color)
+    clip = clip_of(best, noise=2.0)
+    if how == "alpha":  # as the model itself lets light through
+        over_white = np.stack(list(best.frames(background=(1.0, 1.0, 1.0)))).astype(float)
+        alpha = 255 - (over_white - pictures(best)).mean(-1, keepdims=True)
+        clip = np.concatenate([np.minimum(clip, alpha), alpha], -1).round().astype(np.uint8)
+    plain, mended = (compress(model, clip, max_loss_db=0.2, passes=passes) for passes in (0, 30))
+    assert len(packed(mended.quantised)) < 0.95 * len(packed(plain.quantised))
+    lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
+    assert lost == pytest.approx(mended.loss_db, abs=1e-9)
+    assert lost <= 0.2
+
+
 def test_a_greater_loss_makes_a_smaller_file():
     model = soft_model(options=RenderOptions())
     sizes = [len(packed(compress(model, max_loss_db=loss).quantised)) for loss in (0.02, 0.2, 2.0)]
