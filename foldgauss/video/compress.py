@@ -91,8 +91,8 @@ def compress(
 
     With the clip, `passes` over its frames mend what is lost: all leaves once Gaussians have been left out; in half as
     many, paths and colours once geometry is rounded; in a quarter, colours once paths are. What is gained so allows for
-    coarser steps. With 0 nothing is mended: every number is the model's own, rounded. `on_step(what, loss_db)` is called
-    now and then, with NaN where nothing has been measured yet.
+    coarser steps. With 0 nothing is mended: every number is the model's own, rounded. `on_step(what, loss_db)` is
+    called now and then, with NaN where nothing has been measured yet.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for one with numbers that are not finite, with
     several envelopes or a degree above 15, for frames that do not fit, and for a loss out of reach.
