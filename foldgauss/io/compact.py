@@ -37,8 +37,8 @@ MAGIC = b"\x8bFGZ\r\n\x1a\n"
 VERSION = 1
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
-#: The coder spends a hundredth of a bit at least on each number, so no byte holds more Gaussians, or intervals.
-_MOST_PER_BYTE = 1000
+#: No byte may hold more Gaussians or frames, so that a small file cannot ask for much memory: filled up with spaces.
+_MOST_PER_BYTE = 8
 _SIDE = 1 << 20  # no picture is longer: a decoder holds it in memory
 
 
@@ -79,7 +79,9 @@ def packed(quantised: Quantised, metadata: dict | None = None) -> bytes:
         "metadata": plain(metadata or {}),
     }
     text = to_json("header", header).encode()
-    body = text + b"".join(streams)
+    data = b"".join(streams)
+    text += b" " * (-(-(facts.num_gaussians + header["num_frames"]) // _MOST_PER_BYTE) - len(text) - len(data))
+    body = text + data
     numbers = (VERSION, len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
@@ -129,7 +131,7 @@ def compact_metadata(path: str | os.PathLike) -> dict:
 def _unpacked(path: Path, data: bytes) -> tuple[Quantised, dict]:
     header, body = _header(path, data)
     try:
-        return _decoded(header, body), header["metadata"]
+        return _decoded(header, body, len(data)), header["metadata"]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         text = " ".join(str(error).split())[:200]
         raise _unreadable(path, f"one that does not fit together ({type(error).__name__}: {text})") from error
@@ -170,12 +172,11 @@ def _no_number(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _decoded(header: dict, body: bytes) -> Quantised:
+def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
     facts = _facts(header)
     num, num_frames = facts.num_gaussians, header["num_frames"]
     _check(whole(num_frames, 2), "num_frames", num_frames)
-    most = _MOST_PER_BYTE * len(body)
-    _check(num <= most and num_frames <= most, "num_gaussians", num)
+    _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     names = column_names(facts.degree)
     described = header["columns"]
     _check(isinstance(described, list) and [own["name"] for own in described] == list(names), "columns", "others")

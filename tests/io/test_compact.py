@@ -435,6 +435,18 @@ def test_streams_of_a_stranger(tmp_path, good):
         assert model.num_gaussians == 40
 
 
+def test_a_byte_for_every_eight_gaussians(tmp_path):
+    """All alike, they need next to nothing, and the file is filled up: none may claim more than its length allows."""
+    described = describe(only(soft_model(degree=0), np.full(100_000, 20)))
+    origins = {name: float(value[0]) for name, value in described.values.items()}
+    rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0)}
+    path = save_compact(tmp_path / "m.fgz", quantise(described, np.zeros(100_000, np.int32), rules))
+    assert 100_000 / 8 <= path.stat().st_size < 100_000 / 8 + 30
+    assert load_video_model(path).num_gaussians == 100_000
+    shorter = resealed(path.read_bytes())  # the same without spaces
+    refused(tmp_path, shorter, "num_gaussians")
+
+
 def test_names(tmp_path):
     quantised = fine(soft_model())
     with pytest.raises(ValueError, match=r"path: expected a name ending in .fgz"):
