@@ -89,6 +89,15 @@ def test_editing(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_format(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = _run("format.md")
+    assert names["made"].loss_db == pytest.approx(names["lost"], abs=1e-6)
+    assert names["lost"] <= 0.2
+    assert {path.name for path in tmp_path.iterdir()} == {"waves.fgz"}
+
+
+@pytest.mark.slow
 def test_formats(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = _run("formats.md")

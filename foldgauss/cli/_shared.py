@@ -17,7 +17,6 @@ from rich.table import Table
 
 from foldgauss._checks import invalid
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.model_file import read_header
 from foldgauss.io.video_file import (
     ANIMATION_SUFFIXES,
     MAX_FPS,
@@ -29,6 +28,7 @@ from foldgauss.io.video_file import (
     write_image,
     write_video,
 )
+from foldgauss.io.video_model import read_metadata
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
@@ -38,7 +38,7 @@ from foldgauss.video.model import VideoModel
 class _InOrderOfUse(typer.core.TyperGroup):
     """The commands as one comes to need them; typer has them as they were registered."""
 
-    _ORDER = ("fit", "render", "evaluate", "info", "uncertainty", "edit", "export", "import", "demo")
+    _ORDER = ("fit", "render", "evaluate", "info", "uncertainty", "edit", "compress", "export", "import", "demo")
 
     def list_commands(self, ctx: typer.Context) -> list[str]:
         others = set(self.commands).difference(self._ORDER)
@@ -172,7 +172,7 @@ def clip_of_model(
 
     Raises WrongUse, with `as_many`, for another number of frames than the model's.
     """
-    about = read_header(model_path)["metadata"]
+    about = read_metadata(model_path)
     kept = about.get("frames")
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     clip = read_video(video, frames=wanted, size=model.size)
@@ -209,7 +209,11 @@ _LABELS = {
     "fit_seconds": ("time spent fitting", "{:.1f} s"),
     "steps": ("steps", "{:,}"),
     "stopped_by": ("stopped by", "{}"),
+    "loss_db": ("loss", "{:.3f} dB"),
+    "num_dropped": ("Gaussians left out", "{:,}"),
+    "bytes_before": ("before", "{:,} bytes"),
     "file_bytes": ("model file", "{:,} bytes"),
+    "ratio": ("smaller by a factor of", "{:.2f}"),
     "bits_per_pixel": ("bits per pixel", "{:.3f}"),
 }
 

@@ -33,12 +33,13 @@ from foldgauss.cli._shared import (
     write_json,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.model_file import read_header
+from foldgauss.io.compact import is_compact
 from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS
-from foldgauss.io.video_model import load_video_model
+from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.metrics import evaluate
+from foldgauss.video.model import VideoModel
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
@@ -191,7 +192,7 @@ def evaluate_command(
 def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]) -> None:
     """Say what a model file holds."""
     model = load_video_model(model_path)
-    about = read_header(model_path)["metadata"]
+    about = read_metadata(model_path)
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
     times = np.asarray(model.frame_times.times())
     figures = {
@@ -201,7 +202,7 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
         "numbers stored": f"{model.num_floats:,}",
-        "file": f"{model_path.stat().st_size:,} bytes",
+        "file": _size_of(model_path, model),
     }
     if isinstance(model, EditedVideo):
         figures["edits"] = ", ".join(
@@ -211,6 +212,12 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
         table.add_row(name, value)
     out.print(table)
+
+
+def _size_of(path: Path, model: VideoModel | EditedVideo) -> str:
+    num_bytes, num_pixels = path.stat().st_size, model.num_frames * model.size[0] * model.size[1]
+    kind = "compact, " if is_compact(path) else ""
+    return f"{kind}{num_bytes:,} bytes, {8 * num_bytes / num_pixels:.3f} bits per pixel of the frames"
 
 
 def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:

@@ -2,6 +2,7 @@
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._ply import FormatError
+from foldgauss.io.compact import load_compact, save_compact
 from foldgauss.io.exchange import export, import_model
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.masks import read_masks
@@ -31,6 +32,7 @@ __all__ = [
     "export",
     "frame_gaussians",
     "import_model",
+    "load_compact",
     "load_selection",
     "load_video_model",
     "read_3dgs_ply",
@@ -39,6 +41,7 @@ __all__ = [
     "read_pseudomesh",
     "read_vegas_ply",
     "read_video",
+    "save_compact",
     "save_selection",
     "save_video_model",
     "write_3dgs_frames",

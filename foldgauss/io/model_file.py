@@ -89,14 +89,14 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     """
     kind = _kind_of(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
-    header = _to_json("header", kind.to_header(model))
+    header = to_json("header", kind.to_header(model))
     _check_described(kind, model, header)
     about = {
         "format": FORMAT,
         "version": VERSION,
         "kind": kind.name,
         "header": header,
-        "metadata": _to_json("metadata", _plain(metadata or {})),
+        "metadata": to_json("metadata", plain(metadata or {})),
     }
     path = Path(path)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -184,7 +184,8 @@ def _check_described(kind: _Kind, model: Any, header: str) -> None:
         )
 
 
-def _to_json(parameter: str, value: Any) -> str:
+def to_json(parameter: str, value: Any) -> str:
+    """JSON, the same for the same value. Raises `ModelFileError` for what it cannot hold."""
     try:
         return json.dumps(value, allow_nan=False, sort_keys=True, default=_scalar)
     except (TypeError, ValueError, RecursionError) as error:
@@ -201,12 +202,12 @@ def _scalar(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__}")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Provenance in JSON's terms: an infinite PSNR (a perfect frame) must not cost the user the fit."""
     if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
+        return {str(key): plain(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
+        return [plain(part) for part in value]
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value

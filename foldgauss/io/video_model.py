@@ -14,6 +14,7 @@ import numpy as np
 from foldgauss._checks import invalid, one_of, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import checked_path
+from foldgauss.io.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
@@ -50,6 +51,8 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
     path = Path(path)
     if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
         cure = "Pictures: write_video, or foldgauss render; other programs' formats: export."
+        if path.suffix.lower() == COMPACT_SUFFIX:
+            cure = "A compact file: foldgauss compress, or foldgauss.video.compress and foldgauss.io.save_compact."
         raise invalid(
             parameter,
             expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
@@ -59,8 +62,18 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
 
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
-    """Read a fitted or an edited video. Raises `ModelFileError` also where the file holds something else of ours."""
-    return _load(checked_path(path), VIDEO, EDITED)
+    """Read a fitted or an edited video, or a compact file (told by its first bytes, not by its name).
+
+    Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
+    """
+    path = checked_path(path)
+    return load_compact_model(path) if is_compact(path) else _load(path, VIDEO, EDITED)
+
+
+def read_metadata(path: str | os.PathLike) -> dict:
+    """What was noted when a model's file was written, of either kind. Raises as `load_video_model`."""
+    path = checked_path(path)
+    return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
 def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:

@@ -1,5 +1,6 @@
 """Videos as folded splats: the model, its fit and its quality. Frames are arrays here; files are `foldgauss.io`'s."""
 
+from foldgauss.video.compress import Compressed, compress
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
 from foldgauss.video.edit import Edit, edit
@@ -27,6 +28,7 @@ from foldgauss.video.timing import Clock, Span
 
 __all__ = [
     "Clock",
+    "Compressed",
     "Edit",
     "EditedVideo",
     "Evaluation",
@@ -49,6 +51,7 @@ __all__ = [
     "by_mask",
     "by_polygon",
     "by_time",
+    "compress",
     "contribution",
     "density_image",
     "edit",

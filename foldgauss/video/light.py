@@ -33,7 +33,7 @@ class LitModel:
     def __init__(self, model: VideoModel):
         check_model(model)
         self.model, self.size = model, model.size
-        self._conditioned = Stage(model, model.size)
+        self.stage = Stage(model, model.size)
         self.times = np.asarray(model.frame_times.times())
 
     @property
@@ -43,7 +43,7 @@ class LitModel:
     @property
     def window(self) -> Float32[np.ndarray, "num_gaussians 2"]:
         """First and last time at which each Gaussian is drawn."""
-        return self._conditioned.window
+        return self.stage.window
 
     def frame(self, k: int) -> "Light":
         """The light of frame k."""
@@ -51,12 +51,12 @@ class LitModel:
 
     def at(self, t: float) -> "Light":
         """The light at time t; between two shots the nearer one's, as pictures are drawn."""
-        return Light(self, self._conditioned.at(float(out_of_cuts(t, self.times))))
+        return Light(self, self.stage.at(float(out_of_cuts(t, self.times))))
 
     def position(self, indices: Int[np.ndarray, "num"], t: float) -> Float32[np.ndarray, "num 2"]:
         """Centres of the named Gaussians, in pixels, at any time, alive or not."""
         ever = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
-        return condition(self._conditioned.rows[indices], ever, t, self._conditioned.shape).mean
+        return condition(self.stage.rows[indices], ever, t, self.stage.shape).mean
 
     def own_place(self, indices: Int[np.ndarray, "num"]) -> Float[np.ndarray, "num 2"]:
         """Centres of the named Gaussians at their own times, in pixels: there the fold is 0."""
@@ -86,13 +86,13 @@ class Light:
         return self.splats.alive
 
     @functools.cached_property
-    def _trace(self) -> cpu.Trace:
+    def trace(self) -> cpu.Trace:
         return self._forward(self.splats.color)
 
     @property
     def picture(self) -> Float32[np.ndarray, "3 height width"]:
         """What is seen, over black."""
-        return self._trace.image
+        return self.trace.image
 
     @functools.cached_property
     def total(self) -> Float32[np.ndarray, "num_alive"]:
@@ -105,7 +105,7 @@ class Light:
 
     def gathered(self, planes: Float[np.ndarray, "channels height width"]) -> Float32[np.ndarray, "num_alive channels"]:
         """A^T y: sums over pixels of up to three pictures times the weights."""
-        return cpu.backward(self._trace, _three(planes, 0))[3][:, : len(planes)]
+        return cpu.backward(self.trace, _three(planes, 0))[3][:, : len(planes)]
 
     def _forward(self, color: Float32[np.ndarray, "num_alive 3"]) -> cpu.Trace:
         splats, model = self.splats, self.lit.model

@@ -1,0 +1,145 @@
+"""Bytes, loss and bits per pixel of compact files; beside x264 and AV1 at the same PSNR where ffmpeg is there.
+
+    python -m benchmarks.compress [--json FILE] [--model FILE --clip NAME --size HxW] [--loss DB] [--passes N]
+
+Without options: Bunny and bikes at 160x320, each fitted first with the command's defaults (40,000 Gaussians). *pruned*
+is the float32 file without the Gaussians that no frame shows or whose absence, all together, costs 0.01 dB; *rounded*
+is `passes=0`. Other coders are asked for the mean PSNR of RGB pictures that the compact file has, by bisection over
+their quality, with their slowest sensible presets; their files' bytes count whole.
+"""
+
+import argparse
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from benchmarks import _common
+from benchmarks._common import console
+from foldgauss.datasets import sample_clip
+from foldgauss.io import read_video, save_compact, save_video_model
+from foldgauss.io.video_file import Clip
+from foldgauss.io.video_model import load_video_model
+from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit, psnr
+from foldgauss.video.light import LitModel, contributions
+from foldgauss.video.regions import Region
+
+SIZE, CLIPS, PRUNED_DB = (160, 320), ("bunny", "bikes"), 0.01
+#: Arguments of each coder; {q} is its quality, 0 the best.
+CODERS = {
+    "x264": ("libx264", ["-preset", "veryslow", "-crf"], 51),
+    "AV1": ("libsvtav1", ["-preset", "2", "-crf"], 63),
+}
+
+
+def pruned(model: VideoModel, clip: Clip) -> VideoModel:
+    """Without as many of the Gaussians that add least as `PRUNED_DB` allows."""
+    lit = LitModel(model)
+    everywhere = np.ones(model.size, np.float32)
+    order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
+    before, least, most = evaluate(model, clip.frames).mean_psnr, 0, model.num_gaussians - 1
+    while most - least > model.num_gaussians // 200:
+        middle = (least + most) // 2
+        lost = before - evaluate(kept(model, np.sort(order[middle:])), clip.frames).mean_psnr
+        least, most = (middle, most) if lost <= PRUNED_DB else (least, middle)
+    return kept(model, np.sort(order[least:]))
+
+
+def kept(model: VideoModel, indices: np.ndarray) -> VideoModel:
+    def cut(leaf: np.ndarray) -> np.ndarray:
+        return np.asarray(leaf)[indices] if np.ndim(leaf) else leaf
+
+    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
+
+
+def by_coder(name: str, clip: Clip, wanted: float, folder: Path) -> tuple[int, float] | None:
+    """Bytes and mean PSNR of the smallest file of a coder that has the PSNR wanted; None where it has no such coder."""
+    library, arguments, worst = CODERS[name]
+    num, height, width, _ = clip.frames.shape
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    best, low, high = None, 0, worst
+    while low <= high:
+        quality, path = (low + high) // 2, folder / f"{name}.mp4"
+        command = ["ffmpeg", "-v", "error", "-y", *raw, "-r", f"{clip.fps:g}", "-i", "-", "-c:v", library]
+        command += [*arguments, str(quality), "-pix_fmt", "yuv420p", str(path)]
+        if subprocess.run(command, input=clip.frames.tobytes(), check=False).returncode:
+            return None
+        back = ["ffmpeg", "-v", "error", "-i", str(path), *raw[:4], "-"]
+        shown = np.frombuffer(subprocess.run(back, capture_output=True, check=True).stdout, np.uint8)
+        shown = shown.reshape(-1, height, width, 3)[:num]
+        reached = float(np.mean([psnr(a, b) for a, b in zip(clip.frames, shown, strict=True)]))
+        if reached >= wanted:
+            best, low = (path.stat().st_size, reached), quality + 1
+        else:
+            high = quality - 1
+    return best
+
+
+def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespace, figures: dict) -> None:
+    pixels = model.num_frames * model.size[0] * model.size[1]
+    rows = []
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+
+        def row(what: str, path: Path, lost: float, num: int, seconds: float = 0.0) -> None:
+            rows.append((what, path.stat().st_size, lost, num, seconds))
+
+        before = evaluate(model, clip.frames).mean_psnr
+        row("float32", save_video_model(folder / "m.safetensors", model), 0.0, model.num_gaussians)
+        small = pruned(model, clip)
+        lost = before - evaluate(small, clip.frames).mean_psnr
+        row("float32, pruned", save_video_model(folder / "p.safetensors", small), lost, small.num_gaussians)
+        for what, passes in (("rounded", 0), ("compact", options.passes)):
+            begun = time.perf_counter()
+            made = compress(model, clip.frames, max_loss_db=options.loss, passes=passes)
+            seconds = time.perf_counter() - begun
+            path = save_compact(folder / f"{what}.fgz", made.quantised)
+            lost = before - evaluate(load_video_model(path), clip.frames).mean_psnr
+            row(what, path, lost, made.model.num_gaussians, seconds)
+        if shutil.which("ffmpeg") is None:
+            console.print("x264, AV1: not measured, since there is no ffmpeg here", style="dim")
+        else:
+            for coder in CODERS:
+                found = by_coder(coder, clip, before - lost, folder)
+                if found is None:
+                    console.print(f"{coder}: not measured, since this ffmpeg has no {CODERS[coder][0]}", style="dim")
+                else:
+                    rows.append((coder, found[0], before - found[1], 0, 0.0))
+    base = rows[1][1]
+    title = f"{name}, {model.num_frames} frames of {model.size[0]}x{model.size[1]}, {before:.2f} dB"
+    shown = _common.table(title, "file", "bytes", "pruned / it", "loss (dB)", "bits per pixel", "Gaussians", "seconds")
+    for what, size, lost, num, seconds in rows:
+        cells = f"{size:,}", f"{base / size:.2f}", f"{lost:.3f}", f"{8 * size / pixels:.3f}"
+        shown.add_row(what, *cells, f"{num:,}" if num else "", f"{seconds:.0f}" if seconds else "")
+        figures |= {f"{name}, {what}: bytes": size, f"{name}, {what}: loss (dB)": lost}
+    console.print(shown)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = _common.parser(__doc__)
+    parser.add_argument("--model", type=Path, help="a fitted model of --clip [fit them first]")
+    parser.add_argument("--clip", choices=CLIPS, help="[both]")
+    parser.add_argument("--size", type=_common.size, default=SIZE, metavar="HxW", help="[160x320]")
+    parser.add_argument("--loss", type=float, default=0.2, help="dB [0.2]")
+    parser.add_argument("--passes", type=_common.whole, default=8, help="[8]")
+    options = _common.parse(parser, arguments)
+    if options.model is not None and options.clip is None:
+        parser.error("--model needs --clip")
+    facts, figures = _common.machine(), {}
+    for name in CLIPS if options.clip is None else (options.clip,):
+        clip = read_video(sample_clip(name), size=options.size)
+        if options.model is not None:
+            model = load_video_model(options.model)
+        else:
+            model = fit(clip.frames, FitConfig(), fps=clip.fps).model
+        measure(name, model, clip, options, figures)
+    _common.finish(options.json, figures, facts, setting={"size": options.size, "loss": options.loss})
+
+
+if __name__ == "__main__":
+    main()

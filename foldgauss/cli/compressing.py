@@ -1,0 +1,97 @@
+"""The command that makes a model's file small: `compress`."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foldgauss._checks import invalid, within
+from foldgauss.cli._shared import (
+    Overwrite,
+    WrongUse,
+    app,
+    clip_of_model,
+    err,
+    print_figures,
+    refuse_existing,
+)
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.compact import COMPACT_SUFFIX, check_compact_name, save_compact
+from foldgauss.io.video_model import load_video_model, read_metadata
+from foldgauss.video.compress import compress
+from foldgauss.video.model import VideoModel
+
+
+@app.command(name="compress")
+def compress_command(
+    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    video: Annotated[
+        Path | None, typer.Argument(help="The clip it was fitted to: for a smaller file, and a loss that is measured.")
+    ] = None,
+    max_loss_db: Annotated[float, typer.Option(help="How much of the mean PSNR it may cost, in dB.")] = 0.2,
+    out_path: Annotated[
+        Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
+    ] = None,
+    passes: Annotated[
+        int, typer.Option(help="Passes over VIDEO that make up for what rounding costs; 0: only round.", min=0)
+    ] = 8,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a model as a compact file: a fraction of its size.
+
+    It is rendered, evaluated, edited and exported as any other. Its pictures differ a little: by --max-loss-db at most.
+    See docs/format.md.
+    """
+    target = Path(f"{model_path.resolve().stem}{COMPACT_SUFFIX}") if out_path is None else out_path
+    try:
+        check_compact_name(target, "--out")
+    except ValueError as error:
+        raise WrongUse(str(error)) from error
+    if not within(max_loss_db, "(0, 60]"):
+        raise WrongUse(str(invalid("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)))
+    if frames is not None and video is None:
+        raise WrongUse(str(invalid("--frames", expected="a VIDEO to take them from", got="none")))
+    if target.exists() and model_path.exists() and target.samefile(model_path):
+        raise WrongUse(f"--out: expected another file than the model, got {target}.")
+    refuse_existing(target, overwrite)
+    check_writable(target)
+    model, about = load_video_model(model_path), read_metadata(model_path)
+    if not isinstance(model, VideoModel):
+        cure = "Compress the model before it is edited, and edit that."
+        raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
+    clip = None if video is None else clip_of_model(model, model_path, video, frames)
+    told = about.get("mean_psnr")
+    told = told if within(told, "(0, 100]") else None
+    with err.status("Compressing") as status:
+
+        def show(what: str, loss: float) -> None:
+            status.update(f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost"))
+
+        given = None if clip is None else clip.frames
+        made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
+    about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
+    known = clip is not None or told is not None
+    about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
+    save_compact(target, made.quantised, metadata=about | {"loss_db": round(made.loss_db, 4)})
+    before, after = model_path.stat().st_size, target.stat().st_size
+    figures = {
+        "loss_db": made.loss_db,
+        "num_gaussians": made.model.num_gaussians,
+        "num_dropped": made.num_dropped,
+        "bytes_before": before,
+        "file_bytes": after,
+        "ratio": before / after,
+        "bits_per_pixel": 8 * after / (model.num_frames * model.size[0] * model.size[1]),
+    }
+    print_figures(str(target), figures)
+    if clip is None:
+        source = "that is noted in the file" if told is not None else "that is assumed"
+        err.print(
+            f"note: without the clip the loss is estimated, from the model's own pictures and a PSNR of "
+            f"{made.psnr:.2f} dB {source}. Give VIDEO for a smaller file, and a loss that is measured.",
+            soft_wrap=True,
+        )

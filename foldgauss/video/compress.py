@@ -1,0 +1,349 @@
+"""The smallest compact form of a model whose pictures lose no more than they may.
+
+Each number's step is chosen by what its error does to the picture (`sensitivities`): in the optimum of coding theory,
+where bits and errors trade at one rate, every number adds the same error. One factor scales all steps; it is found by
+bisection, each try rendered and measured. Gaussians whose loss costs less than their bits are worth are left out, and
+what is not rounded yet is fitted to the clip anew (`finish`), to make up for what is.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from foldgauss._checks import invalid, whole, within
+from foldgauss.video.alpha import BLACK, composited, random_background
+from foldgauss.video.finish import COLOR, PATH_AND_COLOR, refitted
+from foldgauss.video.light import LitModel
+from foldgauss.video.metrics import psnr as psnr_of
+from foldgauss.video.model import SH_C0, VideoModel, check_model
+from foldgauss.video.playback import Playback
+from foldgauss.video.quantise import (
+    AXES,
+    FEATURES,
+    Described,
+    Quantised,
+    Rule,
+    column_names,
+    dequantise,
+    describe,
+    in_clip,
+    moved_to,
+    quantise,
+    values_of,
+)
+from foldgauss.video.sensitivity import sensitivities
+
+#: Assumed of the fit where neither its clip nor its PSNR is known: few fits are better, and for worse ones the loss is
+#: less than stated.
+ASSUMED_PSNR = 40.0
+#: Frames that a try is measured on; the one that is taken is measured on all.
+TRIED_FRAMES = 24
+#: Binary logarithms of the factor of all steps, in levels: the finest and the coarsest, and how close the search comes.
+_FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
+#: A Gaussian is left out if that adds less error than this many times a number's own: its bits, times 2 ln 2.
+_WORTH = 40.0
+#: How much coarser the steps are, in powers of two, that mending is first tried with; and what such a power costs, dB.
+_COARSER, _SLOPE = 1.7, 0.7
+#: Tries with mending, each of passes / 2 + passes / 4 passes; and the share of the loss allowed that ends them.
+_TRIES, _ENOUGH = 5, 0.9
+#: Fewer Gaussians than this tell nothing of how steps follow geometry.
+_FEW = 100
+_NOTHING = 1e-4  # of sensitivity: of Gaussians that no picture shows
+_SOLID = 0.03  # of light left: less is none
+_COLORS = ("luma", "blue", "green")
+
+
+@dataclasses.dataclass(frozen=True)
+class Compressed:
+    """A model's compact form: `quantised`, the `model` it decodes to, and what was measured.
+
+    `loss_db`: mean PSNR of the frames before (`psnr`) less after, dB. `measured_by`: "clip", or "model" where the loss
+    is that of pictures at `psnr` dB from their clip that get an error independent of theirs. `num_dropped`: Gaussians
+    left out.
+    """
+
+    quantised: Quantised
+    model: VideoModel
+    loss_db: float
+    psnr: float
+    measured_by: str
+    num_dropped: int
+
+
+def compress(
+    model: VideoModel,
+    frames: np.ndarray | None = None,
+    *,
+    max_loss_db: float = 0.2,
+    psnr: float | None = None,
+    passes: int = 8,
+    on_step: Callable[[str, float], None] = lambda what, loss_db: None,
+) -> Compressed:
+    """Quantise `model` as coarsely as `max_loss_db`, in dB of the mean PSNR of all frames, allows.
+
+    `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
+    Without it the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own pictures.
+
+    With the clip, `passes` over its frames mend what is lost: all leaves once Gaussians have been left out; in half as
+    many, paths and colours once geometry is rounded; in a quarter, colours once paths are. What is gained so allows for
+    coarser steps. With 0 nothing is mended: every number is the model's own, rounded. `on_step(what, loss_db)` is
+    called now and then, with NaN where nothing has been measured yet.
+
+    Raises ValueError for anything but a `VideoModel` (bake edits first), for one with numbers that are not finite, with
+    several envelopes or a degree above 15, for frames that do not fit, and for a loss out of reach.
+
+    Example: `save_compact("clip.fgz", compress(model, clip.frames).quantised)`.
+    """
+    check_model(model)
+    if not within(max_loss_db, "(0, 60]"):
+        raise invalid("max_loss_db", expected="a loss in (0, 60] dB", got=max_loss_db, cure="0.2 is hardly seen.")
+    if psnr is not None and not within(psnr, "(0, 100]"):
+        raise invalid("psnr", expected="a PSNR in (0, 100] dB", got=psnr)
+    if not whole(passes, 0):
+        raise invalid("passes", expected="a whole number >= 0", got=passes)
+    on_step("looking at what each number does", math.nan)
+    loss = _Loss(model, frames, psnr)
+    plan = _Plan(model)
+    made = _rounded(plan, loss, max_loss_db, on_step)
+    if passes and frames is not None:
+        factor = made.factor + _COARSER
+        mended = _mended(_some(model, plan.kept(factor)), factor, made.factor, loss, max_loss_db, passes, on_step)
+        made = made if mended is None else mended
+    dropped = model.num_gaussians - made.model.num_gaussians
+    return Compressed(made.quantised, made.model, made.loss_db, loss.psnr, loss.measured_by, dropped)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Try:
+    factor: float
+    quantised: Quantised
+    model: VideoModel
+    loss_db: float
+
+
+def _rounded(plan: "_Plan", loss: "_Loss", most: float, on_step: Callable) -> _Try:
+    """The coarsest steps that lose no more than `most`, nothing mended."""
+    tried = np.unique(np.linspace(0, loss.num_frames - 1, TRIED_FRAMES).round().astype(int))
+
+    def at(factor: float, which: Int[np.ndarray, "some"]) -> _Try:
+        quantised = plan.at(factor, plan.kept(factor))
+        model = dequantise(quantised)
+        found = loss(model, which)
+        on_step("rounding", found)
+        return _Try(factor, quantised, model, found)
+
+    fine, coarse = _FINEST, _COARSEST
+    while coarse - fine > _CLOSE:
+        middle = (fine + coarse) / 2
+        fine, coarse = (middle, coarse) if at(middle, tried).loss_db <= most else (fine, middle)
+    for _ in range(8):
+        made = at(fine, np.arange(loss.num_frames))
+        if made.loss_db <= most:
+            return made
+        fine -= 2 * _CLOSE
+    cure = "Allow a greater loss, or keep the .safetensors file, which is exact."
+    raise invalid("max_loss_db", expected=f"at least {made.loss_db:.3g} for this model", got=most, cure=cure)
+
+
+def _mended(
+    model: VideoModel,
+    factor: float,
+    least: float,
+    loss: "_Loss",
+    most: float,
+    passes: int,
+    on_step: Callable,
+) -> _Try | None:
+    """The coarsest steps found that lose no more than `most` once mended, `factor` first; None if not above `least`."""
+
+    def mend(model: VideoModel, share: float, what: str, **how: object) -> VideoModel:
+        def tell() -> None:
+            on_step(what, math.nan)
+
+        return refitted(model, loss.target, math.ceil(share * passes), on_pass=tell, **how)
+
+    left = mend(model, 1, "fitting without those left out", seed=0)
+    plan, every = _Plan(left), np.arange(loss.num_frames)
+    best, tried = None, {}
+    for _ in range(_TRIES):
+        quantised = plan.at(factor)
+        described = plan.described
+        for what, free, share in (("paths and colours", PATH_AND_COLOR, 0.5), ("colours", COLOR, 0.25)):
+            begun = _freed(quantised, described, path=free is PATH_AND_COLOR)
+            again = mend(begun, share, f"mending {what}", free=free, seed=1)
+            described = _settled(quantised, again, path=free is PATH_AND_COLOR, before=described)
+            quantised = quantise(described, quantised.columns["class"], quantised.rules)
+        decoded = dequantise(quantised)
+        tried[factor] = found = loss(decoded, every)
+        on_step("mended", found)
+        if found <= most and (best is None or factor > best.factor):
+            best = _Try(factor, quantised, decoded, found)
+            if found > _ENOUGH * most:
+                break
+        factor = _next(tried, most, least)
+        if factor is None:
+            break
+    return best
+
+
+def _next(tried: dict[float, float], most: float, least: float) -> float | None:
+    """Where to try next: between the tries on either side of `most`, or beyond the last one by the usual slope."""
+    aim = 0.95 * most
+    below = max((factor for factor, loss in tried.items() if loss <= most), default=None)
+    above = min((factor for factor, loss in tried.items() if loss > most), default=None)
+    if below is not None and above is not None:
+        if above - below < 0.5 * _CLOSE:
+            return None
+        share = (aim - tried[below]) / (tried[above] - tried[below])
+        return below + min(max(share, 0.1), 0.9) * (above - below)
+    known = above if below is None else below
+    factor = known + (aim - tried[known]) / _SLOPE
+    return factor if least < factor <= _COARSEST + 2 else None
+
+
+def _some(model: VideoModel, kept: Bool[np.ndarray, "num"]) -> VideoModel:
+    def cut(leaf: np.ndarray) -> np.ndarray:
+        return np.asarray(leaf)[kept] if np.shape(leaf)[:1] == kept.shape else leaf
+
+    splats = model.splats
+    envelope = splats.envelope
+    splats = eqx.tree_at(lambda s: s.envelope, jax.tree.map(cut, splats), envelope)
+    return eqx.tree_at(lambda m: m.splats, model, splats)
+
+
+def _freed(quantised: Quantised, described: Described, *, path: bool) -> VideoModel:
+    """The model as decoded, but with colours, and paths if asked for, not rounded."""
+    model, values = dequantise(quantised), values_of(quantised)
+    color = np.stack([described.values[name] for name in _COLORS], 1) @ AXES
+    splats = eqx.tree_at(lambda s: s.color_dc, model.splats, color.astype(np.float32))
+    if path:
+        shift = in_clip(values["time"]) - described.values["time"]
+        place = moved_to(described.place, shift).astype(np.float32)
+        splats = eqx.tree_at(lambda s: (s.loc, s.coefficients), splats, (place[:, 0], place[:, 1:]))
+    return eqx.tree_at(lambda m: m.splats, model, splats)
+
+
+def _settled(quantised: Quantised, again: VideoModel, *, path: bool, before: Described) -> Described:
+    """What is to be rounded next: the numbers that were rounded, which stay, and those of `again` for the others."""
+    now, values = describe(again), values_of(quantised)
+    values = {name: values[name] for name in before.values} | {name: now.values[name] for name in _COLORS}
+    values["time"] = in_clip(values["time"])
+    # Paths that stay are rounded again from the same place, hence to the same numbers.
+    place, time = (now.place, values["time"]) if path else (before.place, before.values["time"])
+    return dataclasses.replace(before, values=values | {"time": time}, place=place)
+
+
+class _Loss:
+    """What quantisation costs, in dB; and, given the clip, the pictures that mending aims at."""
+
+    def __init__(self, model: VideoModel, frames: np.ndarray | None, reference: float | None):
+        self._model, self._frames, self.num_frames = model, frames, model.num_frames
+        pictures = list(Playback(model).frames())
+        if frames is None:
+            self.measured_by, self._shown = "model", pictures
+            self.psnr = ASSUMED_PSNR if reference is None else reference
+            return
+        expected = (model.num_frames, *model.size)
+        if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4):
+            raise invalid("frames", expected=f"uint8 {(*expected, 3)}, or 4 with alpha", got=frames.shape)
+        if frames.dtype != np.uint8:
+            raise invalid("frames", expected="uint8", got=frames.dtype)
+        self.measured_by = "clip"
+        self._shown = frames if frames.shape[-1] == 3 else [composited(frame, np.float32(BLACK)) for frame in frames]
+        self._before = np.array([psnr_of(*pair) for pair in zip(self._shown, pictures, strict=True)])
+        self.psnr = float(self._before.mean())
+
+    def __call__(self, model: VideoModel, which: Int[np.ndarray, "some"]) -> float:
+        """Mean over the frames `which`."""
+        pictures = Playback(model).frames(np.asarray(model.frame_times.times())[which])
+        after = np.array([psnr_of(self._shown[k], picture) for k, picture in zip(which, pictures, strict=True)])
+        if self.measured_by == "clip":
+            return float((self._before[which] - after).mean())
+        # Errors that are independent add up: a share 10^((psnr - after) / 10) of the clip's own.
+        share = np.where(after >= 100, 0.0, 10 ** ((self.psnr - after) / 10))
+        return float(10 * np.log10(1 + share).mean())
+
+    def target(self, k: int, step: int) -> tuple[Float32[np.ndarray, "3 height width"], Float32[np.ndarray, "3"]]:
+        """Frame k over another colour in every step where it lets light through: see `finish.Target`."""
+        summed = self._model.compositing == "sum"
+        opaque = self._frames.shape[-1] == 3
+        behind = np.zeros(3, np.float32) if summed or opaque else random_background(0, step)
+        frame = self._frames[k]
+        picture = frame if opaque else composited(frame, behind)
+        return np.ascontiguousarray(np.moveaxis(picture, -1, 0) * np.float32(1 / 255)), behind
+
+
+class _Plan:
+    """Classes and rules of a model's numbers, but for the one factor."""
+
+    def __init__(self, model: VideoModel):
+        self.described = describe(model)
+        sensitivity, best = sensitivities(LitModel(model), self.described)
+        self._names = [name for name in column_names(self.described.facts.degree) if name != "class"]
+        self._seen = best > 0
+        if not self._seen.any():
+            cure = "There is nothing to see in it at any frame."
+            raise invalid("model", expected="Gaussians that are seen", got="none", cure=cure)
+        self._fit(sensitivity)
+        opacity = 1 / (1 + np.exp(-self.described.values["opacity"]))
+        # Without it: a change of -1 / (1 - opacity) in the logit, were the picture linear in it.
+        own = sensitivity["opacity"] / np.maximum(1 - opacity, _SOLID) ** 2
+        # Where it is solid, logits tell nothing: as if it stood a tenth of the range from what it hides.
+        solid = np.where(opacity > 1 - _SOLID, sensitivity["luma"] * (0.1 / SH_C0) ** 2, 0)
+        self._own = np.where(self._seen, np.maximum(own, solid), 0)
+
+    def _fit(self, sensitivity: dict[str, Float[np.ndarray, "num"]]) -> None:
+        """Logarithms of sensitivities as lines in the features; classes hold what all columns of a Gaussian share."""
+        seen, first = self._seen, FEATURES[1:]
+        raw = np.stack([self.described.values[name] for name in first], 1)
+        # Beyond the bulk a line through it says nothing: steps of odd Gaussians would run away.
+        features = np.clip(raw, *np.quantile(raw[seen], [0.001, 0.999], axis=0))
+        levels = {name: 0.5 * np.log2(np.maximum(sensitivity[name], _NOTHING)) for name in self._names}
+        design = np.concatenate([np.ones((len(features), 1)), features], 1)
+        self._fits, rest = {}, []
+        for name in self._names:
+            fit = np.zeros(design.shape[1])
+            if name in first or seen.sum() < _FEW:
+                fit[0] = levels[name][seen].mean()
+            else:
+                fit = np.linalg.lstsq(design[seen], levels[name][seen], rcond=None)[0]
+            self._fits[name] = fit
+            rest.append(np.clip(levels[name] - design @ fit, -6, 6))
+        self._classes = np.rint(np.mean(rest, axis=0)).astype(np.int32)
+        for name, fit in self._fits.items():
+            # The same error from every column: the mean, not the typical, sensitivity by the square of the step.
+            told = np.concatenate([np.ones((len(raw), 1)), raw], 1) @ fit + self._classes
+            fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][seen] * 4.0 ** -np.clip(told[seen], -30, 30)) + 1e-30)
+
+    def kept(self, factor: float) -> Bool[np.ndarray, "num"]:
+        """The Gaussians that are worth their bits at such steps; one at least."""
+        kept = self._own > _WORTH * 4.0**factor / 12
+        kept[np.argmax(self._own)] = True
+        return kept
+
+    def at(self, factor: float, kept: Bool[np.ndarray, "num"] | None = None) -> Quantised:
+        """The Gaussians `kept` (None: all), steps times 2^factor; the error of a number is then about 4^factor / 12."""
+        kept = np.ones(len(self._own), bool) if kept is None else kept
+        described = subset(self.described, kept)
+        rules = {"class": Rule(0.0, 0.0)}
+        for name in self._names:
+            exponent, *slopes = np.round(self._fits[name], 4).tolist()
+            given = described.values.get(name)
+            # Stretch has its origin at 0, so that none is rounded below.
+            origin = 0.0 if given is None or name == "stretch" else round(float(np.median(given)), 4)
+            slopes = () if name in FEATURES else tuple(-slope for slope in slopes)
+            rules[name] = Rule(origin, round(factor - exponent, 4), (-1.0, *slopes))
+        return quantise(described, self._classes[kept], rules)
+
+
+def subset(described: Described, kept: Bool[np.ndarray, "num"]) -> Described:
+    """Some of a model's Gaussians, in their order."""
+    facts = dataclasses.replace(described.facts, num_gaussians=int(kept.sum()))
+    values = {name: value[kept] for name, value in described.values.items()}
+    own = described.swapped[kept], described.turn[kept], values, described.place[kept]
+    return Described(facts, *own, described.logits)

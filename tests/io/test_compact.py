@@ -1,0 +1,460 @@
+"""Compact files: within the loss they state, the same bits everywhere, and nothing breaks on bad ones."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from soft_models import SIZE, soft_model
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import ModelFileError, compact, load_compact, load_video_model, save_compact, save_video_model
+from foldgauss.io.compact import MAGIC, VERSION, packed
+from foldgauss.io.video_model import read_metadata
+from foldgauss.render import RenderOptions
+from foldgauss.video import compress, layers
+from foldgauss.video.metrics import evaluate
+from foldgauss.video.quantise import (
+    AXES,
+    Rule,
+    _log,
+    column_names,
+    dequantise,
+    describe,
+    legendre,
+    moved_to,
+    path_matrix,
+    quantise,
+    span_of,
+)
+
+
+def clip_of(model, noise=6.0):
+    """Its pictures, with noise: what it might have been fitted to."""
+    rng = np.random.default_rng(5)
+    pictures = np.stack(list(model.frames())).astype(float)
+    return np.clip(np.rint(pictures + noise * rng.normal(size=pictures.shape)), 0, 255).astype(np.uint8)
+
+
+def fine(model, exponent=-22.0):
+    """Quantised by even steps of 2^exponent."""
+    rules = {name: Rule(0.0, exponent) for name in column_names(model.degree)} | {"class": Rule(0.0, 0.0)}
+    return quantise(describe(model), np.zeros(model.num_gaussians, np.int32), rules)
+
+
+def same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def pictures(model):
+    return np.stack(list(model.frames())).astype(float)
+
+
+# ------------------------------------------------------------------------------------ what is kept
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 7])
+def test_fine_steps_give_the_picture_back(degree):
+    model = soft_model(degree=degree, options=RenderOptions())
+    again = dequantise(fine(model))
+    for t in (0.0, 0.37, 1.0):
+        np.testing.assert_allclose(again.render(t), model.render(t), atol=2e-3)
+    assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
+    assert again.degree == degree
+
+
+@pytest.mark.parametrize("how", [{"power": 0.0}, {"power": 1.0}, {"floor": 0.05}, {"compositing": "sum"}])
+def test_envelopes_and_compositings(tmp_path, how):
+    model = soft_model(**how)
+    path = save_compact(tmp_path / "m.fgz", fine(model))
+    again = load_video_model(path)
+    assert again.compositing == model.compositing
+    assert float(again.splats.envelope.power) == float(model.splats.envelope.power)
+    assert float(again.splats.envelope.floor) == pytest.approx(float(model.splats.envelope.floor))
+    np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=2e-3)
+
+
+def test_the_order_of_gaussians_is_kept():
+    model = soft_model()
+    np.testing.assert_allclose(dequantise(fine(model)).splats.opacity_logit, model.splats.opacity_logit, atol=1e-5)
+
+
+def test_frame_times_and_cut_are_kept():
+    model = soft_model()
+    logits = np.float32([0.1, -0.3, 3.5, 0.0, 0.2, 40.0])
+    model = eqx.tree_at(lambda m: m.frame_times.logits, model, logits)
+    again = dequantise(fine(model))
+    np.testing.assert_allclose(again.frame_times.times(), model.frame_times.times(), atol=1e-3)
+
+
+# ------------------------------------------------------------------------------------ stated loss
+
+
+@pytest.mark.parametrize("max_loss_db", [0.05, 0.5])
+def test_loss_is_the_one_stated(max_loss_db):
+    model = soft_model(options=RenderOptions())
+    clip = clip_of(model)
+    tries = []
+    made = compress(model, clip, max_loss_db=max_loss_db, on_step=lambda *one: tries.append(one))
+    before, after = evaluate(model, clip).mean_psnr, evaluate(made.model, clip).mean_psnr
+    assert made.psnr == pytest.approx(before)
+    assert made.loss_db == pytest.approx(before - after, abs=1e-9)
+    assert made.loss_db <= max_loss_db
+    assert made.measured_by == "clip"
+    assert len(tries) > 5
+
+
+def test_loss_without_the_clip_is_that_of_an_independent_error():
+    model = soft_model(options=RenderOptions())
+    clip = clip_of(model)
+    known = compress(model, max_loss_db=0.3, psnr=evaluate(model, clip).mean_psnr)
+    assert known.measured_by == "model"
+    assert evaluate(model, clip).mean_psnr - evaluate(known.model, clip).mean_psnr == pytest.approx(0.3, abs=0.15)
+
+
+@pytest.mark.parametrize("how", ["opaque", "alpha", "sum"])
+def test_fitting_anew_pays(how):
+    """A model that is not at its best: what is gained pays for coarser steps, within the loss allowed."""
+    best = soft_model(options=RenderOptions(), compositing="sum" if how == "sum" else "over")
+    if how == "sum":  # where they add up to no more than white
+        best = eqx.tree_at(lambda m: m.splats.opacity_logit, best, best.splats.opacity_logit - np.float32(2.5))
+    rng = np.random.default_rng(0)
+    color = best.splats.color_dc + 0.1 * rng.normal(size=best.splats.color_dc.shape).astype(np.float32)
+    model = eqx.tree_at(lambda m: m.splats.color_dc, best, color)
+    clip = clip_of(best, noise=2.0)
+    if how == "alpha":  # as the model itself lets light through
+        over_white = np.stack(list(best.frames(background=(1.0, 1.0, 1.0)))).astype(float)
+        alpha = 255 - (over_white - pictures(best)).mean(-1, keepdims=True)
+        clip = np.concatenate([np.minimum(clip, alpha), alpha], -1).round().astype(np.uint8)
+    plain, mended = (compress(model, clip, max_loss_db=0.2, passes=passes) for passes in (0, 30))
+    assert len(packed(mended.quantised)) < 0.95 * len(packed(plain.quantised))
+    lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
+    assert lost == pytest.approx(mended.loss_db, abs=1e-9)
+    assert lost <= 0.2
+
+
+def test_a_greater_loss_makes_a_smaller_file():
+    model = soft_model(options=RenderOptions())
+    sizes = [len(packed(compress(model, max_loss_db=loss).quantised)) for loss in (0.02, 0.2, 2.0)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 0.85 * sizes[0]
+
+
+def test_gaussians_that_nobody_sees_are_left_out():
+    model = soft_model(options=RenderOptions())
+    hidden = eqx.tree_at(
+        lambda m: m.splats.opacity_logit,
+        model,
+        np.where(np.arange(40) < 5, np.float32(-20), model.splats.opacity_logit),
+    )
+    assert compress(hidden, max_loss_db=0.1).num_dropped >= 5
+
+
+def test_loss_out_of_reach(monkeypatch):
+    """Where even the finest steps lose more."""
+    module = sys.modules["foldgauss.video.compress"]  # its name in the package is the function's
+    monkeypatch.setattr(module._Loss, "__call__", lambda *one: 0.3)
+    with pytest.raises(ValueError, match=r"^max_loss_db: expected at least .* Allow a greater loss"):
+        compress(soft_model())
+
+
+# ------------------------------------------------------------------------------------ exactness
+
+
+def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
+    quantised = compress(soft_model(options=RenderOptions())).quantised
+    path = save_compact(tmp_path / "m.fgz", quantised, metadata={"clip": "x", "bad": float("nan")})
+    again = load_compact(path)
+    assert packed(again, read_metadata(path)) == path.read_bytes()
+    same(dequantise(again), dequantise(quantised))
+    same(load_video_model(path), dequantise(quantised))
+    assert read_metadata(path) == {"clip": "x", "bad": None}
+
+
+def test_a_decoded_model_by_the_same_rules_is_the_same_file():
+    """Quantising is a projection: what was rounded is not rounded further."""
+    quantised = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantised
+    again = quantise(describe(dequantise(quantised)), quantised.columns["class"], quantised.rules)
+    assert packed(again) == packed(quantised)
+
+
+def test_logarithm_is_one():
+    x = np.concatenate([np.random.default_rng(0).uniform(0, 1, 1000), [2.0**-40, 0.5, 1.0, 0.7071067811865476]])
+    np.testing.assert_allclose(_log(x), np.log(x), rtol=1e-13, atol=1e-13)
+
+
+def test_axes_are_orthonormal_and_legendre_is_legendre():
+    np.testing.assert_allclose(AXES @ AXES.T, np.eye(3), atol=1e-15)
+    for k, row in enumerate(legendre(7)):
+        np.testing.assert_allclose(np.polynomial.legendre.leg2poly(np.eye(8)[k]), row[: k + 1], rtol=1e-12)
+
+
+def test_a_path_is_the_same_from_another_time():
+    rng = np.random.default_rng(0)
+    place, shift, u = rng.normal(size=(5, 4, 2)), rng.normal(size=5), 0.3
+
+    def at(place, u):
+        return sum(place[:, k] * u[:, None] ** k for k in range(4))
+
+    np.testing.assert_allclose(at(moved_to(place, shift), u + shift), at(place, np.full(5, u)), rtol=1e-9)
+
+
+def test_paths_are_legendre_series_over_the_span():
+    model = soft_model(degree=3)
+    facts, v = describe(model).facts, describe(model).values
+    matrix = path_matrix(v["time"], v["duration"], facts)
+    middle, half = span_of(v["time"], v["duration"], facts.reach)
+    for w in (-1.0, 0.2, 1.0):
+        u = v["time"] - (middle + half * w)
+        by_matrix = (matrix * (u[:, None] ** np.arange(4))[:, :, None]).sum(1)
+        expected = [np.polynomial.legendre.legval(w, np.eye(4)[k]) for k in range(4)]
+        np.testing.assert_allclose(by_matrix, np.tile(expected, (len(u), 1)), atol=1e-8)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="the decoder for browsers is run by node")
+@pytest.mark.parametrize("how", [{"degree": 0}, {"degree": 3, "power": 1.0}, {"degree": 7}])
+def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
+    model = soft_model(options=RenderOptions(), **how)
+    path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantised)
+    decoder = Path(compact.__file__).with_suffix(".js")
+    (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
+    (tmp_path / "run.mjs").write_text(
+        """
+        import { readFileSync, writeFileSync } from "node:fs";
+        import { decode } from "./decoder.mjs";
+        const file = readFileSync("m.fgz");
+        const { header, leaves } = decode(file.buffer.slice(file.byteOffset, file.byteOffset + file.length));
+        for (const [name, own] of Object.entries(leaves)) writeFileSync(name, new Uint8Array(own.buffer));
+        """
+    )
+    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=60)
+    again = load_video_model(path)
+    leaves = {field.name: getattr(again.splats, field.name) for field in dataclasses.fields(again.splats)}
+    leaves = {name: leaf for name, leaf in leaves.items() if name != "envelope"}
+    for name, leaf in (leaves | {"frame_times": again.frame_times.logits}).items():
+        by_browser = np.fromfile(tmp_path / name, np.float32)
+        np.testing.assert_array_equal(by_browser.view(np.int32), np.asarray(leaf).ravel().view(np.int32), err_msg=name)
+
+
+# ------------------------------------------------------------------------------------ extremes
+
+
+def only(model, keep):
+    def cut(leaf):
+        return leaf[keep] if np.ndim(leaf) else leaf
+
+    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
+
+
+def test_one_gaussian(tmp_path):
+    model = only(soft_model(options=RenderOptions()), np.array([20]))
+    made = compress(model, clip_of(model))
+    path = save_compact(tmp_path / "m.fgz", made.quantised)
+    same(load_video_model(path), made.model)
+    assert path.stat().st_size < 2500
+
+
+@pytest.mark.parametrize(
+    ("leaf", "value"),
+    [
+        ("log_scale", 12.0),
+        ("log_scale", -60.0),
+        ("log_time_scale", 30.0),
+        ("log_time_scale", -30.0),
+        ("time_loc_logit", 40.0),
+        ("time_loc_logit", -40.0),
+        ("opacity_logit", 60.0),
+        ("angle_logit", 50.0),
+        ("loc", 1e4),
+        ("coefficients", 1e4),
+        ("color_dc", 1e3),
+    ],
+)
+def test_extremes_of_values(leaf, value):
+    model = soft_model(options=RenderOptions())
+    changed = np.asarray(getattr(model.splats, leaf)).copy()
+    changed[5] = value
+    model = eqx.tree_at(lambda m: getattr(m.splats, leaf), model, changed)
+    made = compress(model, clip_of(model), max_loss_db=0.3)
+    assert made.loss_db <= 0.3
+    assert all(np.isfinite(one).all() for one in jax.tree.leaves(made.model))
+
+
+def test_numbers_that_are_not_finite_are_refused():
+    model = soft_model()
+    for value in (np.nan, np.inf):
+        broken = eqx.tree_at(lambda m: m.splats.loc, model, model.splats.loc.copy())
+        broken.splats.loc[0, 0] = value
+        with pytest.raises(ValueError, match="expected finite numbers"):
+            compress(broken)
+
+
+def test_what_the_format_does_not_hold_is_refused():
+    model = soft_model()
+    powers = eqx.tree_at(lambda m: m.splats.envelope, model, TimeLikelihood(np.linspace(1, 2, model.num_gaussians)))
+    with pytest.raises(ValueError, match=r"several|different"):
+        compress(powers)
+    with pytest.raises(ValueError, match=r"model: expected a VideoModel, got EditedVideo"):
+        compress(layers(model, model))
+    with pytest.raises(ValueError, match=r"model.degree: expected at most 15"):
+        compress(soft_model(degree=16))
+    with pytest.raises(ValueError, match=r"frames: expected uint8"):
+        compress(model, np.zeros((2, *SIZE, 3), np.uint8))
+    for wrong in (0.0, -1, np.nan, "a"):
+        with pytest.raises(ValueError, match=r"max_loss_db: expected a loss"):
+            compress(model, max_loss_db=wrong)
+    dark = eqx.tree_at(lambda m: m.splats.opacity_logit, model, np.full(model.num_gaussians, -90.0, np.float32))
+    with pytest.raises(ValueError, match=r"model: expected Gaussians that are seen"):
+        compress(dark)
+
+
+# ------------------------------------------------------------------------------------ bad files
+
+
+@pytest.fixture(scope="module")
+def good():
+    return packed(fine(soft_model(), -12.0), {"clip": "x"})
+
+
+def resealed(data, change=lambda header: None, cut=None):
+    """The file with another header, and the checksum it then has: what a stranger may send."""
+    start = len(MAGIC) + 12
+    length = int.from_bytes(data[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
+    header = json.loads(data[start : start + length])
+    change(header)
+    text = json.dumps(header).encode()
+    body = text + data[start + length :][:cut]
+    numbers = (VERSION, len(text), zlib.crc32(body))
+    return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
+
+
+def refused(tmp_path, data, match):
+    path = tmp_path / "m.fgz"
+    path.write_bytes(data)
+    with pytest.raises(ModelFileError, match=match):
+        load_video_model(path)
+
+
+def test_truncated(tmp_path, good):
+    for length in (*range(4, 24), 60, len(good) // 2, len(good) - 1):
+        refused(tmp_path, good[:length], "compact model")
+
+
+def test_damaged_everywhere(tmp_path, good):
+    rng = np.random.default_rng(0)
+    for place in rng.integers(4, len(good), 100):
+        data = bytearray(good)
+        data[place] ^= 1 << rng.integers(8)
+        refused(tmp_path, bytes(data), "compact model")
+
+
+def test_later_version(tmp_path, good):
+    data = bytearray(good)
+    data[len(MAGIC)] = 9
+    refused(tmp_path, bytes(data), r"expected a compact model of version 1, .* got version 9 .* Update foldgauss")
+
+
+def test_changed_by_a_transfer_as_text(tmp_path, good):
+    refused(tmp_path, good.replace(b"\r\n", b"\n", 1), "a transfer as text has changed")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("num_gaussians", 10**12),
+        ("num_gaussians", 0),
+        ("num_gaussians", 39),
+        ("num_gaussians", 3.5),
+        ("num_frames", 10**12),
+        ("num_frames", 1),
+        ("degree", 10**9),
+        ("degree", -1),
+        ("degree", 2),
+        ("size", [0, 5]),
+        ("size", [10**12, 5]),
+        ("size", "no"),
+        ("fps", -1),
+        ("power", 1e300),
+        ("floor", 1.0),
+        ("reach", 0),
+        ("compositing", "under"),
+        ("options", {"low_pass": -1}),
+        ("options", {"unknown": 1}),
+        ("columns", []),
+        ("columns", 5),
+        ("intervals", 0),
+        ("metadata", 5),
+        ("scale_cutoff", True),
+    ],
+)
+def test_header_of_a_stranger(tmp_path, good, key, value):
+    def change(header):
+        header[key] = value
+
+    refused(tmp_path, resealed(good, change), "compact model")
+
+
+def test_columns_of_a_stranger(tmp_path, good):
+    for own in (
+        {"bytes": 10**9},
+        {"bytes": -1},
+        {"slopes": [1.0] * 9},
+        {"exponent": 1e300},
+        {"slopes": 5},
+        {"name": 1},
+    ):
+        refused(tmp_path, resealed(good, lambda header, own=own: header["columns"][3].update(own)), "compact model")
+    refused(tmp_path, resealed(good, cut=-3), "compact model")
+    for key in json.loads(good[20 : 20 + int.from_bytes(good[12:16], "little")]):
+        refused(tmp_path, resealed(good, lambda header, key=key: header.pop(key)), "compact model")
+
+
+def test_streams_of_a_stranger(tmp_path, good):
+    """With the right checksum: they decode to something or are refused, in no time and memory of note."""
+    rng, path = np.random.default_rng(1), tmp_path / "m.fgz"
+    start = len(MAGIC) + 12 + int.from_bytes(good[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
+    for _ in range(60):
+        data = bytearray(good)
+        for place in rng.integers(start, len(good), 5):
+            data[place] = rng.integers(256)
+        path.write_bytes(resealed(bytes(data)))
+        try:
+            model = load_video_model(path)
+        except ModelFileError:
+            continue
+        assert model.num_gaussians == 40
+
+
+def test_a_byte_for_every_eight_gaussians(tmp_path):
+    """All alike, they need next to nothing, and the file is filled up: none may claim more than its length allows."""
+    described = describe(only(soft_model(degree=0), np.full(100_000, 20)))
+    origins = {name: float(value[0]) for name, value in described.values.items()}
+    rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0)}
+    path = save_compact(tmp_path / "m.fgz", quantise(described, np.zeros(100_000, np.int32), rules))
+    assert 100_000 / 8 <= path.stat().st_size < 100_000 / 8 + 30
+    assert load_video_model(path).num_gaussians == 100_000
+    shorter = resealed(path.read_bytes())  # the same without spaces
+    refused(tmp_path, shorter, "num_gaussians")
+
+
+def test_names(tmp_path):
+    quantised = fine(soft_model())
+    with pytest.raises(ValueError, match=r"path: expected a name ending in .fgz"):
+        save_compact(tmp_path / "m.safetensors", quantised)
+    with pytest.raises(ValueError, match="foldgauss compress"):
+        save_video_model(tmp_path / "m.fgz", soft_model())
+    path = save_compact(tmp_path / "m.fgz", quantised)
+    plain = path.rename(tmp_path / "other.name")  # told by its bytes
+    assert load_video_model(plain).num_gaussians == 40
+    with pytest.raises(FileNotFoundError):
+        load_video_model(tmp_path / "missing.fgz")

@@ -1,0 +1,119 @@
+"""`foldgauss compress` as a user meets it."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from commands import run
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import load_video_model, read_video, save_video_model, write_video
+from foldgauss.io.video_model import read_metadata
+from foldgauss.render import RenderOptions
+from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
+
+SIZE, FRAMES, NUM = (32, 48), 5, 60
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A model, and a clip that is nearly its pictures."""
+    folder, rng = tmp_path_factory.mktemp("work"), np.random.default_rng(0)
+
+    def normal(*shape, scale=1.0, at=0.0):
+        return (at + scale * rng.normal(size=(NUM, *shape))).astype(np.float32)
+
+    splats = FoldedSplats(
+        loc=normal(2, scale=0.25),
+        log_scale=normal(2, scale=0.3, at=-2.3),
+        angle_logit=normal(),
+        time_loc_logit=normal(scale=0.5),
+        log_time_scale=normal(scale=0.2, at=-0.5),
+        coefficients=normal(2, 2, scale=0.05),
+        opacity_logit=normal(),
+        color_dc=normal(3),
+        envelope=TimeLikelihood(np.float32(2)),
+    )
+    model = VideoModel(splats, FrameTimes.uniform(FRAMES), SIZE, 12.0, RenderOptions())
+    save_video_model(folder / "model.safetensors", model, metadata={"clip": "clip", "mean_psnr": 33.3})
+    pictures = np.stack(list(model.frames())).astype(float) + 5 * rng.normal(size=(FRAMES, *SIZE, 3))
+    write_video(folder / "clip", np.clip(pictures, 0, 255).astype(np.uint8), 12.0)
+    return folder
+
+
+def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("compress", work / "model.safetensors", work / "clip", "--max-loss-db", 0.3, "--passes", 1) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"smaller by a factor of\s*│ \d+\.\d\d", shown)
+    about = read_metadata("model.fgz")
+    assert about["clip"] == "clip"
+    assert about["loss_db"] <= 0.3
+    scores = []
+    for path in (work / "model.safetensors", "model.fgz"):
+        assert run("evaluate", path, work / "clip", "--json", "s.json", "--overwrite") == 0
+        scores.append(json.loads((tmp_path / "s.json").read_text())["mean_psnr"])
+    assert scores[0] - scores[1] == pytest.approx(about["loss_db"], abs=2e-3)
+    assert scores[1] == pytest.approx(about["mean_psnr"], abs=2e-3)
+    capsys.readouterr()
+    assert run("info", "model.fgz") == 0
+    assert "bits per pixel" in capsys.readouterr().out
+    assert run("render", "model.fgz", "--out", "slow.mp4", "--upsample", 2) == 0
+    assert read_video("slow.mp4").num_frames == 9
+    assert run("export", "model.fgz", "--format", "ply", "--out", "m.ply") == 0
+    (tmp_path / "edits.toml").write_text(
+        '[selections.left]\nbox = [0, 0, 24, 32]\nframe = 0\n[[edits]]\nselect = "left"\ndo = "vanish"\n'
+    )
+    assert run("edit", "model.fgz", "edits.toml", "--out", "edited.safetensors") == 0
+    assert load_video_model("edited.safetensors").num_gaussians < load_video_model("model.fgz").num_gaussians
+    with pytest.raises(ValueError, match="foldgauss compress"):
+        save_video_model("again.fgz", load_video_model("model.fgz"))
+
+
+def test_without_the_clip(work, tmp_path, capsys):
+    assert run("compress", work / "model.safetensors", "--out", tmp_path / "m.fgz", "--passes", 0) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert (
+        "the loss is estimated, from the model's own pictures and a PSNR of 33.30 dB that is noted in the file" in told
+    )
+    assert load_video_model(tmp_path / "m.fgz").num_frames == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--out", "m.zip"], "--out: expected a name ending in .fgz"),
+        (["--max-loss-db", "0"], "--max-loss-db: expected a loss in (0, 60] dB"),
+        (["--max-loss-db", "nan"], "--max-loss-db: expected a loss in (0, 60] dB"),
+        (["--frames", "0:5"], "--frames: expected a VIDEO"),
+        (["--passes", "-1"], "passes"),
+        (["nowhere.mp4"], "nowhere.mp4"),
+        (["--out", "missing/m.fgz"], "missing"),
+    ],
+)
+def test_wrong_use(work, tmp_path, capsys, monkeypatch, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    assert run("compress", work / "model.safetensors", *arguments) in (1, 2)
+    assert told in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_replaced_unasked(work, tmp_path, capsys):
+    target = tmp_path / "m.fgz"
+    target.write_text("mine")
+    assert run("compress", work / "model.safetensors", "--out", target) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert target.read_text() == "mine"
+    copy = tmp_path / "c.fgz"
+    copy.write_bytes((work / "model.safetensors").read_bytes())  # told by its bytes: it is a float32 model
+    assert run("compress", copy, "--out", copy, "--overwrite") == 2
+    assert "another file than the model" in capsys.readouterr().err
+
+
+def test_edited_models_are_refused(work, tmp_path, capsys):
+    model = load_video_model(work / "model.safetensors")
+    save_video_model(tmp_path / "e.safetensors", layers(model, model))
+    assert run("compress", tmp_path / "e.safetensors", "--out", tmp_path / "e.fgz") == 2
+    assert "MODEL: expected a plain model, got one with edits" in capsys.readouterr().err
+    assert not (tmp_path / "e.fgz").exists()
