@@ -28,7 +28,7 @@ from foldgauss.cli._shared import (
 )
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable
 from foldgauss.io.video_file import Clip
-from foldgauss.io.video_model import load_video_model
+from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.uncertainty import (
     Evidence,
     FrameNoise,
@@ -48,6 +48,7 @@ from foldgauss.video.model import VideoModel
 
 CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
 PICTURES = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
+IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PICTURES)
 #: Draws of each ensemble that posterior.nc holds, evenly spaced: of all there would be gigabytes.
 MOST_DRAWS = 4000
@@ -92,7 +93,7 @@ def uncertainty_command(
     Tells error bars of every frame, duplicated and dropped frames, and whether sampling has converged. A run that was
     stopped goes on when called again with the same arguments; more --steps go on from fewer.
     """
-    for name in ("emcee", "arviz", "h5py", "h5netcdf", "matplotlib"):
+    for name in ("matplotlib", "emcee", "h5py", "h5netcdf", "arviz"):
         needed(name)
     if noise not in NOISES:
         raise WrongUse(str(invalid("--noise", expected="one of " + ", ".join(NOISES), got=noise)))
@@ -105,11 +106,18 @@ def uncertainty_command(
         cure = "Take the model that was edited, and the clip that it was fitted to."
         raise WrongUse(str(invalid("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)))
     clip = clip_of_model(model, model_path, video, frames, as_many=False)
+    if clip.num_frames != model.num_frames and read_metadata(model_path).get("clip") == Path(clip.source).name:
+        expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
+        cure = "To draw the times of some of them: --only A:B."
+        raise WrongUse(str(invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)))
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
     seen = _kept_evidence(out_dir, key, overwrite)
     with _bars() as bars:
-        if seen is None:
+        if seen is not None:
+            for note in seen.notes:
+                err.print(f"warning: {note}", soft_wrap=True)
+        else:
             seen = _evidence(model, clip, noise, level, wanted, bars)
             _make_folder(out_dir)
             _keep_evidence(out_dir / EVIDENCE, key, seen)
@@ -144,6 +152,10 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     if video.is_dir() and folder.resolve() == video.resolve():
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder other than the clip's", got=folder, cure=cure)))
+    images = [path for path in folder.glob("*") if path.suffix.lower() in IMAGES and path.name not in PICTURES]
+    if images:
+        cure = "Pictures would be frames there."
+        raise WrongUse(str(invalid("--out", expected="a folder without other images", got=folder, cure=cure)))
     there = [name for name in FILES if (folder / name).exists()]
     if there and not (folder / CHAINS).exists() and not overwrite:
         raise WrongUse(f"--out: {folder / there[0]} exists. Choose another folder, or add --overwrite.")
@@ -192,7 +204,7 @@ def _keep_evidence(path: Path, key: str, seen: Evidence) -> None:
     arrays = {name: getattr(seen.profiles, name) for name in _PROFILES}
     arrays |= {"scale": seen.noise.scale, "share": seen.noise.share, "correlation": seen.residual_correlation}
     with atomic_path(path) as temporary:
-        np.savez(temporary, key=key, num_drawn=seen.num_drawn, **arrays)
+        np.savez(temporary, key=key, num_drawn=seen.num_drawn, level=seen.level, notes=list(seen.notes), **arrays)
 
 
 def _kept_evidence(folder: Path, key: str, overwrite: bool) -> Evidence | None:
@@ -203,7 +215,8 @@ def _kept_evidence(folder: Path, key: str, overwrite: bool) -> Evidence | None:
             if str(kept["key"]) == key:
                 profiles = Profiles(*(kept[name] for name in _PROFILES))
                 noise = FrameNoise(kept["scale"], kept["share"])
-                return Evidence(profiles, noise, kept["correlation"], int(kept["num_drawn"]))
+                told = str(kept["level"]), tuple(map(str, kept["notes"]))
+                return Evidence(profiles, noise, kept["correlation"], int(kept["num_drawn"]), *told)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # none, or not one of ours: drawn anew
         return None
     if (folder / CHAINS).exists() and not overwrite:
@@ -253,6 +266,8 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
             if not str(error).startswith("backend:"):
                 raise
             if not overwrite:
+                if "damaged" in str(error):
+                    raise WrongUse(f"--out: {path} is damaged. Remove it, or add --overwrite.") from error
                 raise _of_another(path) from error
             path.unlink()
             existed, posterior = False, sample()

@@ -95,6 +95,8 @@ def simulated_ranks(
     **Example:** `simulated_ranks(model, FrameNoise(0.02, 1.0), num_frames=10, replicates=300).inside()`.
     """
     _check_simulation(num_frames, replicates, sampler, draws, correlation)
+    if not isinstance(noise, FrameNoise):
+        raise invalid("noise", expected="a FrameNoise", got=noise, cure="As FrameNoise(0.02, 1.0).")
     noise = noise.of(num_frames)
     assumed = noise if assumed_noise is None else assumed_noise
     if isinstance(assumed, FrameNoise):

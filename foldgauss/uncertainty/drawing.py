@@ -50,13 +50,16 @@ class Evidence:
     """What the pictures say of every frame's time: profiles, and the noise they were made with.
 
     `residual_correlation` (lags,): correlation of residuals by distance in pixels, mean over the frames.
-    `num_drawn`: pictures drawn for it.
+    `num_drawn`: pictures drawn for it. `level`: what is held, "splats" or, but for colours, "colors". `notes`: what was
+    warned of.
     """
 
     profiles: Profiles
     noise: FrameNoise
     residual_correlation: Float64[np.ndarray, "lags"]
     num_drawn: int
+    level: str = "splats"
+    notes: tuple[str, ...] = ()
 
 
 def evidence(
@@ -91,11 +94,13 @@ def evidence(
     _check_changes(screen.frames)
     drawn = Drawn(screen, reach, on_picture)
     drawn.coarse()
-    _check_explained(screen.frames, drawn)
+    notes = _explained(screen.frames, drawn)
     seen = drawn.evidence(noise)
     _check_identified(seen.profiles)
-    _check_ends(seen.profiles, drawn.model_times)
-    return seen
+    notes += _ends(seen.profiles, drawn.model_times)
+    for note in notes:
+        warnings.warn(note, UserWarning, stacklevel=2)
+    return dataclasses.replace(seen, notes=tuple(notes))
 
 
 class Drawn:
@@ -262,8 +267,8 @@ def _check_changes(frames: np.ndarray) -> None:
         raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
 
 
-def _check_explained(frames: np.ndarray, drawn: Drawn) -> None:
-    """By what is left of the frames' variance over space and time; and a warning by what is left of that over time."""
+def _explained(frames: np.ndarray, drawn: Drawn) -> list[str]:
+    """Raises by what is left of the frames' variance over space and time; notes by what is left of that over time."""
     mean = np.mean(frames, axis=0, dtype=np.float64)
     over_time = sum(float(np.square(frame - mean).sum()) for frame in frames) / 255**2
     over_all = over_time + len(frames) * float(np.square(mean - mean.mean((0, 1))).sum()) / 255**2
@@ -274,12 +279,13 @@ def _check_explained(frames: np.ndarray, drawn: Drawn) -> None:
         raise invalid(
             "video", expected=f"frames of which the model explains {100 * EXPLAINED:.0f}%", got=got, cure=cure
         )
-    if left > WORSE_THAN_MEAN * over_time:
-        worse = left / over_time if over_time else np.inf
-        text = (
-            f"The model's errors are {worse:.1f} times those of the clip's mean frame. Is it of another video? {cure}"
-        )
-        warnings.warn(text, UserWarning, stacklevel=3)
+    if left <= WORSE_THAN_MEAN * over_time:
+        return []
+    worse = left / over_time if over_time else np.inf
+    return [
+        f"The model's errors are {worse:.1f} times those of the mean frame: nearly nothing moves in this video, or the"
+        f" model is of another one. {cure}"
+    ]
 
 
 def _check_identified(profiles: Profiles) -> None:
@@ -290,15 +296,15 @@ def _check_identified(profiles: Profiles) -> None:
         raise invalid("video", expected="frames that tell their times", got=got, cure=cure)
 
 
-def _check_ends(profiles: Profiles, model_times: np.ndarray) -> None:
-    """Warn where the first or the last frame is better somewhere else than at 0 or 1."""
-    step = np.median(np.diff(model_times))
+def _ends(profiles: Profiles, model_times: np.ndarray) -> list[str]:
+    """Notes of a first or last frame that is better somewhere else than at 0 or 1."""
+    step, notes = np.median(np.diff(model_times)), []
     for k, end in ((0, 0.0), (profiles.num_frames - 1, 1.0)):
         best = profiles.modes()[k]
         lost = -float(profiles[k](np.array([end]))[0])
         if lost > PINNED and abs(best - end) > AWAY * step:
-            text = (
+            notes.append(
                 f"Frame {k} is held at time {end:g}, but {best:.4f}, {abs(best - end) / step:.1f} frames away, is"
                 f" better by {lost:.0f}: a video begins and ends where its model does; times beside it will be wrong."
             )
-            warnings.warn(text, UserWarning, stacklevel=3)
+    return notes

@@ -96,7 +96,7 @@ def at_level(
     if level == "splats":
         return seen
     profiles = evidence_without_colors(model, video, seen, frames=frames, on_frame=on_frame)
-    return dataclasses.replace(seen, profiles=profiles)
+    return dataclasses.replace(seen, profiles=profiles, level=level)
 
 
 def check_level(level: str, video: np.ndarray | None) -> None:

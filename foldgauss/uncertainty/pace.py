@@ -70,6 +70,12 @@ def intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementInt
     return IncrementIntervals(steps.mean(0), low, high, level)
 
 
+def judged(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
+    """Intervals that `irregularities` looks at: no cuts, a free frame at an end, and ends that tell their time."""
+    free, told = posterior.log_prob.increments.free, posterior.identified()
+    return ~cuts(posterior) & (free[:-1] | free[1:]) & told[:-1] & told[1:]
+
+
 def irregularities(
     posterior: FrameTimePosterior,
     duplicate: float = 0.25,
@@ -83,9 +89,8 @@ def irregularities(
     Told are those that are so in at least the share `probability` of the draws. The local median is that of the `reach`
     intervals before and after, as far as the shot goes, in the same draw: a pace that changes smoothly, in the clip or
     as learned, is even. Cuts (`foldgauss.video.shots.is_cut`) are not flagged, and end the neighbourhood. Intervals
-    between two frames whose times were held are not judged.
-
-    Where times are not identified the prior decides, under which neither is likely: nothing is found.
+    between two frames whose times were held are not judged, nor are those of a frame that does not tell its time
+    (`FrameTimePosterior.identified`).
 
     Raises ValueError for bounds that are not 0 < duplicate < 1 < dropped, a probability out of (0, 1], reach < 1.
 
@@ -99,10 +104,9 @@ def irregularities(
         raise invalid("probability", expected="a number in (0, 1]", got=probability)
     if reach < 1:
         raise invalid("reach", expected="a whole number >= 1", got=reach)
-    steps, free = np.diff(_some(posterior), axis=1), posterior.log_prob.increments.free
-    found = []
+    steps, asked, found = np.diff(_some(posterior), axis=1), judged(posterior), []
     for k, near in _neighbours(cuts(posterior), reach):
-        if not (free[k] or free[k + 1]):
+        if not asked[k]:
             continue
         size = steps[:, k] / np.median(steps[:, near], axis=1)
         for kind, so in (("duplicated", size < duplicate), ("dropped", size > dropped)):

@@ -50,7 +50,7 @@ AT_ONCE = 12
 TOGETHER = 64
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class FrameTimePosterior:
     r"""Draws of frame times, and how far to trust them.
 
@@ -78,6 +78,11 @@ class FrameTimePosterior:
     laplace: LaplaceTimes
     exact: ExactTimes
     seen: Evidence | None = None
+
+    def __repr__(self) -> str:
+        ensembles, steps, walkers, frames = self.times.shape
+        shape = f"{len(self.free)} of {frames} times, {ensembles} x {steps} x {walkers} draws"
+        return f"{type(self).__name__}({shape}: {self.message})"
 
     @property
     def free(self) -> np.ndarray:
@@ -550,7 +555,8 @@ def _fingerprint_of(path: Path) -> str:
         with needed("h5py").File(path) as file:
             return file.attrs.get("fingerprint", "")
     except OSError as error:
-        raise invalid("backend", expected="an HDF5 file, or none yet", got=str(path), cure="Choose another.") from error
+        cure = "Remove it, or choose another."
+        raise invalid("backend", expected="an HDF5 file, or none yet", got=f"{path}, damaged", cure=cure) from error
 
 
 def needed(name: str):

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._checks import invalid
-from foldgauss.uncertainty.pace import Irregularity, even_pace, irregularities
+from foldgauss.uncertainty.pace import Irregularity, even_pace, irregularities, judged
 from foldgauss.uncertainty.posterior import FrameTimePosterior
 
 
@@ -50,21 +50,24 @@ def summary(
     fitted: Float[np.ndarray, "num_frames"] | None = None,
     *,
     flagged: Sequence[Irregularity] | None = None,
-    level: Literal["splats", "colors"] = "splats",
+    level: Literal["splats", "colors"] | None = None,
 ) -> str:
     """What was found, how far to trust it, and what it is conditioned on, in Markdown.
 
     `fitted`: the model's own times, which are compared. `flagged`: default `irregularities(posterior)`. `level`: what
-    the posterior is given, all of the splats, or all but their colours (`evidence_without_colors`).
+    the posterior is given, all of the splats, or all but their colours; default: as its evidence says.
 
     **Example:** `print(summary(posterior, model.frame_times.times()))`.
     """
     flagged = irregularities(posterior) if flagged is None else flagged
+    seen = posterior.seen
+    level = level or ("splats" if seen is None else seen.level)
     parts = [
         posterior.message,
+        *(f"**Note:** {note}" for note in (() if seen is None else seen.notes)),
         _sampling(posterior),
         "## How sure\n\n" + _sureness(posterior),
-        "## Pace\n\n" + _pace(flagged),
+        "## Pace\n\n" + _pace(posterior, flagged),
         "## Against other times\n\n" + _against(posterior, fitted),
         "## What this is conditioned on\n\n" + _conditions(posterior, level),
     ]
@@ -108,9 +111,20 @@ def _sureness(posterior: FrameTimePosterior) -> str:
     return "\n\n".join(lines)
 
 
-def _pace(flagged: Sequence[Irregularity]) -> str:
+def _pace(posterior: FrameTimePosterior, flagged: Sequence[Irregularity]) -> str:
+    asked = judged(posterior)
+    others = (
+        ""
+        if asked.all()
+        else (f" {int((~asked).sum())} others were not judged: cuts, frames that are held or do not tell their time.")
+    )
+    caution = (
+        "A gap, or a frame shown twice, in the very frames that the model was fitted to may be taken up by its clock "
+        "and its folds; the model of a clip that has the frames left out sees it."
+    )
     if not flagged:
-        return "No interval looks like that of a duplicated frame, or of frames left out."
+        found = "none looks like that of a duplicated frame, or of frames left out"
+        return f"Of {int(asked.sum())} intervals {found}.{others} {caution}"
     rows = [
         (
             "{}, {}".format(*one.frames),
@@ -129,7 +143,7 @@ def _pace(flagged: Sequence[Irregularity]) -> str:
             "\n\nA long step beside a duplicated frame: that frame stands in the place of one that was left out; or "
             "the splats themselves stand still there, since they were fitted to it, and it may lie anywhere there."
         )
-    return text
+    return f"{text}\n\n{caution}{others}"
 
 
 def _against(posterior: FrameTimePosterior, fitted) -> str:

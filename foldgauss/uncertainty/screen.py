@@ -49,6 +49,9 @@ class Screen:
 
     def __init__(self, model: VideoModel, frames: UInt8[np.ndarray, "num_frames height width channels"]):
         check_model(model)
+        if not isinstance(frames, np.ndarray | list | tuple):
+            cure = "Of a file: read_video(path, size=model.size).frames."
+            raise invalid("video", expected="an array of frames", got=short_repr(frames), cure=cure)
         frames = np.asarray(frames)
         if (
             frames.dtype != np.uint8
@@ -59,9 +62,9 @@ class Screen:
             expected = (
                 f"uint8 (frames, {model.size[0]}, {model.size[1]}, 3), as the model was fitted to, or 4 with alpha"
             )
-            raise invalid(
-                "video", expected=expected, got=f"{frames.dtype} {frames.shape}", cure="Read it at that size."
-            )
+            fits = frames.ndim == 4 and frames.shape[1:3] == model.size
+            cure = "Make it 8-bit colour." if fits else "Read it at that size."
+            raise invalid("video", expected=expected, got=f"{frames.dtype} {frames.shape}", cure=cure)
         if frames.shape[3] == 4:
             frames = np.stack([composited(frame, np.zeros(3, np.float32)) for frame in frames])
         self.model, self.frames = model, np.ascontiguousarray(frames)
