@@ -13,7 +13,7 @@ import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
-from foldgauss.io import save_video_model
+from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import edit
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
@@ -181,7 +181,7 @@ def test_wrong_use(work, tmp_path, capsys):
         ([model, clip, "--out", target, "--frames", "0:2"], 2, "--frames: expected at least 3 frames"),
         ([model, clip, "--out", clip], 2, "other than the clip's"),
         ([model, clip, "--out", tmp_path / "file"], 2, "--out: expected a folder"),
-        ([model, clip, "--out", tmp_path / "bad"], 2, "--out: expected the draws of this model"),
+        ([model, clip, "--out", tmp_path / "bad"], 2, "chains.h5 is damaged"),
         ([tmp_path / "none", clip, "--out", target], 2, "missing"),
         ([tmp_path / "edited.safetensors", clip, "--out", target], 2, "an edited one"),
     ]
@@ -190,6 +190,13 @@ def test_wrong_use(work, tmp_path, capsys):
         assert message in (told := capsys.readouterr().err), told
         assert len(told.strip().splitlines()) == 1, told
         assert not target.exists(), words
+    own = save_video_model(tmp_path / "own.safetensors", load_video_model(model), metadata={"clip": clip.name})
+    assert run("uncertainty", own, clip, "--out", target, "--frames", "0:5") == 2
+    assert "--only A:B" in capsys.readouterr().err
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "0.png").write_text("precious")
+    assert run("uncertainty", model, clip, "--out", tmp_path / "images") == 2
+    assert "without other images" in capsys.readouterr().err
     assert (tmp_path / "file").read_text() == "precious"
     assert (tmp_path / "bad" / "chains.h5").read_text() == "precious"
 

@@ -347,6 +347,7 @@ def _false_degree_rate(penalty, n):
     return stats.f.sf(hotelling * (freedom - 1) / (2 * freedom), 2, freedom - 1)
 
 
+@pytest.mark.slow
 def test_select_degree_finds_the_true_degree_as_often_as_it_should(x64):
     # With (time_loc, time_scale) given the law of the choice between degrees 2 (the truth) and 3 is exact.
     n, replicates = 300, 1000

@@ -57,7 +57,7 @@ def test_nothing_is_found_where_nothing_is_known():
     posterior = posterior_about(np.linspace(0, 1, 25), 50.0)
     assert irregularities(posterior) == []
     assert not posterior.identified()[1:-1].any()
-    assert len(irregularities(posterior, probability=0.05)) > 10  # they are looked at
+    assert irregularities(posterior, probability=0.05) == []  # they are not judged
 
 
 def test_held_frames_are_not_judged():
@@ -148,7 +148,8 @@ def test_summary_says_what_is_not_known():
     posterior = posterior_about(times, std)
     text = summary(posterior, times)
     assert "Not identified: frame 5.**" in text
-    assert "No interval looks like" in text
+    assert "Of 9 intervals none looks like" in text
+    assert "2 others were not judged" in text
     assert "20" not in text.split("grey")[0].rsplit("residuals", 1)[1]
     unsure = dataclasses.replace(posterior, converged=False, message="Not converged after 9 steps.")
     assert summary(unsure).startswith("Not converged")
@@ -168,3 +169,14 @@ def test_even_pace_within_shots():
     even, unit = even_pace(posterior_about(times_of(steps), 0.002))
     np.testing.assert_allclose(np.diff(even), steps / steps.sum(), rtol=1e-2)
     assert unit == pytest.approx(13 / 9 / steps.sum(), rel=1e-2)
+
+
+def test_evidence_tells_what_was_warned_of():
+    from foldgauss.uncertainty import summary
+
+    posterior = posterior_about(np.linspace(0, 1, 12))
+    noted = dataclasses.replace(posterior.seen, notes=("It is late.",), level="colors")
+    text = summary(dataclasses.replace(posterior, seen=noted))
+    assert "**Note:** It is late." in text
+    assert "their colours are integrated out" in text
+    assert len(repr(posterior)) < 200

@@ -147,7 +147,7 @@ def test_a_constant_video_has_no_times():
 
 def test_noise_too_great_for_any_time_is_said():
     with pytest.raises(ValueError, match="not identified"):
-        evidence(model(), clip(uneven()), noise=FrameNoise(100.0, 1.0))
+        evidence(model(), clip(uneven()), noise=FrameNoise(1.0, 1e-6))
 
 
 def test_frames_backwards_are_refused():
@@ -243,7 +243,7 @@ def test_another_clip_of_the_same_place_is_told():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         evidence(speck, other, noise=white(0.02))
-    assert any("another video" in str(each.message) for each in caught)
+    assert any("of another one" in str(each.message) for each in caught)
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0, np.nan, np.inf, "a", [1.0, 2.0], [1.0, -1.0, 1.0]])
