@@ -20,6 +20,7 @@
 import argparse
 import dataclasses
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,9 @@ def inside(interval: np.ndarray, truth: np.ndarray) -> float:
 
 def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: dict[str, float]):
     """Level (a) of a whole clip: how long it takes, and how far emcee is from the exact passes."""
-    evidence(model, frames[: max(3, len(frames) // 40)], noise="score", reach=1)  # what is compiled once is not timed
+    with warnings.catch_warnings():  # what is compiled once is not timed
+        warnings.simplefilter("ignore")
+        evidence(model, frames[: max(3, len(frames) // 40)], noise="score", reach=1)
     begun = time.perf_counter()
     seen = evidence(model, frames, noise="score")
     pictures = time.perf_counter() - begun
