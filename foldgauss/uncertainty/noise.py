@@ -38,11 +38,14 @@ class FrameNoise:
     share: Float64[np.ndarray, "num_frames"]
 
     def __post_init__(self):
-        cures = {"scale": "5 grey levels are 5 / 255.", "share": "1 counts every value, 1/30 one in 30."}
-        for name, cure in cures.items():
+        told = {
+            "scale": (np.inf, "numbers > 0", "5 grey levels are 5 / 255."),
+            "share": (1.0, "numbers in (0, 1]", "1 counts every value, 1/30 one in 30."),
+        }
+        for name, (limit, expected, cure) in told.items():
             values = np.asarray(getattr(self, name), np.float64)
-            if not (np.isfinite(values).all() and (values > 0).all() and (values <= 1).all()):
-                raise invalid(name, expected="numbers in (0, 1]", got=values.tolist(), cure=cure)
+            if not (np.isfinite(values).all() and (values > 0).all() and (values <= limit).all()):
+                raise invalid(name, expected=expected, got=values.tolist(), cure=cure)
             object.__setattr__(self, name, values)
 
     def of(self, num_frames: int) -> "FrameNoise":
