@@ -292,7 +292,7 @@ def _check_identified(profiles: Profiles) -> None:
     rises = np.nanmax(profiles.values, axis=1) - np.nanmin(profiles.values, axis=1)
     if (rises[1:-1] < FLAT).all():
         got = f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times"
-        cure = "The times are not identified: nothing changes, or the noise is too great (5 grey levels are scale 5 / 255)."
+        cure = "The times are not identified: nothing changes, or the noise is too great (5 grey levels: 5 / 255)."
         raise invalid("video", expected="frames that tell their times", got=got, cure=cure)
 
 
