@@ -109,9 +109,11 @@ def test_formats(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_uncertainty():
+def test_uncertainty(tmp_path, monkeypatch):
     pytest.importorskip("emcee", reason="emcee is an optional extra")
+    monkeypatch.chdir(tmp_path)
     names = _run("uncertainty.md")
+    assert {path.name for path in tmp_path.iterdir()} == {"chains.h5"}
     assert names["posterior"].converged
     assert [(one.frames, one.kind) for one in names["found"]] == [((4, 5), "duplicated"), ((11, 12), "dropped")]
     assert names["some"].free.tolist() == [4, 5, 6]
