@@ -10,7 +10,7 @@ from emcee.state import State
 from foldgauss._kernels import inline, kernel
 from foldgauss.uncertainty.exact import profile_grid
 from foldgauss.uncertainty.log_prob import FrameTimeLogProb
-from foldgauss.uncertainty.profiles import Profiles, value_at
+from foldgauss.uncertainty.profiles import Profiles, piece_of, value_at
 
 _d = nb.float64
 
@@ -202,14 +202,9 @@ def _sweep(
 
 @inline
 def _mass_below(t, grid, likelihood, summed, last):
-    """Integral of the piecewise linear likelihood up to t; and the piece that t is in."""
-    low, high = 0, last
-    while high - low > 1:
-        middle = (low + high) // 2
-        if grid[middle] <= t:
-            low = middle
-        else:
-            high = middle
+    """Integral of the piecewise linear likelihood up to t."""
+    low = piece_of(t, grid, last)
+    high = low + 1
     step = t - grid[low]
     slope = (likelihood[high] - likelihood[low]) / (grid[high] - grid[low])
     return summed[low] + step * (likelihood[low] + slope * step / 2)
@@ -217,26 +212,16 @@ def _mass_below(t, grid, likelihood, summed, last):
 
 @inline
 def _density(t, grid, likelihood, last):
-    low, high = 0, last
-    while high - low > 1:
-        middle = (low + high) // 2
-        if grid[middle] <= t:
-            low = middle
-        else:
-            high = middle
+    low = piece_of(t, grid, last)
+    high = low + 1
     return likelihood[low] + (likelihood[high] - likelihood[low]) * (t - grid[low]) / (grid[high] - grid[low])
 
 
 @inline
 def _time_of(mass, grid, likelihood, summed, last):
     """The time up to which the piecewise linear likelihood has this integral."""
-    low, high = 0, last
-    while high - low > 1:
-        middle = (low + high) // 2
-        if summed[middle] <= mass:
-            low = middle
-        else:
-            high = middle
+    low = piece_of(mass, summed, last)
+    high = low + 1
     left, width, rest = likelihood[low], grid[high] - grid[low], mass - summed[low]
     root = np.sqrt(max(left * left + _d(2) * (likelihood[high] - left) * rest / width, _d(0)))
     if left + root <= 0:

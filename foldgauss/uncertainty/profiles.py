@@ -97,17 +97,25 @@ class Profiles:
 
 
 @inline
+def piece_of(value, rising, last):
+    """Number of the piece, between an entry of `rising` and the next, that a value is in; the end ones go on."""
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if rising[middle] <= value:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@inline
 def value_at(t, nodes, values, slopes, last):
     """A profile at time t; `last` is the number of its last node. -inf outside, and for NaN."""
     if not (t >= nodes[0] and t <= nodes[last]):
         return -np.inf
-    low, high = 0, last
-    while high - low > 1:
-        middle = (low + high) // 2
-        if nodes[middle] <= t:
-            low = middle
-        else:
-            high = middle
+    low = piece_of(t, nodes, last)
+    high = low + 1
     width = nodes[high] - nodes[low]
     u = (t - nodes[low]) / width
     v = _d(1) - u
