@@ -232,6 +232,20 @@ def _draw(curve: _Curve, base_nodes: np.ndarray, base_values: np.ndarray, low: f
         if steps[widest] <= STEP:
             widest = int(np.argmax(np.diff(times)))
         curve.draw(float(times[widest] + times[widest + 1]) / 2)
+    curve.draw(_vertex(*curve.profile()))
+
+
+def _vertex(times: np.ndarray, values: np.ndarray) -> float:
+    """Where the parabola through the greatest value and its neighbours is highest; half way where that is a node."""
+    middle = int(np.clip(np.argmax(values), 1, len(times) - 2))
+    (a, b, c), (left, top, right) = times[middle - 1 : middle + 2], values[middle - 1 : middle + 2]
+    rise, fall = (top - left) / (b - a), (right - top) / (c - b)
+    bend = (fall - rise) / (c - a)
+    if bend < 0:
+        t = float(np.clip((a + b) / 2 - rise / (2 * bend), a, c))
+        if np.abs(times - t).min() > 1e-3 * (c - a):
+            return t
+    return float((a + b) / 2 if left > right else (b + c) / 2)
 
 
 def _reached(times: np.ndarray, values: np.ndarray) -> float:
