@@ -223,6 +223,7 @@ def _checkpoint_skeleton(header: dict) -> FitState:
         first=floats(num, width),
         second=floats(num, width),
         counts=counts,
+        kinds=jax.ShapeDtypeStruct((num,), np.uint8),
         time_logits=floats(intervals),
         time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
         statistics=Statistics(floats(num), floats(num), counts) if header["growing"] else None,

@@ -6,6 +6,7 @@ from typing import Any
 
 from foldgauss._checks import invalid, one_of, whole, within
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.economy import Economy
 from foldgauss.video.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 
 
@@ -130,6 +131,7 @@ class FitConfig:
     falling: str = "all"  # which do: all, or "loc", that of positions alone
     two_cameras: bool = False  # see above
     growth: Growth | None = None  # None: the number of Gaussians stays
+    economy: Economy | None = None  # None: nothing is dropped
     #: "over": front to back as 3DGS and VeGaS; "sum": contributions added up, in any order, as GaussianImage.
     compositing: str = "over"
     options: RenderOptions = FINE
@@ -180,6 +182,8 @@ class FitConfig:
         kinds = dict.fromkeys(flags, bool) | {"rates": LearningRates, "options": RenderOptions}
         if self.growth is not None:
             kinds |= {"growth": Growth}
+        if self.economy is not None:
+            kinds |= {"economy": Economy}
         for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
                 raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))

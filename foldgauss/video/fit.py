@@ -19,9 +19,11 @@ from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
+from foldgauss.video.economy import cut, forget, kinds_of
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
+from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.metrics import psnr
 from foldgauss.video.model import FoldedSplats, VideoModel
@@ -49,7 +51,7 @@ class FitInfo(NamedTuple):
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["rows", "first", "second", "counts", "time_logits", "time_moments", "statistics"],
+    data_fields=["rows", "first", "second", "counts", "kinds", "time_logits", "time_moments", "statistics"],
     meta_fields=["step", "plan", "seconds", "error"],
 )
 @dataclasses.dataclass
@@ -60,6 +62,7 @@ class FitState:
     first: np.ndarray  # Adam's moments, likewise
     second: np.ndarray
     counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
+    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `economy`
     time_logits: np.ndarray  # float32 (num_frames - 1,)
     time_moments: optax.OptState
     statistics: Statistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
@@ -138,6 +141,8 @@ def fit_steps(
         state.step += 1
         if state.statistics is not None and state.plan:
             step.grow(state)
+        if config.economy is not None and state.plan:
+            step.economise(state)
         passed = time.perf_counter() - begun
         state.seconds += passed
         if not state.plan:
@@ -282,6 +287,7 @@ def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = Non
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
+        kinds=np.full(len(rows), config.degree, np.uint8),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         statistics=None if config.growth is None else Statistics.zeros(len(rows)),
@@ -313,6 +319,7 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
+        kinds=kinds_of(rows, config.degree),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         statistics=None,
@@ -434,7 +441,7 @@ class _Stepper:
         rates = np.where(self.falling, self.rates * np.float32(decay), self.rates)
         moments = state.first, state.second, state.counts
         unit = UNIT_TIME if self.config.own_time else 0.0
-        sparse_adam(state.rows, self.grad, *moments, touched, rates, unit_time=unit)
+        sparse_adam(state.rows, self.grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
             rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0))
@@ -469,8 +476,41 @@ class _Stepper:
             np.concatenate([part[stay], np.zeros_like(born)]) for part in (state.first, state.second)
         )
         state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
+        state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, self.config.degree)])
         state.statistics = Statistics.zeros(len(state.rows))
         self._make_room(state)
+
+    def economise(self, state: FitState) -> None:
+        """Leave out what does not pay, where a round is due."""
+        economy = self.config.economy
+        if economy.round_at(state.step, state.plan) is None:
+            return
+        ledger = self._ledger(state)
+        room = None
+        if economy.psnr is not None:
+            room = ledger.num_samples * 10 ** (-economy.psnr / 10) - ledger.squared_error
+        made = cut(
+            state.rows,
+            state.kinds,
+            ledger,
+            economy,
+            degree=self.config.degree,
+            pixels=pixels_per_unit(self.shapes[-1].size),
+            room=room,
+        )
+        state.rows, state.kinds, state.counts = made.rows, made.kinds, state.counts[made.stay]
+        state.first, state.second = (part[made.stay] for part in (state.first, state.second))
+        forget(state.first, state.second, made.kinds, self.config.degree)
+        self._make_room(state)
+
+    def _ledger(self, state: FitState) -> Ledger:
+        def target(k: int) -> tuple[np.ndarray, np.ndarray]:
+            behind = random_background(self.config.seed, k) if self.frames.shape[3] == 4 else self.background
+            return _planar(self.frames[k], behind), behind
+
+        times = np.asarray(_frame_times(state.time_logits))
+        how = {"compositing": self.config.compositing, "options": self.config.options, "seed": state.step}
+        return measured(state.rows, self.window, times, self.shapes[-1], target, **how)
 
     def _batch(self, step: int) -> np.ndarray:
         """Views of a step: every pass visits all once, in an order that depends on seed and pass only.

@@ -26,6 +26,8 @@ SH_C0 = 0.28209479177387814
 TIME_CUTOFF = 0.01
 #: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
 TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
+#: log sigma_t of Gaussians that last: the envelope of power 2 is 1 to 1e-6 wherever a clip's time goes.
+LASTING = np.float32(np.log(1024))
 #: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
 PEAK_OPACITY = 0.99
 
