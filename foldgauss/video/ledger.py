@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from foldgauss.render import RenderOptions, cpu
 from foldgauss.video.conditioning import Conditioned, Shape, condition
-from foldgauss.video.model import TAU_MAX
+from foldgauss.video.model import SH_C0, TAU_MAX
 from foldgauss.video.packing import columns
 
 #: Draws of random signs a frame.
@@ -28,27 +28,48 @@ Target = Callable[[int], tuple[Float32[np.ndarray, "3 height width"], Float32[np
 class Ledger:
     """Sums over all frames, pixels and channels; colours are about [0, 1], lengths pixels, float64.
 
-    * `squared_error`, `num_samples`: of the pictures.
+    * `errors` (num_frames,): squared error of each frame; `num_samples`: numbers that the pictures have.
+    * `alike` (3,): correlation of the errors of neighbours in time, along columns and along rows.
     * `slope` (num,): its change by leaving a Gaussian out, to first order; `own` (num,): to second, which is what the
       Gaussian adds to the pictures, squared.
     * `by_path` (num, 2 degree + 1, 3): sum over frames of (u / span)^m M, M the second derivatives (xx, xy, yy) by the
       Gaussian's place, halved; `span` (num,): a length of time to measure u = m_t - t by.
+    * `by_color` (num,): half the second derivative by any of a Gaussian's `color_dc`.
     * `by_size` (num, 3): sums of S, S l and S l^2, S the second derivative by the logarithm of the Gaussian's size,
       halved, and l = log a(t) / 2; `misses` (num,): frames at which the Gaussian is not alive.
     """
 
-    squared_error: float
+    errors: Float[np.ndarray, "num_frames"]
     num_samples: int
+    size: tuple[int, int]
+    alike: Float[np.ndarray, "3"]
     slope: Float[np.ndarray, "num"]
     own: Float[np.ndarray, "num"]
     by_path: Float[np.ndarray, "num moments 3"]
     span: Float[np.ndarray, "num"]
+    by_color: Float[np.ndarray, "num"]
     by_size: Float[np.ndarray, "num 3"]
     misses: Float[np.ndarray, "num"]
 
     @property
-    def mean_squared_error(self) -> float:
-        return self.squared_error / self.num_samples
+    def squared_error(self) -> float:
+        return float(self.errors.sum())
+
+    @property
+    def psnr(self) -> float:
+        """dB, mean over the frames."""
+        samples = self.num_samples / len(self.errors)
+        return float(np.mean(-10 * np.log10(np.maximum(self.errors / samples, 1e-12))))
+
+    @property
+    def effective_samples(self) -> float:
+        """How many independent errors tell as much: neighbours that err alike say the same thing twice.
+
+        As of a first-order autoregression, n (1 - r) / (1 + r), along each direction; at least one of each line.
+        """
+        alike = np.clip(self.alike, 0, 1)
+        shares = np.maximum((1 - alike) / (1 + alike), 1 / np.array([len(self.errors), *self.size]))
+        return float(self.num_samples * shares.prod())
 
     @property
     def removed(self) -> Float[np.ndarray, "num"]:
@@ -123,7 +144,8 @@ def measured(
     spread = np.exp(rows[:, place["log_time_scale"]][:, 0].astype(float))
     span = np.minimum(TAU_MAX * spread, 1.0)
     slope, own, misses = np.zeros((3, num))
-    by_path, by_size, error = np.zeros((num, 2 * shape.degree + 1, 3)), np.zeros((num, 3)), 0.0
+    by_path, by_size, by_color = np.zeros((num, 2 * shape.degree + 1, 3)), np.zeros((num, 3)), np.zeros(num)
+    errors, products, before = np.zeros(len(times)), np.zeros(3), None
     signs_shape = (3, *shape.size)
     for k, t in enumerate(times):
         wanted, behind = target(k)
@@ -131,14 +153,15 @@ def measured(
         alive = done.alive
         misses += 1
         misses[alive] -= 1
-        if not len(alive):
-            error += float(np.sum((behind[:, None, None] - wanted) ** 2, dtype=float))
-            on_frame()
-            continue
         leaves = done.mean, done.factor, done.opacity, done.color, behind
         trace = cpu.forward(*leaves, shape.size, compositing=compositing, options=options)
         residual = trace.image - wanted
-        error += float(np.vdot(residual, residual))
+        errors[k] = np.vdot(residual, residual)
+        products += _products(residual, before)
+        before = residual
+        on_frame()
+        if not len(alive):
+            continue
         slope[alive] -= 2 * done.opacity * cpu.backward(trace, residual)[2]
         u = centre[alive] - t
         powers = (u / span[alive])[:, None] ** np.arange(2 * shape.degree + 1)
@@ -146,13 +169,23 @@ def measured(
         weights = np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
         for _ in range(DRAWS):
             signs = rng.integers(0, 2, signs_shape, dtype=np.int8) * np.float32(2) - np.float32(1)
-            d_mean, d_factor, d_opacity = cpu.backward(trace, signs)[:3]
+            d_mean, d_factor, d_opacity, d_color, _ = cpu.backward(trace, signs)
             own[alive] += (done.opacity * d_opacity).astype(float) ** 2 / DRAWS
             by_path[alive] += powers[:, :, None] * _outer(d_mean.astype(float))[:, None] / DRAWS
             by_size[alive] += weights * _by_log_size(done, d_factor)[:, None] ** 2 / DRAWS
-        on_frame()
+            by_color[alive] += SH_C0**2 * (d_color.astype(float) ** 2).mean(1) / DRAWS
     num_samples = len(times) * 3 * math.prod(shape.size)
-    return Ledger(error, num_samples, slope, own, by_path, span, by_size, misses)
+    alike = products / max(errors.sum(), np.finfo(float).tiny)
+    facts = errors, num_samples, shape.size, alike
+    return Ledger(*facts, slope, own, by_path, span, by_color, by_size, misses)
+
+
+def _products(residual: np.ndarray, before: np.ndarray | None) -> list[float]:
+    """Sums of products of errors with those one frame, one row and one column before."""
+    in_time = 0.0 if before is None else float(np.vdot(residual, before))
+    down = float(np.einsum("chw,chw->", residual[:, 1:], residual[:, :-1]))
+    along = float(np.einsum("chw,chw->", residual[:, :, 1:], residual[:, :, :-1]))
+    return [in_time, down, along]
 
 
 def _log_envelope(tau: np.ndarray, shape: Shape) -> np.ndarray:
