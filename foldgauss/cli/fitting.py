@@ -41,6 +41,7 @@ from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import Clip, read_video, write_image, write_video
 from foldgauss.io.video_model import check_model_name, load_checkpoint, save_checkpoint, save_video_model
 from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.economy import Economy
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
 
 #: A running fit is kept on disk this often, in seconds.
@@ -105,6 +106,14 @@ def fit(
         typer.Option(help="Number of Gaussians at the start [default: by the preset, or the frame's size]."),
     ] = None,
     max_gaussians: Annotated[int | None, typer.Option(help="Largest number of Gaussians, grown or not.")] = None,
+    economy: Annotated[
+        bool,
+        typer.Option("--economy", help="Keep only what saves more bits than it takes: Gaussians, powers, colours."),
+    ] = False,
+    smallest_at_psnr: Annotated[
+        float | None,
+        typer.Option("--smallest-at-psnr", help="The smallest model whose mean PSNR is this, in dB; takes its time."),
+    ] = None,
     max_size_mb: Annotated[
         float | None,
         typer.Option("--max-size-mb", help="Largest model file, in 10^6 bytes; limits the Gaussians."),
@@ -169,6 +178,8 @@ def fit(
         raise WrongUse(f"--out: expected another file than the clip, got {target}.")
     try:
         check_model_name(target, "out")
+        if economy or smallest_at_psnr is not None:
+            changes["economy"] = Economy(psnr=smallest_at_psnr)
         config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error

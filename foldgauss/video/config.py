@@ -184,6 +184,9 @@ class FitConfig:
             kinds |= {"growth": Growth}
         if self.economy is not None:
             kinds |= {"economy": Economy}
+            if isinstance(self.economy, Economy) and self.economy.psnr is not None and self.target_psnr is not None:
+                got = f"also target_psnr={self.target_psnr:g}"
+                raise invalid("economy.psnr", expected="the only PSNR asked for", got=got, cure="Leave one out.")
         for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
                 raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
@@ -220,6 +223,8 @@ class FitConfig:
 HEADER_BYTES = 4096
 #: Steps where neither steps nor minutes are given: this many, and at least so many visits to every frame.
 DEFAULT_STEPS, DEFAULT_VISITS = 3000, 12
+#: Times as many for the smallest model at a PSNR: what is dropped must be made up for.
+SMALLEST_TIMES = 2
 
 
 def default_num_gaussians(height: int, width: int) -> int:
@@ -249,4 +254,6 @@ def planned_steps(config: FitConfig, num_frames: int) -> int | None:
     """Steps of the whole fit; None where time ends it and no number of steps does."""
     if config.minutes is not None:
         return config.steps
-    return config.steps or max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
+    steps = max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
+    smallest = config.economy is not None and config.economy.psnr is not None
+    return config.steps or (SMALLEST_TIMES * steps if smallest else steps)

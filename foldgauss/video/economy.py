@@ -14,27 +14,27 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.spatial import cKDTree
 
 from foldgauss._checks import invalid, whole, within
-from foldgauss.video.ledger import Ledger
+from foldgauss.video.ledger import ROUNDING, Ledger
 from foldgauss.video.model import LASTING
 from foldgauss.video.packing import columns
 from foldgauss.video.quantise import moved_to
 
 #: Numbers of a Gaussian that lasts and stands still; m_t and sigma_t of one that comes and goes.
 NUMBERS, OF_TIME = 9, 2
-#: Squared error of rounding to 8 bits: no residual is taken to be finer.
-ROUNDING = 1 / (12 * 255.0**2)
 #: The bit of a kind that says: it lasts.
 LASTS = 128
 #: What a fit gains in its last part by falling rates and from what was dropped, in dB for the whole plan: a round aims so
 #: much lower. (Bunny at 80x160 and 160x320: 1.5 to 3.)
-YET_TO_COME = 2.0
+YET_TO_COME, SPARE = 0.8, 0.1
 #: Doubling the Gaussians brings so many dB (Bunny 160x320, degree 1: 4,000 28.7, 7,000 30.2); beyond this share of the plan none
 #: are born.
 DOUBLING, LAST_BIRTHS = 1.9, 0.6
 #: Of the Gaussians, in rounds without a PSNR: births; they go on while at least half of the last ones stay.
 BIRTHS = 0.2
 #: Rounds of Lloyd's algorithm, and sizes of palettes tried.
-_LLOYD, _PALETTES = 12, tuple(4**k for k in range(2, 9))
+_LLOYD, _PALETTES = 12, tuple(2**k for k in range(3, 17))
+#: Of the error that sharing colours adds, what is left once the others have made up for it.
+_LEFT = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Economy:
     first_share: float = 0.3
     last_share: float = 0.88
     most_dropped: float = 0.3
-    grows: bool = False
+    grows: bool = True
 
     def __post_init__(self) -> None:
         bounds = {"bits": "(0, inf)", "first_share": "(0, 1)", "last_share": "(0, 1)", "most_dropped": "(0, 1]"}
@@ -72,17 +72,10 @@ class Economy:
             got = f"{self.first_share:g} and {self.last_share:g}"
             raise invalid("economy.first_share, last_share", expected="in this order", got=got)
 
-    def due(self, step: int, plan: int) -> bool:
-        """Whether stock is taken after `step` of `plan` steps."""
-        return bool((self._steps(plan) == step).any())
-
-    def is_last(self, step: int, plan: int) -> bool:
-        """Whether that is the last time."""
-        return step == self._steps(plan)[-1]
-
-    def _steps(self, plan: int) -> Int[np.ndarray, "rounds"]:
-        shares = np.linspace(self.first_share, self.last_share, self.rounds)
-        return np.clip(np.rint(shares * plan), 1, plan).astype(int)
+    def steps(self, plan: int, coarse: float) -> Int[np.ndarray, "rounds"]:
+        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet."""
+        first = max(self.first_share, min(coarse + 0.05, self.last_share))
+        return np.clip(np.rint(np.linspace(first, self.last_share, self.rounds) * plan), 1, plan).astype(int)
 
     def births(self, ledger: Ledger, progress: float, num: int, young: Bool[np.ndarray, "num"] | None) -> int:
         """How many Gaussians are to be born to `num`; `young`: which of those born last are still there."""
@@ -91,15 +84,18 @@ class Economy:
         if self.psnr is None:
             goes_on = self.grows and (young is None or young.mean() >= 0.5)
             return round(BIRTHS * num) if goes_on else 0
-        missing = self.psnr - (ledger.psnr + YET_TO_COME * (1 - progress))
+        missing = self._aim(progress) - ledger.psnr
         return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
 
     def room(self, ledger: Ledger, progress: float) -> float | None:
         """The squared error that a round may add; None where the price decides."""
         if self.psnr is None:
             return None
-        aim = self.psnr - YET_TO_COME * (1 - progress)
-        return ledger.squared_error * (10 ** ((ledger.psnr - aim) / 10) - 1)
+        return ledger.squared_error * (10 ** ((ledger.psnr - self._aim(progress)) / 10) - 1)
+
+    def _aim(self, progress: float) -> float:
+        """dB that a round aims at: the rest of the fit brings more."""
+        return self.psnr + SPARE - YET_TO_COME * (1 - progress)
 
 
 # ------------------------------------------------------------------------------------------ kinds of Gaussians
@@ -253,8 +249,9 @@ def shared_colors(
         palette = averaged(color, index)
         error = float((weight * ((color - palette) ** 2).sum(1)).sum())
         stored = len(np.unique(index)) * 3 + num * (1 if size <= 256 else 2) / 4
-        if error + stored * price < least:
-            best, least = index, error + stored * price
+        cost = _LEFT * error + stored * price
+        if cost < least:
+            best, least = index, cost
     return best
 
 

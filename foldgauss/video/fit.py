@@ -211,9 +211,9 @@ class _Pace:
 
 
 def _progress(state: FitState, config: FitConfig) -> float:
-    """Share of the plan that is done; while there is none, of the number of steps asked for, or 0."""
+    """Share of the plan that is done, above 1 in overtime; while there is none, of the steps asked for, or 0."""
     plan = state.plan or config.steps
-    return min(state.step / plan, 1.0) if plan else 0.0
+    return state.step / plan if plan else 0.0
 
 
 def _level(state: FitState, levels: list[Level]) -> int:
@@ -516,7 +516,11 @@ class _Stepper:
     def economise(self, state: FitState) -> None:
         """Take stock where that is due: drop what does not pay, bear where it does, share colours at the last."""
         economy, degree = self.config.economy, self.config.degree
-        if not economy.due(state.step, state.plan):
+        coarse = 1 - self.levels[-1].share
+        if self.config.growth is not None:
+            coarse = max(coarse, self.config.growth.for_plan(state.plan).until_step / state.plan)
+        steps = economy.steps(state.plan, coarse)
+        if state.step not in steps:
             return
         ledger, progress = self._ledger(state), state.step / state.plan
         made = self._cut(state, ledger, economy.room(ledger, progress))
@@ -527,7 +531,7 @@ class _Stepper:
         state.young = np.zeros(len(state.rows), bool)
         if num > 0:
             self._bear(state, ledger, num)
-        if economy.is_last(state.step, state.plan):
+        if state.step == steps[-1]:
             color = state.rows[:, columns(degree)["color_dc"]]
             index = shared_colors(color, ledger.by_color[made.stay], made.price, self.config.seed)
             state.palette = np.zeros(0, np.int32) if index is None else index.astype(np.int32)

@@ -15,6 +15,8 @@ from foldgauss.video.conditioning import Conditioned, Shape, condition
 from foldgauss.video.model import SH_C0, TAU_MAX
 from foldgauss.video.packing import columns
 
+#: Squared error of rounding to 8 bits.
+ROUNDING = 1 / (12 * 255.0**2)
 #: Draws of random signs a frame.
 DRAWS = 2
 #: Of the trace, on the diagonal of the paths' equations: a Gaussian seen in few frames leaves some of them open.
@@ -63,13 +65,19 @@ class Ledger:
 
     @property
     def effective_samples(self) -> float:
-        """How many independent errors tell as much: neighbours that err alike say the same thing twice.
+        """Of how many numbers the error costs bits, beyond those of rounding to 8 bits.
 
-        As of a first-order autoregression, n (1 - r) / (1 + r), along each direction; at least one of each line.
+        Errors are coded given their neighbours in time and in the picture, as a first-order autoregression: what is
+        new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are log2(1 + v / q) / 2, q
+        the variance of rounding, so a number counts v / (v + q). A picture that stands still is paid for once.
         """
-        alike = np.clip(self.alike, 0, 1)
-        shares = np.maximum((1 - alike) / (1 + alike), 1 / np.array([len(self.errors), *self.size]))
-        return float(self.num_samples * shares.prod())
+        mean = self.squared_error / self.num_samples
+        in_time, *in_space = 1 - np.clip(self.alike, 0, 1) ** 2
+        once = mean * float(np.prod(in_space))
+        each = once * float(in_time)
+        own, first = (v / (v + ROUNDING) if v > 0 else 0.0 for v in (each, once))
+        frames = len(self.errors)
+        return max(self.num_samples * (first + (frames - 1) * own) / frames, 1.0)
 
     @property
     def removed(self) -> Float[np.ndarray, "num"]:
