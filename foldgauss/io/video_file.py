@@ -28,7 +28,6 @@ MAX_WEBP_SIDE = 16_383
 MAX_GIF_FPS = 50.0  # frames of less than 2 hundredths of a second are shown for 10 by browsers
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
-MIN_SIZE = 16  # px; below this there is less than one tile and one SSIM window (11 taps) of picture
 MAX_FPS = 1000.0  # a container's time stamps are milliseconds
 
 Range = tuple[int | None, int | None]
@@ -112,20 +111,6 @@ def read_video(
         _check_fps(fps)
     read = _read_folder if path.is_dir() else _read_file
     kept, num_declared, found_fps = read(path, start, stop, prepare)
-    if min(kept[0].shape[:2]) < MIN_SIZE:
-        raise _error(
-            "path",
-            expected=f"frames of at least {MIN_SIZE}x{MIN_SIZE}",
-            got=f"{_shape_text(kept[0].shape)} in {str(path)!r}",
-            cure="Enlarge it with --size, or size=(height, width).",
-        )
-    if len(kept) < 2:
-        raise _error(
-            "path",
-            expected="at least 2 frames",
-            got=f"{len(kept)} in {str(path)!r}",
-            cure="Give a longer clip or range.",
-        )
     return Clip(_stacked(kept), float(found_fps if fps is None else fps), str(path), num_declared)
 
 
@@ -650,8 +635,8 @@ def _checked_range(frames: Range | None) -> tuple[int, int | None]:
     start = 0 if start is None else start
     if start < 0 or (stop is not None and stop < 0):
         raise _error("frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more.")
-    if stop is not None and stop - start < 2:
-        raise _error("frames", expected="A:B with at least 2 frames", got=_text(start, stop), cure="Choose B >= A + 2.")
+    if stop is not None and stop <= start:
+        raise _error("frames", expected="A:B with at least 1 frame", got=_text(start, stop), cure="Choose B > A.")
     return start, stop
 
 
@@ -669,10 +654,10 @@ def _checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tupl
     if size is None:
         return None
     height, width = size
-    if height != int(height) or width != int(width) or min(height, width) < MIN_SIZE:
+    if height != int(height) or width != int(width) or min(height, width) < 1:
         raise _error(
             parameter,
-            expected=f"height and width of at least {MIN_SIZE} px",
+            expected="height and width of whole pixels, at least 1",
             got=f"{height}x{width}",
             cure="Write it as HEIGHTxWIDTH, such as 160x320.",
         )

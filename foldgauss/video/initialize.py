@@ -136,7 +136,7 @@ def born(
 ) -> tuple[FoldedSplats, np.ndarray]:
     """Splats at `position` in frames `home`, one pixel wide, with the frames' own colours; and their sigma_t."""
     num, (height, width) = len(home), frames.shape[1:3]
-    interval = np.diff(times).min()
+    interval = np.diff(times).min(initial=1.0)  # one frame alone has all the time
     if motion is None:
         time = times[home] + rng.uniform(-0.5, 0.5, num) * interval
         coefficients = np.zeros((num, degree, 2), np.float32)
