@@ -91,7 +91,7 @@ def demo(
 
 @app.command()
 def fit(
-    video: Annotated[Path, typer.Argument(help="Video file, or folder of images in natural order.")],
+    video: Annotated[Path, typer.Argument(help="Video file, folder of images in natural order, or one image.")],
     out_path: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name].")
     ] = None,

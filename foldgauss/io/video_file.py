@@ -83,7 +83,7 @@ def read_video(
     fps: float | None = None,
     center_crop: tuple[int, int] | None = None,
 ) -> Clip:
-    """Read a video file, or a folder of images in natural order (img2 before img10).
+    """Read a video file, a folder of images in natural order (img2 before img10), or one image: a clip of one frame.
 
     `frames = (A, B)` keeps frames A <= i < B, None for an open end. `size = (height, width)` cuts each
     frame to that aspect around its centre (to whole pixels), then resizes it, by area where it shrinks and
@@ -109,7 +109,7 @@ def read_video(
     prepare = _fit_to(_checked_size(size), _checked_size(center_crop, "center_crop"))
     if fps is not None:
         _check_fps(fps)
-    read = _read_folder if path.is_dir() else _read_file
+    read = _read_folder if path.is_dir() else _read_image_file if _is_image(path) else _read_file
     kept, num_declared, found_fps = read(path, start, stop, prepare)
     return Clip(_stacked(kept), float(found_fps if fps is None else fps), str(path), num_declared)
 
@@ -156,7 +156,29 @@ def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) 
             cure="Give the folder that holds the frames, or a video file.",
         )
     _check_within(start, stop, len(images), folder)
-    chosen = images[start:stop]
+    return _read_images(images[start:stop], prepare)
+
+
+def _is_image(path: Path) -> bool:
+    """Whether a file is one image; what moves, as an animated PNG, is left to the decoder of videos."""
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        return False
+    with _quiet():
+        num_images = cv2.imcount(str(path))
+    if num_images > 1 and path.suffix.lower() in (".tif", ".tiff"):  # of which that decoder sees the first alone
+        got = f"{num_images} in {str(path)!r}"
+        raise _error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
+    return num_images == 1
+
+
+def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
+    """As `_read_folder`, of a file with one image."""
+    _check_within(start, stop, 1, path)
+    return _read_images([path], prepare)
+
+
+def _read_images(chosen: list[Path], prepare: Callable) -> tuple[list, int, float]:
+    """(prepared frames, their number, fps) of images of one size."""
     first_shape, kept = None, []
     for entry in chosen:
         image = _read_image(entry)
