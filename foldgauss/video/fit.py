@@ -237,8 +237,8 @@ def _num_views(config: FitConfig, num_frames: int) -> int:
 
 
 def running_psnr(state: FitState) -> float:
-    """dB, by the running mean of the squared error."""
-    return -10 * math.log10(max(state.error, 1e-12))
+    """dB, by the running mean of the squared error; at most 100, as of pictures that are equal (`psnr`)."""
+    return -10 * math.log10(max(state.error, 1e-10))
 
 
 class _Outlook:
