@@ -95,9 +95,7 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
         upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
         lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3, label="each step")
         lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6, label="running median")
-        lower.set(
-            xlabel=name, yscale="log" if (loss > 0).any() else "linear"
-        )  # a black clip costs nothing from the start
+        lower.set(xlabel=name, yscale="log" if (loss > 0).any() else "linear")  # a black clip's is 0 from the start
         lower.set_xlim(left=0)  # the start takes its seconds too
         for ax in (upper, lower):
             ax.grid(alpha=0.3)

@@ -41,8 +41,8 @@ from foldgauss.video.sensitivity import sensitivities
 #: Assumed of the fit where neither its clip nor its PSNR is known: few fits are better, and for worse ones the loss is
 #: less than stated.
 ASSUMED_PSNR = 40.0
-#: dB of pictures that are right but for their rounding to 8 bits, an error of variance 1/12. Better frames, as black ones
-#: are, count as these: or a loss that nobody sees in them would cost all others their bits.
+#: dB of pictures that are right but for their rounding to 8 bits, an error of variance 1/12. Better frames, as black
+#: ones are, count as these: or a loss that nobody sees in them would cost all others their bits.
 EXACT_PSNR = 10 * math.log10(12 * 255**2)
 #: Frames that a try is measured on; the one that is taken is measured on all.
 TRIED_FRAMES = 24
