@@ -30,6 +30,8 @@ CHUNK = 12_000  # tracks held at once: some 3 kB each on the way
 #: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side. Of a long
 #: clip as many in all as `MOST_PILOTS`, or they take longer than the fit.
 PILOT, CORE, ROUNDS, MOST_PILOTS = 32, 1.5, 50, 40_000
+#: With fewer starts than this for each frame, homes are drawn at even distances.
+FEW_STARTS = 16
 #: Share of the starts that is spread so that all frames, however short the tracks there, are covered alike. With more,
 #: the worst frames get better and the mean worse.
 EVEN_FRAMES = 0.2
@@ -68,7 +70,10 @@ def initialize(
     pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MOST_PILOTS // num_frames), 1))
     _, spread = make(pilot, drawn(pilot, share_of, rng)[0])
     chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
-    home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)  # by chance, but none left out
+    if num_gaussians < FEW_STARTS * num_frames:  # where chance would leave out whole stretches: at even distances
+        home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
+    else:
+        home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
     position, density = drawn(home, share_of, rng)
     splats, spread = make(home, position)
     alive = num_alive(times[home], spread, times)[home]
