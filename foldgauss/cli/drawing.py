@@ -195,14 +195,13 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     model = load_video_model(model_path)
     about = read_metadata(model_path)
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
-    times = np.asarray(model.frame_times.times())
     figures = {
         "frames": f"{model.num_frames} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second",
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
         **_economies(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
-        "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
+        "frame times": _about_times(np.asarray(model.frame_times.times())),
         "numbers stored": f"{model.num_floats:,}",
         "file": _size_of(model_path, model),
     }
@@ -230,6 +229,12 @@ def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
     if any(num_colors for _, num_colors in shared):
         told["colours"] = ", ".join(f"{colors:,} of {num:,} Gaussians" for num, colors in shared if colors)
     return told
+
+
+def _about_times(times: np.ndarray) -> str:
+    if len(times) == 1:
+        return "one frame alone, shown at all times"
+    return f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}"
 
 
 def _size_of(path: Path, model: VideoModel | EditedVideo) -> str:

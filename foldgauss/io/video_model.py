@@ -149,7 +149,7 @@ def _video_skeleton(header: dict) -> VideoModel:
         raise ValueError(f"envelope {header['envelope']!r} is unknown here")
     num, degree, num_frames = header["num_gaussians"], header["degree"], header["num_frames"]
     height, width = header["size"]
-    if min(num, num_frames - 1, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
+    if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
     one_of("compositing", compositing, COMPOSITINGS)
