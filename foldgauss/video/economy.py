@@ -110,6 +110,12 @@ def kinds_of(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8[np.nd
     return (last + LASTS * lasts).astype(np.uint8)
 
 
+def kinds_at_start(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8[np.ndarray, "num"]:
+    """Kinds of rows that have not learned yet: all powers, but for those that last, which stand still."""
+    kinds = kinds_of(rows, degree)
+    return np.where(kinds >= LASTS, kinds, degree).astype(np.uint8)
+
+
 def forget(first: np.ndarray, second: np.ndarray, kinds: UInt8[np.ndarray, "num"], degree: int) -> None:
     """Adam's moments of numbers that a kind does not have become 0, in place."""
     at = columns(degree)

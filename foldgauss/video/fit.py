@@ -20,7 +20,7 @@ from foldgauss.video.alpha import random_background
 from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
-from foldgauss.video.economy import Cut, averaged, cut, forget, kinds_of, shared_colors
+from foldgauss.video.economy import Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
@@ -312,7 +312,7 @@ def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = Non
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
-        kinds=np.full(len(rows), config.degree, np.uint8),
+        kinds=kinds_at_start(rows, config.degree),
         young=np.zeros(len(rows), bool),
         palette=np.zeros(0, np.int32),
         time_logits=logits,
@@ -385,7 +385,7 @@ def _splats(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: M
         return initialize_uniform(num, frames.shape[1:3], envelope=_envelope(config), **shape)
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
-    clip = {"times": times, "motion": motion, "opacity": opacity}
+    clip = {"times": times, "motion": motion, "opacity": opacity, "lasting": config.economy is not None}
     return initialize(frames, num, envelope=_envelope(config), **clip, **shape)
 
 

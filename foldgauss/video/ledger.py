@@ -183,7 +183,8 @@ def measured(
             by_size[alive] += weights * _by_log_size(done, d_factor)[:, None] ** 2 / DRAWS
             by_color[alive] += SH_C0**2 * (d_color.astype(float) ** 2).mean(1) / DRAWS
     num_samples = len(times) * 3 * math.prod(shape.size)
-    alike = products / max(errors.sum(), np.finfo(float).tiny)
+    lines = np.array([len(times), *shape.size])
+    alike = products * lines / np.maximum(lines - 1, 1) / max(errors.sum(), np.finfo(float).tiny)
     facts = errors, num_samples, shape.size, alike
     return Ledger(*facts, slope, own, by_path, span, by_color, by_size, misses)
 
