@@ -131,7 +131,9 @@ def fit(
     batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
     power: Annotated[
         float | None,
-        typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 2]."),
+        typer.Option(
+            help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 1; paper: 2]."
+        ),
     ] = None,
     compositing: Annotated[
         str | None, typer.Option(help="Blend of the Gaussians: over (front to back) or sum [default: over].")

@@ -3,11 +3,11 @@
 from foldgauss.video.compress import Compressed, compress
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
+from foldgauss.video.economy import Economy
 from foldgauss.video.edit import Edit, edit
 from foldgauss.video.edited import EditedVideo, Layer, layers
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
-from foldgauss.video.economy import Economy
 from foldgauss.video.growth import Growth
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
@@ -30,6 +30,7 @@ from foldgauss.video.timing import Clock, Span
 __all__ = [
     "Clock",
     "Compressed",
+    "Economy",
     "Edit",
     "EditedVideo",
     "Evaluation",
@@ -39,7 +40,6 @@ __all__ = [
     "FitState",
     "FoldedSplats",
     "FrameTimes",
-    "Economy",
     "Growth",
     "Layer",
     "LearningRates",

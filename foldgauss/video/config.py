@@ -108,7 +108,7 @@ class FitConfig:
     target_psnr: float | None = None  # dB, mean over all frames; no coarse levels then
     max_size_mb: float | None = None  # 10^6 bytes
     batch_size: int = 1
-    power: float = 2.0  # of the envelope: 1 as in the paper's text, 2 as in its code
+    power: float = 1.0  # of the envelope: 1 as in the paper's text, 2 as in its code
     floor: float = 0.0  # of the envelope
     ssim_share: float = 0.2
     seed: int = 0

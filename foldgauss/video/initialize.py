@@ -62,8 +62,8 @@ def initialize(
 
     Positions are drawn by image gradient within each frame, m_t at that frame, sizes by the local density of starts,
     colours from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a share of the time
-    for which that works; without, folds are at rest and sigma_t is log-uniform. With `lasting`, starts whose pixel never
-    changes are there throughout the clip, behind the others.
+    for which that works; without, folds are at rest and sigma_t is log-uniform. With `lasting`, starts whose pixel
+    never changes are there throughout the clip, behind the others.
     """
     rng = np.random.default_rng([seed, 0])
     num_frames = len(frames)

@@ -68,8 +68,8 @@ class Ledger:
         """Of how many numbers the error costs bits, beyond those of rounding to 8 bits.
 
         Errors are coded given their neighbours in time and in the picture, as a first-order autoregression: what is
-        new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are log2(1 + v / q) / 2, q
-        the variance of rounding, so a number counts v / (v + q). A picture that stands still is paid for once.
+        new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are log2(1 + v / q) / 2,
+        q the variance of rounding, so a number counts v / (v + q). A picture that stands still is paid for once.
         """
         mean = self.squared_error / self.num_samples
         in_time, *in_space = 1 - np.clip(self.alike, 0, 1) ** 2
