@@ -1,6 +1,6 @@
 """Numbers stored at one PSNR: models that hold only what the scene requires, beside plain ones, the best of a sweep.
 
-    python -m benchmarks.economy [--json FILE] [--clip NAME] [--size HxW] [--psnr DB] [--steps N] [--degrees 0,1,3,7]
+    python -m benchmarks.economy [--json FILE] [--clip NAME] [--size HxW] [--psnr DB] [--steps N] [--degrees 1,3,7,0]
 
 *Off* is a plain fit: for each degree the number of Gaussians is searched, in steps of a quarter octave, for the
 smallest that reaches the PSNR (mean over the frames); each fit that does is also *pruned*, of Gaussians in the order of
@@ -24,9 +24,9 @@ from foldgauss.video import Economy, FitConfig, VideoModel, evaluate, fit
 from foldgauss.video.light import LitModel, contributions
 from foldgauss.video.regions import Region
 
-SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (0, 1, 3, 7)
+SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (1, 3, 7, 0)
 #: Where the search begins, for the default clip, and its step.
-FIRST, RATIO = 9500, 2**0.25
+FIRST, RATIO = 13_500, 2**0.25
 
 
 def pruned(model: VideoModel, frames: np.ndarray, psnr: float) -> VideoModel:
@@ -80,8 +80,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=_common.size, default=SIZE, metavar="HxW", help="[160x320]")
     parser.add_argument("--psnr", type=float, default=PSNR, help="dB [33]")
     parser.add_argument("--steps", type=_common.whole, default=STEPS, help="[6000]")
-    parser.add_argument("--first", type=_common.whole, default=FIRST, help="Gaussians the search begins with [9500]")
-    parser.add_argument("--degrees", default=",".join(map(str, DEGREES)), help="[0,1,3,7]")
+    parser.add_argument("--first", type=_common.whole, default=FIRST, help="Gaussians the search begins with [13500]")
+    parser.add_argument("--degrees", default=",".join(map(str, DEGREES)), help="[1,3,7,0]")
     parser.add_argument("--model", type=Path, help="write the economical model here")
     options = _common.parse(parser, arguments)
     facts, figures, rows = _common.machine(), {}, []

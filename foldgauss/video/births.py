@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.initialize import SCALE_FACTOR, born, drawn
+from foldgauss.video.initialize import SCALE_FACTOR, born, drawn, steady, without_end
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack
 
@@ -45,7 +45,7 @@ def newborns(
 
     position, _ = drawn(home, share_of, rng)
     splats, _ = born(frames, home, position, times, degree, envelope, motion, rng, opacity)
-    rows = pack(splats)
+    rows = pack(without_end(splats, steady(frames, home, position)))
     size = frames.shape[1:3]
     apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
     rows[:, columns(degree)["log_scale"]] = np.log(SMALLER * SCALE_FACTOR * apart)

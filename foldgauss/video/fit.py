@@ -595,7 +595,7 @@ class _Stepper:
             setattr(state, name, np.concatenate([getattr(state, name), np.zeros_like(new)])[order])
         state.counts = np.concatenate([state.counts, np.zeros(num, np.int32)])[order]
         state.young = np.concatenate([state.young, np.ones(num, bool)])[order]
-        state.kinds = np.concatenate([state.kinds, np.full(num, config.degree, np.uint8)])[order]
+        state.kinds = np.concatenate([state.kinds, kinds_at_start(new, config.degree)])[order]
 
     def _target(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Frame k, whole, as the ledger sees it: with alpha over one colour for good."""

@@ -82,7 +82,7 @@ def initialize(
     position, density = drawn(home, share_of, rng)
     splats, spread = make(home, position)
     still = steady(frames, home, position) if lasting else np.zeros(num_gaussians, bool)
-    splats, spread = _without_end(splats, still), np.where(still, np.exp(LASTING), spread)
+    splats, spread = without_end(splats, still), np.where(still, np.exp(LASTING), spread)
     alive = num_alive(times[home], spread, times)[home]
     scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     order = rng.permutation(num_gaussians)  # depth has nothing to do with time
@@ -187,7 +187,7 @@ def steady(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.nda
     return most < (255 * STEADY) ** 2
 
 
-def _without_end(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
+def without_end(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
     """Those of the splats made to last, at rest."""
     return dataclasses.replace(
         splats,

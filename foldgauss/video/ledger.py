@@ -17,8 +17,9 @@ from foldgauss.video.packing import columns
 
 #: Squared error of rounding to 8 bits.
 ROUNDING = 1 / (12 * 255.0**2)
-#: Draws of random signs a frame.
-DRAWS = 2
+#: Draws of random signs: so many a frame, and in all for short clips. With few, estimates scatter, and what is unlucky in
+#: one of several rounds is dropped.
+DRAWS, LEAST_DRAWS = 3, 96
 #: Of the trace, on the diagonal of the paths' equations: a Gaussian seen in few frames leaves some of them open.
 _RIDGE = 1e-6
 
@@ -68,14 +69,15 @@ class Ledger:
         """Of how many numbers the error costs bits, beyond those of rounding to 8 bits.
 
         Errors are coded given their neighbours in time and in the picture, as a first-order autoregression: what is
-        new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are log2(1 + v / q) / 2,
-        q the variance of rounding, so a number counts v / (v + q). A picture that stands still is paid for once.
+        new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are
+        log2(1 + (v / q)^2) / 4, q the variance of rounding: none where pictures are rounded to the same, log2(v / q) / 2
+        beyond. So a number counts v^2 / (v^2 + q^2), and a picture that stands still is paid for once.
         """
         mean = self.squared_error / self.num_samples
         in_time, *in_space = 1 - np.clip(self.alike, 0, 1) ** 2
         once = mean * float(np.prod(in_space))
         each = once * float(in_time)
-        own, first = (v / (v + ROUNDING) if v > 0 else 0.0 for v in (each, once))
+        own, first = (v**2 / (v**2 + ROUNDING**2) for v in (each, once))
         frames = len(self.errors)
         return max(self.num_samples * (first + (frames - 1) * own) / frames, 1.0)
 
@@ -153,6 +155,7 @@ def measured(
     span = np.minimum(TAU_MAX * spread, 1.0)
     slope, own, misses = np.zeros((3, num))
     by_path, by_size, by_color = np.zeros((num, 2 * shape.degree + 1, 3)), np.zeros((num, 3)), np.zeros(num)
+    draws = max(DRAWS, -(-LEAST_DRAWS // len(times)))
     errors, products, before = np.zeros(len(times)), np.zeros(3), None
     signs_shape = (3, *shape.size)
     for k, t in enumerate(times):
@@ -175,13 +178,13 @@ def measured(
         powers = (u / span[alive])[:, None] ** np.arange(2 * shape.degree + 1)
         narrowed = _log_envelope(u / spread[alive], shape) / 2
         weights = np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
-        for _ in range(DRAWS):
+        for _ in range(draws):
             signs = rng.integers(0, 2, signs_shape, dtype=np.int8) * np.float32(2) - np.float32(1)
             d_mean, d_factor, d_opacity, d_color, _ = cpu.backward(trace, signs)
-            own[alive] += (done.opacity * d_opacity).astype(float) ** 2 / DRAWS
-            by_path[alive] += powers[:, :, None] * _outer(d_mean.astype(float))[:, None] / DRAWS
-            by_size[alive] += weights * _by_log_size(done, d_factor)[:, None] ** 2 / DRAWS
-            by_color[alive] += SH_C0**2 * (d_color.astype(float) ** 2).mean(1) / DRAWS
+            own[alive] += (done.opacity * d_opacity).astype(float) ** 2 / draws
+            by_path[alive] += powers[:, :, None] * _outer(d_mean.astype(float))[:, None] / draws
+            by_size[alive] += weights * _by_log_size(done, d_factor)[:, None] ** 2 / draws
+            by_color[alive] += SH_C0**2 * (d_color.astype(float) ** 2).mean(1) / draws
     num_samples = len(times) * 3 * math.prod(shape.size)
     lines = np.array([len(times), *shape.size])
     alike = products * lines / np.maximum(lines - 1, 1) / max(errors.sum(), np.finfo(float).tiny)
