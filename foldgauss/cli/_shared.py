@@ -246,7 +246,8 @@ def write_json(path: Path, figures: dict[str, Any]) -> None:
 def as_option(text: str) -> str:
     """An error about a setting, as one about its option: num_gaussians is --gaussians."""
     name, colon, rest = text.partition(":")
-    return f"--{name.replace('num_gaussians', 'gaussians').replace('_', '-')}{colon}{rest}"
+    name = name.replace("num_gaussians", "gaussians").replace("economy.psnr", "smallest_at_psnr")
+    return f"--{name.replace('_', '-')}{colon}{rest}"
 
 
 def check_picture_path(path: Path, *, others: str = "", single: bool = False) -> None:

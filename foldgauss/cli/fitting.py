@@ -41,6 +41,7 @@ from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import Clip, read_video, write_image, write_video
 from foldgauss.io.video_model import check_model_name, load_checkpoint, save_checkpoint, save_video_model
 from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.economy import Economy
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
 
 #: A running fit is kept on disk this often, in seconds.
@@ -105,6 +106,14 @@ def fit(
         typer.Option(help="Number of Gaussians at the start [default: by the preset, or the clip's size and length]."),
     ] = None,
     max_gaussians: Annotated[int | None, typer.Option(help="Largest number of Gaussians, grown or not.")] = None,
+    economy: Annotated[
+        bool,
+        typer.Option("--economy", help="Keep only what saves more bits than it takes: Gaussians, powers, colours."),
+    ] = False,
+    smallest_at_psnr: Annotated[
+        float | None,
+        typer.Option("--smallest-at-psnr", help="The smallest model whose mean PSNR is this, in dB; takes its time."),
+    ] = None,
     max_size_mb: Annotated[
         float | None,
         typer.Option("--max-size-mb", help="Largest model file, in 10^6 bytes; limits the Gaussians."),
@@ -122,7 +131,9 @@ def fit(
     batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
     power: Annotated[
         float | None,
-        typer.Option(help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 2]."),
+        typer.Option(
+            help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 1; paper: 2]."
+        ),
     ] = None,
     compositing: Annotated[
         str | None, typer.Option(help="Blend of the Gaussians: over (front to back) or sum [default: over].")
@@ -169,6 +180,8 @@ def fit(
         raise WrongUse(f"--out: expected another file than the clip, got {target}.")
     try:
         check_model_name(target, "out")
+        if economy or smallest_at_psnr is not None:
+            changes["economy"] = Economy(psnr=smallest_at_psnr)
         config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error

@@ -296,7 +296,8 @@ def _with_steps(config: FitConfig, num_frames: int, start: str, steps: int | Non
             raise invalid("steps", expected="a number for a config with minutes alone", got=None, cure=cure)
         steps = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = steps if start == "scratch" else max(1, round((1 - AGAIN_FROM) * steps))
-    return dataclasses.replace(config, steps=steps, minutes=None, target_psnr=None)
+    own = {"economy": None} if start == "model" else {}  # a model's Gaussians stay
+    return dataclasses.replace(config, steps=steps, minutes=None, target_psnr=None, **own)
 
 
 def resampled(

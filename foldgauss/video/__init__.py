@@ -3,6 +3,7 @@
 from foldgauss.video.compress import Compressed, compress
 from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
+from foldgauss.video.economy import Economy
 from foldgauss.video.edit import Edit, edit
 from foldgauss.video.edited import EditedVideo, Layer, layers
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
@@ -29,6 +30,7 @@ from foldgauss.video.timing import Clock, Span
 __all__ = [
     "Clock",
     "Compressed",
+    "Economy",
     "Edit",
     "EditedVideo",
     "Evaluation",

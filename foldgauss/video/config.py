@@ -6,6 +6,7 @@ from typing import Any
 
 from foldgauss._checks import invalid, one_of, whole, within
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.economy import Economy
 from foldgauss.video.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 
 
@@ -107,7 +108,7 @@ class FitConfig:
     target_psnr: float | None = None  # dB, mean over all frames; no coarse levels then
     max_size_mb: float | None = None  # 10^6 bytes
     batch_size: int = 1
-    power: float = 2.0  # of the envelope: 1 as in the paper's text, 2 as in its code
+    power: float = 1.0  # of the envelope: 1 as in the paper's text, 2 as in its code
     floor: float = 0.0  # of the envelope
     ssim_share: float = 0.2
     seed: int = 0
@@ -130,6 +131,7 @@ class FitConfig:
     falling: str = "all"  # which do: all, or "loc", that of positions alone
     two_cameras: bool = False  # see above
     growth: Growth | None = None  # None: the number of Gaussians stays
+    economy: Economy | None = None  # None: nothing is dropped
     #: "over": front to back as 3DGS and VeGaS; "sum": contributions added up, in any order, as GaussianImage.
     compositing: str = "over"
     options: RenderOptions = FINE
@@ -180,6 +182,11 @@ class FitConfig:
         kinds = dict.fromkeys(flags, bool) | {"rates": LearningRates, "options": RenderOptions}
         if self.growth is not None:
             kinds |= {"growth": Growth}
+        if self.economy is not None:
+            kinds |= {"economy": Economy}
+            if isinstance(self.economy, Economy) and self.economy.psnr is not None and self.target_psnr is not None:
+                got = f"also target_psnr={self.target_psnr:g}"
+                raise invalid("economy.psnr", expected="the only PSNR asked for", got=got, cure="Leave one out.")
         for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
                 raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
@@ -216,6 +223,8 @@ class FitConfig:
 HEADER_BYTES = 4096
 #: Steps where neither steps nor minutes are given: this many, and at least so many visits to every frame.
 DEFAULT_STEPS, DEFAULT_VISITS = 3000, 12
+#: Times as many for the smallest model at a PSNR: what is dropped must be made up for.
+SMALLEST_TIMES = 2
 
 
 def default_num_gaussians(num_frames: int, height: int, width: int) -> int:
@@ -249,4 +258,6 @@ def planned_steps(config: FitConfig, num_frames: int) -> int | None:
     """Steps of the whole fit; None where time ends it and no number of steps does."""
     if config.minutes is not None:
         return config.steps
-    return config.steps or max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
+    steps = max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
+    smallest = config.economy is not None and config.economy.psnr is not None
+    return config.steps or (SMALLEST_TIMES * steps if smallest else steps)

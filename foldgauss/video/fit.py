@@ -17,11 +17,14 @@ from foldgauss._checks import invalid, whole, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
+from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
+from foldgauss.video.economy import Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
+from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.metrics import psnr
 from foldgauss.video.model import FoldedSplats, VideoModel
@@ -44,12 +47,23 @@ class FitInfo(NamedTuple):
     num_alive: int  # Gaussians that took part in this step
     seconds: float  # spent fitting so far
     seconds_left: float  # by the pace so far
-    stopped_by: str | None  # the budget that bound, at the last step: "steps", "minutes" or "target_psnr"
+    stopped_by: str | None  # at the last step, what bound: "steps", "minutes", "target_psnr" or "smallest_at_psnr"
 
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["rows", "first", "second", "counts", "time_logits", "time_moments", "statistics"],
+    data_fields=[
+        "rows",
+        "first",
+        "second",
+        "counts",
+        "kinds",
+        "young",
+        "palette",
+        "time_logits",
+        "time_moments",
+        "statistics",
+    ],
     meta_fields=["step", "plan", "seconds", "error"],
 )
 @dataclasses.dataclass
@@ -60,6 +74,9 @@ class FitState:
     first: np.ndarray  # Adam's moments, likewise
     second: np.ndarray
     counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
+    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `economy.kinds_of`
+    young: np.ndarray  # bool (num,): born the last time that stock was taken
+    palette: np.ndarray  # int32 (num,): whose colours are one and the same; (0,): each has its own
     time_logits: np.ndarray  # float32 (num_frames - 1,)
     time_moments: optax.OptState
     statistics: Statistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
@@ -138,12 +155,16 @@ def fit_steps(
         state.step += 1
         if state.statistics is not None and state.plan:
             step.grow(state)
+        if config.economy is not None and state.plan:
+            step.economise(state)
         passed = time.perf_counter() - begun
         state.seconds += passed
         if not state.plan:
             state.plan = pace.plan(state, level, passed)
         begun = time.perf_counter()
         stopped_by = _stopped_by(state, config, frames)
+        if stopped_by == "smallest_at_psnr":
+            step.trim(state)
         state.seconds += time.perf_counter() - begun
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
@@ -190,9 +211,9 @@ class _Pace:
 
 
 def _progress(state: FitState, config: FitConfig) -> float:
-    """Share of the plan that is done; while there is none, of the number of steps asked for, or 0."""
+    """Share of the plan that is done, above 1 in overtime; while there is none, of the steps asked for, or 0."""
     plan = state.plan or config.steps
-    return min(state.step / plan, 1.0) if plan else 0.0
+    return state.step / plan if plan else 0.0
 
 
 def _level(state: FitState, levels: list[Level]) -> int:
@@ -206,11 +227,20 @@ def _stopped_by(state: FitState, config: FitConfig, frames: np.ndarray) -> str |
         return "target_psnr"
     # The pace that minutes are planned by is that of the Gaussians at the start, and of steps alone: where they grow,
     # or frames are looked at between steps, the clock decides.
-    by_clock = config.growth is not None or config.target_psnr is not None
+    by_clock = config.growth is not None or config.target_psnr is not None or config.economy is not None
     if by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes:
         return "minutes"
     if not state.plan or state.step < state.plan:
         return None
+    economy = config.economy
+    if economy is not None and economy.psnr is not None:
+        over = state.step >= OVERTIME * state.plan or (by_clock and state.seconds >= 60 * (config.minutes or math.inf))
+        if not over and (state.step - state.plan) % len(frames):
+            return None
+        if np.isfinite(state.rows).all() and _mean_psnr(state, config, frames) >= economy.psnr:
+            return "smallest_at_psnr"
+        if not over:
+            return None
     return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
 
 
@@ -261,7 +291,7 @@ class _Outlook:
 def _info(
     state: FitState, config: FitConfig, outlook: _Outlook, loss: float, num_alive: int, stopped_by: str | None
 ) -> FitInfo:
-    done = 1.0 if stopped_by else _progress(state, config)
+    done = 1.0 if stopped_by else min(_progress(state, config), 0.999)  # a PSNR asked for may take overtime
     left = 0.0 if stopped_by else outlook.seconds_left(state, done)
     return FitInfo(
         state.step, done, loss, running_psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by
@@ -282,6 +312,9 @@ def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = Non
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
+        kinds=kinds_at_start(rows, config.degree),
+        young=np.zeros(len(rows), bool),
+        palette=np.zeros(0, np.int32),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         statistics=None if config.growth is None else Statistics.zeros(len(rows)),
@@ -313,6 +346,9 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
+        kinds=kinds_of(rows, config.degree),
+        young=np.zeros(len(rows), bool),
+        palette=np.zeros(0, np.int32),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         statistics=None,
@@ -349,7 +385,7 @@ def _splats(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: M
         return initialize_uniform(num, frames.shape[1:3], envelope=_envelope(config), **shape)
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
-    clip = {"times": times, "motion": motion, "opacity": opacity}
+    clip = {"times": times, "motion": motion, "opacity": opacity, "lasting": config.economy is not None}
     return initialize(frames, num, envelope=_envelope(config), **clip, **shape)
 
 
@@ -403,6 +439,7 @@ class _Stepper:
         for name, place in columns(config.degree).items():
             self.rates[place] = getattr(config.rates, name)
             self.falling[place] = config.falling in ("all", name)
+        self.motion = None  # known where Gaussians have been born
         self.between = _Between(frames, config) if config.between_share > 0 else None
         self._make_room(state)
 
@@ -445,7 +482,10 @@ class _Stepper:
         rates = np.where(self.falling, self.rates * np.float32(decay), self.rates)
         moments = state.first, state.second, state.counts
         unit = UNIT_TIME if self.config.own_time else 0.0
-        sparse_adam(state.rows, self.grad, *moments, touched, rates, unit_time=unit)
+        sparse_adam(state.rows, self.grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit)
+        if len(state.palette):
+            at = columns(self.config.degree)["color_dc"]
+            state.rows[:, at] = averaged(state.rows[:, at], state.palette)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
             rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0))
@@ -480,8 +520,108 @@ class _Stepper:
             np.concatenate([part[stay], np.zeros_like(born)]) for part in (state.first, state.second)
         )
         state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
+        state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, self.config.degree)])
         state.statistics = Statistics.zeros(len(state.rows))
         self._make_room(state)
+
+    def economise(self, state: FitState) -> None:
+        """Take stock where that is due: drop what does not pay, bear where it does, share colours at the last."""
+        economy, degree = self.config.economy, self.config.degree
+        coarse = 1 - self.levels[-1].share
+        if self.config.growth is not None:
+            coarse = max(coarse, self.config.growth.for_plan(state.plan).until_step / state.plan)
+        steps = economy.steps(state.plan, coarse)
+        if state.step not in steps:
+            return
+        ledger, progress = self._ledger(state), state.step / state.plan
+        made = self._cut(state, ledger, economy.room(ledger, progress))
+        young = state.young[made.stay] if state.young.any() else None
+        self._keep(state, made)
+        room = most_gaussians(self.config, self.num_frames) - len(state.rows)
+        num = min(economy.births(ledger, progress, len(state.rows), young), room)
+        state.young = np.zeros(len(state.rows), bool)
+        if num > 0:
+            self._bear(state, ledger, num)
+        if state.step == steps[-1]:
+            color = state.rows[:, columns(degree)["color_dc"]]
+            index = shared_colors(color, ledger.by_color[made.stay], made.price, self.config.seed)
+            state.palette = np.zeros(0, np.int32) if index is None else index.astype(np.int32)
+        self._make_room(state)
+
+    def _cut(self, state: FitState, ledger: Ledger, room: float | None) -> Cut:
+        how = {"degree": self.config.degree, "pixels": pixels_per_unit(self.shapes[-1].size), "room": room}
+        return cut(state.rows, state.kinds, ledger, self.config.economy, **how)
+
+    def _keep(self, state: FitState, made: Cut) -> None:
+        state.rows, state.kinds = made.rows, made.kinds
+        state.first, state.second, state.counts, state.young = (
+            part[made.stay] for part in (state.first, state.second, state.counts, state.young)
+        )
+        state.palette = state.palette[made.stay] if len(state.palette) else state.palette
+        forget(state.first, state.second, state.kinds, self.config.degree)
+
+    def _bear(self, state: FitState, ledger: Ledger, num: int) -> None:
+        """Gaussians where the error is, in depth anywhere between the others."""
+        config, times = self.config, np.asarray(_frame_times(state.time_logits))
+        colors = np.ascontiguousarray(self.frames[..., :3])
+        if config.follow_motion and self.motion is None:
+            self.motion = Motion.of(colors)
+        self._make_room(state)
+
+        def squares(k: int) -> np.ndarray:
+            target, behind = self._target(k)
+            done = condition(state.rows, self.window, times[k], self.shapes[-1])
+            leaves = done.mean, done.factor, done.opacity, done.color, behind
+            drawn = {"compositing": config.compositing, "options": config.options}
+            return ((cpu.forward(*leaves, self.shapes[-1].size, **drawn).image - target) ** 2).sum(0)
+
+        alive = float(np.mean([((self.window[:, 0] < t) & (t < self.window[:, 1])).sum() for t in times]))
+        new = newborns(
+            num,
+            colors,
+            times,
+            ledger.errors,
+            squares,
+            alive,
+            degree=config.degree,
+            envelope=_envelope(config),
+            motion=self.motion,
+            opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
+            seed=(config.seed, 3, state.step),
+        )
+        order = among(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
+        state.rows = np.concatenate([state.rows, new])[order]
+        for name in ("first", "second"):
+            setattr(state, name, np.concatenate([getattr(state, name), np.zeros_like(new)])[order])
+        state.counts = np.concatenate([state.counts, np.zeros(num, np.int32)])[order]
+        state.young = np.concatenate([state.young, np.ones(num, bool)])[order]
+        state.kinds = np.concatenate([state.kinds, kinds_at_start(new, config.degree)])[order]
+
+    def _target(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Frame k, whole, as the ledger sees it: with alpha over one colour for good."""
+        behind = random_background(self.config.seed, k) if self.frames.shape[3] == 4 else self.background
+        return _planar(self.frames[k], behind), behind
+
+    def _ledger(self, state: FitState) -> Ledger:
+        times = np.asarray(_frame_times(state.time_logits))
+        how = {"compositing": self.config.compositing, "options": self.config.options, "seed": state.step}
+        return measured(state.rows, self.window, times, self.shapes[-1], self._target, **how)
+
+    def trim(self, state: FitState) -> None:
+        """At the end: leave out what the PSNR asked for has no need of, each try measured."""
+        config, ledger = self.config, self._ledger(state)
+        wanted, before = config.economy.psnr, dataclasses.replace(state)
+        most, best = ledger.squared_error * (10 ** (max(ledger.psnr - wanted, 0.0) / 10) - 1), None
+        for share in (1.0, 0.8, 0.6, 0.4, 0.2):
+            tried = dataclasses.replace(before)
+            self._keep(tried, self._cut(tried, ledger, share * most))
+            if _mean_psnr(tried, config, self.frames) >= wanted:
+                best = tried
+                break
+        if best is not None:
+            for name in ("rows", "kinds", "first", "second", "counts", "young", "palette"):
+                setattr(state, name, getattr(best, name))
+            self._make_room(state)
 
     def _batch(self, step: int) -> np.ndarray:
         """Views of a step: every pass visits all once, in an order that depends on seed and pass only.
@@ -589,6 +729,8 @@ def _envelope(config: FitConfig) -> TimeLikelihood:
 
 #: A fit to a target looks at all frames once in so many passes, which is a tenth of its time.
 LOOK_PASSES = 4
+#: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.
+OVERTIME = 1.5
 #: The pace is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
 #: share of the time.
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.growth import PUBLISHED_UNIT
-from foldgauss.video.model import SH_C0, TAU_MAX, FoldedSplats
+from foldgauss.video.model import LASTING, SH_C0, TAU_MAX, FoldedSplats
 from foldgauss.video.motion import Motion, fitted_folds
 
 #: Share of the starts that is spread evenly, so that flat parts are covered too.
@@ -26,6 +26,9 @@ TIME_SCALES = (0.02, 0.4)
 TRACK_SHARES, LEAST_FRAMES = (0.25, 1.2), 0.6
 #: Where the fold misses the track by more than this many pixels, sigma_t is shortened by this, some times.
 MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
+#: A pixel is steady whose colour changes by less than this (of 1, root mean square over the channels) in any of so many
+#: frames.
+STEADY, STEADY_FRAMES = 0.03, 64
 CHUNK = 12_000  # tracks held at once: some 3 kB each on the way
 #: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side. Of a long
 #: clip as many in all as `MOST_PILOTS`, or they take longer than the fit.
@@ -53,12 +56,14 @@ def initialize(
     times: np.ndarray | None = None,
     motion: Motion | None = None,
     opacity: float = START_OPACITY,
+    lasting: bool = False,
 ) -> FoldedSplats:
     """Starting splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
     Positions are drawn by image gradient within each frame, m_t at that frame, sizes by the local density of starts,
     colours from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a share of the time
-    for which that works; without, folds are at rest and sigma_t is log-uniform.
+    for which that works; without, folds are at rest and sigma_t is log-uniform. With `lasting`, starts whose pixel
+    never changes are there throughout the clip, behind the others.
     """
     rng = np.random.default_rng([seed, 0])
     num_frames = len(frames)
@@ -76,9 +81,12 @@ def initialize(
         home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
     position, density = drawn(home, share_of, rng)
     splats, spread = make(home, position)
+    still = steady(frames, home, position) if lasting else np.zeros(num_gaussians, bool)
+    splats, spread = without_end(splats, still), np.where(still, np.exp(LASTING), spread)
     alive = num_alive(times[home], spread, times)[home]
     scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     order = rng.permutation(num_gaussians)  # depth has nothing to do with time
+    order = order[np.argsort(still[order], kind="stable")]  # but what never changes is behind
     splats = dataclasses.replace(splats, log_scale=np.log(np.stack([scale, scale], -1), dtype=np.float32))
     return jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, splats)
 
@@ -166,6 +174,27 @@ def born(
         "color_dc": (color - 0.5) / SH_C0,
     }
     return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope), spread
+
+
+def steady(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Whether a pixel's colour is the same in all frames, but for noise: bool (num,); many frames are sampled."""
+    height, width = frames.shape[1:3]
+    column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
+    own, most = frames[home, row, column].astype(np.float32), np.zeros(len(home), np.float32)
+    for k in np.unique(np.linspace(0, len(frames) - 1, STEADY_FRAMES).round().astype(int)):
+        change = frames[k, row, column] - own
+        most = np.maximum(most, (change * change).mean(1))
+    return most < (255 * STEADY) ** 2
+
+
+def without_end(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
+    """Those of the splats made to last, at rest."""
+    return dataclasses.replace(
+        splats,
+        time_loc_logit=np.where(which, np.float32(0), splats.time_loc_logit),
+        log_time_scale=np.where(which, LASTING, splats.log_time_scale),
+        coefficients=np.where(which[:, None, None], np.float32(0), splats.coefficients),
+    )
 
 
 def along_tracks(

@@ -13,6 +13,8 @@ from foldgauss._threads import run_tasks
 from foldgauss.video.packing import columns
 
 CHUNK = 2048  # rows per task
+#: The unit of time of Gaussians that last, whose sigma_t says nothing: the standard deviation of all times of a clip.
+LASTING_TIME = 0.29
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
 
 _f, _u = nb.float32, nb.uint64
@@ -24,7 +26,7 @@ _UNBIAS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(_UNBIAS))[:,
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, rates, unit, spread, time, fold, unbias):
+def _update(start, stop, touched, rows, grad, first, second, counts, kinds, rates, unit, spread, time, fold, unbias):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     width, own = _u(rows.shape[1]), rates.copy()
     for k in range(start, stop):
@@ -33,8 +35,13 @@ def _update(start, stop, touched, rows, grad, first, second, counts, rates, unit
         taken = min(counts[i], len(unbias) - 1)
         unbias1, unbias2 = unbias[taken, 0], unbias[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
+        lasts, powers = kinds[i] >= 128, kinds[i] & 127
+        if lasts:  # its times stay
+            g[time], g[spread] = _f(0.0), _f(0.0)
+        for c in range(fold + 2 * powers, width):
+            g[c] = _f(0.0)
         if unit > _f(0.0):
-            wide = math.exp(row[spread]) / unit
+            wide = (_f(LASTING_TIME) if lasts else math.exp(row[spread])) / unit
             own[time] = rates[time] * wide
             short, power = _f(1.0) / wide, _f(1.0)
             for c in range(fold, width, 2):
@@ -57,17 +64,21 @@ def sparse_adam(
     touched: np.ndarray,
     rates: np.ndarray,
     *,
+    kinds: np.ndarray | None = None,
     unit_time: float = 0.0,
 ) -> None:
     """One step on rows `touched`, in place; their gradients are set back to zero.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps each row
-    has taken; `rates`: float32 (width,), learning rates by column. With `unit_time` > 0 the rates of m_t and of the
+    has taken; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which columns a row has, by
+    `economy.kinds_of` (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the
     fold are those at sigma_t = `unit_time`, and others' as `config.LearningRates` says.
     """
     place = columns(0)  # the fold comes last, so its degree moves none of these
     at = place["log_time_scale"].start, place["time_loc_logit"].start, place["coefficients"].start
     num = len(touched)
+    if kinds is None:
+        kinds = np.full(len(rows), (rows.shape[1] - at[2]) // 2, np.uint8)
 
     def work(start: int) -> None:
         _update(
@@ -79,6 +90,7 @@ def sparse_adam(
             first,
             second,
             counts,
+            kinds,
             rates,
             np.float32(unit_time),
             *at,

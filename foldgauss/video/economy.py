@@ -1,0 +1,280 @@
+"""Only what the scene requires: what of a fit's Gaussians is worth its bits; the rest is dropped.
+
+A number that is stored has a price in bits and must save as many in the residual. That is the description length of a
+two-part code (Rissanen 1978): bits of the parameters, and of the residual given them, which for n independent errors
+of one variance are n / 2 log2(squared error) and a constant.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.spatial import cKDTree
+
+from foldgauss._checks import invalid, whole, within
+from foldgauss.video.ledger import ROUNDING, Ledger
+from foldgauss.video.model import LASTING
+from foldgauss.video.packing import columns
+from foldgauss.video.quantise import moved_to
+
+#: Numbers of a Gaussian that lasts and stands still; m_t and sigma_t of one that comes and goes.
+NUMBERS, OF_TIME = 9, 2
+#: The bit of a kind that says: it lasts.
+LASTS = 128
+#: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
+#: lower; and so much higher, in dB, that the end is not missed by a hair.
+YET_TO_COME, SPARE = 0.8, 0.1
+#: Doubling the Gaussians brings so many dB (Bunny 160x320, degree 1: 4,000 28.7, 7,000 30.2); beyond this share of the
+#: plan none are born.
+DOUBLING, LAST_BIRTHS = 1.9, 0.6
+#: Of the Gaussians, in rounds without a PSNR: births; they go on while at least half of the last ones stay.
+BIRTHS = 0.5
+#: Rounds of Lloyd's algorithm, and sizes of palettes tried.
+_LLOYD, _PALETTES = 12, tuple(2**k for k in range(3, 17))
+#: Of the error that sharing colours adds, what is left once the others have made up for it.
+_LEFT = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Economy:
+    """What a fit pays for: at `rounds` points of its plan, evenly from `first_share` to `last_share`, it takes stock.
+
+    * Without `psnr`: a Gaussian, a power of its path, a beginning and an end of its life, a colour of its own stay if
+      they save more than `bits` for each of their numbers. (Compact files hold a number in 8 bits on the average.)
+      With `grows`, a `BIRTHS` share of Gaussians are born where the error is, as long as half of them stay.
+    * With `psnr`, dB: what is dropped is what costs the least, until the mean over all frames is that; where it seems
+      out of reach, Gaussians are born.
+
+    A round drops at most a share `most_dropped` of the Gaussians: then the others take over what is missed.
+    Raises ValueError for numbers out of range.
+    """
+
+    psnr: float | None = None
+    bits: float = 8.0
+    rounds: int = 8
+    first_share: float = 0.3
+    last_share: float = 0.88
+    most_dropped: float = 0.3
+    grows: bool = True
+
+    def __post_init__(self) -> None:
+        bounds = {"bits": "(0, inf)", "first_share": "(0, 1)", "last_share": "(0, 1)", "most_dropped": "(0, 1]"}
+        if self.psnr is not None:
+            bounds["psnr"] = "(0, 100]"
+        for name, interval in bounds.items():
+            if not within(getattr(self, name), interval):
+                raise invalid(f"economy.{name}", expected=f"a number in {interval}", got=repr(getattr(self, name)))
+        if not whole(self.rounds, 1):
+            raise invalid("economy.rounds", expected="a whole number >= 1", got=repr(self.rounds))
+        if self.first_share > self.last_share:
+            got = f"{self.first_share:g} and {self.last_share:g}"
+            raise invalid("economy.first_share, last_share", expected="in this order", got=got)
+
+    def steps(self, plan: int, coarse: float) -> Int[np.ndarray, "rounds"]:
+        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet."""
+        first = max(self.first_share, min(coarse + 0.05, self.last_share))
+        return np.clip(np.rint(np.linspace(first, self.last_share, self.rounds) * plan), 1, plan).astype(int)
+
+    def births(self, ledger: Ledger, progress: float, num: int, young: Bool[np.ndarray, "num"] | None) -> int:
+        """How many Gaussians are to be born to `num`; `young`: which of those born last are still there."""
+        if progress > LAST_BIRTHS:
+            return 0
+        if self.psnr is None:
+            goes_on = self.grows and (young is None or young.mean() >= 0.5)
+            return round(BIRTHS * num) if goes_on else 0
+        missing = self._aim(progress) - ledger.psnr
+        return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
+
+    def room(self, ledger: Ledger, progress: float) -> float | None:
+        """The squared error that a round may add; None where the price decides."""
+        if self.psnr is None:
+            return None
+        return ledger.squared_error * (10 ** ((ledger.psnr - self._aim(progress)) / 10) - 1)
+
+    def _aim(self, progress: float) -> float:
+        """dB that a round aims at: the rest of the fit brings more."""
+        return self.psnr + SPARE - YET_TO_COME * (1 - progress)
+
+
+# ------------------------------------------------------------------------------------------ kinds of Gaussians
+
+
+def kinds_of(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8[np.ndarray, "num"]:
+    """The last power that each packed row has, and `LASTS` more for one that lasts."""
+    at, num = columns(degree), len(rows)
+    there = (rows[:, at["coefficients"]].reshape(num, degree, 2) != 0).any(2)
+    last = np.max(there * np.arange(1, degree + 1), axis=1, initial=0)
+    lasts = (rows[:, at["log_time_scale"].start] == LASTING) & (rows[:, at["time_loc_logit"].start] == 0)
+    return (last + LASTS * lasts).astype(np.uint8)
+
+
+def kinds_at_start(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8[np.ndarray, "num"]:
+    """Kinds of rows that have not learned yet: all powers, but for those that last, which stand still."""
+    kinds = kinds_of(rows, degree)
+    return np.where(kinds >= LASTS, kinds, degree).astype(np.uint8)
+
+
+def forget(first: np.ndarray, second: np.ndarray, kinds: UInt8[np.ndarray, "num"], degree: int) -> None:
+    """Adam's moments of numbers that a kind does not have become 0, in place."""
+    at = columns(degree)
+    gone = np.repeat(np.arange(1, degree + 1), 2) > (kinds % LASTS)[:, None]
+    for moments in (first, second):
+        moments[:, at["coefficients"]][gone] = 0
+        for name in ("time_loc_logit", "log_time_scale"):
+            moments[kinds >= LASTS, at[name].start] = 0
+
+
+# ------------------------------------------------------------------------------------------ what is dropped
+
+
+class Cut(NamedTuple):
+    """What stays: indices of rows, in order; those rows anew, and their kinds.
+
+    `added`: squared error, as foretold; `price`: what a number had to save.
+    """
+
+    stay: Int[np.ndarray, "left"]
+    rows: Float32[np.ndarray, "left width"]
+    kinds: UInt8[np.ndarray, "left"]
+    added: float
+    price: float
+
+
+def price_of(ledger: Ledger, bits: float) -> float:
+    """The squared error that a number has to save: its bits, at d(n / 2 log2 e) / de = n / (2 e ln 2)."""
+    error = max(ledger.squared_error, ROUNDING * ledger.num_samples)
+    return bits * 2 * math.log(2) * error / ledger.effective_samples
+
+
+def cut(
+    rows: Float32[np.ndarray, "num width"],
+    kinds: UInt8[np.ndarray, "num"],
+    ledger: Ledger,
+    economy: Economy,
+    *,
+    degree: int,
+    pixels: float,
+    room: float | None = None,
+) -> Cut:
+    """What is left of packed rows, by what `ledger` says of them.
+
+    At the price of `price_of`; or where `room` is given, at the one that adds so much squared error. `pixels`: those
+    along a unit of model space. At least one Gaussian is left.
+    """
+    book = _Book(rows, kinds, ledger, degree, pixels)
+    if room is None:
+        return book.at(price_of(ledger, economy.bits), economy.most_dropped)
+    low, high = 0.0, max(ledger.squared_error, 1e-9)
+    for _ in range(40):
+        middle = (low + high) / 2 if low > 0 else high / 2
+        low, high = (middle, high) if book.added(middle, economy.most_dropped) <= room else (low, middle)
+        if low > 0 and high < 1.01 * low:
+            break
+    return book.at(low, economy.most_dropped)
+
+
+class _Book:
+    """All that may be done to each Gaussian, with the squared error that it adds and the numbers that it leaves."""
+
+    def __init__(self, rows: np.ndarray, kinds: np.ndarray, ledger: Ledger, degree: int, pixels: float):
+        self._rows, self._kinds, self._ledger, self._degree, self._pixels = rows, kinds, ledger, degree, pixels
+        self._at, num = columns(degree), len(rows)
+        own, lasts = kinds % LASTS, kinds >= LASTS
+        place = np.concatenate([rows[:, self._at["loc"]], rows[:, self._at["coefficients"]]], 1)
+        self._place = place.reshape(num, degree + 1, 2).astype(float) * pixels
+        added = np.full((num, degree + 1, 2), np.inf)
+        for lower in range(degree + 1):
+            which = np.flatnonzero(own > lower)
+            if len(which):
+                added[which, lower, 0] = ledger.lower(self._place, lower, which)[0]
+            added[own == lower, lower, 0] = 0
+        added[:, :, 1] = added[:, :, 0] + ledger.lasting[:, None]
+        added[lasts, :, 1], added[lasts, :, 0] = added[lasts, :, 0], np.inf
+        numbers = NUMBERS + 2 * np.arange(degree + 1)[:, None] + OF_TIME * np.array([1, 0])
+        self._added, self._numbers = added.reshape(num, -1), numbers.ravel()
+
+    def _chosen(self, price: float, most_dropped: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Who stays, the best for each, and the squared error that both add."""
+        num, removed = len(self._rows), self._ledger.removed
+        costs = self._added + price * self._numbers
+        best = np.argmin(costs, 1)
+        gain = costs[np.arange(num), best] - removed  # by leaving it out
+        out = np.flatnonzero(gain > 0)
+        most = min(math.ceil(most_dropped * num), num - 1)
+        if len(out) > most:
+            out = out[np.argsort(-gain[out], kind="stable")[:most]]
+        stays = np.ones(num, bool)
+        stays[out] = False
+        return stays, best, float(removed[out].sum() + self._added[stays, best[stays]].sum())
+
+    def added(self, price: float, most_dropped: float) -> float:
+        return self._chosen(price, most_dropped)[2]
+
+    def at(self, price: float, most_dropped: float) -> Cut:
+        """The cheapest at a price of a number, in squared error."""
+        stays, best, added = self._chosen(price, most_dropped)
+        stay = np.flatnonzero(stays)
+        lower, lasts = np.divmod(best[stay], 2)
+        kinds = (lower + LASTS * lasts).astype(np.uint8)
+        return Cut(stay, self._changed(stay, lower, lasts == 1), kinds, added, price)
+
+    def _changed(self, stay: np.ndarray, lower: np.ndarray, lasts: np.ndarray) -> np.ndarray:
+        rows, own, at = self._rows[stay].copy(), self._kinds[stay], self._at
+        place, now = self._place[stay], lasts & (own < LASTS)
+        for degree in range(self._degree):
+            here = np.flatnonzero((lower == degree) & (own % LASTS > degree))
+            if len(here):
+                place[here] = self._ledger.lower(self._place, degree, stay[here])[1]
+        logit = rows[now, at["time_loc_logit"].start].astype(float)
+        place[now] = moved_to(place[now], 0.5 - 1 / (1 + np.exp(-logit)))
+        rows[now, at["log_scale"]] += self._ledger.mean_log_envelope[stay[now], None].astype(np.float32)
+        rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, LASTING
+        moved = now | (lower < own % LASTS)
+        anew = (place[moved] / self._pixels).astype(np.float32)
+        rows[moved, at["loc"]] = anew[:, 0]
+        rows[moved, at["coefficients"]] = anew[:, 1:].reshape(len(anew), 2 * self._degree)
+        return rows
+
+
+# ------------------------------------------------------------------------------------------ colours shared
+
+
+def shared_colors(
+    color: Float32[np.ndarray, "num 3"], weight: Float[np.ndarray, "num"], price: float, seed: int
+) -> Int[np.ndarray, "num"] | None:
+    """Which Gaussians share a colour: the number of each one's in a palette; None where sharing does not pay.
+
+    `weight` is what the square of an error of a colour adds to the squared error, `price` what a number has to save.
+    Clusters by Lloyd's algorithm (1982), weighted, for palettes of several sizes.
+    """
+    num, best, least = len(color), None, 3 * len(color) * price
+    for size in (size for size in _PALETTES if size < num):
+        index = _clustered(color.astype(float), weight, size, seed)
+        palette = averaged(color, index)
+        error = float((weight * ((color - palette) ** 2).sum(1)).sum())
+        stored = len(np.unique(index)) * 3 + num * (1 if size <= 256 else 2) / 4
+        cost = _LEFT * error + stored * price
+        if cost < least:
+            best, least = index, cost
+    return best
+
+
+def averaged(color: Float32[np.ndarray, "num 3"], index: Int[np.ndarray, "num"]) -> Float32[np.ndarray, "num 3"]:
+    """Each row's mean with those of its number."""
+    count = np.maximum(np.bincount(index), 1)
+    sums = np.stack([np.bincount(index, color[:, c]) for c in range(3)], 1)
+    return (sums / count[:, None]).astype(np.float32)[index]
+
+
+def _clustered(color: np.ndarray, weight: np.ndarray, size: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng([seed, 5])
+    chance = np.maximum(weight, 1e-9 * weight.max() + 1e-300)
+    centre = color[rng.choice(len(color), size, replace=False, p=chance / chance.sum())]
+    for _ in range(_LLOYD):
+        index = cKDTree(centre).query(color)[1]
+        total = np.bincount(index, chance, size)
+        sums = np.stack([np.bincount(index, chance * color[:, c], size) for c in range(3)], 1)
+        centre = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], centre)
+    return cKDTree(centre).query(color)[1]

@@ -1,0 +1,350 @@
+"""Only what the scene requires: the ledger against pictures drawn without a part, and clips of which it is known."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from scenes_of_motion import SIZE, cut, disc, noise, still
+
+from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.render import cpu, pixels_per_unit
+from foldgauss.video import Economy, FitConfig, evaluate, fit
+from foldgauss.video.conditioning import Shape, condition, update_windows
+from foldgauss.video.economy import LASTS, averaged, forget, kinds_of, shared_colors
+from foldgauss.video.economy import cut as cut_rows
+from foldgauss.video.fit import fit_steps, to_model
+from foldgauss.video.ledger import Ledger, measured
+from foldgauss.video.light import LitModel
+from foldgauss.video.packing import columns, pack
+
+STEPS = 700
+
+
+@functools.cache
+def fitted(name: str, **changes):
+    clips = {
+        "one": lambda: still(1),
+        "still": lambda: still(60),
+        "line": lambda: disc(lambda s: (15 + 50 * s, 24)),
+        "parabola": lambda: disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2)),
+        "cut": cut,
+        "noise": noise,
+    }
+    frames = clips[name]()
+    config = FitConfig(num_gaussians=300, steps=STEPS, economy=Economy(), **changes)
+    counts, state = [], None
+    for state, info in fit_steps(frames, config):
+        counts.append(info.num_gaussians)
+    return frames, to_model(state, config, SIZE, 25.0), state, counts
+
+
+def weights(model) -> np.ndarray:
+    """(num_frames, num_gaussians): what each Gaussian adds to each frame, in pixels."""
+    lit = LitModel(model)
+    out = np.zeros((model.num_frames, model.num_gaussians))
+    for k in range(model.num_frames):
+        light = lit.frame(k)
+        out[k, light.alive] = light.total
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- what scenes require
+
+
+def test_a_still_costs_what_one_frame_costs():
+    _, one, _, _ = fitted("one")
+    frames, many, _, _ = fitted("still")
+    assert many.num_floats < 1.1 * one.num_floats
+    seen = weights(many).sum(0)
+    assert seen[many.splats.degrees == 0].sum() > 0.99 * seen.sum()
+    assert seen[many.splats.lasting].sum() > 0.99 * seen.sum()
+    assert evaluate(many, frames).mean_psnr > 45
+
+
+@pytest.mark.parametrize(("name", "degree"), [("line", 1), ("parabola", 2)])
+def test_a_path_has_the_degree_that_it_needs(name, degree):
+    frames, model, _, _ = fitted(name)
+    assert evaluate(model, frames).mean_psnr > 38
+    splats, seen = model.splats, weights(model)
+    # The disc is red: what adds to it there.
+    moving = np.asarray(splats.color_dc)[:, 0] > 0.5
+    share = [seen[:, moving & (splats.degrees == k)].sum() / seen[:, moving].sum() for k in range(4)]
+    assert share[degree] > 0.7
+    assert sum(share[: degree + 1]) > 0.9  # hardly any with more
+
+
+def test_what_is_still_beside_it_stands_still():
+    _, model, _, _ = fitted("line")
+    still_ones = np.asarray(model.splats.color_dc)[:, 0] < 0
+    seen = weights(model).sum(0)
+    assert seen[still_ones & model.splats.lasting].sum() > 0.5 * seen[still_ones].sum()
+
+
+def test_gaussians_end_at_a_cut():
+    frames, model, _, _ = fitted("cut")
+    seen = weights(model)
+    first, second = seen[:12].sum(0), seen[12:].sum(0)
+    both = np.minimum(first, second).sum()
+    assert both < 0.02 * seen.sum()
+    assert evaluate(model, frames).mean_psnr > 35
+
+
+def test_noise_ends_growth():
+    _, model, _, counts = fitted("noise")
+    assert max(counts) <= 1.2 * 300  # those born once do not pay, and none are born after them
+    assert counts[-1] < 0.5 * 300
+    assert model.num_gaussians == counts[-1]
+
+
+def test_what_pays_grows():
+    config = FitConfig(num_gaussians=160, steps=STEPS, economy=Economy())
+    counts = [info.num_gaussians for _, info in fit_steps(cut(), config)]
+    assert max(counts) > 1.4 * 160
+
+
+# ---------------------------------------------------------------------------------------------- the ledger
+
+
+def _scene(degree=2, power=1.0, floor=0.0):
+    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2), num_frames=8)
+    config = FitConfig(num_gaussians=120, steps=250, degree=degree, power=power, floor=floor)
+    model = fit(frames, config).model
+    rows = pack(model.splats)
+    shape = Shape(degree, power, floor, SIZE)
+    times = np.asarray(model.frame_times.times())
+    drawn = {"compositing": "over", "options": model.options}
+    return frames, rows, shape, times, drawn
+
+
+def _target(frames):
+    def target(k):
+        planes = frames[k] if frames[k].dtype == np.float32 else np.moveaxis(frames[k], -1, 0) * np.float32(1 / 255)
+        return planes, np.zeros(3, np.float32)
+
+    return target
+
+
+def _pictures(rows, shape, times, drawn) -> list[np.ndarray]:
+    """Planes (3, height, width), float32."""
+    window = np.empty((len(rows), 2), np.float32)
+    update_windows(rows, np.arange(len(rows)), window)
+    pictures = []
+    for t in times:
+        done = condition(rows, window, t, shape)
+        leaves = done.mean, done.factor, done.opacity, done.color, np.zeros(3, np.float32)
+        pictures.append(cpu.forward(*leaves, SIZE, **drawn).image)
+    return pictures
+
+
+def _error(rows, frames, shape, times, drawn) -> float:
+    shown = _pictures(rows, shape, times, drawn)
+    return sum(float(((shown[k] - _target(frames)(k)[0]).astype(float) ** 2).sum()) for k in range(len(times)))
+
+
+def _measured(rows, frames, shape, times, drawn, **how):
+    window = np.empty((len(rows), 2), np.float32)
+    update_windows(rows, np.arange(len(rows)), window)
+    return measured(rows, window, times, shape, _target(frames), **drawn, **how)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return _scene()
+
+
+def _mean_ledger(scene, draws=24):
+    ledgers = [_measured(*(scene[1], scene[0], *scene[2:]), seed=seed) for seed in range(draws)]
+    fields = {
+        field.name: np.mean([getattr(each, field.name) for each in ledgers], axis=0)
+        for field in dataclasses.fields(ledgers[0])
+        if field.name not in ("num_samples", "size")
+    }
+    return dataclasses.replace(ledgers[0], **fields)
+
+
+def test_errors_are_those_of_the_pictures(scene):
+    frames, rows, shape, times, drawn = scene
+    ledger = _measured(rows, frames, shape, times, drawn)
+    assert ledger.squared_error == pytest.approx(_error(rows, frames, shape, times, drawn), rel=1e-4)
+
+
+def test_leaving_out_costs_what_it_says(scene):
+    frames, rows, shape, times, drawn = scene
+    ledger, before = _mean_ledger(scene), _error(rows, frames, shape, times, drawn)
+    chosen = np.argsort(-ledger.own)[:: len(rows) // 12]
+    cost = [_error(np.delete(rows, i, 0), frames, shape, times, drawn) - before for i in chosen]
+    told = ledger.removed[chosen]
+    scale = max(map(abs, cost))
+    assert np.abs(told - cost).max() < 0.25 * scale
+    assert np.corrcoef(told, cost)[0, 1] > 0.97
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_lower_path_costs_what_it_says(scene, degree):
+    """Against the pictures themselves, where nothing but the path is wrong, and by little."""
+    _, rows, shape, times, drawn = scene
+    own = _pictures(rows, shape, times, drawn)
+    ledger, at, pixels = _mean_ledger((own, *scene[1:])), columns(shape.degree), pixels_per_unit(SIZE)
+    place = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2) * pixels
+    added, path = ledger.lower(place.astype(float), degree, np.arange(len(rows)))
+    assert (path[:, degree + 1 :] == 0).all()
+    ratios = []
+    for i in np.flatnonzero((added > 1e-5) & (added < 1e-3))[:15]:
+        changed = rows.copy()
+        changed[i, at["loc"]] = path[i, 0] / pixels
+        changed[i, at["coefficients"]] = (path[i, 1:] / pixels).ravel()
+        ratios.append(_error(changed, own, shape, times, drawn) / added[i])
+    assert len(ratios) >= 6
+    assert 0.6 < np.median(ratios) < 1.4
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_the_lower_path_is_the_best(degree):
+    """Against least squares over the frames, written out."""
+    rng = np.random.default_rng(degree)
+    u, factors = rng.uniform(-1, 1, 9), rng.normal(size=(9, 2, 2))
+    weights, path = factors @ factors.transpose(0, 2, 1), rng.normal(size=(4, 2))
+    parts = np.stack([weights[:, 0, 0], weights[:, 0, 1], weights[:, 1, 1]], 1)
+    span = 0.7
+    moments = ((u / span)[:, None, None] ** np.arange(7)[:, None] * parts[:, None]).sum(0)
+    none = np.zeros(1)
+    ledger = Ledger(none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, np.zeros((1, 3)), none)
+    added, lower = ledger.lower(path[None], degree, np.array([0]))
+    powers = u[:, None] ** np.arange(4)
+    # sum over frames of |F^T (powers (path - lower))|^2
+    design = np.einsum("tij,tk->tjki", factors, powers).reshape(18, 4, 2)
+    low = design[:, : degree + 1].reshape(18, -1)
+    wanted = design[:, degree + 1 :].reshape(18, -1) @ path[degree + 1 :].ravel()
+    best, left, *_ = np.linalg.lstsq(low, wanted, rcond=None)
+    assert added[0] == pytest.approx(left[0], rel=1e-3)
+    np.testing.assert_allclose(lower[0, : degree + 1], path[: degree + 1] + best.reshape(-1, 2), rtol=1e-3, atol=1e-4)
+
+
+def test_neighbours_that_err_alike_count_once():
+    frames, rows, shape, times, drawn = _scene()
+    same = np.repeat(frames[:1], 8, 0)
+    still_rows = rows.copy()
+    still_rows[:, columns(2)["coefficients"]] = 0
+    still_rows[:, columns(2)["log_time_scale"]] = 6
+    one = _measured(still_rows, same[:1], shape, times[:1], drawn)
+    many = _measured(still_rows, same, shape, times, drawn)
+    assert many.alike[0] > 0.999
+    assert many.effective_samples < 1.02 * one.effective_samples
+    rough = _measured(still_rows, noise(8), shape, times, drawn)
+    assert rough.effective_samples > 0.9 * rough.num_samples
+
+
+# ---------------------------------------------------------------------------------------------- kinds, colours
+
+
+def test_kinds_are_those_of_the_stored_model():
+    _, model, state, _ = fitted("line")
+    kinds = model.splats.degrees + LASTS * model.splats.lasting
+    np.testing.assert_array_equal(kinds_of(state.rows, model.degree), kinds)
+    np.testing.assert_array_equal(state.kinds >= LASTS, model.splats.lasting)
+    assert (state.kinds % LASTS >= model.splats.degrees).all()  # a power may be there and be 0
+
+
+def test_what_a_kind_has_not_got_never_moves():
+    frames = disc(lambda s: (15 + 50 * s, 24))
+    config = FitConfig(num_gaussians=200, steps=300, economy=Economy(rounds=2, first_share=0.3, last_share=0.4))
+    for state, info in fit_steps(frames, config):
+        pass
+    at, kinds = columns(config.degree), state.kinds
+    powers = np.repeat(np.arange(1, config.degree + 1), 2)
+    assert (kinds % LASTS < config.degree).any()
+    assert (state.rows[:, at["coefficients"]][powers > (kinds % LASTS)[:, None]] == 0).all()
+    assert (kinds >= LASTS).any()
+
+
+def test_forgotten_moments_are_those_of_numbers_that_are_gone():
+    first, second = np.ones((2, 3, 11 + 4), np.float32)
+    forget(first, second, np.array([2, 1, LASTS], np.uint8), 2)
+    at = columns(2)
+    assert first[:, at["coefficients"]].tolist() == [[1, 1, 1, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
+    assert second[:, at["log_time_scale"].start].tolist() == [1, 1, 0]
+    assert second[:, at["time_loc_logit"].start].tolist() == [1, 1, 0]
+    assert (first[:, at["color_dc"]] == 1).all()
+
+
+def test_colours_are_shared_where_it_pays():
+    rng = np.random.default_rng(0)
+    few = rng.normal(size=(8, 3))[rng.integers(0, 8, 400)].astype(np.float32)
+    many = rng.normal(size=(400, 3)).astype(np.float32)
+    index = shared_colors(few, np.ones(400), 1e-3, 0)
+    np.testing.assert_allclose(averaged(few, index), few, atol=1e-5)
+    assert shared_colors(many, np.ones(400), 1e-6, 0) is None
+    assert len(np.unique(shared_colors(many, np.ones(400), 10.0, 0))) == 8  # dear numbers: few colours
+
+
+def test_at_least_one_is_left():
+    _, model, state, _ = fitted("noise")
+    rows = state.rows[:3]
+    window = np.empty((3, 2), np.float32)
+    update_windows(rows, np.arange(3), window)
+    shape = Shape(3, 1.0, 0.0, SIZE)
+    times = np.asarray(model.frame_times.times())
+    ledger = measured(rows, window, times, shape, _target(noise()), compositing="over", options=model.options)
+    dear = Economy(bits=1e12, most_dropped=1.0)
+    assert len(cut_rows(rows, np.full(3, 3, np.uint8), ledger, dear, degree=3, pixels=80.0).stay) == 1
+
+
+# ---------------------------------------------------------------------------------------------- a PSNR asked for
+
+
+def test_the_smallest_at_a_psnr():
+    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
+    smallest = fit(frames, FitConfig(num_gaussians=300, steps=STEPS, economy=Economy(psnr=34)))
+    plain = fit(frames, FitConfig(num_gaussians=300, steps=STEPS, degree=1)).model
+    assert smallest.history[-1].stopped_by == "smallest_at_psnr"
+    assert 34 <= evaluate(smallest.model, frames).mean_psnr < 35.5
+    assert smallest.model.num_floats < 0.35 * plain.num_floats
+
+
+def test_a_psnr_out_of_reach_is_told():
+    result = fit(noise(4), FitConfig(num_gaussians=60, steps=60, economy=Economy(psnr=60)))
+    assert result.history[-1].stopped_by == "steps"
+    assert result.history[-1].step == 90  # in vain for half as long again
+    assert result.model.num_gaussians >= 60  # nothing was dropped
+
+
+def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path):
+    frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
+    config = FitConfig(num_gaussians=200, steps=120, economy=Economy(rounds=4))
+    kept = {}
+    for state, info in fit_steps(frames, config):
+        if info.step in (30, 60, 110):
+            kept[info.step] = save_checkpoint(tmp_path / f"{info.step}.ck", state, config=config, source={})
+    for path in kept.values():
+        again = load_checkpoint(path, config=config, source={})
+        for state_again, _ in fit_steps(frames, config, again):
+            pass
+        for name in ("rows", "kinds", "palette", "time_logits"):
+            np.testing.assert_array_equal(getattr(state_again, name), getattr(state, name))
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"psnr": 0.0}, r"economy\.psnr"),
+        ({"psnr": float("nan")}, r"economy\.psnr"),
+        ({"bits": 0}, r"economy\.bits"),
+        ({"rounds": 0}, r"economy\.rounds"),
+        ({"first_share": 0.9}, r"economy\.first_share, last_share"),
+        ({"most_dropped": 2}, r"economy\.most_dropped"),
+    ],
+)
+def test_bad_numbers_are_refused(changes, name):
+    with pytest.raises(ValueError, match=rf"^{name}: expected"):
+        Economy(**changes)
+
+
+def test_one_psnr_is_enough():
+    with pytest.raises(ValueError, match=r"^economy\.psnr: expected the only PSNR asked for"):
+        FitConfig(target_psnr=30, economy=Economy(psnr=30))
+
+
+def test_stock_is_taken_once_frames_are_whole():
+    steps = Economy(rounds=3, first_share=0.2, last_share=0.8).steps(1000, 0.6)
+    assert steps.tolist() == [650, 725, 800]
