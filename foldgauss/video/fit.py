@@ -20,7 +20,7 @@ from foldgauss.video.alpha import random_background
 from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
-from foldgauss.video.economy import Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
+from foldgauss.video.economy import LEAST_PASSES, Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
@@ -139,7 +139,7 @@ def fit_steps(
     _warm_up(frames, config)
     state = start(frames, config) if state is None else state
     step = _Stepper(frames, config, state)
-    pace = _Pace(config, [level.share for level in step.levels])
+    pace = _Pace(config, [level.share for level in step.levels], len(frames))
     outlook = _Outlook(state, config, step.levels)
     stopped_by = _stopped_by(state, config, frames)
     if stopped_by:  # a kept state that needs no more steps
@@ -185,8 +185,10 @@ class _Pace:
     """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that one which
     was stopped goes on as if it had not been."""
 
-    def __init__(self, config: FitConfig, shares: list[float]):
+    def __init__(self, config: FitConfig, shares: list[float], num_frames: int):
         self.config, self.shares, self.count = config, shares, 0
+        rounds = 0 if config.economy is None else config.economy.rounds
+        self.taken = ROUND * rounds * num_frames / config.batch_size  # steps that taking stock is worth, at most
         self.seconds = [[] for _ in shares]  # of steps, by level
 
     def plan(self, state: FitState, level: int, seconds: float) -> int:
@@ -206,6 +208,8 @@ class _Pace:
         seconds = [np.mean(own) for own in self.seconds]
         # The steps so far count as steps of the first level, which this many are still left of.
         left = (budget - state.seconds) / SLOWER + state.step * seconds[0]
+        if self.taken:
+            left = left / GROWN - min(self.taken * seconds[-1], left * ROUND / (ROUND + LEAST_PASSES))
         planned = max(int(left / np.dot(self.shares, seconds)), state.step)
         return min(planned, self.config.steps or planned)
 
@@ -530,7 +534,8 @@ class _Stepper:
         coarse = 1 - self.levels[-1].share
         if self.config.growth is not None:
             coarse = max(coarse, self.config.growth.for_plan(state.plan).until_step / state.plan)
-        steps = economy.steps(state.plan, coarse)
+        passes = state.plan * self.config.batch_size / self.num_frames
+        steps = economy.steps(state.plan, passes=passes, coarse=coarse)
         if state.step not in steps:
             return
         ledger, progress = self._ledger(state), state.step / state.plan
@@ -731,6 +736,10 @@ def _envelope(config: FitConfig) -> TimeLikelihood:
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.
 OVERTIME = 1.5
+#: Births make steps slower by this much, at first.
+GROWN = 1.15
+#: Taking stock of a frame costs as much as so many steps with it: a pass forward and four back.
+ROUND = 2.0
 #: The pace is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
 #: share of the time.
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05
