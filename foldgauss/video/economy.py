@@ -57,7 +57,7 @@ class Economy:
     psnr: float | None = None
     bits: float = 8.0
     rounds: int = 8
-    first_share: float = 0.3
+    first_share: float = 0.2
     last_share: float = 0.88
     most_dropped: float = 0.3
     grows: bool = True
