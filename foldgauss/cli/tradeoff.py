@@ -113,7 +113,7 @@ def tradeoff_command(
     seed: Annotated[int, typer.Option(help="Seed of all fits.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where results are kept.")] = False,
 ) -> None:
-    """Measure speed and size against quality, one setting at a time.
+    """Measure what speed and size cost, one setting at a time.
 
     Leaves a table (tradeoff.csv, tradeoff.json) and a plot (tradeoff.png), names the knee of each front, and tells the
     command that reproduces each point on it. Stopped, it goes on when it is run again. See docs/tradeoff.md.
