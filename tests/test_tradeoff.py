@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from commands import run
 
+from foldgauss.cli import _tradeoff as kept
 from foldgauss.cli import fitting
 from foldgauss.cli import tradeoff as command
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
@@ -74,6 +75,7 @@ def name_of(row):
         ([3, 2, 1], [33, 29, 30], [2, 0]),
         ([1, 1, 1], [30, 31, 29], [1]),
         ([1, 2, 3, 4], [30, 30.004, 30.008, 30.012], [0, 3]),
+        ([1, 1, 2, 2], [30.0, 30.005, 30.3, 31], [0, 3]),
         ([1, math.nan, 3], [math.inf, 30, 31], [2]),
         ([], [], []),
     ],
@@ -115,11 +117,11 @@ def test_each_turn_changes_one_thing_and_has_a_command():
     made, left = points(BASE, tuple(AXES), 132, (320, 640))
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
-    words = command._Words(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
+    words = kept.Words(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
     lines = [words.of(point, (320, 640)) for point in made]
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
-        changed = command._settings(point, BASE)
+        changed = kept.settings_of(point, BASE)
         allowed = {"base": (0,), "batch": (2,), "schedule": (1, 2)}.get(point.axis, (1,))
         assert len(changed) in allowed
         assert "my clip.mp4" in shlex.split(line)
@@ -223,13 +225,13 @@ def test_everything_is_there(done, clip):
         table = list(csv.DictReader(file))
     assert [name_of(row) for row in table] == list(rows)
     for row in table:
-        kept = rows[name_of(row)]
-        for name in ("psnr", "ssim", "seconds", "bytes", "floats", "gaussians", "frames_per_second"):
-            assert float(row[name]) == kept[name]
-        assert row["command"] == kept["command"]
-        for column in command.COSTS:
-            assert (name_of(row) in record["fronts"][column]["front"]) == (column in row["front"].split())
-            assert (name_of(row) == record["fronts"][column]["knee"]) == (column in row["knee"].split())
+        same = rows[name_of(row)]
+        for name in ("psnr", "ssim", "seconds", "cpu_seconds", "bytes", "floats", "gaussians", "frames_per_second"):
+            assert float(row[name]) == same[name]
+        assert row["command"] == same["command"]
+        for cost in kept.COSTS:
+            assert (name_of(row) in record["fronts"][cost]["front"]) == (cost in row["front"].split())
+            assert (name_of(row) == record["fronts"][cost]["knee"]) == (cost in row["knee"].split())
     # What is told is so: the model beside it is the base, and more steps are better.
     base = load_video_model(done / "base.safetensors")
     scores = evaluate(base, read_video(clip, frames=(1, 6)).frames)
@@ -247,7 +249,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record = record_of(done)
     rows = {name_of(row): row for row in record["points"]}
-    chosen = {name for column in command.COSTS for name in record["fronts"][column]["front"]}
+    chosen = {name for cost in kept.COSTS for name in record["fronts"][cost]["front"]}
     chosen |= {"base", "batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played", "ssim 0.5", "compositing sum"}
     chosen |= {f"precision {turn.value}" for turn in AXES["precision"]}
     for name in sorted(chosen):
@@ -279,9 +281,12 @@ def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
     before = record_of(target)["points"]
     assert len(before) < 14
     fitted, steps = [], command.fit_steps
-    monkeypatch.setattr(
-        command, "fit_steps", lambda frames, config: fitted.append(config.steps) or steps(frames, config)
-    )
+
+    def watched(frames, config):
+        fitted.extend([config.steps] if config.steps > 2 else [])  # else it only compiles
+        return steps(frames, config)
+
+    monkeypatch.setattr(command, "fit_steps", watched)
     # The base's model is fitted again where it has gone.
     (target / "base.safetensors").unlink()
     assert run(*arguments) == 0
@@ -300,13 +305,13 @@ def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
 
 
 def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
-    target, count, kept = tmp_path / "results", [], command.evaluate
+    target, count, looked = tmp_path / "results", [], command.evaluate
 
     def stopped(*given, **more):
         count.append(1)
-        if len(count) == 3:
+        if len(count) == 4:  # the first is that of the pace
             raise KeyboardInterrupt
-        return kept(*given, **more)
+        return looked(*given, **more)
 
     monkeypatch.setattr(command, "evaluate", stopped)
     assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 1
@@ -340,6 +345,7 @@ def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, step
     [
         (["--axes", "time,speed"], "--axes: expected some of time, gaussians, degree"),
         (["--axes", ""], "--axes: expected some of"),
+        (["--clock", "sun"], "--clock: expected one of 'wall', 'cpu'"),
         (["--minutes", "0"], "--minutes: expected a number above 0"),
         (["--minutes", "nan"], "--minutes: expected a number above 0"),
         (["--seed", "-1"], "--seed: expected a whole number >= 0"),
@@ -402,9 +408,9 @@ def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
     (config,) = seen
     assert (config.ssim_share, config.quarter_share, config.half_share) == (0.3, 0.1, 0.2)
-    kept = load_video_model(target).options
-    assert (kept.alpha_cutoff, kept.support_radius, kept.transmittance_stop) == (0.01, 2.0, 0.02)
-    assert kept.low_pass == FitConfig().options.low_pass
+    options = load_video_model(target).options
+    assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
+    assert options.low_pass == FitConfig().options.low_pass
 
 
 @pytest.mark.parametrize("words", [["fit"], ["evaluate"], ["render"]])

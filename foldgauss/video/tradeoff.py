@@ -82,7 +82,6 @@ AXES: Mapping[str, tuple[Turn, ...]] = MappingProxyType(
         "degree": (
             Turn("0", fit={"degree": 0}, work=0.9),
             Turn("1", fit={"degree": 1}, work=0.9),
-            Turn("5", fit={"degree": 5}, work=1.1),
             Turn("7", fit={"degree": 7}, work=1.3),
         ),
         # As many frames are seen: of a batch's steps there are fewer.
@@ -97,7 +96,7 @@ AXES: Mapping[str, tuple[Turn, ...]] = MappingProxyType(
         ),
         "cutoff": _cutoffs(),
         "precision": tuple(Turn(stored, stored=stored) for stored in (FLOAT16, *PASSES)),
-        "power": (Turn("0", fit={"power": 0.0}), Turn("1", fit={"power": 1.0}), Turn("4", fit={"power": 4.0})),
+        "power": (Turn("0", fit={"power": 0.0}), Turn("1", fit={"power": 1.0})),
         "compositing": (Turn("sum", fit={"compositing": "sum"}),),
         "ssim": (Turn("0", fit={"ssim_share": 0.0}, work=0.9), Turn("0.5", fit={"ssim_share": 0.5})),
     }
@@ -214,7 +213,8 @@ def _costs(made: Sequence[Point], pace: Pace, num_frames: int) -> tuple[float, f
 def front(cost: Sequence[float], quality: Sequence[float], least_gain: float = LEAST_GAIN) -> list[int]:
     """Indices of the Pareto front, the cheapest first: each is better by more than `least_gain` than all cheaper ones.
 
-    **Shapes:** one cost and one quality per point. Points with a number that is not finite are left out.
+    **Shapes:** one cost and one quality per point. Points with a number that is not finite are left out; of those that
+    cost the same and differ by no more than `least_gain`, the first one stands.
 
     **Example:** `front([1, 2, 3], [30, 29, 33]) == [0, 2]`.
     """
@@ -222,7 +222,8 @@ def front(cost: Sequence[float], quality: Sequence[float], least_gain: float = L
     chosen, best = [], -math.inf
     for k in sorted(known, key=lambda k: (cost[k], -quality[k])):
         if quality[k] > best + least_gain:
-            chosen.append(k)
+            least = max(quality[k] - least_gain, best + least_gain)
+            chosen.append(next(j for j in known if cost[j] == cost[k] and quality[j] >= least))
             best = quality[k]
     return chosen
 
@@ -265,15 +266,28 @@ def halved(model: VideoModel) -> VideoModel:
     return eqx.tree_at(lambda m: m.splats, model, dataclasses.replace(splats, **kept))
 
 
-def frames_per_second(model: VideoModel | EditedVideo) -> float:
-    """How fast a video is drawn at its own size and times, conditioning included: each frame at its fastest of some."""
-    playback, times = Playback(model), np.asarray(model.frame_times.times())
-    times = times[np.unique(np.linspace(0, len(times) - 1, _SHOWN).round().astype(int))]
-    playback.frame(times[0])  # kernels are there from here on
-    best = np.full(len(times), np.inf)
+def seconds_per_frame(*models: VideoModel | EditedVideo) -> list[float]:
+    """How long each video takes to draw a frame at its own size and times, conditioning included.
+
+    They are drawn in turn, frame by frame, and of each frame the fastest of a few rounds counts: so what else the
+    machine does tells on all alike.
+    """
+    playbacks = [Playback(model) for model in models]
+    num_frames = min(model.num_frames for model in models)
+    shown = np.unique(np.linspace(0, num_frames - 1, _SHOWN).round().astype(int))
+    times = [np.asarray(model.frame_times.times())[shown] for model in models]
+    for playback, own in zip(playbacks, times, strict=True):
+        playback.frame(own[0])  # kernels are there from here on
+    best = np.full((len(models), len(shown)), np.inf)
     for _ in range(_ROUNDS):
-        for k, t in enumerate(times):
-            begun = time.perf_counter()
-            playback.frame(t)
-            best[k] = min(best[k], time.perf_counter() - begun)
-    return float(len(times) / best.sum())
+        for k in range(len(shown)):
+            for number, playback in enumerate(playbacks):
+                begun = time.perf_counter()
+                playback.frame(times[number][k])
+                best[number, k] = min(best[number, k], time.perf_counter() - begun)
+    return best.mean(1).tolist()
+
+
+def frames_per_second(model: VideoModel | EditedVideo) -> float:
+    """How fast a video is drawn, see `seconds_per_frame`."""
+    return 1 / seconds_per_frame(model)[0]
