@@ -218,7 +218,7 @@ def test_everything_is_there(done, clip):
         "tradeoff.png",
     }
     assert {row["axis"] for row in rows.values()} == {"base", *AXES} - {"schedule"}
-    assert set(record["fronts"]["left_out"]) == {f"schedule {turn.value}" for turn in AXES["schedule"]}
+    assert set(record["left_out"]) == {f"schedule {turn.value}" for turn in AXES["schedule"]}
     assert {"cpu", "cores", "load_average", "jax"} <= set(record["machine"])
     assert min(cv2.imread(str(done / "tradeoff.png")).shape[:2]) > 500
     with open(done / "tradeoff.csv", newline="") as file:

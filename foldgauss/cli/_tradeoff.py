@@ -30,7 +30,7 @@ FIT_OPTIONS = {"num_gaussians": "--gaussians"} | {
 DRAW_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("alpha_cutoff", "support_radius", "transmittance_stop")
 }
-#: Panels of the plot: what costs, its units, and whether more of it is better; the column is chosen by `_columns`.
+#: Panels of the plot: what costs, its label, and whether more of it is better.
 COSTS = {
     "time": ("fit time", "time to fit (s)", False),
     "size": ("file size", "file (bytes)", False),
@@ -57,6 +57,7 @@ class Record:
     plan: dict[str, Any] = dataclasses.field(default_factory=dict)
     rows: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     fronts: dict[str, Any] = dataclasses.field(default_factory=dict)
+    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
     machine: dict[str, Any] = dataclasses.field(default_factory=machine)
 
     def __post_init__(self) -> None:
@@ -89,7 +90,8 @@ class Record:
 
     def keep(self) -> None:
         kept = {"settings": self.settings, "machine": self.machine, "plan": self.plan}
-        write_json(self.path, kept | {"fronts": self.fronts, "points": list(self.rows.values())})
+        kept |= {"left_out": self.left_out, "fronts": self.fronts}
+        write_json(self.path, kept | {"points": list(self.rows.values())})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +168,7 @@ def report(record: Record, made: list[Point], left: list[Left], clock: str) -> N
             "front": [names[k] for k in chosen],
             "knee": None if at is None else names[at],
         }
-    record.fronts["left_out"] = {one.name: one.why for one in left}
+    record.left_out = {one.name: one.why for one in left}
     record.keep()
     _write_csv(folder / ROWS, rows, record.fronts)
     try:

@@ -105,8 +105,7 @@ def tradeoff_command(
     make_folder(out_dir)
     run = _Run(clip, record, Words(video, size, frames, out_dir), noted(clip, seed, frames))
     base = run.planned(wanted, chosen, minutes, steps)
-    shape = {"has_alpha": clip.has_alpha}
-    made, left = points(base, chosen, clip.num_frames, clip.size, **shape)
+    made, left = points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
     for one in left:
         err.print(f"note: {one.name} is left out: {one.why}.", soft_wrap=True)
     try:
@@ -142,7 +141,6 @@ class _Run:
             self._say(len(made), chosen, expected)
             if steps is None:
                 self._say_misfit(len(made), chosen, full, expected, minutes)
-        make_folder(self.folder)
         self.record.keep()
         return dataclasses.replace(wanted, num_gaussians=num, steps=self.record.plan["steps"])
 
@@ -213,7 +211,7 @@ class _Run:
                 shown, spent = self._fitted(point.config, tell)
                 scores = evaluate(shown, self.clip.frames)
                 save_video_model(path, shown, metadata=self.about | scores_of(scores))
-            num_bytes = path.stat().st_size
+            num_bytes = (self.folder / BASE if point.played is not None else path).stat().st_size
         tell("playing")
         if point.axis == "base":
             rate = frames_per_second(shown)
@@ -242,7 +240,6 @@ class _Run:
         fitted = _Spent(self.record.rows["base"]["seconds"], self.record.rows["base"]["cpu_seconds"])
         if point.played is not None:
             shown = dataclasses.replace(model, options=point.played)
-            path.write_bytes((self.folder / BASE).read_bytes())
             return shown, evaluate(shown, self.clip.frames), fitted
         if point.stored == FLOAT16:
             score = functools.partial(evaluate, frames=self.clip.frames)
@@ -301,7 +298,7 @@ class _Spent(NamedTuple):
 
 @contextmanager
 def _passing(folder: Path, point: Point) -> Iterator[Path]:
-    """A file that is written to be weighed, and gone afterwards."""
+    """A place for a file that is only written to be weighed: it is gone afterwards."""
     suffix = ".fgz" if point.stored in PASSES else ".safetensors"
     path = folder / f".weighed{suffix}"
     try:
