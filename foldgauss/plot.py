@@ -194,7 +194,7 @@ def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) ->
     line = places[list(panel.front)]
     for one, other in itertools.pairwise(line):
         along = one + np.linspace(0, 1, 20)[1:-1, None] * (other - one)
-        taken += [Bbox.from_extents(*(place - 2), *(place + 2)) for place in along]
+        taken += [Bbox.from_extents(*(place - 4), *(place + 4)) for place in along]
     for k in sorted(panel.front, key=lambda k: (k != panel.knee, -quality[k])):
         is_knee = k == panel.knee
         text = f"knee: {names[k]}" if is_knee else names[k]

@@ -21,7 +21,7 @@ from foldgauss.video.pyramid import levels
 #: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
 #: with that many passes over the clip, at a loss of at most `MAX_LOSS_DB`.
 FLOAT32, FLOAT16 = "float32", "float16"
-PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, mended": 2})
+PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, mended": 4})
 MAX_LOSS_DB = 0.2
 #: What compressing takes, in steps of a fit per frame: about what was measured.
 _COMPRESSING = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, mended": 18.0}
@@ -64,7 +64,7 @@ def _cutoffs() -> tuple[Turn, ...]:
     for name, (shown, each) in values.items():
         played += [Turn(f"{shown} {text}, played", options={name: value}, played=True) for text, value in each]
         text, value = each[1]
-        fitted.append(Turn(f"{shown} {text}, fitted", options={name: value}, work=0.9))
+        fitted.append(Turn(f"{shown} {text}, fitted", options={name: value}, work=0.85))
     return (*played, *fitted)
 
 
@@ -82,9 +82,9 @@ AXES: Mapping[str, tuple[Turn, ...]] = MappingProxyType(
             Turn("{num_gaussians}", scale={"num_gaussians": 2}, work=1.6),
         ),
         "degree": (
-            Turn("0", fit={"degree": 0}, work=0.9),
+            Turn("0", fit={"degree": 0}, work=0.75),
             Turn("1", fit={"degree": 1}, work=0.9),
-            Turn("7", fit={"degree": 7}, work=1.3),
+            Turn("7", fit={"degree": 7}, work=1.1),
         ),
         # As many frames are seen: of a batch's steps there are fewer.
         "batch": (
@@ -99,8 +99,8 @@ AXES: Mapping[str, tuple[Turn, ...]] = MappingProxyType(
         "cutoff": _cutoffs(),
         "precision": tuple(Turn(stored, stored=stored) for stored in (FLOAT16, *PASSES)),
         "power": (Turn("0", fit={"power": 0.0}), Turn("1", fit={"power": 1.0})),
-        "compositing": (Turn("sum", fit={"compositing": "sum"}),),
-        "ssim": (Turn("0", fit={"ssim_share": 0.0}, work=0.9), Turn("0.5", fit={"ssim_share": 0.5})),
+        "compositing": (Turn("sum", fit={"compositing": "sum"}, work=0.85),),
+        "ssim": (Turn("0", fit={"ssim_share": 0.0}, work=0.85), Turn("0.5", fit={"ssim_share": 0.5})),
     }
 )
 
