@@ -329,8 +329,9 @@ def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
     ],
 )
 def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
-    """The fits are 4.75 of the base's, at a pace with which 1,000 steps of it take a minute in all."""
-    pace = Pace(start=0.0, step=60 / 1.1 / (4.75 * 1000), look=0.0)
+    """At a pace with which all fits take a minute if the base has 1,000 steps."""
+    work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
+    pace = Pace(start=0.0, step=60 / command.SLOWER / (work * 1000.001), look=0.0)
     monkeypatch.setattr(command._Run, "_pace", lambda self, config: pace)
     monkeypatch.setattr(command._Run, "measure", lambda self, made, base: (_ for _ in ()).throw(KeyboardInterrupt))
     arguments = ["--axes", "time,compositing", "--minutes", minutes]
