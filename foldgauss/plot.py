@@ -82,7 +82,7 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
 
     **Shapes:** `history` has at least one step; `axes`, given or made, are (2, 2).
 
-    **Units:** dB, seconds of fitting, the loss on a logarithmic scale.
+    **Units:** dB, seconds of fitting, the loss on a logarithmic scale unless it is 0 throughout.
 
     **Example:** `plot_history(fit(frames).history)[0, 0].figure.savefig("fit.png")`
 
@@ -98,7 +98,7 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
         upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
         lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3, label="each step")
         lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6, label="running median")
-        lower.set(xlabel=name, yscale="log")
+        lower.set(xlabel=name, yscale="log" if (loss > 0).any() else "linear")  # a black clip's is 0 from the start
         lower.set_xlim(left=0)  # the start takes its seconds too
         for ax in (upper, lower):
             ax.grid(alpha=0.3)

@@ -11,7 +11,9 @@ SIZE, NUM, NUM_FRAMES = (40, 64), 40, 7
 OBJECT = np.arange(NUM) < 12
 
 
-def soft_model(*, power=2.0, floor=0.0, options=None, size=SIZE, degree=3, seed=0, compositing="over") -> VideoModel:
+def soft_model(
+    *, power=2.0, floor=0.0, options=None, size=SIZE, degree=3, seed=0, compositing="over", num_frames=NUM_FRAMES
+) -> VideoModel:
     rng = np.random.default_rng(seed)
 
     def normal(*shape, scale=1.0):
@@ -30,4 +32,4 @@ def soft_model(*, power=2.0, floor=0.0, options=None, size=SIZE, degree=3, seed=
         envelope=TimeLikelihood(power, floor),
     )
     options = RenderOptions.exact() if options is None else options
-    return VideoModel(splats, FrameTimes.uniform(NUM_FRAMES), size, 25.0, options, compositing)
+    return VideoModel(splats, FrameTimes.uniform(num_frames), size, 25.0, options, compositing)

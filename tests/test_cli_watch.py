@@ -215,7 +215,7 @@ def test_errors_name_the_option(clip, tmp_path, capsys):
         (["--preset", "best"], "--preset: expected one of"),
         (["--out", tmp_path / "m.mp4"], "--out: expected a name for the model, as "),
         (["--max-size-mb", "0.001"], "--max-size-mb: expected at least"),
-        (["--frames", "0:1"], "--frames: expected"),
+        (["--frames", "1:1"], "--frames: expected"),
     ):
         assert run("fit", clip, *given) == 2, given
         assert says in capsys.readouterr().err

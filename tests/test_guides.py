@@ -108,9 +108,10 @@ def test_formats(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = _run("formats.md")
     np.testing.assert_allclose(names["again"].splats.loc, names["model"].splats.loc, atol=1e-6)
+    np.testing.assert_array_equal(names["loaded"].splats.coefficients, names["model"].splats.coefficients)
     assert len(names["gaussians"].mean) > 10
     assert names["vertices"].shape[1:] == (3, 3)
-    made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply"}
+    made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply", "waves.safetensors"}
     assert {path.name for path in tmp_path.iterdir()} == made
 
 

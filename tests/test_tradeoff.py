@@ -1,6 +1,7 @@
 """Speed against accuracy: fronts, knees, plans, and `foldgauss tradeoff` as a user meets it."""
 
 import csv
+import dataclasses
 import json
 import math
 import shlex
@@ -22,6 +23,7 @@ from foldgauss.io import load_video_model, read_video, save_video_model, write_v
 from foldgauss.io.video_model import read_metadata
 from foldgauss.plot import Panel, plot_tradeoff
 from foldgauss.video import FitConfig, evaluate, fit
+from foldgauss.video.model import LASTING
 from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,
@@ -171,8 +173,8 @@ def test_axes_by_name():
 
 
 def test_half_precision_is_kept_and_widened(tmp_path):
-    frames = np.zeros((3, 16, 16, 3), np.uint8)
-    model = fit(frames, FitConfig(num_gaussians=20, steps=1)).model
+    frames = np.random.default_rng(0).integers(0, 256, (3, 16, 16, 3), np.uint8)
+    model = fit(frames, FitConfig(num_gaussians=20, steps=6)).model
     save_video_model(tmp_path / "whole.safetensors", model)
     save_video_model(tmp_path / "half.safetensors", halved(model))
     again = load_video_model(tmp_path / "half.safetensors")
@@ -183,11 +185,20 @@ def test_half_precision_is_kept_and_widened(tmp_path):
     np.testing.assert_array_equal(again.frame_times.logits, model.frame_times.logits)
     saved = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half")]
     assert saved[0] - saved[1] == pytest.approx(2 * 20 * 17, abs=16)  # but for the header
-    huge = np.asarray(model.splats.coefficients).copy()
-    huge[3, 0, 0] = 1e5
-    broken = type(model)(
-        **{**vars(model), "splats": type(model.splats)(**{**vars(model.splats), "coefficients": huge})}
-    )
+    # What is not stored stays exact: powers that are 0, and who lasts.
+    leaves = {
+        name: np.array(getattr(model.splats, name)) for name in ("coefficients", "log_time_scale", "time_loc_logit")
+    }
+    leaves["coefficients"][:, 1:] = 0
+    leaves["log_time_scale"][:5], leaves["time_loc_logit"][:5] = LASTING, 0
+    lean = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
+    save_video_model(tmp_path / "lean.safetensors", halved(lean))
+    again = load_video_model(tmp_path / "lean.safetensors")
+    assert (again.splats.degrees == 1).all()
+    np.testing.assert_array_equal(again.splats.lasting, lean.splats.lasting)
+    assert again.splats.lasting.sum() == 5
+    leaves["coefficients"][3, 0, 0] = 1e5
+    broken = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
     with pytest.raises(ValueError, match="coefficients: expected numbers of at most 65504, got 1 beyond"):
         halved(broken)
 

@@ -44,6 +44,7 @@ from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.metrics import evaluate
 from foldgauss.video.model import VideoModel
+from foldgauss.video.stored import stored_counts, to_stored
 from foldgauss.video.tradeoff import frames_per_second
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
@@ -208,13 +209,13 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     model = load_video_model(model_path)
     about = read_metadata(model_path)
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
-    times = np.asarray(model.frame_times.times())
     figures = {
         "frames": f"{model.num_frames} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second",
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
+        **_economies(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
-        "frame times": f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}",
+        "frame times": _about_times(np.asarray(model.frame_times.times())),
         "numbers stored": f"{model.num_floats:,}",
         "file": _size_of(model_path, model),
     }
@@ -226,6 +227,28 @@ def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model
     for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
         table.add_row(name, value)
     out.print(table)
+
+
+def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
+    """What Gaussians do without, where some do."""
+    parts = [layer.model.splats for layer in as_edited(model).layers]
+    degrees = np.concatenate([splats.degrees for splats in parts])
+    told = {}
+    if any((splats.degrees < splats.degree).any() for splats in parts):
+        counts = zip(*np.unique(degrees, return_counts=True), strict=True)
+        told["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
+    if lasting := sum(int(splats.lasting.sum()) for splats in parts):
+        told["lasting"] = f"{lasting:,} of {len(degrees):,} Gaussians, throughout the clip"
+    shared = [(splats.num_gaussians, stored_counts(to_stored(splats)).get("colors")) for splats in parts]
+    if any(num_colors for _, num_colors in shared):
+        told["colours"] = ", ".join(f"{colors:,} of {num:,} Gaussians" for num, colors in shared if colors)
+    return told
+
+
+def _about_times(times: np.ndarray) -> str:
+    if len(times) == 1:
+        return "one frame alone, shown at all times"
+    return f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}"
 
 
 def _size_of(path: Path, model: VideoModel | EditedVideo) -> str:

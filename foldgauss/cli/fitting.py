@@ -96,7 +96,7 @@ def demo(
 
 @app.command()
 def fit(
-    video: Annotated[Path, typer.Argument(help="Video file, or folder of images in natural order.")],
+    video: Annotated[Path, typer.Argument(help="Video file, folder of images in natural order, or one image.")],
     out_path: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name].")
     ] = None,
@@ -107,7 +107,7 @@ def fit(
     frames: Frames = None,
     gaussians: Annotated[
         int | None,
-        typer.Option(help="Number of Gaussians at the start [default: by the preset, or the frame's size]."),
+        typer.Option(help="Number of Gaussians at the start [default: by the preset, or the clip's size and length]."),
     ] = None,
     max_gaussians: Annotated[int | None, typer.Option(help="Largest number of Gaussians, grown or not.")] = None,
     max_size_mb: Annotated[
@@ -391,6 +391,12 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
         )
     num = chosen_num_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
+    if steps is not None and steps * config.batch_size < clip.num_frames:
+        err.print(
+            f"warning: --steps: {steps:,} steps see {steps * config.batch_size:,} of {clip.num_frames:,} frames; the "
+            "others stay as they start, and look faint.",
+            soft_wrap=True,
+        )
     budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
     plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
     if manner == "json":
@@ -399,8 +405,9 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
     if manner in ("json", "quiet"):
         return
     growing = "" if config.growth is None else " at the start"
+    number = "1 frame" if clip.num_frames == 1 else f"{clip.num_frames} frames"
     out.print(
-        f"{clip.source}: {clip.num_frames} frames of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
+        f"{clip.source}: {number} of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
         f"{num:,} Gaussians of degree {config.degree}{growing}, "
         f"{plan}, {num_threads()} threads",
         soft_wrap=True,

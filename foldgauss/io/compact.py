@@ -175,7 +175,7 @@ def _no_number(name: str) -> None:
 def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
     facts = _facts(header)
     num, num_frames = facts.num_gaussians, header["num_frames"]
-    _check(whole(num_frames, 2), "num_frames", num_frames)
+    _check(whole(num_frames, 1), "num_frames", num_frames)
     _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     names = column_names(facts.degree)
     described = header["columns"]

@@ -45,6 +45,12 @@ class _Kind:
     model_type: type
     to_header: Callable[[Any], dict]
     from_header: Callable[[dict], Any]
+    to_stored: Callable[[Any], Any]
+    from_stored: Callable[[Any], Any]
+
+
+def _as_it_is(model: Any) -> Any:
+    return model
 
 
 _KINDS: dict[str, _Kind] = {}
@@ -56,6 +62,8 @@ def register_model(
     *,
     to_header: Callable[[Any], dict],
     from_header: Callable[[dict], Any],
+    to_stored: Callable[[Any], Any] = _as_it_is,
+    from_stored: Callable[[Any], Any] = _as_it_is,
 ) -> None:
     """Teach this module to save and load `model_type` under the name `kind`.
 
@@ -63,12 +71,16 @@ def register_model(
     skeleton: the same pytree with a `jax.ShapeDtypeStruct` for every array leaf and everything else in
     place. It must allocate nothing in proportion to numbers in the dict: that may come from a stranger.
 
+    Where a model is stored in another form than it has in memory, `to_stored` gives that pytree, which `to_header` and
+    `from_header` are then about, and `from_stored` is its inverse. The latter raises ValueError for leaves that do not
+    fit each other, which have the skeleton's shapes but may hold anything.
+
     Raises `ValueError` if `kind` already names another type.
     """
     known = _KINDS.get(kind)
     if known is not None and known.model_type is not model_type:
         raise invalid("kind", expected="a free name", got=f"{kind!r}, taken by {known.model_type.__name__}")
-    _KINDS[kind] = _Kind(kind, model_type, to_header, from_header)
+    _KINDS[kind] = _Kind(kind, model_type, to_header, from_header, to_stored, from_stored)
 
 
 # ----------------------------------------------------------------------------------------------- saving
@@ -88,6 +100,7 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     or a header that does not describe the model; `OutputError` where the path cannot be written.
     """
     kind = _kind_of(model)
+    model = kind.to_stored(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = to_json("header", kind.to_header(model))
     _check_described(kind, model, header)
@@ -222,7 +235,7 @@ def load_model(path: str | os.PathLike) -> Any:
 
     Leaves come as JAX arrays; 64-bit ones stay NumPy arrays unless JAX's x64 mode is on, since JAX would
     round them; those kept in half precision come in the type that the header describes. No more memory is taken than
-    twice the file's size, plus the skeleton.
+    twice the file's size, plus the skeleton and what `from_stored` adds.
 
     Raises `FileNotFoundError` for a missing file, `ModelFileError` for one of another kind or version, a
     damaged one, or one whose tensors differ from what its header describes.
@@ -247,7 +260,12 @@ def load_model(path: str | os.PathLike) -> Any:
         ) from error
     described = _specs(_array_leaves(skeleton))
     _check_tensors(_widened(about["tensors"], described), described, str(path))
-    return _filled(skeleton, path)
+    filled = _filled(skeleton, path)
+    try:
+        return kind.from_stored(filled)
+    except ValueError as error:
+        got = f"others in {str(path)!r} ({_line(error)})"
+        raise _error("path", expected="tensors that fit each other", got=got) from error
 
 
 def read_header(path: str | os.PathLike) -> dict:

@@ -119,7 +119,7 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     after the envelope, is below 1e-4 of its units (a fifth of a pixel at 1280 wide) are left out there.
 
     **Raises:** ValueError for a model that the published code cannot draw: another power of the envelope than 2, a
-    floor, compositing "sum"; `OutputError` where the path cannot be written.
+    floor, compositing "sum", one frame alone; `OutputError` where the path cannot be written.
 
     **Example:** `write_vegas_ply("point_cloud.ply", load_video_model("holiday.safetensors"))`
 
@@ -237,6 +237,9 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         "floor": (np.unique(envelope.floor), 0.0, "Fit it without a floor."),
         "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
     }
+    if model.num_frames < 2:
+        cure = "Write the picture as a still scene, ply3dgs."
+        raise invalid("model", expected="at least 2 frames, whose distances a VeGaS file holds", got="1", cure=cure)
     for name, (found, known, cure) in facts.items():
         if not (found == known).all():
             got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"

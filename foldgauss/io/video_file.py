@@ -28,7 +28,6 @@ MAX_WEBP_SIDE = 16_383
 MAX_GIF_FPS = 50.0  # frames of less than 2 hundredths of a second are shown for 10 by browsers
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
-MIN_SIZE = 16  # px; below this there is less than one tile and one SSIM window (11 taps) of picture
 MAX_FPS = 1000.0  # a container's time stamps are milliseconds
 
 Range = tuple[int | None, int | None]
@@ -84,7 +83,7 @@ def read_video(
     fps: float | None = None,
     center_crop: tuple[int, int] | None = None,
 ) -> Clip:
-    """Read a video file, or a folder of images in natural order (img2 before img10).
+    """Read a video file, a folder of images in natural order (img2 before img10), or one image: a clip of one frame.
 
     `frames = (A, B)` keeps frames A <= i < B, None for an open end. `size = (height, width)` cuts each
     frame to that aspect around its centre (to whole pixels), then resizes it, by area where it shrinks and
@@ -110,22 +109,8 @@ def read_video(
     prepare = _fit_to(_checked_size(size), _checked_size(center_crop, "center_crop"))
     if fps is not None:
         _check_fps(fps)
-    read = _read_folder if path.is_dir() else _read_file
+    read = _read_folder if path.is_dir() else _read_image_file if _is_image(path) else _read_file
     kept, num_declared, found_fps = read(path, start, stop, prepare)
-    if min(kept[0].shape[:2]) < MIN_SIZE:
-        raise _error(
-            "path",
-            expected=f"frames of at least {MIN_SIZE}x{MIN_SIZE}",
-            got=f"{_shape_text(kept[0].shape)} in {str(path)!r}",
-            cure="Enlarge it with --size, or size=(height, width).",
-        )
-    if len(kept) < 2:
-        raise _error(
-            "path",
-            expected="at least 2 frames",
-            got=f"{len(kept)} in {str(path)!r}",
-            cure="Give a longer clip or range.",
-        )
     return Clip(_stacked(kept), float(found_fps if fps is None else fps), str(path), num_declared)
 
 
@@ -171,7 +156,29 @@ def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) 
             cure="Give the folder that holds the frames, or a video file.",
         )
     _check_within(start, stop, len(images), folder)
-    chosen = images[start:stop]
+    return _read_images(images[start:stop], prepare)
+
+
+def _is_image(path: Path) -> bool:
+    """Whether a file is one image; what moves, as an animated PNG, is left to the decoder of videos."""
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        return False
+    with _quiet():
+        num_images = cv2.imcount(str(path))
+    if num_images > 1 and path.suffix.lower() in (".tif", ".tiff"):  # of which that decoder sees the first alone
+        got = f"{num_images} in {str(path)!r}"
+        raise _error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
+    return num_images == 1
+
+
+def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
+    """As `_read_folder`, of a file with one image."""
+    _check_within(start, stop, 1, path)
+    return _read_images([path], prepare)
+
+
+def _read_images(chosen: list[Path], prepare: Callable) -> tuple[list, int, float]:
+    """(prepared frames, their number, fps) of images of one size."""
     first_shape, kept = None, []
     for entry in chosen:
         image = _read_image(entry)
@@ -650,8 +657,8 @@ def _checked_range(frames: Range | None) -> tuple[int, int | None]:
     start = 0 if start is None else start
     if start < 0 or (stop is not None and stop < 0):
         raise _error("frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more.")
-    if stop is not None and stop - start < 2:
-        raise _error("frames", expected="A:B with at least 2 frames", got=_text(start, stop), cure="Choose B >= A + 2.")
+    if stop is not None and stop <= start:
+        raise _error("frames", expected="A:B with at least 1 frame", got=_text(start, stop), cure="Choose B > A.")
     return start, stop
 
 
@@ -669,10 +676,10 @@ def _checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tupl
     if size is None:
         return None
     height, width = size
-    if height != int(height) or width != int(width) or min(height, width) < MIN_SIZE:
+    if height != int(height) or width != int(width) or min(height, width) < 1:
         raise _error(
             parameter,
-            expected=f"height and width of at least {MIN_SIZE} px",
+            expected="height and width of whole pixels, at least 1",
             got=f"{height}x{width}",
             cure="Write it as HEIGHTxWIDTH, such as 160x320.",
         )

@@ -1,4 +1,4 @@
-"""How the fitted video and the running fit are described in a model file's header."""
+"""How the fitted video and the running fit are described in a model file's header, and what of them is stored."""
 
 import dataclasses
 import os
@@ -26,6 +26,7 @@ from foldgauss.video.growth import Statistics
 from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
+from foldgauss.video.stored import from_stored, stored_counts, stored_skeleton, to_stored
 
 MODEL_SUFFIX = ".safetensors"
 VIDEO, EDITED, CHECKPOINT = "video", "edited-video", "fit-checkpoint"
@@ -111,8 +112,25 @@ def _load(path: str | os.PathLike, *kinds: str) -> Any:
     return load_model(path)
 
 
+def _to_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
+    """The same tree, with the splats of each model in the form that they are stored in."""
+    return _with_splats(video, to_stored)
+
+
+def _from_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
+    return _with_splats(video, from_stored)
+
+
+def _with_splats(video: VideoModel | EditedVideo, change: Callable[[Any], Any]) -> VideoModel | EditedVideo:
+    if isinstance(video, VideoModel):
+        return dataclasses.replace(video, splats=change(video.splats))
+    layers = [dataclasses.replace(layer, model=_with_splats(layer.model, change)) for layer in video.layers]
+    return dataclasses.replace(video, layers=tuple(layers))
+
+
 def _describe_video(model: VideoModel) -> dict:
-    return {
+    counts = stored_counts(model.splats)
+    about = {
         "num_gaussians": model.splats.num_gaussians,
         "degree": model.splats.degree,
         "envelope": type(model.splats.envelope).__name__,
@@ -123,6 +141,7 @@ def _describe_video(model: VideoModel) -> dict:
         "compositing": model.compositing,
         "scale_cutoff": model.scale_cutoff,
     }
+    return about | {"stored": counts} if counts else about
 
 
 def _video_skeleton(header: dict) -> VideoModel:
@@ -130,7 +149,7 @@ def _video_skeleton(header: dict) -> VideoModel:
         raise ValueError(f"envelope {header['envelope']!r} is unknown here")
     num, degree, num_frames = header["num_gaussians"], header["degree"], header["num_frames"]
     height, width = header["size"]
-    if min(num, num_frames - 1, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
+    if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
     one_of("compositing", compositing, COMPOSITINGS)
@@ -149,7 +168,8 @@ def _video_skeleton(header: dict) -> VideoModel:
             scale_cutoff=float(header.get("scale_cutoff", 0.0)),
         )
 
-    return jax.eval_shape(build)  # traced, not computed: nothing is allocated
+    model = jax.eval_shape(build)  # traced, not computed: nothing is allocated
+    return dataclasses.replace(model, splats=stored_skeleton(model.splats, **header.get("stored", {})))
 
 
 def _describe_edited(video: EditedVideo) -> dict:
@@ -233,6 +253,7 @@ def _checkpoint_skeleton(header: dict) -> FitState:
     )
 
 
-register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton)
-register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton)
+_FORMS = {"to_stored": _to_stored, "from_stored": _from_stored}
+register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
+register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)
 register_model(CHECKPOINT, FitState, to_header=_describe_checkpoint, from_header=_checkpoint_skeleton)

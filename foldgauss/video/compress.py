@@ -41,6 +41,9 @@ from foldgauss.video.sensitivity import sensitivities
 #: Assumed of the fit where neither its clip nor its PSNR is known: few fits are better, and for worse ones the loss is
 #: less than stated.
 ASSUMED_PSNR = 40.0
+#: dB of pictures that are right but for their rounding to 8 bits, an error of variance 1/12. Better frames, as black
+#: ones are, count as these: or a loss that nobody sees in them would cost all others their bits.
+EXACT_PSNR = 10 * math.log10(12 * 255**2)
 #: Frames that a try is measured on; the one that is taken is measured on all.
 TRIED_FRAMES = 24
 #: Binary logarithms of the factor of all steps, in levels: the finest and the coarsest, and how close the search comes.
@@ -62,7 +65,8 @@ _COLORS = ("luma", "blue", "green")
 class Compressed:
     """A model's compact form: `quantised`, the `model` it decodes to, and what was measured.
 
-    `loss_db`: mean PSNR of the frames before (`psnr`) less after, dB. `measured_by`: "clip", or "model" where the loss
+    `loss_db`: mean PSNR of the frames before (`psnr`) less after, dB, none counted as more than `EXACT_PSNR`.
+    `measured_by`: "clip", or "model" where the loss
     is that of pictures at `psnr` dB from their clip that get an error independent of theirs. `num_dropped`: Gaussians
     left out.
     """
@@ -85,6 +89,8 @@ def compress(
     on_step: Callable[[str, float], None] = lambda what, loss_db: None,
 ) -> Compressed:
     """Quantise `model` as coarsely as `max_loss_db`, in dB of the mean PSNR of all frames, allows.
+
+    Frames beyond `EXACT_PSNR`, 58.9 dB, count as frames of that.
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own pictures.
@@ -246,7 +252,7 @@ class _Loss:
         pictures = list(Playback(model).frames())
         if frames is None:
             self.measured_by, self._shown = "model", pictures
-            self.psnr = ASSUMED_PSNR if reference is None else reference
+            self.psnr = ASSUMED_PSNR if reference is None else min(reference, EXACT_PSNR)
             return
         expected = (model.num_frames, *model.size)
         if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4):
@@ -256,6 +262,7 @@ class _Loss:
         self.measured_by = "clip"
         self._shown = frames if frames.shape[-1] == 3 else [composited(frame, np.float32(BLACK)) for frame in frames]
         self._before = np.array([psnr_of(*pair) for pair in zip(self._shown, pictures, strict=True)])
+        self._before = np.minimum(self._before, EXACT_PSNR)
         self.psnr = float(self._before.mean())
 
     def __call__(self, model: VideoModel, which: Int[np.ndarray, "some"]) -> float:
@@ -263,7 +270,7 @@ class _Loss:
         pictures = Playback(model).frames(np.asarray(model.frame_times.times())[which])
         after = np.array([psnr_of(self._shown[k], picture) for k, picture in zip(which, pictures, strict=True)])
         if self.measured_by == "clip":
-            return float((self._before[which] - after).mean())
+            return float((self._before[which] - np.minimum(after, EXACT_PSNR)).mean())
         # Errors that are independent add up: a share 10^((psnr - after) / 10) of the clip's own.
         share = np.where(after >= 100, 0.0, 10 ** ((self.psnr - after) / 10))
         return float(10 * np.log10(1 + share).mean())

@@ -99,7 +99,7 @@ class FitConfig:
     fidelity to the paper.
     """
 
-    num_gaussians: int | None = None  # at the start; None: by the size of the frames, `default_num_gaussians`
+    num_gaussians: int | None = None  # at the start; None: by size and number of the frames, `default_num_gaussians`
     max_gaussians: int | None = None  # at any time; None: `MAX_GAUSSIANS`
     degree: int = 3
     steps: int | None = None
@@ -218,14 +218,18 @@ HEADER_BYTES = 4096
 DEFAULT_STEPS, DEFAULT_VISITS = 3000, 12
 
 
-def default_num_gaussians(height: int, width: int) -> int:
-    """40,000 for 160x320, growing as the square root of the pixels: larger frames are smoother per pixel."""
-    return round(177 * math.sqrt(height * width))
+def default_num_gaussians(num_frames: int, height: int, width: int) -> int:
+    """40,000 for 160x320, growing as the square root of the pixels: larger frames are smoother per pixel.
+
+    Clips for which steps are more than `DEFAULT_STEPS` get more in proportion, so that frames have no fewer each.
+    """
+    return round(177 * math.sqrt(height * width) * max(1.0, DEFAULT_VISITS * num_frames / DEFAULT_STEPS))
 
 
 def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int) -> int:
     """Gaussians at the start: `num_gaussians`, or fewer as `most_gaussians` bids. Raises ValueError as it does."""
-    return min(config.num_gaussians or default_num_gaussians(height, width), most_gaussians(config, num_frames))
+    asked = config.num_gaussians or default_num_gaussians(num_frames, height, width)
+    return min(asked, most_gaussians(config, num_frames))
 
 
 def most_gaussians(config: FitConfig, num_frames: int) -> int:

@@ -432,8 +432,8 @@ class Edit:
         line = Clock.shifted(shift, stretch, about=about, outside=outside)
         identity = (shift, stretch) == (0, 1) and outside == "continue"
         bake = partial(baking.retimed, shift=float(shift), stretch=float(stretch), about=float(about))
-        # Between shots a clock shows the nearer one, which no leaves say.
-        bakes = outside == "continue" and not any(layer.has_cuts for layer in self._video.layers)
+        # Between shots a clock shows the nearer one, of one frame alone that frame: no leaves say so.
+        bakes = outside == "continue" and not any(layer.holds_frames for layer in self._video.layers)
         return self._apply(partial(Retimed, clock=line), when, bake if bakes else None, skip=identity)
 
     def freeze(self, at: float, **when: Unpack[When]) -> "Edit":
@@ -668,7 +668,7 @@ def _warn_of_frames(parameter: str, shift: float, stretch: float, about: float, 
     ends = [about + shift + stretch * (own - about) for own in (0.0, 1.0)]
     if max(ends) < 0 or min(ends) > 1:
         text = f"{parameter}: expected times of a clip of [0, 1], got {shift:g}: nothing of it is left there."
-        warnings.warn(f"{text} For frames divide by {num_frames - 1}.", stacklevel=3)
+        warnings.warn(f"{text} For frames divide by {max(num_frames - 1, 1)}.", stacklevel=3)
 
 
 def _listed(parameter: str, values: ArrayLike) -> tuple[float, ...]:

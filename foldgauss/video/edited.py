@@ -43,9 +43,10 @@ class Layer(eqx.Module):
         return self.model.splats.num_gaussians
 
     @property
-    def has_cuts(self) -> bool:
-        """Whether there are several shots, with nothing to see between them."""
-        return bool(np.asarray(is_cut(self.model.frame_times.times())).any())
+    def holds_frames(self) -> bool:
+        """Whether a frame stands for times about it: beside a cut, where nothing is to be seen, or one frame alone."""
+        times = self.model.frame_times.times()
+        return len(times) == 1 or bool(np.asarray(is_cut(times)).any())
 
 
 class EditedVideo(eqx.Module):
@@ -258,7 +259,7 @@ class _LayerStage:
         self._stage, self._layer = Stage(layer.model, size, aspect=aspect), layer
         self._masks = [np.asarray(overlay.mask) for overlay in layer.overlays]
         self._times = np.asarray(layer.model.frame_times.times())
-        self._has_cuts = layer.has_cuts
+        self._holds_frames = layer.holds_frames
         self._groups = _by_clocks(layer)
 
     def at(self, t: float) -> "_Moment":
@@ -283,7 +284,7 @@ class _LayerStage:
     def _own_time(self, clocks: tuple[Retimed, ...], t: float) -> float:
         for clock in reversed(clocks):  # the last edit is asked first: it retimes all that the others made
             t = clock.own_time(t)
-        return float(out_of_cuts(t, self._times)) if self._has_cuts else t
+        return float(out_of_cuts(t, self._times)) if self._holds_frames else t
 
 
 def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray, "num"] | None]]:

@@ -237,8 +237,8 @@ def _num_views(config: FitConfig, num_frames: int) -> int:
 
 
 def running_psnr(state: FitState) -> float:
-    """dB, by the running mean of the squared error."""
-    return -10 * math.log10(max(state.error, 1e-12))
+    """dB, by the running mean of the squared error; at most 100, as of pictures that are equal (`psnr`)."""
+    return -10 * math.log10(max(state.error, 1e-10))
 
 
 class _Outlook:
@@ -366,14 +366,25 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
 
 
 def check_frames(frames: np.ndarray) -> None:
-    """Raise ValueError unless `frames` is a uint8 array (num_frames >= 2, height, width, 3 or 4)."""
+    """Raise ValueError unless `frames` is a uint8 array (num_frames, height, width, 3 or 4), none of them 0."""
     shape, dtype = getattr(frames, "shape", None), getattr(frames, "dtype", None)
-    if shape is None or len(shape) != 4 or shape[3] not in (3, 4) or shape[0] < 2 or dtype != np.uint8 or 0 in shape:
-        raise invalid(
-            "frames",
-            expected="a uint8 array (num_frames >= 2, height, width, 3 or 4)",
-            got=f"{dtype} {shape}",
-        )
+    if shape is None or len(shape) != 4 or shape[3] not in (3, 4) or dtype != np.uint8 or 0 in shape:
+        got = type(frames).__name__ if shape is None else f"{dtype} {shape}"
+        expected = "a uint8 array (num_frames, height, width, 3 or 4)"
+        raise invalid("frames", expected=expected, got=got, cure=_cure_of_frames(shape, dtype))
+
+
+def _cure_of_frames(shape: tuple[int, ...] | None, dtype: np.dtype | None) -> str:
+    """What makes frames of an array that is none; pixels are never scaled unasked, since no array says of what."""
+    if shape is None:
+        return "Stack them: np.stack(frames). Of a file: read_video(path).frames."
+    if dtype == np.uint16:
+        return "From 16 bits: np.rint(frames / 257).astype(np.uint8)."
+    if dtype is not None and dtype.kind == "f":
+        return "From floats in [0, 1]: np.rint(255 * np.clip(frames, 0, 1)).astype(np.uint8)."
+    if len(shape) == 3:
+        return "One picture: frames[None]. Grey ones: np.repeat(frames[..., None], 3, axis=-1)."
+    return ""
 
 
 class _Stepper:

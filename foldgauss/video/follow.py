@@ -72,7 +72,7 @@ def traits(lit: LitModel, k: int) -> Traits:
 def _motion(lit: LitModel, k: int, light: Light) -> Float32[np.ndarray, "num_alive 2"]:
     """How far each Gaussian's centre goes in the time of a frame, in pixels."""
     intervals = np.diff(lit.times)
-    half = intervals[max(k - 1, 0) : k + 1].min() / 2  # not that of a cut
+    half = intervals[max(k - 1, 0) : k + 1].min(initial=1.0) / 2  # not that of a cut
     t = float(lit.times[k])
     return lit.position(light.alive, t + half) - lit.position(light.alive, t - half)
 

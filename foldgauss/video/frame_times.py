@@ -11,7 +11,7 @@ from foldgauss.video.shots import is_cut
 
 
 class FrameTimes(eqx.Module):
-    r"""Times of n frames in [0, 1], learned through n - 1 softmax weights.
+    r"""Times of n frames in [0, 1], learned through n - 1 softmax weights; one frame alone is at 0.
 
     .. math:: t_k = \sum_{i \le k} \frac{e^{w_i}}{\sum_j e^{w_j}}, \qquad t_0 = 0,\; t_{n-1} = 1
 
@@ -24,9 +24,9 @@ class FrameTimes(eqx.Module):
 
     @classmethod
     def uniform(cls, num_frames: int) -> "FrameTimes":
-        """Equally spaced times. Raises ValueError below two frames."""
-        if num_frames < 2:
-            raise invalid("num_frames", expected="at least 2", got=num_frames)
+        """Equally spaced times. Raises ValueError for no frames."""
+        if num_frames < 1:
+            raise invalid("num_frames", expected="at least 1", got=num_frames)
         return cls(np.zeros(num_frames - 1, np.float32))
 
     @property
@@ -39,7 +39,7 @@ class FrameTimes(eqx.Module):
         Neighbours are equal only where a weight is too small for the dtype to show.
         """
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
-        return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1]])
+        return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 
 
 def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
@@ -61,8 +61,8 @@ def times_at(
     Positions are held within the clip. At a cut nothing lies between: the nearer frame's time. Shapes: as `positions`.
     """
     times, positions = np.asarray(times), np.clip(np.asarray(positions, np.float64), 0, len(times) - 1)
-    interval = np.minimum(positions.astype(int), len(times) - 2)
-    positions = np.where(np.asarray(is_cut(times))[interval], np.floor(positions + 0.5), positions)
+    cut = np.append(np.asarray(is_cut(times)), False)  # after the last frame nothing comes
+    positions = np.where(cut[positions.astype(int)], np.floor(positions + 0.5), positions)
     return np.interp(positions, np.arange(len(times)), times).astype(times.dtype)
 
 

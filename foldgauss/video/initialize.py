@@ -27,8 +27,11 @@ TRACK_SHARES, LEAST_FRAMES = (0.25, 1.2), 0.6
 #: Where the fold misses the track by more than this many pixels, sigma_t is shortened by this, some times.
 MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
 CHUNK = 12_000  # tracks held at once: some 3 kB each on the way
-#: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side.
-PILOT, CORE, ROUNDS = 32, 1.5, 50
+#: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side. Of a long
+#: clip as many in all as `MOST_PILOTS`, or they take longer than the fit.
+PILOT, CORE, ROUNDS, MOST_PILOTS = 32, 1.5, 50, 40_000
+#: With fewer starts than this for each frame, homes are drawn at even distances.
+FEW_STARTS = 16
 #: Share of the starts that is spread so that all frames, however short the tracks there, are covered alike. With more,
 #: the worst frames get better and the mean worse.
 EVEN_FRAMES = 0.2
@@ -64,10 +67,13 @@ def initialize(
     make = lambda home, position: born(  # noqa: E731
         frames, home, position, times, degree, envelope, motion, rng, opacity
     )
-    pilot = np.repeat(np.arange(num_frames), PILOT)
+    pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MOST_PILOTS // num_frames), 1))
     _, spread = make(pilot, drawn(pilot, share_of, rng)[0])
     chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
-    home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
+    if num_gaussians < FEW_STARTS * num_frames:  # where chance would leave out whole stretches: at even distances
+        home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
+    else:
+        home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
     position, density = drawn(home, share_of, rng)
     splats, spread = make(home, position)
     alive = num_alive(times[home], spread, times)[home]
@@ -136,7 +142,7 @@ def born(
 ) -> tuple[FoldedSplats, np.ndarray]:
     """Splats at `position` in frames `home`, one pixel wide, with the frames' own colours; and their sigma_t."""
     num, (height, width) = len(home), frames.shape[1:3]
-    interval = np.diff(times).min()
+    interval = np.diff(times).min(initial=1.0)  # one frame alone has all the time
     if motion is None:
         time = times[home] + rng.uniform(-0.5, 0.5, num) * interval
         coefficients = np.zeros((num, degree, 2), np.float32)
@@ -210,17 +216,19 @@ def num_alive(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.nda
 def _even_chance(home: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
     """How often to start in each frame, so that all are covered alike by windows of `CORE` sigma_t.
 
-    `home` and `spread` are of starts tried, `PILOT` in every frame. Source: Richardson 1972, Lucy 1974.
+    `home` and `spread` are of starts tried, as many in every frame. Source: Richardson 1972, Lucy 1974.
     """
     num = len(times)
-    covers = np.zeros((num, num + 1))  # [k, j]: how often frame j is covered by starts in frame k
-    np.add.at(covers, (home, np.searchsorted(times, times[home] - CORE * spread)), 1 / PILOT)
-    np.add.at(covers, (home, np.searchsorted(times, times[home] + CORE * spread, side="right")), -1 / PILOT)
-    covers = np.cumsum(covers, axis=1)[:, :-1]
+    first = np.searchsorted(times, times[home] - CORE * spread)
+    last = np.searchsorted(times, times[home] + CORE * spread, side="right")
+    length = np.bincount(home, last - first, num)
     chance = np.full(num, 1 / num)
     for _ in range(ROUNDS):
-        chance *= (covers / (chance @ covers)).sum(1) / covers.sum(1)
-    return chance / chance.sum()
+        ends = np.bincount(first, chance[home], num + 1) - np.bincount(last, chance[home], num + 1)
+        rarity = np.concatenate([[0.0], np.cumsum(1 / np.cumsum(ends)[:-1])])  # of the frames before each
+        chance *= np.bincount(home, rarity[last] - rarity[first], num) / length
+        chance /= chance.sum()
+    return chance
 
 
 def _logit(p: np.ndarray) -> np.ndarray:

@@ -18,12 +18,21 @@ def psnr(target: np.ndarray, picture: np.ndarray) -> float:
     return float(peak_signal_noise_ratio(target, picture, data_range=255))
 
 
+#: Pixels along a side of the window of SSIM, and from its middle to its edge.
+SSIM_WINDOW, SSIM_REACH = 11, 5
+
+
 def ssim(target: np.ndarray, picture: np.ndarray) -> float:
-    """Mean SSIM of two uint8 pictures (height, width, 3), both sides >= 11 px, with the weights of Wang et al. 2004."""
+    """Mean SSIM of two uint8 pictures (height, width, 3), with the weights of Wang et al. 2004.
+
+    The mean is over the pixels whose window of 11 px lies within the picture; along a side shorter than that, over all,
+    the picture being mirrored at its border.
+    """
+    short = [(SSIM_REACH, SSIM_REACH) if length < SSIM_WINDOW else (0, 0) for length in target.shape[:2]]
+    pair = (np.pad(one, [*short, (0, 0)], mode="symmetric") for one in (target, picture))
     return float(
         structural_similarity(
-            target,
-            picture,
+            *pair,
             data_range=255,
             gaussian_weights=True,
             sigma=1.5,

@@ -1,12 +1,13 @@
 """The fitted video: folded splats, frame times and what it takes to draw them."""
 
+import dataclasses
 from collections.abc import Iterator
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from foldgauss._batch import known
 from foldgauss._checks import invalid, short_repr
@@ -26,6 +27,9 @@ SH_C0 = 0.28209479177387814
 TIME_CUTOFF = 0.01
 #: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
 TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
+#: log sigma_t of a Gaussian that is there throughout the clip: with m_t = 0.5 its |tau| is at most 1/2048, and the
+#: envelope, of power 2 or less, is 1 to 3e-7. Neither is stored.
+LASTING = np.float32(np.log(1024))
 #: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
 PEAK_OPACITY = 0.99
 
@@ -66,6 +70,20 @@ class FoldedSplats(eqx.Module):
     @property
     def degree(self) -> int:
         return self.coefficients.shape[1]
+
+    @property
+    def degrees(self) -> Int[np.ndarray, "num"]:
+        """Of each Gaussian: its last power whose coefficients are not both 0. Higher ones are not stored.
+
+        A coefficient of -0 counts: it is not the bits that an absent one is restored with.
+        """
+        kept = _holds_bits(self.coefficients).any(axis=2)
+        return (kept * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
+
+    @property
+    def lasting(self) -> Bool[np.ndarray, "num"]:
+        """Who is there throughout the clip: m_t = 0.5 and log sigma_t = `LASTING` exactly. Neither is stored."""
+        return (np.asarray(self.log_time_scale) == LASTING) & ~_holds_bits(self.time_loc_logit)
 
     def gaussians(self) -> FoldedGaussian:
         """The batch of Folded-Gaussians, batch shape (num,), event shape (3,)."""
@@ -137,6 +155,12 @@ class FoldedSplats(eqx.Module):
         opacity = jnp.where(near, jax.nn.sigmoid(self.opacity_logit), jnp.zeros_like(self.opacity_logit))
         color = jnp.maximum(0.5 + SH_C0 * self.color_dc, 0.0)
         return Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
+
+
+def _holds_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
+    """Where a number has other bits than 0 has."""
+    leaf = np.asarray(leaf)
+    return (leaf != 0) | np.signbit(leaf)
 
 
 def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, "num"]) -> Float[Array, "num 2 2"]:
@@ -250,8 +274,11 @@ class VideoModel(eqx.Module):
 
     @property
     def num_floats(self) -> int:
-        """Numbers stored."""
-        return sum(np.size(leaf) for leaf in jax.tree.leaves(self))
+        """Numbers stored: of each Gaussian what it has, see `StoredSplats`. Four bytes of kinds or indices are one."""
+        from foldgauss.video.stored import to_stored  # which knows these classes
+
+        leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
+        return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
 
     def at(self, t: Float[Array, ""], size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, in pixels of a picture of `size` (default: the fitted one)."""

@@ -27,6 +27,8 @@ FLOW_SIDE, KEPT_SIDE = 640, 320
 LOOKS = 2
 #: A long clip's maps are smaller, so that they take no more bytes than this, or than this share of the frames' own.
 MAP_BYTES, MAP_SHARE, BYTES_PER_CELL = 256e6, 0.25, 11
+#: With fewer points than this in each frame, the mean over frames, they are looked up all at once.
+FEW = 16
 #: Between two frames is a cut where the flow knows the way of less than this share of the points.
 CUT_SHARE = 0.15
 
@@ -215,9 +217,11 @@ def _sampled(stack, index, position, size) -> np.ndarray:
     """Bilinear samples of `stack[index]`, maps over frames of `size` (height, width) pixels, at positions in pixels."""
     _, rows, columns, channels = stack.shape
     scaled = position * np.float32([columns / size[1], rows / size[0]]) - np.float32(0.5)
-    samples = np.empty((len(index), channels), np.float32)
     order = np.argsort(index, kind="stable")
     frames, starts = np.unique(index[order], return_index=True)
+    if len(index) < FEW * len(frames):
+        return _gathered(stack, index, scaled)
+    samples = np.empty((len(index), channels), np.float32)
     stops = np.append(starts[1:], len(order))
 
     def sample(n: int) -> None:
@@ -230,6 +234,21 @@ def _sampled(stack, index, position, size) -> np.ndarray:
 
     run_tasks(sample, range(len(frames)))
     return samples
+
+
+def _gathered(stack, index, scaled) -> np.ndarray:
+    """As `_sampled`, at positions in pixels of the maps, all frames at once: no map is read but where it is asked."""
+    _, rows, columns, _ = stack.shape
+    inside = np.clip(scaled, 0, np.float32([columns - 1, rows - 1]))
+    left, top = np.minimum(inside.astype(np.int64), [columns - 2, rows - 2]).T
+    right, low = (inside - np.stack([left, top], -1)).astype(np.float32).T[..., None]
+
+    def row(y) -> np.ndarray:
+        one, other = (stack[index, y, x].astype(np.float32) for x in (left, left + 1))
+        return one + right * (other - one)
+
+    above, below = row(top), row(top + 1)
+    return above + low * (below - above)
 
 
 #: Ridge on the coefficients, in frames at the window's edge.

@@ -349,7 +349,7 @@ def quantise(described: Described, classes: Int32[np.ndarray, "num"], rules: dic
             raise invalid("model", expected="numbers within the reach of their steps", got=got, cure="Remove it first.")
         columns[name] = numbers.astype(np.int32)
         unrolling.add(name, columns[name], halves)
-    logits = described.logits - described.logits.max()
+    logits = described.logits - described.logits.max(initial=-np.inf)
     return Quantised(facts, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
 
 

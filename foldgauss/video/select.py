@@ -421,6 +421,8 @@ def _span(
     """The span of time that is meant, from first to last; frames `widened` by half a frame to either side."""
     if times is None:
         chosen = chosen_frames(lit.model, frame, frames)
+        if widened and len(lit.times) == 1:
+            return 0.0, 1.0  # one frame alone lasts all the time
         ends = np.array([chosen[0], chosen[-1]]) + (np.array([-0.5, 0.5]) if widened else 0)
         return tuple(np.interp(ends, np.arange(len(lit.times)), lit.times))
     pair = np.asarray(times)

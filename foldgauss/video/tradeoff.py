@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from foldgauss._checks import invalid
@@ -17,6 +16,7 @@ from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 from foldgauss.video.playback import Playback
 from foldgauss.video.pyramid import levels
+from foldgauss.video.stored import to_stored
 
 #: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
 #: with that many passes over the clip, at a loss of at most `MAX_LOSS_DB`.
@@ -249,23 +249,25 @@ def knee(cost: Sequence[float], quality: Sequence[float]) -> int | None:
 
 
 def halved(model: VideoModel) -> VideoModel:
-    """The model with 16-bit numbers: half the file; frame times and the envelope stay as they are.
+    """The model to be stored with 16-bit numbers, in half the bytes; frame times and the envelope stay as they are.
 
-    Arrays are NumPy's float16, which `foldgauss.io.save_video_model` keeps, and a file's reader widens again. Raises
-    ValueError where a number is beyond them.
+    Its splats have the form that they are stored in (`to_stored`) and leaves of NumPy's float16, which
+    `foldgauss.io.save_video_model` keeps and a file's reader widens again. Raises ValueError where a number is beyond
+    them.
     """
-    splats, kept = model.splats, {}
+    splats, short = to_stored(model.splats), {}
     for field in dataclasses.fields(splats):
         leaf = getattr(splats, field.name)
-        if field.name != "envelope":
-            with np.errstate(over="ignore"):
-                kept[field.name] = np.asarray(leaf, np.float16)
-            beyond = int((~np.isfinite(kept[field.name])).sum())
-            if beyond:
-                cure = "Compress it to .fgz, which has room for them."
-                expected = f"numbers of at most {np.finfo(np.float16).max:g}"
-                raise invalid(f"model.splats.{field.name}", expected=expected, got=f"{beyond:,} beyond", cure=cure)
-    return eqx.tree_at(lambda m: m.splats, model, dataclasses.replace(splats, **kept))
+        if field.name == "envelope" or getattr(leaf, "dtype", None) != np.float32:
+            continue
+        with np.errstate(over="ignore"):
+            short[field.name] = np.asarray(leaf).astype(np.float16)
+        beyond = int((~np.isfinite(short[field.name])).sum())
+        if beyond:
+            cure = "Compress it to .fgz, which has room for them."
+            expected = f"numbers of at most {np.finfo(np.float16).max:g}"
+            raise invalid(f"model.splats.{field.name}", expected=expected, got=f"{beyond:,} beyond", cure=cure)
+    return dataclasses.replace(model, splats=dataclasses.replace(splats, **short))
 
 
 def seconds_per_frame(*models: VideoModel | EditedVideo) -> list[float]:

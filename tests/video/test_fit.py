@@ -319,7 +319,7 @@ def test_bad_rates():
 @pytest.mark.parametrize(
     "frames",
     [
-        np.zeros((1, 20, 20, 3), np.uint8),
+        np.zeros((0, 20, 20, 3), np.uint8),
         np.zeros((3, 20, 20, 2), np.uint8),
         np.zeros((3, 20, 20, 5), np.uint8),
         np.zeros((3, 20, 20), np.uint8),

@@ -66,7 +66,7 @@ def test_nothing_lies_between_shots():
 
 def test_bad_input():
     with pytest.raises(ValueError, match="num_frames"):
-        FrameTimes.uniform(1)
+        FrameTimes.uniform(0)
     with pytest.raises(ValueError, match="upsample"):
         interpolated_times(np.array([0.0, 1.0]), 0)
 

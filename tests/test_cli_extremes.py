@@ -1,0 +1,91 @@
+"""The commands with clips at the extremes: one picture, 16 bits, a few pixels, a line of them, plain white."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+
+from foldgauss.io import load_video_model, read_video
+
+
+def ramp(num_frames, height, width, depth=np.uint8):
+    """Smooth, and of all bits."""
+    y, x = np.mgrid[:height, :width]
+    one = np.stack([(x + 1) / (width + 1), (y + 1) / (height + 1), 0.5 + 0.4 * np.sin(8 * x / width)], -1)
+    return np.broadcast_to((one * np.iinfo(depth).max).astype(depth), (num_frames, height, width, 3))
+
+
+CLIPS = {
+    "one": ramp(1, 24, 32),
+    "two, 16 bits": ramp(2, 24, 32, np.uint16),
+    "tiny": ramp(3, 8, 8),
+    "line": ramp(2, 1, 600),
+    "column": ramp(2, 600, 1),
+    "white": np.full((3, 24, 32, 3), 255, np.uint8),
+    "black": np.zeros((3, 24, 32, 3), np.uint8),
+}
+QUICK = ("--gaussians", 300, "--steps", 60)
+
+
+def written(folder, frames):
+    folder.mkdir()
+    for k, frame in enumerate(frames):
+        assert cv2.imwrite(str(folder / f"{k}.png"), frame[..., ::-1])
+    return folder
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_from_a_clip_to_its_pictures(tmp_path, capsys, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    frames = CLIPS[name]
+    clip = written(tmp_path / "clip", frames)
+    assert run("fit", clip, "--out", "m.safetensors", *QUICK, "--preview", "p.png", "--history", "h.jsonl") == 0
+    assert run("evaluate", "m.safetensors", clip, "--json", "s.json") == 0
+    scores = json.loads((tmp_path / "s.json").read_text())
+    assert 25 < scores["mean_psnr"] <= 100
+    assert all(math.isfinite(x) for x in scores["psnr"] + scores["ssim"])
+    assert run("info", "m.safetensors") == 0
+    assert run("render", "m.safetensors", "--out", "slow", "--upsample", 3) == 0
+    shown = read_video(tmp_path / "slow").frames
+    assert shown.shape == (3 * (len(frames) - 1) + 1, *frames.shape[1:])
+    assert np.abs(shown[0].astype(float) - read_video(clip).frames[0]).mean() < 12
+    assert run("render", "m.safetensors", "--out", "fast.mp4", "--fps", 60) == 0
+    assert run("compress", "m.safetensors", clip, "--passes", 1, "--max-loss-db", 1) == 0
+    assert run("evaluate", "m.fgz", clip) == 0
+    assert run("export", "m.safetensors", "--format", "ply3dgs", "--out", "scenes") == 0
+    assert "nan" not in capsys.readouterr().out.lower()
+
+
+def test_one_image_file(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image = ramp(1, 24, 32, np.uint16)[0]
+    assert cv2.imwrite("picture.png", image[..., ::-1])
+    assert run("fit", "picture.png", *QUICK) == 0
+    assert "1 frame of 24x32" in capsys.readouterr().out
+    assert run("render", "picture.safetensors", "--times", 0.5, "--out", "again.png") == 0
+    again = cv2.imread("again.png")[..., ::-1]
+    np.testing.assert_allclose(again, image / 257, atol=40)
+    assert np.abs(again - image / 257).mean() < 5
+
+
+def test_what_one_frame_cannot_do_is_said(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    clip = written(tmp_path / "clip", CLIPS["one"])
+    assert run("fit", clip, "--out", "m.safetensors", *QUICK) == 0
+    assert run("uncertainty", "m.safetensors", clip, "--out", "times") == 2
+    assert "at least 3 frames" in capsys.readouterr().err
+    assert run("export", "m.safetensors", "--format", "ply", "--out", "v.ply") == 1
+    assert "at least 2 frames" in capsys.readouterr().err
+    assert not (tmp_path / "v.ply").exists()
+
+
+def test_steps_that_do_not_see_all_frames_are_warned_of(tmp_path, capsys):
+    clip = written(tmp_path / "clip", ramp(9, 16, 16))
+    for steps, warned in ((8, True), (9, False)):
+        out = tmp_path / f"{steps}.safetensors"
+        assert run("fit", clip, "--out", out, "--gaussians", 100, "--steps", steps) == 0
+        assert ("8 steps see 8 of 9 frames" in " ".join(capsys.readouterr().err.split())) == warned
+        assert load_video_model(out).num_frames == 9

@@ -1,0 +1,314 @@
+"""Clips at the extremes: fitted, kept, drawn and judged like any other, with no NaN and no frame left dark."""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.io import load_video_model, save_compact, save_video_model
+from foldgauss.uncertainty import evidence
+from foldgauss.video import (
+    FitConfig,
+    FrameTimes,
+    by_time,
+    compress,
+    edit,
+    evaluate,
+    fit,
+    interpolated_times,
+    layers,
+    played_positions,
+    psnr,
+    ssim,
+    times_at,
+)
+from foldgauss.video.compress import EXACT_PSNR
+from foldgauss.video.config import chosen_num_gaussians
+from foldgauss.video.fit import start, to_model
+from foldgauss.video.initialize import CORE, ROUNDS, _even_chance
+from foldgauss.video.motion import Motion
+from foldgauss.video.shots import is_cut, out_of_cuts, time_logits
+
+SIZE = (24, 32)
+
+
+def constant(level, num_frames=3, size=SIZE, channels=3):
+    return np.full((num_frames, *size, channels), level, np.uint8)
+
+
+def one_bright_pixel():
+    frames = constant(0)
+    frames[:, 10, 13] = 255
+    return frames
+
+
+def pictures_of(num, size=SIZE):
+    """Pictures that have nothing in common: plain, but of a colour and with a disc each."""
+    rng, (y, x) = np.random.default_rng(4), np.mgrid[: size[0], : size[1]]
+    made = []
+    for _ in range(num):
+        where = rng.uniform(0.2, 0.8, 2) * size
+        inside = np.hypot(y - where[0], x - where[1]) < 0.3 * min(size)
+        ground, disc = rng.integers(0, 256, (2, 3))
+        made.append(np.where(inside[..., None], disc, ground))
+    return np.array(made, np.uint8)
+
+
+def alternating(pattern, of):
+    return np.stack([of["AB".index(name)] for name in pattern])
+
+
+def with_alpha(frames):
+    """Its left half; the right one is clear."""
+    alpha = np.zeros((*frames.shape[:3], 1), np.uint8)
+    alpha[:, :, : max(frames.shape[2] // 2, 1)] = 255
+    return np.concatenate([frames * (alpha > 0), alpha], -1)
+
+
+BLACK_AND_WHITE = np.concatenate([constant(0, 1), constant(255, 1)])
+#: Frames, and the mean PSNR in dB that a short fit must reach.
+CLIPS = {
+    "one frame": (moving_blobs(1, *SIZE), 32),
+    "one frame with alpha": (with_alpha(moving_blobs(1, *SIZE)), 26),
+    "two frames": (moving_blobs(2, *SIZE), 30),
+    "two unlike frames": (pictures_of(2), 22),
+    "all black": (constant(0), 100),
+    "all white": (constant(255), 48),
+    "one black frame": (constant(0, 1), 100),
+    "all clear": (constant(0, channels=4), 60),
+    "one bright pixel": (one_bright_pixel(), 48),
+    "black and white": (alternating("ABABAB", BLACK_AND_WHITE), 15),
+    "two pictures in turn": (alternating("ABABAB", pictures_of(2)), 20),
+    "8x8": (moving_blobs(4, 8, 8), 30),
+    "1x1": (moving_blobs(3, 1, 1), 40),
+    "1x4096": (moving_blobs(2, 1, 4096), 22),
+    "4096x1": (moving_blobs(2, 4096, 1), 22),
+    "1x4096 with alpha": (with_alpha(moving_blobs(2, 1, 4096)), 18),
+}
+SETTINGS = {
+    "standard": {},
+    "sum": {"compositing": "sum"},
+    "degree 0": {"degree": 0},
+    "degree 7": {"degree": 7},
+    "two cameras, batches": {"two_cameras": True, "batch_size": 3, "steps": 30},
+    "between, target": {"between_share": 0.5, "target_psnr": 99.0, "steps": 30},
+    "at rest": {"follow_motion": False},
+}
+
+
+def check_whole(model, history, frames):
+    """Finite, and the same from its file, at its frames and between them; returns the scores."""
+    assert all(np.isfinite(leaf).all() for leaf in map(np.asarray, jax.tree.leaves(model)))
+    assert all(math.isfinite(info.loss) and math.isfinite(info.psnr) for info in history)
+    scores = evaluate(model, frames)
+    assert np.isfinite(scores.psnr).all()
+    assert np.isfinite(scores.ssim).all()
+    times = np.asarray(model.frame_times.times())
+    for picture in model.frames(interpolated_times(times, 2), (9, 7)):
+        assert picture.shape == (9, 7, 3)
+    return scores
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_a_short_fit_and_its_file(tmp_path, name):
+    frames, least = CLIPS[name]
+    result = fit(frames, FitConfig(num_gaussians=400, steps=120))
+    scores = check_whole(result.model, result.history, frames)
+    assert scores.mean_psnr >= least
+    kept = load_video_model(save_video_model(tmp_path / "m.safetensors", result.model))
+    assert (kept.num_frames, kept.size) == (len(frames), frames.shape[1:3])
+    assert evaluate(kept, frames) == scores
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("name", ["one frame", "all white", "black and white", "8x8", "1x4096"])
+def test_every_setting_at_the_extremes(name, setting):
+    frames, least = CLIPS[name]
+    config = FitConfig(**({"num_gaussians": 300, "steps": 60} | SETTINGS[setting]))
+    result = fit(frames, config)
+    assert check_whole(result.model, result.history, frames).mean_psnr > 0.4 * least
+
+
+@pytest.mark.parametrize("name", ["one frame", "all black", "black and white", "1x4096"])
+@pytest.mark.parametrize("preset", ["draft", "paper"])
+def test_presets_at_the_extremes(name, preset):
+    """The published recipe is far from its end after so few steps, but grows and stays finite."""
+    frames, _ = CLIPS[name]
+    config = FitConfig.preset(preset, num_gaussians=200, max_gaussians=300, steps=60)
+    result = fit(frames, config)
+    check_whole(result.model, result.history, frames)
+
+
+# ------------------------------------------------------------------------------------------ one frame alone
+
+
+@pytest.fixture(scope="module")
+def still():
+    frames = moving_blobs(1, *SIZE)
+    return frames, fit(frames, FitConfig(num_gaussians=400, steps=120)).model
+
+
+def test_one_frame_has_one_time():
+    times = FrameTimes.uniform(1).times()
+    np.testing.assert_array_equal(times, [0])
+    assert times.dtype == np.float32
+    assert time_logits(1, []).shape == is_cut(times).shape == (0,)
+    np.testing.assert_array_equal(interpolated_times(np.asarray(times), 5), [0])
+    np.testing.assert_array_equal(times_at(np.asarray(times), np.array([[0.0, 0.7], [-1.0, 3.0]])), np.zeros((2, 2)))
+    np.testing.assert_array_equal(played_positions(1, 2.4, speed=-0.5), [0])
+    np.testing.assert_array_equal(out_of_cuts(np.array([0.0, 0.3, 1.0], np.float32), times), [0, 0, 0])
+
+
+def test_one_frame_is_shown_at_all_times(still):
+    _, model = still
+    shown = np.stack(list(model.frames(np.array([0.0, 0.5, 1.0]))))
+    np.testing.assert_array_equal(shown[1:], shown[:1].repeat(2, 0))
+    np.testing.assert_array_equal(np.asarray(model.render(1.0)), np.asarray(model.render(0.0)))
+    moved = edit(model).move((0.1, 0)).video()
+    later = edit(moved).retime(shift=0.5).video()
+    for video in (moved, later, layers(model, moved)):
+        first, last = video.frames(np.array([0.0, 1.0]))
+        np.testing.assert_array_equal(first, last)
+        assert psnr(first, shown[0]) < 60
+
+
+def test_one_frame_stands_behind_a_clip(still):
+    """A picture as the background of a video, at all of its times."""
+    frames, picture = still
+    clip = fit(constant(0, 4), FitConfig(num_gaussians=20, steps=2)).model
+    gone = edit(clip).vanish().video()
+    for shown in layers(gone, picture, timeline=0).frames():
+        assert psnr(frames[0], shown) > 32
+
+
+def test_one_frame_has_all_its_gaussians(still):
+    model = still[1]
+    assert by_time(model, frame=0).mask.all()
+
+
+@pytest.mark.parametrize("passes", [0, 1])
+def test_one_frame_in_a_compact_file(tmp_path, still, passes):
+    frames, model = still
+    made = compress(model, frames, max_loss_db=0.5, passes=passes)
+    loaded = load_video_model(save_compact(tmp_path / "m.fgz", made.quantised))
+    assert loaded.num_frames == 1
+    assert evaluate(model, frames).mean_psnr - evaluate(loaded, frames).mean_psnr <= 0.5
+
+
+def test_one_frame_tells_no_times(still):
+    frames, model = still
+    with pytest.raises(ValueError, match="at least 3 frames"):
+        evidence(model, frames)
+
+
+# -------------------------------------------------------------------------------------------- alternating
+
+
+def test_pictures_in_turn_have_no_dark_between_them():
+    """Most intervals are cuts: gaps there would be the usual interval, and what is shown within them nothing."""
+    frames = alternating("AABAABAAB", np.maximum(pictures_of(2), 100))
+    assert len(Motion.of(frames).cuts()) == 5
+    model = fit(frames, FitConfig(num_gaussians=600, steps=150)).model
+    shown = np.stack(list(model.frames(interpolated_times(np.asarray(model.frame_times.times()), 4))))
+    assert shown.mean((1, 2, 3)).min() > 0.5 * frames.mean((1, 2, 3)).min()
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "cuts"), [(2, [1]), (3, [2]), (5, [1, 3]), (9, [2, 3, 5, 6, 8]), (6, [1, 2, 3]), (8, [3])]
+)
+def test_gaps_stand_only_where_they_are_seen_as_cuts(num_frames, cuts):
+    logits = time_logits(num_frames, cuts)
+    found = np.flatnonzero(is_cut(FrameTimes(logits).times())) + 1
+    assert found.tolist() == (cuts if logits.any() else [])
+    assert logits.any() == (2 * len(cuts) < num_frames - 1)
+
+
+# -------------------------------------------------------------------------------------------------- long
+
+
+def test_five_thousand_frames_and_few_steps():
+    """No frame is left dark, though most of them were never looked at; nor does it take long to begin."""
+    num = 5000
+    frames = moving_blobs(50, 8, 8)[np.abs(np.arange(num) % 98 - 49)]
+    result = fit(frames, FitConfig(steps=200, num_gaussians=5000))
+    assert result.history[-1].seconds < 60
+    shown = np.stack(list(result.model.frames()))
+    assert (shown.mean((1, 2, 3)) > 0.25 * frames.mean((1, 2, 3))).all()
+    assert math.isfinite(result.history[-1].psnr)
+
+
+def test_long_clips_get_as_many_gaussians_a_frame_as_shorter_ones():
+    number = {n: chosen_num_gaussians(FitConfig(), n, 160, 320) for n in (1, 132, 250, 500, 5000)}
+    assert number[1] == number[132] == number[250] == round(177 * math.sqrt(160 * 320))
+    assert number[500] == pytest.approx(2 * number[250], abs=2)
+    assert number[5000] == pytest.approx(20 * number[250], abs=20)
+    assert chosen_num_gaussians(FitConfig(max_gaussians=9000), 5000, 160, 320) == 9000
+
+
+def test_starts_are_spread_as_by_the_whole_matrix():
+    """Against the matrix of who covers what, which 5,000 frames have no room for."""
+    rng, num, tried = np.random.default_rng(2), 40, 8
+    times, home = np.linspace(0, 1, num), np.repeat(np.arange(num), tried)
+    spread = np.exp(rng.uniform(-5, -2, num))[home]
+    first = np.searchsorted(times, times[home] - CORE * spread)
+    last = np.searchsorted(times, times[home] + CORE * spread, side="right")
+    covers = np.zeros((num, num))
+    for k, a, b in zip(home, first, last, strict=True):
+        covers[k, a:b] += 1 / tried
+    chance = np.full(num, 1 / num)
+    for _ in range(ROUNDS):
+        chance *= (covers / (chance @ covers)).sum(1) / covers.sum(1)
+    np.testing.assert_allclose(_even_chance(home, spread, times), chance / chance.sum(), rtol=1e-9)
+
+
+def test_every_stretch_of_a_long_clip_has_starts():
+    """By chance alone, with one start in ten frames, one stretch of 60 in four hundred has none."""
+    frames = moving_blobs(10, 16, 16)[np.arange(3000) % 10]
+    config = FitConfig(num_gaussians=300, steps=1, follow_motion=False)
+    model = to_model(start(frames, config), config, (16, 16), 25.0)
+    own = np.sort(1 / (1 + np.exp(-model.splats.time_loc_logit)))
+    assert np.diff(own, prepend=0, append=1).max() < 25 / 3000
+
+
+# --------------------------------------------------------------------------------------------- judgement
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (8, 8), (10, 30)])
+def test_ssim_of_small_pictures(size):
+    rng = np.random.default_rng(1)
+    one, other = rng.integers(0, 256, (2, *size, 3)).astype(np.uint8)
+    assert ssim(one, one) == pytest.approx(1)
+    assert ssim(one, other) < 0.8
+    assert ssim(one, other) == pytest.approx(ssim(other, one))
+    assert ssim(one.swapaxes(0, 1), other.swapaxes(0, 1)) == pytest.approx(ssim(one, other))
+
+
+def test_frames_that_are_exact_cost_the_others_no_bits():
+    """Half of the frames are black: that they are no longer so to the last bit is no loss of tens of dB."""
+    frames = np.concatenate([moving_blobs(4, *SIZE), constant(0, 4)])
+    model = fit(frames, FitConfig(num_gaussians=500, steps=200)).model
+    assert max(evaluate(model, frames).psnr) > EXACT_PSNR
+    made = compress(model, frames, max_loss_db=0.3, passes=1)
+    assert made.loss_db <= 0.3
+    before, after = (np.minimum(evaluate(one, frames).psnr, EXACT_PSNR) for one in (model, made.model))
+    assert before.mean() - after.mean() == pytest.approx(made.loss_db, abs=1e-6)
+    assert pytest.approx(58.92, abs=0.01) == EXACT_PSNR
+
+
+@pytest.mark.parametrize(
+    ("frames", "words"),
+    [
+        (constant(7).astype(np.uint16), "uint16.*np.rint"),
+        (constant(1).astype(np.float32), "float32.*255"),
+        (constant(1)[0], r"frames\[None\]"),
+        (list(constant(1)), "list.*np.stack"),
+        (constant(1)[:0], r"\(0, 24, 32, 3\)"),
+        (constant(1)[:, :, :0], r"\(3, 24, 0, 3\)"),
+    ],
+    ids=["16 bits", "floats", "one picture", "a list", "no frames", "no pixels"],
+)
+def test_arrays_that_are_no_frames_come_with_a_cure(frames, words):
+    with pytest.raises(ValueError, match=f"frames: expected a uint8 array.*{words}"):
+        fit(frames, FitConfig(steps=1))
