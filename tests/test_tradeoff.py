@@ -120,7 +120,7 @@ def test_each_turn_changes_one_thing_and_has_a_command():
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
     words = kept.Words(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
-    lines = [words.of(point, (320, 640)) for point in made]
+    lines = [words.of(point, 132, (320, 640)) for point in made]
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
         changed = kept.settings_of(point, BASE)

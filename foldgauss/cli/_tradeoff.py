@@ -103,7 +103,7 @@ class Words:
     frames: str | None
     folder: Path
 
-    def of(self, point: Point, clip_size: tuple[int, int]) -> str:
+    def of(self, point: Point, num_frames: int, size: tuple[int, int]) -> str:
         """`point` as commands: its fit; or what is done to the base's model, which is kept."""
         name, base = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_"), self.folder / BASE
         if point.played is not None:
@@ -118,7 +118,7 @@ class Words:
         words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
         words += [] if self.size is None else ["--size", self.size]
         words += [] if self.frames is None else ["--frames", self.frames]
-        default = FitConfig(num_gaussians=default_num_gaussians(*clip_size))
+        default = FitConfig(num_gaussians=default_num_gaussians(num_frames, *size))
         words += _changed(point.config, default, FIT_OPTIONS)
         words += _changed(point.config.options, default.options, DRAW_OPTIONS)
         return shlex.join(["foldgauss", *words])

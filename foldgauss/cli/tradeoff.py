@@ -66,7 +66,7 @@ Tell = Callable[[str], None]
 
 @app.command(name="tradeoff")
 def tradeoff_command(
-    video: Annotated[Path, typer.Argument(help="Video file, or folder of images in natural order.")],
+    video: Annotated[Path, typer.Argument(help="Video file, folder of images in natural order, or one image.")],
     out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")],
     axes: Annotated[
         str | None, typer.Option(metavar="AXIS,AXIS,..", help=f"Which axes, of {', '.join(AXES)} [default: all].")
@@ -230,7 +230,7 @@ class _Run:
             "floats": shown.num_floats,
             "gaussians": shown.num_gaussians,
             "frames_per_second": round(rate, 2),
-            "command": self.words.of(point, self.clip.size),
+            "command": self.words.of(point, self.clip.num_frames, self.clip.size),
         }
 
     def _again(
