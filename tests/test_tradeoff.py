@@ -197,10 +197,13 @@ def test_half_precision_is_kept_and_widened(tmp_path):
     assert (again.splats.degrees == 1).all()
     np.testing.assert_array_equal(again.splats.lasting, lean.splats.lasting)
     assert again.splats.lasting.sum() == 5
+    # A leaf with a number beyond 16 bits keeps its 32.
     leaves["coefficients"][3, 0, 0] = 1e5
-    broken = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
-    with pytest.raises(ValueError, match="coefficients: expected numbers of at most 65504, got 1 beyond"):
-        halved(broken)
+    steep = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
+    save_video_model(tmp_path / "steep.safetensors", halved(steep))
+    again = load_video_model(tmp_path / "steep.safetensors")
+    np.testing.assert_array_equal(again.splats.coefficients, leaves["coefficients"])
+    np.testing.assert_array_equal(again.splats.loc, np.asarray(model.splats.loc).astype(np.float16))
 
 
 def test_plot():
@@ -329,6 +332,22 @@ def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
     assert "2 of 4 points are kept" in " ".join(capsys.readouterr().err.split())
     assert len(record_of(target)["points"]) == 2
     assert sorted(path.name for path in target.iterdir()) == ["base.safetensors", "tradeoff.json"]
+
+
+def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
+    def failing(*given, **more):
+        raise ValueError("max_loss_db: out of reach")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(command, "compress", failing)
+        assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0
+    assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
+    record = record_of(tmp_path / "r")
+    assert [name_of(row) for row in record["points"]] == ["base", "precision float16"]
+    assert set(record["left_out"]) == {"precision compact", "precision compact, mended"}
+    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
+    assert len(record_of(tmp_path / "r")["points"]) == 4
+    assert record_of(tmp_path / "r")["left_out"] == {}
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,8 @@ def compress_command(
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
     ] = None,
     float16: Annotated[
-        bool, typer.Option("--float16", help=f"Only round to 16 bits, into a {MODEL_SUFFIX} file of half the size.")
+        bool,
+        typer.Option("--float16", help=f"Only round to 16 bits, into a {MODEL_SUFFIX} file of about half the size."),
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:

@@ -47,6 +47,7 @@ from foldgauss.video.tradeoff import (
     LEAST_STEPS,
     MAX_LOSS_DB,
     PASSES,
+    Left,
     Pace,
     Point,
     check_axes,
@@ -109,11 +110,12 @@ def tradeoff_command(
     for one in left:
         err.print(f"note: {one.name} is left out: {one.why}.", soft_wrap=True)
     try:
-        run.measure(made, base)
+        failed = run.measure(made, base)
     except KeyboardInterrupt:
         kept = f"{len(record.rows)} of {len(made)} points are kept in {record.path}"
         raise Stopped(f"stopped; {kept}. Run the same command again to go on.") from None
-    report(record, made, left, clock)
+    missing = {one.name for one in failed}
+    report(record, [point for point in made if point.name not in missing], left + failed, clock)
 
 
 class _Run:
@@ -135,7 +137,8 @@ class _Run:
             base = dataclasses.replace(wanted, num_gaussians=num, steps=full)
             made, _ = points(base, axes, self.clip.num_frames, self.clip.size, has_alpha=self.clip.has_alpha)
             allowed = steps_within(60 * minutes / SLOWER, made, pace, self.clip.num_frames)
-            chosen = min(max(allowed, LEAST_STEPS), full) if steps is None else steps
+            least = max(LEAST_STEPS, self.clip.num_frames)  # so that the base sees every frame
+            chosen = min(max(allowed, least), full) if steps is None else steps
             expected = SLOWER * seconds_of(made, chosen, pace, self.clip.num_frames) / 60
             self.record.plan = {"steps": chosen, "expected_minutes": round(expected, 2), "pace": pace._asdict()}
             self._say(len(made), chosen, expected)
@@ -182,15 +185,22 @@ class _Run:
             tell(info)
             yield state, info
 
-    def measure(self, made: list[Point], base: FitConfig) -> None:
-        """A row for each point that has none yet, kept as soon as it is there."""
-        busy = False
+    def measure(self, made: list[Point], base: FitConfig) -> list[Left]:
+        """A row for each point that has none yet, kept as soon as it is there; and the points that cannot be had."""
+        failed, busy = [], False
         with _bar(len(made), sum(point.name in self.record.rows for point in made)) as (tell, advance):
             for point in made:
                 if point.name in self.record.rows:
                     continue
                 tell(point.name)
-                row = self._measured(point, base, lambda text, point=point: tell(f"{point.name}: {text}"))
+                try:
+                    row = self._measured(point, base, lambda text, point=point: tell(f"{point.name}: {text}"))
+                except ValueError as error:  # a fit that diverged, a loss out of reach
+                    if point.axis == "base":
+                        raise
+                    failed.append(Left(point.name, str(error)))
+                    advance(f"{point.name} is left out: {error}")
+                    continue
                 self.record.rows[point.name] = row
                 self.record.machine["load_average_last"] = load_average()
                 busy |= (load_average() or 0) > 1.5 * self.record.machine["cores"]
@@ -202,6 +212,7 @@ class _Run:
                 "With --clock cpu, the same command again, the front is by the work done.",
                 soft_wrap=True,
             )
+        return failed
 
     def _measured(self, point: Point, base: FitConfig, tell: Tell) -> dict[str, Any]:
         with atomic_path(self.folder / BASE) if point.axis == "base" else _passing(self.folder, point) as path:
