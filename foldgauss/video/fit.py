@@ -126,9 +126,12 @@ def fit(
 
 
 def fit_steps(
-    frames: np.ndarray, config: FitConfig, state: FitState | None = None
+    frames: np.ndarray, config: FitConfig, state: FitState | None = None, *, motion: Motion | None = None
 ) -> Iterator[tuple[FitState, FitInfo]]:
-    """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one."""
+    """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one.
+
+    `motion`: the frames' own, where it is known from before; finding it takes some hundredths of a second a frame.
+    """
     check_frames(frames)
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
@@ -137,8 +140,9 @@ def fit_steps(
         cure = "Leave it out: the flow knows nothing of what is behind."
         raise invalid("between_share", expected="0 for frames with alpha", got=config.between_share, cure=cure)
     _warm_up(frames, config)
-    state = start(frames, config) if state is None else state
-    step = _Stepper(frames, config, state)
+    flow = _Flow(frames, motion)
+    state = _started(frames, config, None, flow) if state is None else state
+    step = _Stepper(frames, config, state, flow)
     pace = _Pace(config, [level.share for level in step.levels], len(frames))
     outlook = _Outlook(state, config, step.levels)
     stopped_by = _stopped_by(state, config, frames)
@@ -304,9 +308,13 @@ def _info(
 
 def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
     """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
+    return _started(frames, config, logits, _Flow(frames))
+
+
+def _started(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, flow: "_Flow") -> FitState:
     frames = np.ascontiguousarray(frames[..., :3])  # as seen over black, where there is alpha
     begun, num_frames = time.perf_counter(), len(frames)
-    motion = Motion.of(frames) if config.follow_motion else None
+    motion = flow.motion if config.follow_motion else None
     if logits is None:
         logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
     logits = np.array(logits, np.float32)
@@ -427,10 +435,23 @@ def _cure_of_frames(shape: tuple[int, ...] | None, dtype: np.dtype | None) -> st
     return ""
 
 
+class _Flow:
+    """The motion of a clip, found when it is first asked for."""
+
+    def __init__(self, frames: np.ndarray, motion: Motion | None = None):
+        self._frames, self._motion = frames, motion
+
+    @property
+    def motion(self) -> Motion:
+        if self._motion is None:
+            self._motion = Motion.of(np.ascontiguousarray(self._frames[..., :3]))
+        return self._motion
+
+
 class _Stepper:
     """One step of the fit: buffers and constants that every step shares."""
 
-    def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState):
+    def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState, flow: _Flow | None = None):
         self.frames, self.config = frames, config
         self.background = np.zeros(3, np.float32)  # another in every step for frames with alpha
         self.num_frames, height, width, _ = frames.shape
@@ -443,8 +464,8 @@ class _Stepper:
         for name, place in columns(config.degree).items():
             self.rates[place] = getattr(config.rates, name)
             self.falling[place] = config.falling in ("all", name)
-        self.motion = None  # known where Gaussians have been born
-        self.between = _Between(frames, config) if config.between_share > 0 else None
+        self.flow = _Flow(frames) if flow is None else flow
+        self.between = _Between(frames, config, self.flow.motion) if config.between_share > 0 else None
         self._make_room(state)
 
     def _make_room(self, state: FitState) -> None:
@@ -569,8 +590,6 @@ class _Stepper:
         """Gaussians where the error is, in depth anywhere between the others."""
         config, times = self.config, np.asarray(_frame_times(state.time_logits))
         colors = np.ascontiguousarray(self.frames[..., :3])
-        if config.follow_motion and self.motion is None:
-            self.motion = Motion.of(colors)
         self._make_room(state)
 
         def squares(k: int) -> np.ndarray:
@@ -590,7 +609,7 @@ class _Stepper:
             alive,
             degree=config.degree,
             envelope=_envelope(config),
-            motion=self.motion,
+            motion=self.flow.motion if config.follow_motion else None,
             opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
             seed=(config.seed, 3, state.step),
         )
@@ -694,9 +713,9 @@ class _Stepper:
 class _Between:
     """What a fit learns of the times between frames: which ones, and what is to be seen there."""
 
-    def __init__(self, frames: np.ndarray, config: FitConfig):
+    def __init__(self, frames: np.ndarray, config: FitConfig, motion: Motion):
         self.frames, self.config = np.ascontiguousarray(frames[..., :3]), config
-        self.motion = Motion.of(self.frames)
+        self.motion = motion
         self.last_of_shots = {*(k - 1 for k in self.motion.cuts()), len(frames) - 1}
 
     def share(self, step: int, k: int) -> float | None:
