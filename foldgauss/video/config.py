@@ -90,7 +90,8 @@ class FitConfig:
     """Everything a fit depends on beside the frames; `preset` has some of them ready.
 
     `steps`, `minutes` and `target_psnr` are budgets: the fit ends with the first that binds. Minutes are turned into
-    steps once, by the measured pace; where Gaussians grow (`growth`), or with a target, the clock ends the fit. A
+    steps once, by the measured pace; where Gaussians grow (`growth`, `economy`), or with a target, the clock ends the
+    fit. A
     target is looked for once in four passes through the frames. With neither steps nor minutes, steps are
     `DEFAULT_STEPS`, or more for long clips. `max_size_mb` bounds the number of Gaussians by the model file's size.
 
@@ -184,9 +185,12 @@ class FitConfig:
             kinds |= {"growth": Growth}
         if self.economy is not None:
             kinds |= {"economy": Economy}
-            if isinstance(self.economy, Economy) and self.economy.psnr is not None and self.target_psnr is not None:
-                got = f"also target_psnr={self.target_psnr:g}"
-                raise invalid("economy.psnr", expected="the only PSNR asked for", got=got, cure="Leave one out.")
+            if self.compositing == "sum":
+                # Overlapping contributions add up: what each is worth says nothing of what several are.
+                raise invalid("economy", expected="None with compositing 'sum'", got="one", cure="Take 'over'.")
+            if self.target_psnr is not None:
+                cure = "The smallest model at a PSNR: Economy(psnr=...), or --smallest-at-psnr, alone."
+                raise invalid("target_psnr", expected="None with an economy", got=self.target_psnr, cure=cure)
         for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
                 raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
