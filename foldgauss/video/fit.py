@@ -521,6 +521,7 @@ class _Stepper:
         )
         state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
         state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, self.config.degree)])
+        state.young = np.zeros(len(state.rows), bool)
         state.statistics = Statistics.zeros(len(state.rows))
         self._make_room(state)
 
