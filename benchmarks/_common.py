@@ -1,10 +1,7 @@
 """What the benchmarks share: arguments, scenes, timing side by side, and the file of figures."""
 
 import argparse
-import importlib.metadata
 import json
-import os
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from foldgauss._threads import available_cores, num_threads
+from foldgauss._machine import machine as machine
 from foldgauss.io._atomic import atomic_path, check_writable
 
 console = Console(width=140)
@@ -123,29 +120,6 @@ def size(text: str) -> tuple[int, int]:
     """argparse type: HxW."""
     height, _, width = text.lower().partition("x")
     return whole(height), whole(width)
-
-
-def machine() -> dict[str, object]:
-    """Facts a timing depends on; no names of hosts or users."""
-    packages = ("jax", "jaxlib", "numba", "numpy", "optax")
-    return {
-        "cpu": _cpu_model(),
-        "cores": available_cores(),
-        "threads": num_threads(),
-        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in packages},
-    }
-
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:  # not Linux
-        return platform.processor() or "unknown"
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, "unknown")
 
 
 def table(title: str, *columns: str) -> Table:

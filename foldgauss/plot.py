@@ -1,7 +1,8 @@
-"""Pictures of a Folded-Gaussian and of a fit's history; matplotlib is imported when one is drawn."""
+"""Pictures of a Folded-Gaussian, of a fit's history and of speed against accuracy; matplotlib is imported for one."""
 
+import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from foldgauss.distribution import FoldedGaussian
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_density", "plot_history"]
+__all__ = ["Panel", "plot_density", "plot_history", "plot_tradeoff"]
 
 _RED = "#d1242f"
 _BLUE = "#1f4e79"
@@ -21,6 +22,8 @@ _DENSITY = "Blues"
 _MASS = (0.3, 0.6, 0.9)  # probability inside the contour lines
 _GRID = 240
 _REACH = 3.2  # time shown, in time_scales on either side
+_MARKERS = "osD^vPX"  # of axes, colours being ten
+_SIDES = ((-1, 1), (0, 1), (-1, 0), (1, -1), (1, 0), (0, -1), (1, 1), (-1, -1))  # of a name, the best first
 _STEPS_DRAWN = 5000  # of a history: more than a picture has columns
 _LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
 
@@ -103,6 +106,115 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
     axes[1, 0].set_ylabel("loss")
     axes[1, 0].legend()
     return axes
+
+
+class Panel(NamedTuple):
+    """One thing that quality costs: its label, of each point how much, indices of the front and of its knee."""
+
+    label: str
+    cost: Sequence[float]
+    front: Sequence[int]
+    knee: int | None
+
+
+def plot_tradeoff(
+    panels: Sequence[Panel],
+    quality: Sequence[float],
+    names: Sequence[tuple[str, str]],
+    axes: "np.ndarray | None" = None,
+) -> np.ndarray:
+    """Quality against what it costs, a panel for each cost: a colour for each axis, the front drawn, its knee ringed.
+
+    Points of a front are named where there is room for it, the knee always. A point of the axis "base" is a star.
+
+    **Shapes:** `quality` and every cost have one number per point, `names` its axis and value; `axes`, given or made,
+    are (len(panels),).
+
+    **Units:** dB; costs on logarithmic scales.
+
+    **Example:** `plot_tradeoff([Panel("seconds", [1, 2], [0, 1], None)], [30, 33], [("base", ""), ("time", "2")])`
+
+    **Raises:** ImportError that names the extra if matplotlib is missing.
+    """
+    if axes is None:
+        made = needed_pyplot("plot_tradeoff").subplots(1, len(panels), sharey=True, squeeze=False, layout="constrained")
+        axes = made[1][0]
+    axes = np.atleast_1d(axes)
+    groups = list(dict.fromkeys(axis for axis, _ in names))
+    quality = np.asarray(quality, float)
+    for panel, ax in zip(panels, axes, strict=True):
+        cost, chosen = np.asarray(panel.cost, float), list(panel.front)
+        ax.plot(cost[chosen], quality[chosen], "-", color="0.55", linewidth=1.2, zorder=1, label="_front")
+        for number, group in enumerate(groups):
+            own = [k for k, (axis, _) in enumerate(names) if axis == group]
+            marker, color = ("*", "black") if group == "base" else (_MARKERS[number % len(_MARKERS)], f"C{number % 10}")
+            size = 13 if group == "base" else 6.5
+            label = group if ax is axes[0] else f"_{group}"
+            ax.plot(cost[own], quality[own], marker, color=color, markersize=size, alpha=0.9, label=label, zorder=3)
+        if panel.knee is not None:
+            at = cost[panel.knee], quality[panel.knee]
+            ax.plot(*at, "o", color=_RED, markerfacecolor="none", markersize=17, markeredgewidth=2, zorder=2)
+        ax.set(xlabel=panel.label, xscale="log")
+        ax.xaxis.set_minor_formatter("")
+        _few_ticks(ax, cost)
+        ax.margins(x=0.16, y=0.1)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("PSNR (dB)")
+    figure = axes[0].figure
+    figure.legend(loc="outside lower center", ncols=min(len(groups), 6), frameon=False)
+    figure.draw_without_rendering()  # from here on places are known in pixels
+    for panel, ax in zip(panels, axes, strict=True):
+        _name_points(ax, panel, quality, [f"{axis} {value}".rstrip() for axis, value in names])
+    return axes
+
+
+def _few_ticks(ax, cost: np.ndarray) -> None:
+    """Numbers as one writes them; a span of less than a power of ten would show one alone."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    subs = (1, 2, 5) if cost.max() < 100 * cost.min() else (1,)
+    ax.xaxis.set_major_locator(LogLocator(subs=subs))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _short(x)))
+
+
+def _short(number: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:g} {letter}"
+    return f"{number:g}"
+
+
+def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) -> None:
+    """Names beside points of the front, none over another name or a point; the knee's first, and in any case."""
+    from matplotlib.text import Text
+    from matplotlib.transforms import Bbox
+
+    places = ax.transData.transform(np.stack([np.asarray(panel.cost, float), quality], 1))
+    taken = [Bbox.from_extents(*(place - 5), *(place + 5)) for place in places]
+    line = places[list(panel.front)]
+    for one, other in itertools.pairwise(line):
+        along = one + np.linspace(0, 1, 20)[1:-1, None] * (other - one)
+        taken += [Bbox.from_extents(*(place - 4), *(place + 4)) for place in along]
+    for k in sorted(panel.front, key=lambda k: (k != panel.knee, -quality[k])):
+        is_knee = k == panel.knee
+        text = f"knee: {names[k]}" if is_knee else names[k]
+        font = {"fontsize": 10, "color": _RED, "fontweight": "bold"} if is_knee else {"fontsize": 9, "color": "0.15"}
+        for distance, (x, y) in itertools.product((9, 15, 24, 36, 50), _SIDES):
+            how = font | {"ha": ("right", "center", "left")[x + 1], "va": ("top", "center", "bottom")[y + 1]}
+            if distance > 20:
+                how["arrowprops"] = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.7}
+            offset = (distance + 5 * is_knee) * np.array([x, y]) / np.hypot(x, y)
+            place = float(panel.cost[k]), float(quality[k])
+            note = ax.annotate(text, place, offset, textcoords="offset points", in_layout=False, zorder=5, **how)
+            note.get_window_extent()  # puts the text in its place; the note's extent holds its line, too
+            box = Text.get_window_extent(note)
+            if ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max) and not box.count_overlaps(taken):
+                taken.append(box)
+                break
+            note.remove()
+        else:
+            if is_knee:  # over something else, but named
+                ax.annotate(text, place, (0, 14), textcoords="offset points", in_layout=False, ha="center", **font)
 
 
 def _running_median(values: np.ndarray) -> np.ndarray:

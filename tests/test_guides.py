@@ -49,6 +49,12 @@ def test_mixture():
     np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
 
 
+def test_tradeoff():
+    names = _run("tradeoff.md")
+    assert names["chosen"] == [0, 1, 2, 3]
+    assert names["bend"] == 1
+
+
 @pytest.mark.slow
 def test_rendering():
     names = _run("rendering.md")

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from foldgauss import __version__
-from foldgauss.cli import compressing, drawing, editing, fitting, uncertainty  # noqa: F401 - each adds its commands to `app`
+from foldgauss.cli import compressing, drawing, editing, fitting, tradeoff, uncertainty  # noqa: F401 - each adds its own
 from foldgauss.cli._shared import Stopped, WrongUse, app, as_option, err, out
 
 WRONG_USE, FAILURE = 2, 1

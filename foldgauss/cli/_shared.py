@@ -1,5 +1,6 @@
 """What the commands share: consoles, options, arguments and how results are shown."""
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -29,6 +30,7 @@ from foldgauss.io.video_file import (
     write_video,
 )
 from foldgauss.io.video_model import read_metadata
+from foldgauss.render import RenderOptions
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
@@ -38,7 +40,10 @@ from foldgauss.video.model import VideoModel
 class _InOrderOfUse(typer.core.TyperGroup):
     """The commands as one comes to need them; typer has them as they were registered."""
 
-    _ORDER = ("fit", "render", "evaluate", "info", "uncertainty", "edit", "compress", "export", "import", "demo")
+    _ORDER = (
+        *("fit", "render", "evaluate", "info", "uncertainty", "edit", "compress", "tradeoff", "export", "import"),
+        "demo",
+    )
 
     def list_commands(self, ctx: typer.Context) -> list[str]:
         others = set(self.commands).difference(self._ORDER)
@@ -59,6 +64,19 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output 
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
 Frames = Annotated[
     str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be left out.")
+]
+#: Constants of the picture, `RenderOptions`.
+AlphaCutoff = Annotated[
+    float | None,
+    typer.Option(help="Leave a Gaussian out where its alpha is below this [default: 1/255, or what was fitted with]."),
+]
+SupportRadius = Annotated[
+    float | None,
+    typer.Option(help="Leave a Gaussian out beyond so many of its deviations [default: none, or as fitted]."),
+]
+TransmittanceStop = Annotated[
+    float | None,
+    typer.Option(help="A pixel is finished once so little light is left [default: 1e-4, or as fitted]."),
 ]
 
 
@@ -93,6 +111,22 @@ def parse_color(text: str) -> tuple[float, float, float]:
     if not re.fullmatch("[0-9a-fA-F]{6}", digits):
         raise WrongUse(f"--background: expected six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}.")
     return tuple(byte / 255 for byte in bytes.fromhex(digits))
+
+
+def with_constants(options: RenderOptions, **constants: float | None) -> RenderOptions:
+    """`options` with those constants that were given. Raises WrongUse for one out of its bounds."""
+    try:
+        return dataclasses.replace(options, **{name: value for name, value in constants.items() if value is not None})
+    except ValueError as error:
+        raise WrongUse(as_option(str(error).removeprefix("RenderOptions."))) from error
+
+
+def drawn_with(model: VideoModel | EditedVideo, **constants: float | None) -> VideoModel | EditedVideo:
+    """The model, drawn with those constants that were given instead of its own. Raises as `with_constants`."""
+    if isinstance(model, EditedVideo):
+        own = (dataclasses.replace(layer, model=drawn_with(layer.model, **constants)) for layer in model.layers)
+        return dataclasses.replace(model, layers=tuple(own))
+    return dataclasses.replace(model, options=with_constants(model.options, **constants))
 
 
 def refuse_huge(size: tuple[int, int] | None) -> None:
@@ -165,6 +199,11 @@ def fingerprint(clip: Clip) -> dict[str, Any]:
     return {"num_frames": clip.num_frames, "size": list(clip.size), "frames_digest": digest}
 
 
+def provenance(clip: Clip, seed: int) -> dict[str, Any]:
+    """What is noted in a model's file of where it comes from."""
+    return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
+
+
 def clip_of_model(
     model: VideoModel | EditedVideo, model_path: Path, video: Path, frames: str | None, *, as_many: bool = True
 ) -> Clip:
@@ -213,6 +252,7 @@ _LABELS = {
     "num_dropped": ("Gaussians left out", "{:,}"),
     "bytes_before": ("before", "{:,} bytes"),
     "file_bytes": ("model file", "{:,} bytes"),
+    "frames_per_second": ("played", "{:.0f} frames a second"),
     "ratio": ("smaller by a factor of", "{:.2f}"),
     "bits_per_pixel": ("bits per pixel", "{:.3f}"),
 }

@@ -1,8 +1,9 @@
 """The command that makes a model's file small: `compress`."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,14 +14,21 @@ from foldgauss.cli._shared import (
     app,
     clip_of_model,
     err,
+    evaluate_with_progress,
     print_figures,
     refuse_existing,
+    scores_of,
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.compact import COMPACT_SUFFIX, check_compact_name, save_compact
-from foldgauss.io.video_model import load_video_model, read_metadata
-from foldgauss.video.compress import compress
+from foldgauss.io.video_file import Clip
+from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_video_model, read_metadata, save_video_model
+from foldgauss.video.compress import Compressed, compress
+from foldgauss.video.metrics import Evaluation
 from foldgauss.video.model import VideoModel
+from foldgauss.video.tradeoff import halved
+
+Score = Callable[[VideoModel], Evaluation]
 
 
 @app.command(name="compress")
@@ -39,6 +47,10 @@ def compress_command(
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
     ] = None,
+    float16: Annotated[
+        bool,
+        typer.Option("--float16", help=f"Only round to 16 bits, into a {MODEL_SUFFIX} file of about half the size."),
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a model as a compact file: a fraction of its size.
@@ -46,9 +58,10 @@ def compress_command(
     It is rendered, evaluated, edited and exported as any other. Its pictures differ a little: by --max-loss-db at most.
     See docs/format.md.
     """
-    target = Path(f"{model_path.resolve().stem}{COMPACT_SUFFIX}") if out_path is None else out_path
+    suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
+    target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
     try:
-        check_compact_name(target, "--out")
+        check_model_name(target, "--out") if float16 else check_compact_name(target, "--out")
     except ValueError as error:
         raise WrongUse(str(error)) from error
     if not within(max_loss_db, "(0, 60]"):
@@ -64,6 +77,52 @@ def compress_command(
         cure = "Compress the model before it is edited, and edit that."
         raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
     clip = None if video is None else clip_of_model(model, model_path, video, frames)
+    if float16:
+        figures = _only_rounded(target, model, about, clip)
+    else:
+        figures = _compressed(target, model, about, clip, max_loss_db, passes)
+    before, after = model_path.stat().st_size, target.stat().st_size
+    figures |= {
+        "bytes_before": before,
+        "file_bytes": after,
+        "ratio": before / after,
+        "bits_per_pixel": 8 * after / (model.num_frames * model.size[0] * model.size[1]),
+    }
+    print_figures(str(target), figures)
+
+
+def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
+    """Write a compact file with what is known of where it comes from, `about`; `known`: whether its PSNR is."""
+    about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
+    about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
+    save_compact(target, made.quantised, metadata=about | {"loss_db": round(made.loss_db, 4)})
+
+
+def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
+    """Write a model with 16-bit numbers, and the scores, if asked for, of what its reader will get."""
+    about = {name: value for name, value in about.items() if not name.startswith("mean_")}
+    small = halved(model)
+    save_video_model(target, small, metadata=about)
+    if score is None:
+        return None
+    scores = score(load_video_model(target))
+    save_video_model(target, small, metadata=about | scores_of(scores))
+    return scores
+
+
+def _only_rounded(target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None) -> dict[str, Any]:
+    def score(model: VideoModel) -> Evaluation:
+        return evaluate_with_progress(model, clip.frames)
+
+    before = None if clip is None else score(model)
+    scores = save_halved(target, model, about, None if clip is None else score)
+    lost = {} if scores is None else {"loss_db": before.mean_psnr - scores.mean_psnr}
+    return lost | {"num_gaussians": model.num_gaussians}
+
+
+def _compressed(
+    target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None, max_loss_db: float, passes: int
+) -> dict[str, Any]:
     told = about.get("mean_psnr")
     told = told if within(told, "(0, 100]") else None
     with err.status("Compressing") as status:
@@ -73,21 +132,7 @@ def compress_command(
 
         given = None if clip is None else clip.frames
         made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
-    about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
-    known = clip is not None or told is not None
-    about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
-    save_compact(target, made.quantised, metadata=about | {"loss_db": round(made.loss_db, 4)})
-    before, after = model_path.stat().st_size, target.stat().st_size
-    figures = {
-        "loss_db": made.loss_db,
-        "num_gaussians": made.model.num_gaussians,
-        "num_dropped": made.num_dropped,
-        "bytes_before": before,
-        "file_bytes": after,
-        "ratio": before / after,
-        "bits_per_pixel": 8 * after / (model.num_frames * model.size[0] * model.size[1]),
-    }
-    print_figures(str(target), figures)
+    save_compressed(target, made, about, known=clip is not None or told is not None)
     if clip is None:
         source = "that is noted in the file" if told is not None else "that is assumed"
         err.print(
@@ -95,3 +140,4 @@ def compress_command(
             f"{made.psnr:.2f} dB {source}. Give VIDEO for a smaller file, and a loss that is measured.",
             soft_wrap=True,
         )
+    return {"loss_db": made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}

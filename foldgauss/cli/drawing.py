@@ -11,13 +11,17 @@ from rich.table import Table
 from foldgauss._checks import invalid
 from foldgauss.cli._shared import (
     MAX_SHOWN,
+    AlphaCutoff,
     Overwrite,
     Size,
+    SupportRadius,
+    TransmittanceStop,
     WrongUse,
     app,
     check_picture_path,
     clip_of_model,
     draw,
+    drawn_with,
     err,
     evaluate_with_progress,
     figures_of,
@@ -41,6 +45,7 @@ from foldgauss.video.frame_times import interpolated_times, played_positions, re
 from foldgauss.video.metrics import evaluate
 from foldgauss.video.model import VideoModel
 from foldgauss.video.stored import stored_counts, to_stored
+from foldgauss.video.tradeoff import frames_per_second
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
@@ -73,6 +78,9 @@ def render(
     image_format: Annotated[
         str | None, typer.Option("--format", help="Of the images in a folder: png or webp, both exact [default: png].")
     ] = None,
+    alpha_cutoff: AlphaCutoff = None,
+    support_radius: SupportRadius = None,
+    transmittance_stop: TransmittanceStop = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Draw a model as a video, in between its frames too."""
@@ -86,7 +94,8 @@ def render(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
-    model = load_video_model(model_path)
+    constants = {"support_radius": support_radius, "transmittance_stop": transmittance_stop}
+    model = drawn_with(load_video_model(model_path), alpha_cutoff=alpha_cutoff, **constants)
     refuse_huge(picture_size or model.size)
     shown, rate = course.times(np.asarray(model.frame_times.times()), model.fps), course.rate(model.fps)
     course.warn_of_end(model.num_frames, model.fps)
@@ -166,16 +175,20 @@ def evaluate_command(
             "[default: those that it was fitted to].",
         ),
     ] = None,
+    alpha_cutoff: AlphaCutoff = None,
+    support_radius: SupportRadius = None,
+    transmittance_stop: TransmittanceStop = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare a model with its clip: PSNR and SSIM of every frame.
 
-    Tells the size of the file and its bits per pixel, too.
+    Tells the size of the file, its bits per pixel and how fast it is drawn, too.
     """
     if json_path is not None:
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
-    model = load_video_model(model_path)
+    constants = {"support_radius": support_radius, "transmittance_stop": transmittance_stop}
+    model = drawn_with(load_video_model(model_path), alpha_cutoff=alpha_cutoff, **constants)
     clip = clip_of_model(model, model_path, video, frames)
     scores = evaluate_with_progress(model, clip.frames)
     num_bytes = model_path.stat().st_size
@@ -183,6 +196,7 @@ def evaluate_command(
     if clip.has_alpha:
         figures["mean_psnr_on_white"] = round(evaluate(model, clip.frames, background=(1.0, 1.0, 1.0)).mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
+    figures["frames_per_second"] = round(frames_per_second(model), 1)
     if json_path is not None:
         write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
     print_frames(scores)

@@ -15,10 +15,13 @@ from foldgauss._checks import invalid
 from foldgauss._progress import Manner, Observer, previewing, print_json, watching
 from foldgauss._threads import num_threads
 from foldgauss.cli._shared import (
+    AlphaCutoff,
     Frames,
     Overwrite,
     Size,
     Stopped,
+    SupportRadius,
+    TransmittanceStop,
     WrongUse,
     app,
     as_option,
@@ -30,8 +33,10 @@ from foldgauss.cli._shared import (
     parse_frames,
     parse_size,
     print_figures,
+    provenance,
     refuse_existing,
     scores_of,
+    with_constants,
     write_json,
 )
 from foldgauss.datasets import sample_clip
@@ -62,7 +67,7 @@ def demo(
     """
     _refuse_foreign(out_dir)
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
-    _make_folder(out_dir)
+    make_folder(out_dir)
     out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
     with watching(_manner(), err) as observe:
         state, info = _run_fit(clip.frames, DEMO_CONFIG, observe)
@@ -71,7 +76,7 @@ def demo(
     scores = evaluate_with_progress(model, clip.frames, pictures.append)
     figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
     path = save_video_model(
-        out_dir / "model.safetensors", model, metadata=_provenance(clip, DEMO_CONFIG) | scores_of(scores)
+        out_dir / "model.safetensors", model, metadata=provenance(clip, DEMO_CONFIG.seed) | scores_of(scores)
     )
     figures["file_bytes"] = path.stat().st_size
     write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
@@ -144,6 +149,18 @@ def fit(
             help="Share of the steps that learn what lies between frames, for slow motion, as 0.5 [default: 0]."
         ),
     ] = None,
+    ssim_share: Annotated[
+        float | None, typer.Option(help="Share of D-SSIM in the loss, the rest being L1 [default: 0.2].")
+    ] = None,
+    quarter_share: Annotated[
+        float | None, typer.Option(help="Share of the steps with frames at a quarter of their size [default: 0.2].")
+    ] = None,
+    half_share: Annotated[
+        float | None, typer.Option(help="Share of the steps with frames at half of their size [default: 0.4].")
+    ] = None,
+    alpha_cutoff: AlphaCutoff = None,
+    support_radius: SupportRadius = None,
+    transmittance_stop: TransmittanceStop = None,
     seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
@@ -173,6 +190,9 @@ def fit(
         "power": power,
         "compositing": compositing,
         "between_share": between_share,
+        "ssim_share": ssim_share,
+        "quarter_share": quarter_share,
+        "half_share": half_share,
         "seed": seed,
     }
     target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
@@ -185,6 +205,9 @@ def fit(
         config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
+    constants = {"support_radius": support_radius, "transmittance_stop": transmittance_stop}
+    options = with_constants(config.options, alpha_cutoff=alpha_cutoff, **constants)
+    config = dataclasses.replace(config, options=options)
     kept = target.with_name(f"{target.name}.checkpoint")
     manner = _manner(quiet, log_json)
     refuse_existing(target, overwrite)
@@ -213,7 +236,7 @@ def fit(
     with watching(manner, err, history=recorded, preview=previews) as observe:
         state, info = _run_fit(clip.frames, config, observe, state, keep, begin)
     model = to_model(state, config, clip.size, clip.fps)
-    about = _provenance(clip, config) | {"frames": parse_frames(frames)}
+    about = noted(clip, seed, frames)
     save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
     kept.unlink(missing_ok=True)
     if history is not None:
@@ -227,6 +250,11 @@ def fit(
             print_json("done", {"model": str(target)} | figures)
     elif manner != "quiet":
         print_figures(str(target), figures)
+
+
+def noted(clip: Clip, seed: int, frames: str | None) -> dict[str, Any]:
+    """What `fit` notes in a model's file, but for its scores."""
+    return provenance(clip, seed) | {"frames": parse_frames(frames)}
 
 
 def _manner(quiet: bool = False, log_json: bool = False) -> Manner:
@@ -276,7 +304,7 @@ def _refuse_foreign(folder: Path) -> None:
         )
 
 
-def _make_folder(path: Path) -> None:
+def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -397,7 +425,3 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
         f"{plan}, {num_threads()} threads",
         soft_wrap=True,
     )
-
-
-def _provenance(clip: Clip, config: FitConfig) -> dict[str, Any]:
-    return {"clip": Path(clip.source).name, "seed": config.seed, "frames_digest": fingerprint(clip)["frames_digest"]}

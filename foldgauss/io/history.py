@@ -10,6 +10,7 @@ from typing import Any, Self, TextIO
 
 from foldgauss._checks import invalid
 from foldgauss.io._atomic import atomic_path, not_writable
+from foldgauss.io.figures import write_figure
 from foldgauss.plot import plot_history
 from foldgauss.video.fit import FitInfo, FitState
 
@@ -84,15 +85,10 @@ def read_history(path: str | os.PathLike) -> list[FitInfo]:
 
 def write_curves(path: str | os.PathLike, history: Iterable[FitInfo]) -> Path:
     """`plot_history` as a PNG, whole or not at all. Raises ImportError without matplotlib (`foldgauss[plot]`)."""
-    try:
-        from matplotlib.figure import Figure  # and not pyplot, which may want a screen
-    except ImportError as error:
-        raise ImportError("The curves of a fit need matplotlib: pip install 'foldgauss[plot]'.") from error
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    plot_history(list(history), figure.subplots(2, 2, sharex="col", sharey="row"))
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
-    return Path(path)
+    steps = list(history)
+    return write_figure(
+        path, lambda figure: plot_history(steps, figure.subplots(2, 2, sharex="col", sharey="row")), (10, 6)
+    )
 
 
 def _plain(value: Any) -> Any:

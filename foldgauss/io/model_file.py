@@ -186,7 +186,8 @@ def _kind_of(model: Any) -> _Kind:
 def _check_described(kind: _Kind, model: Any, header: str) -> None:
     """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
     skeleton = kind.from_header(json.loads(header))
-    _check_tensors(_specs(_array_leaves(skeleton)), _specs(_array_leaves(model)), "header")
+    described = _specs(_array_leaves(skeleton))
+    _check_tensors(described, _widened(_specs(_array_leaves(model)), described), "header")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
     if have != want:
         raise _error(
@@ -233,7 +234,8 @@ def load_model(path: str | os.PathLike) -> Any:
     """Read the model that `save_model` wrote, equal to the bit. Nothing in the file is executed.
 
     Leaves come as JAX arrays; 64-bit ones stay NumPy arrays unless JAX's x64 mode is on, since JAX would
-    round them. No more memory is taken than the file's size, plus the skeleton and what `from_stored` adds.
+    round them; those kept in half precision come in the type that the header describes. No more memory is taken than
+    twice the file's size, plus the skeleton and what `from_stored` adds.
 
     Raises `FileNotFoundError` for a missing file, `ModelFileError` for one of another kind or version, a
     damaged one, or one whose tensors differ from what its header describes.
@@ -256,7 +258,8 @@ def load_model(path: str | os.PathLike) -> Any:
             expected=f"the header of a model of kind {kind.name!r}",
             got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_line(error)})",
         ) from error
-    _check_tensors(about["tensors"], _specs(_array_leaves(skeleton)), str(path))
+    described = _specs(_array_leaves(skeleton))
+    _check_tensors(_widened(about["tensors"], described), described, str(path))
     filled = _filled(skeleton, path)
     try:
         return kind.from_stored(filled)
@@ -344,6 +347,15 @@ def _specs(leaves: dict[str, Any]) -> dict[str, dict]:
     }
 
 
+def _widened(kept: dict[str, dict], described: dict[str, dict]) -> dict[str, dict]:
+    """What is read of the tensors kept: those of single precision may be kept in half, with fewer digits."""
+    pairs = {key: (spec, described.get(key, spec)) for key, spec in kept.items()}
+    return {
+        key: want if (have["dtype"], want["dtype"]) == ("F16", "F32") and have["shape"] == want["shape"] else have
+        for key, (have, want) in pairs.items()
+    }
+
+
 def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> None:
     """The tensors that are there against those that the header describes: same keys, shapes and types."""
     for key in sorted(have.keys() | want.keys()):
@@ -364,11 +376,16 @@ def _filled(skeleton: Any, path: Path) -> Any:
                 if not isinstance(leaf, jax.ShapeDtypeStruct):
                     return leaf
                 key = jax.tree_util.keystr(keys, simple=True, separator=".")
-                return _to_leaf(key, file.get_tensor(key))
+                array = file.get_tensor(key)
+                return _to_leaf(key, array.astype(np.float32) if _is_half(array, leaf) else array)
 
             return jax.tree_util.tree_map_with_path(fill, skeleton)
     except SafetensorError as error:
         raise _unreadable(path, f"a damaged or truncated file ({_line(error)})") from error
+
+
+def _is_half(array: np.ndarray, described: jax.ShapeDtypeStruct) -> bool:
+    return array.dtype == np.float16 and described.dtype == np.float32
 
 
 def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:

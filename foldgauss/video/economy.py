@@ -21,6 +21,8 @@ from foldgauss.video.quantise import moved_to
 
 #: Numbers of a Gaussian that lasts and stands still; m_t and sigma_t of one that comes and goes.
 NUMBERS, OF_TIME = 9, 2
+#: A round costs as much as some two passes over the frames: there is one in so many passes of the plan at most.
+LEAST_PASSES = 5
 #: The bit of a kind that says: it lasts.
 LASTS = 128
 #: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
@@ -47,14 +49,15 @@ class Economy:
     * With `psnr`, dB: what is dropped is what costs the least, until the mean over all frames is that; where it seems
       out of reach, Gaussians are born.
 
-    A round drops at most a share `most_dropped` of the Gaussians: then the others take over what is missed.
+    A round drops at most a share `most_dropped` of the Gaussians: then the others take over what is missed. Short plans
+    have fewer rounds.
     Raises ValueError for numbers out of range.
     """
 
     psnr: float | None = None
     bits: float = 8.0
     rounds: int = 8
-    first_share: float = 0.3
+    first_share: float = 0.2
     last_share: float = 0.88
     most_dropped: float = 0.3
     grows: bool = True
@@ -72,10 +75,15 @@ class Economy:
             got = f"{self.first_share:g} and {self.last_share:g}"
             raise invalid("economy.first_share, last_share", expected="in this order", got=got)
 
-    def steps(self, plan: int, coarse: float) -> Int[np.ndarray, "rounds"]:
-        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet."""
+    def steps(self, plan: int, *, passes: float, coarse: float) -> Int[np.ndarray, "rounds"]:
+        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet.
+
+        The plan's steps are `passes` over the frames. Of a plan too short for all rounds some are left out.
+        """
         first = max(self.first_share, min(coarse + 0.05, self.last_share))
-        return np.clip(np.rint(np.linspace(first, self.last_share, self.rounds) * plan), 1, plan).astype(int)
+        num = max(min(self.rounds, int(passes / LEAST_PASSES)), 1)
+        shares = np.linspace(first, self.last_share, num) if num > 1 else np.array([self.last_share])
+        return np.clip(np.rint(shares * plan), 1, plan).astype(int)
 
     def births(self, ledger: Ledger, progress: float, num: int, young: Bool[np.ndarray, "num"] | None) -> int:
         """How many Gaussians are to be born to `num`; `young`: which of those born last are still there."""

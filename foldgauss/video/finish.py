@@ -9,6 +9,7 @@ from jaxtyping import Float32
 from foldgauss.render import cpu
 from foldgauss.video.conditioning import condition, narrow_windows, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, LearningRates
+from foldgauss.video.economy import kinds_of
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import columns, unpack
 from foldgauss.video.sparse_adam import sparse_adam
@@ -42,6 +43,7 @@ def refitted(
     for name, place in columns(model.degree).items():
         rates[place] = getattr(own, name) if free is None or name in free else 0.0
     first, second, grad = np.zeros_like(rows), np.zeros_like(rows), np.zeros_like(rows)
+    kinds = kinds_of(rows, model.degree)  # what a Gaussian has not got stays away
     counts, times = np.zeros(len(rows), np.int32), np.asarray(model.frame_times.times())
     drawn = {"compositing": model.compositing, "options": model.options}
     steps = passes * model.num_frames
@@ -58,7 +60,7 @@ def refitted(
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
         pull_back(rows, done, cpu.backward(trace, by_image)[:4], shape, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
-        sparse_adam(rows, grad, first, second, counts, done.alive, rates * rate, unit_time=UNIT_TIME)
+        sparse_adam(rows, grad, first, second, counts, done.alive, rates * rate, kinds=kinds, unit_time=UNIT_TIME)
         if free is None:
             update_windows(rows, done.alive, window)
             if model.scale_cutoff > 0:

@@ -20,7 +20,7 @@ from foldgauss.video.alpha import random_background
 from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
-from foldgauss.video.economy import Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
+from foldgauss.video.economy import LEAST_PASSES, Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
@@ -126,9 +126,12 @@ def fit(
 
 
 def fit_steps(
-    frames: np.ndarray, config: FitConfig, state: FitState | None = None
+    frames: np.ndarray, config: FitConfig, state: FitState | None = None, *, motion: Motion | None = None
 ) -> Iterator[tuple[FitState, FitInfo]]:
-    """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one."""
+    """The steps of a fit, from the start or from a kept `state`: yields (state, info) after each one.
+
+    `motion`: the frames' own, where it is known from before; finding it takes some hundredths of a second a frame.
+    """
     check_frames(frames)
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
@@ -137,9 +140,10 @@ def fit_steps(
         cure = "Leave it out: the flow knows nothing of what is behind."
         raise invalid("between_share", expected="0 for frames with alpha", got=config.between_share, cure=cure)
     _warm_up(frames, config)
-    state = start(frames, config) if state is None else state
-    step = _Stepper(frames, config, state)
-    pace = _Pace(config, [level.share for level in step.levels])
+    flow = _Flow(frames, motion)
+    state = _started(frames, config, None, flow) if state is None else state
+    step = _Stepper(frames, config, state, flow)
+    pace = _Pace(config, [level.share for level in step.levels], len(frames))
     outlook = _Outlook(state, config, step.levels)
     stopped_by = _stopped_by(state, config, frames)
     if stopped_by:  # a kept state that needs no more steps
@@ -185,8 +189,10 @@ class _Pace:
     """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that one which
     was stopped goes on as if it had not been."""
 
-    def __init__(self, config: FitConfig, shares: list[float]):
+    def __init__(self, config: FitConfig, shares: list[float], num_frames: int):
         self.config, self.shares, self.count = config, shares, 0
+        rounds = 0 if config.economy is None else config.economy.rounds
+        self.taken = ROUND * rounds * num_frames / config.batch_size  # steps that taking stock is worth, at most
         self.seconds = [[] for _ in shares]  # of steps, by level
 
     def plan(self, state: FitState, level: int, seconds: float) -> int:
@@ -206,6 +212,8 @@ class _Pace:
         seconds = [np.mean(own) for own in self.seconds]
         # The steps so far count as steps of the first level, which this many are still left of.
         left = (budget - state.seconds) / SLOWER + state.step * seconds[0]
+        if self.taken:
+            left = left / GROWN - min(self.taken * seconds[-1], left * ROUND / (ROUND + LEAST_PASSES))
         planned = max(int(left / np.dot(self.shares, seconds)), state.step)
         return min(planned, self.config.steps or planned)
 
@@ -300,9 +308,13 @@ def _info(
 
 def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
     """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
+    return _started(frames, config, logits, _Flow(frames))
+
+
+def _started(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, flow: "_Flow") -> FitState:
     frames = np.ascontiguousarray(frames[..., :3])  # as seen over black, where there is alpha
     begun, num_frames = time.perf_counter(), len(frames)
-    motion = Motion.of(frames) if config.follow_motion else None
+    motion = flow.motion if config.follow_motion else None
     if logits is None:
         logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
     logits = np.array(logits, np.float32)
@@ -423,10 +435,23 @@ def _cure_of_frames(shape: tuple[int, ...] | None, dtype: np.dtype | None) -> st
     return ""
 
 
+class _Flow:
+    """The motion of a clip, found when it is first asked for."""
+
+    def __init__(self, frames: np.ndarray, motion: Motion | None = None):
+        self._frames, self._motion = frames, motion
+
+    @property
+    def motion(self) -> Motion:
+        if self._motion is None:
+            self._motion = Motion.of(np.ascontiguousarray(self._frames[..., :3]))
+        return self._motion
+
+
 class _Stepper:
     """One step of the fit: buffers and constants that every step shares."""
 
-    def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState):
+    def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState, flow: _Flow | None = None):
         self.frames, self.config = frames, config
         self.background = np.zeros(3, np.float32)  # another in every step for frames with alpha
         self.num_frames, height, width, _ = frames.shape
@@ -439,8 +464,8 @@ class _Stepper:
         for name, place in columns(config.degree).items():
             self.rates[place] = getattr(config.rates, name)
             self.falling[place] = config.falling in ("all", name)
-        self.motion = None  # known where Gaussians have been born
-        self.between = _Between(frames, config) if config.between_share > 0 else None
+        self.flow = _Flow(frames) if flow is None else flow
+        self.between = _Between(frames, config, self.flow.motion) if config.between_share > 0 else None
         self._make_room(state)
 
     def _make_room(self, state: FitState) -> None:
@@ -531,7 +556,8 @@ class _Stepper:
         coarse = 1 - self.levels[-1].share
         if self.config.growth is not None:
             coarse = max(coarse, self.config.growth.for_plan(state.plan).until_step / state.plan)
-        steps = economy.steps(state.plan, coarse)
+        passes = state.plan * self.config.batch_size / self.num_frames
+        steps = economy.steps(state.plan, passes=passes, coarse=coarse)
         if state.step not in steps:
             return
         ledger, progress = self._ledger(state), state.step / state.plan
@@ -565,8 +591,6 @@ class _Stepper:
         """Gaussians where the error is, in depth anywhere between the others."""
         config, times = self.config, np.asarray(_frame_times(state.time_logits))
         colors = np.ascontiguousarray(self.frames[..., :3])
-        if config.follow_motion and self.motion is None:
-            self.motion = Motion.of(colors)
         self._make_room(state)
 
         def squares(k: int) -> np.ndarray:
@@ -586,7 +610,7 @@ class _Stepper:
             alive,
             degree=config.degree,
             envelope=_envelope(config),
-            motion=self.motion,
+            motion=self.flow.motion if config.follow_motion else None,
             opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
             seed=(config.seed, 3, state.step),
         )
@@ -690,9 +714,9 @@ class _Stepper:
 class _Between:
     """What a fit learns of the times between frames: which ones, and what is to be seen there."""
 
-    def __init__(self, frames: np.ndarray, config: FitConfig):
+    def __init__(self, frames: np.ndarray, config: FitConfig, motion: Motion):
         self.frames, self.config = np.ascontiguousarray(frames[..., :3]), config
-        self.motion = Motion.of(self.frames)
+        self.motion = motion
         self.last_of_shots = {*(k - 1 for k in self.motion.cuts()), len(frames) - 1}
 
     def share(self, step: int, k: int) -> float | None:
@@ -732,6 +756,10 @@ def _envelope(config: FitConfig) -> TimeLikelihood:
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.
 OVERTIME = 1.5
+#: Births make steps slower by this much, at first.
+GROWN = 1.15
+#: Taking stock of a frame costs as much as so many steps with it: a pass forward and four back.
+ROUND = 2.0
 #: The pace is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
 #: share of the time.
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05

@@ -17,8 +17,8 @@ from foldgauss.video.packing import columns
 
 #: Squared error of rounding to 8 bits.
 ROUNDING = 1 / (12 * 255.0**2)
-#: Draws of random signs: so many a frame, and in all for short clips. With few, estimates scatter, and what is unlucky in
-#: one of several rounds is dropped.
+#: Draws of random signs: so many a frame, and in all for short clips. With few, estimates scatter, and what is unlucky
+#: in one of several rounds is dropped.
 DRAWS, LEAST_DRAWS = 3, 96
 #: Of the trace, on the diagonal of the paths' equations: a Gaussian seen in few frames leaves some of them open.
 _RIDGE = 1e-6
@@ -70,8 +70,8 @@ class Ledger:
 
         Errors are coded given their neighbours in time and in the picture, as a first-order autoregression: what is
         new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are
-        log2(1 + (v / q)^2) / 4, q the variance of rounding: none where pictures are rounded to the same, log2(v / q) / 2
-        beyond. So a number counts v^2 / (v^2 + q^2), and a picture that stands still is paid for once.
+        log2(1 + (v / q)^2) / 4, q the variance of rounding: none where pictures are rounded to the same, and
+        log2(v / q) / 2 beyond. So a number counts v^2 / (v^2 + q^2), and a picture that stands still is paid for once.
         """
         mean = self.squared_error / self.num_samples
         in_time, *in_space = 1 - np.clip(self.alike, 0, 1) ** 2

@@ -345,6 +345,9 @@ def test_one_psnr_is_enough():
         FitConfig(target_psnr=30, economy=Economy(psnr=30))
 
 
-def test_stock_is_taken_once_frames_are_whole():
-    steps = Economy(rounds=3, first_share=0.2, last_share=0.8).steps(1000, 0.6)
-    assert steps.tolist() == [650, 725, 800]
+def test_stock_is_taken_once_frames_are_whole_and_not_too_often():
+    economy = Economy(rounds=3, first_share=0.2, last_share=0.8)
+    assert economy.steps(1000, passes=100, coarse=0.6).tolist() == [650, 725, 800]
+    assert economy.steps(1000, passes=100, coarse=0).tolist() == [200, 500, 800]
+    assert economy.steps(1000, passes=11, coarse=0).tolist() == [200, 800]
+    assert economy.steps(3, passes=0.1, coarse=0).tolist() == [2]

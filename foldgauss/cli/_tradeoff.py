@@ -1,0 +1,227 @@
+"""What `tradeoff` keeps and tells: its record, the commands that reproduce points, its tables."""
+
+import csv
+import dataclasses
+import io
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from foldgauss._machine import machine
+from foldgauss.cli._shared import WrongUse, err, out, write_json
+from foldgauss.io._atomic import atomic_path
+from foldgauss.io.figures import write_tradeoff
+from foldgauss.plot import Panel
+from foldgauss.render import RenderOptions
+from foldgauss.video.config import FitConfig, default_num_gaussians
+from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Left, Point, front, knee
+
+RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
+FILES = {RECORD, ROWS, PLOT, BASE}
+#: Options of `fit` by field of `FitConfig`, and of `fit` and `evaluate` by constant of `RenderOptions`.
+_FIT_FIELDS = ("steps", "degree", "batch_size", "power", "compositing", "ssim_share", "quarter_share", "half_share")
+FIT_OPTIONS = {"num_gaussians": "--gaussians"} | {
+    name: f"--{name.replace('_', '-')}" for name in (*_FIT_FIELDS, "seed")
+}
+DRAW_OPTIONS = {
+    name: f"--{name.replace('_', '-')}" for name in ("alpha_cutoff", "support_radius", "transmittance_stop")
+}
+#: Panels of the plot: what costs, its label, and whether more of it is better.
+COSTS = {
+    "time": ("fit time", "time to fit (s)", False),
+    "size": ("file size", "file (bytes)", False),
+    "speed": ("playback speed", "played (frames a second)", True),
+}
+#: Columns of the time to fit, by clock.
+CLOCKS = {"wall": "seconds", "cpu": "cpu_seconds"}
+COLUMNS = (
+    *("axis", "value", "settings", "psnr", "ssim", "seconds", "cpu_seconds", "bytes", "floats", "gaussians"),
+    *("frames_per_second", "front", "knee", "command"),
+)
+
+
+@dataclasses.dataclass
+class Record:
+    """What is known so far, in `path`: the settings, the plan and a row for each point, kept as it is done.
+
+    Raises WrongUse where results of other settings are kept, or something else is.
+    """
+
+    path: Path
+    settings: dict[str, Any]
+    anew: bool = False
+    plan: dict[str, Any] = dataclasses.field(default_factory=dict)
+    rows: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    fronts: dict[str, Any] = dataclasses.field(default_factory=dict)
+    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    machine: dict[str, Any] = dataclasses.field(default_factory=machine)
+
+    def __post_init__(self) -> None:
+        if not self.path.exists() or self.anew:
+            return
+        kept = self._read()
+        before = kept["settings"]
+        changed = sorted(name for name in self.settings if before.get(name) != self.settings[name])
+        if changed:
+            raise WrongUse(
+                f"--out: {self.path} holds results of other settings: "
+                + ", ".join(f"{name} was {before.get(name)!r}, is {self.settings[name]!r}" for name in changed)
+                + ". Choose another folder, or start anew with --overwrite."
+            )
+        self.plan, self.machine = kept["plan"], kept["machine"]
+        self.rows = {f"{row['axis']} {row['value']}".rstrip(): row for row in kept["points"]}
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            kept = json.loads(self.path.read_text())
+            rows = [set(row) >= {*COLUMNS} - {"front", "knee"} for row in kept["points"]]
+            if not (all(rows) and isinstance(kept["settings"], dict) and {"plan", "machine"} <= set(kept)):
+                raise ValueError("parts are missing")
+        except (ValueError, KeyError, TypeError) as error:
+            raise WrongUse(
+                f"--out: expected results of `foldgauss tradeoff` in {self.path}, got something else ({error}). "
+                "Choose another folder, or start anew with --overwrite."
+            ) from error
+        return kept
+
+    def keep(self) -> None:
+        kept = {"settings": self.settings, "machine": self.machine, "plan": self.plan}
+        kept |= {"left_out": self.left_out, "fronts": self.fronts}
+        write_json(self.path, kept | {"points": list(self.rows.values())})
+
+
+@dataclasses.dataclass(frozen=True)
+class Words:
+    """The command lines that reproduce points, run from the folder that this one is run from."""
+
+    video: Path
+    size: str | None
+    frames: str | None
+    folder: Path
+
+    def of(self, point: Point, num_frames: int, size: tuple[int, int]) -> str:
+        """`point` as commands: its fit; or what is done to the base's model, which is kept."""
+        name, base = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_"), self.folder / BASE
+        if point.played is not None:
+            constants = _changed(point.played, point.config.options, DRAW_OPTIONS)
+            return shlex.join(["foldgauss", "evaluate", str(base), str(self.video), *constants])
+        if point.stored != FLOAT32:
+            how = ["--float16"] if point.stored == FLOAT16 else ["--passes", str(PASSES[point.stored])]
+            how += [] if point.stored == FLOAT16 else ["--max-loss-db", f"{MAX_LOSS_DB:g}"]
+            suffix = ".safetensors" if point.stored == FLOAT16 else ".fgz"
+            words = ["compress", str(base), str(self.video), *how, "--out", f"{name}{suffix}"]
+            return shlex.join(["foldgauss", *words])
+        words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
+        words += [] if self.size is None else ["--size", self.size]
+        words += [] if self.frames is None else ["--frames", self.frames]
+        default = FitConfig(num_gaussians=default_num_gaussians(num_frames, *size))
+        words += _changed(point.config, default, FIT_OPTIONS)
+        words += _changed(point.config.options, default.options, DRAW_OPTIONS)
+        return shlex.join(["foldgauss", *words])
+
+
+def _changed(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions, options: dict[str, str]) -> list[str]:
+    """Options for all fields that differ."""
+    names = [field.name for field in dataclasses.fields(now) if field.name != "options"]
+    changed = [name for name in names if getattr(now, name) != getattr(before, name)]
+    return [word for name in changed for word in (options[name], str(getattr(now, name)))]
+
+
+def settings_of(point: Point, base: FitConfig) -> dict[str, Any]:
+    """Every setting that differs from the base's."""
+    changed = {
+        field.name: getattr(point.config, field.name)
+        for field in dataclasses.fields(base)
+        if field.name != "options" and getattr(point.config, field.name) != getattr(base, field.name)
+    }
+    options = point.config.options if point.played is None else point.played
+    word = "fitted" if point.played is None else "played"
+    changed |= {
+        f"{field.name} ({word})": getattr(options, field.name)
+        for field in dataclasses.fields(options)
+        if getattr(options, field.name) != getattr(base.options, field.name)
+    }
+    return changed | ({} if point.stored == FLOAT32 else {"stored": point.stored})
+
+
+def report(record: Record, made: list[Point], left: list[Left], clock: str) -> None:
+    """The fronts and their knees, into the files beside the record and onto the screen."""
+    rows, folder = [record.rows[point.name] for point in made], record.path.parent
+    names = [point.name for point in made]
+    panels, columns = [], {"time": CLOCKS[clock], "size": "bytes", "speed": "frames_per_second"}
+    for cost, (what, label, more_is_better) in COSTS.items():
+        amounts = [row[columns[cost]] for row in rows]
+        costs = [1 / amount if more_is_better else amount for amount in amounts]
+        quality = [row["psnr"] for row in rows]
+        chosen = front(costs, quality)
+        bend = knee([costs[k] for k in chosen], [quality[k] for k in chosen])
+        at = None if bend is None else chosen[bend]
+        told = label.replace("(s)", "(CPU seconds)") if columns[cost] == "cpu_seconds" else label
+        panels.append(Panel(told, amounts, chosen, at))
+        record.fronts[cost] = {
+            "what": what,
+            "column": columns[cost],
+            "front": [names[k] for k in chosen],
+            "knee": None if at is None else names[at],
+        }
+    record.left_out = {one.name: one.why for one in left}
+    record.keep()
+    _write_csv(folder / ROWS, rows, record.fronts)
+    try:
+        write_tradeoff(
+            folder / PLOT, panels, [row["psnr"] for row in rows], [(point.axis, point.value) for point in made]
+        )
+    except ImportError as error:
+        err.print(f"warning: no plot in {folder / PLOT}: {error}", soft_wrap=True)
+    _print_rows(rows, record.fronts, CLOCKS[clock])
+    _print_fronts(rows, names, record.fronts)
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]], fronts: dict[str, Any]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS)
+    writer.writeheader()
+    for row in rows:
+        name = f"{row['axis']} {row['value']}".rstrip()
+        settings = "; ".join(f"{key}={value}" for key, value in row["settings"].items())
+        on = [cost for cost in COSTS if name in fronts[cost]["front"]]
+        knees = [cost for cost in COSTS if name == fronts[cost]["knee"]]
+        writer.writerow(row | {"settings": settings, "front": " ".join(on), "knee": " ".join(knees)})
+    with atomic_path(path) as temporary:
+        temporary.write_text(text.getvalue(), newline="")
+
+
+def _print_rows(rows: list[dict[str, Any]], fronts: dict[str, Any], clock: str) -> None:
+    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("point", no_wrap=True)
+    for name in ("dB", "SSIM", "fit s" if clock == "seconds" else "CPU s", "kB", "fps"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("front", no_wrap=True)
+    for row in rows:
+        name = f"{row['axis']} {row['value']}".rstrip()
+        figures = f"{row['psnr']:.2f}", f"{row['ssim']:.4f}", f"{row[clock]:.1f}", f"{row['bytes'] / 1000:,.0f}"
+        marks = [cost for cost in COSTS if name in fronts[cost]["front"]]
+        table.add_row(name, *figures, f"{row['frames_per_second']:.0f}", " ".join(marks))
+    out.print(table)
+
+
+def _print_fronts(rows: list[dict[str, Any]], names: list[str], fronts: dict[str, Any]) -> None:
+    units = {"seconds": "{:.1f} s", "cpu_seconds": "{:.1f} CPU seconds", "bytes": "{:,} bytes"}
+    units |= {"frames_per_second": "{:.0f} frames a second"}
+    for cost, (what, *_) in COSTS.items():
+        bend, column = fronts[cost]["knee"], fronts[cost]["column"]
+        if bend is None:
+            out.print(f"PSNR against {what}: no knee; the front is {'; '.join(fronts[cost]['front'])}", soft_wrap=True)
+            continue
+        row = rows[names.index(bend)]
+        figure = units[column].format(row[column])
+        out.print(f"PSNR against {what}: the knee is {bend}, {row['psnr']:.2f} dB with {figure}", soft_wrap=True)
+    on = {name for cost in COSTS for name in fronts[cost]["front"]}
+    out.print("The points on the fronts, by command:")
+    for name, row in zip(names, rows, strict=True):
+        if name in on:
+            out.print(f"  {name}: {row['command']}", soft_wrap=True)

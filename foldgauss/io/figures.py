@@ -1,0 +1,38 @@
+"""Figures of `foldgauss.plot` as files."""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from foldgauss.io._atomic import atomic_path
+from foldgauss.plot import Panel, plot_tradeoff
+
+DPI = 110
+
+
+def write_figure(path: str | os.PathLike, draw: Callable[[Any], object], size: tuple[float, float]) -> Path:
+    """A PNG of what `draw(figure)` draws, `size` in inches, whole or not at all.
+
+    Raises ImportError without matplotlib (`foldgauss[plot]`).
+    """
+    try:
+        from matplotlib.figure import Figure  # and not pyplot, which may want a screen
+    except ImportError as error:
+        raise ImportError("Curves and plots need matplotlib: pip install 'foldgauss[plot]'.") from error
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    draw(figure)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI)
+    return Path(path)
+
+
+def write_tradeoff(
+    path: str | os.PathLike, panels: Sequence[Panel], quality: Sequence[float], names: Sequence[tuple[str, str]]
+) -> Path:
+    """`plot_tradeoff` as a PNG, whole or not at all. Raises ImportError without matplotlib (`foldgauss[plot]`)."""
+
+    def draw(figure: Any) -> None:
+        plot_tradeoff(panels, quality, names, figure.subplots(1, len(panels), sharey=True))
+
+    return write_figure(path, draw, (5.5 * len(panels), 6.5))

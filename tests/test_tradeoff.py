@@ -1,0 +1,481 @@
+"""Speed against accuracy: fronts, knees, plans, and `foldgauss tradeoff` as a user meets it."""
+
+import csv
+import dataclasses
+import json
+import math
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+
+from foldgauss.cli import _tradeoff as kept
+from foldgauss.cli import fitting
+from foldgauss.cli import tradeoff as command
+from foldgauss.io import load_video_model, read_video, save_video_model, write_video
+from foldgauss.io.video_model import read_metadata
+from foldgauss.plot import Panel, plot_tradeoff
+from foldgauss.video import FitConfig, evaluate, fit
+from foldgauss.video.model import LASTING
+from foldgauss.video.tradeoff import (
+    AXES,
+    LEAST_STEPS,
+    Pace,
+    check_axes,
+    front,
+    halved,
+    knee,
+    points,
+    seconds_of,
+    steps_within,
+)
+
+SIZE, FRAMES = (48, 64), 6
+BASE = FitConfig(num_gaussians=400, steps=1000)
+QUICK = ["--steps", "12"]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """Six frames of a blob that moves."""
+    y, x = np.mgrid[0:48, 0:64]
+    blob = np.exp(-((x - np.linspace(12, 45, FRAMES)[:, None, None]) ** 2 + (y - 24) ** 2) / 40)
+    path = tmp_path_factory.mktemp("clip") / "clip.mp4"
+    return write_video(path, np.stack([255 * blob, 128 + 0 * blob, 255 - 200 * blob], -1).astype(np.uint8), 12.0)
+
+
+@pytest.fixture(scope="module")
+def done(clip, tmp_path_factory):
+    """All axes, to the end."""
+    target = tmp_path_factory.mktemp("done") / "results"
+    assert run("tradeoff", clip, "--out", target, "--frames", "1:6", *QUICK) == 0
+    return target
+
+
+def record_of(folder):
+    return json.loads((folder / "tradeoff.json").read_text())
+
+
+def name_of(row):
+    return f"{row['axis']} {row['value']}".rstrip()
+
+
+# ------------------------------------------------------------------------------------------------ functions
+
+
+@pytest.mark.parametrize(
+    ("cost", "quality", "expected"),
+    [
+        ([1, 2, 3], [30, 29, 33], [0, 2]),
+        ([3, 2, 1], [33, 29, 30], [2, 0]),
+        ([1, 1, 1], [30, 31, 29], [1]),
+        ([1, 2, 3, 4], [30, 30.004, 30.008, 30.012], [0, 3]),
+        ([1, 1, 2, 2], [30.0, 30.005, 30.3, 31], [0, 3]),
+        ([1, math.nan, 3], [math.inf, 30, 31], [2]),
+        ([], [], []),
+    ],
+)
+def test_front(cost, quality, expected):
+    assert front(cost, quality) == expected
+
+
+def test_front_is_what_nothing_beats():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        cost, quality = rng.integers(1, 9, 30), rng.integers(20, 40, 30)
+        chosen = front(cost, quality)
+        for k in range(30):
+            beaten = ((cost <= cost[k]) & (quality >= quality[k]) & ((cost < cost[k]) | (quality > quality[k]))).any()
+            equal = [(cost[j], quality[j]) for j in chosen]
+            assert beaten != ((cost[k], quality[k]) in equal)
+
+
+@pytest.mark.parametrize(
+    ("cost", "quality", "expected"),
+    [
+        ([1, 2, 16], [30, 36, 38], 1),
+        ([1, 2, 4, 8, 16], [30, 35, 37, 38, 38.5], 1),
+        ([1, 2, 4], [30, 33, 36], None),  # on the chord
+        ([1, 2, 4], [30, 31, 36], None),  # below it
+        ([1, 4], [30, 36], None),
+        ([1], [30], None),
+    ],
+)
+def test_knee(cost, quality, expected):
+    assert knee(cost, quality) == expected
+    # Units tell nothing: seconds or minutes, dB above whatever.
+    assert knee([60 * c for c in cost], [q - 20 for q in quality]) == expected
+    assert knee([c**2 for c in cost], [2 * q for q in quality]) == expected
+
+
+def test_each_turn_changes_one_thing_and_has_a_command():
+    made, left = points(BASE, tuple(AXES), 132, (320, 640))
+    assert left == []
+    assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
+    words = kept.Words(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
+    lines = [words.of(point, 132, (320, 640)) for point in made]
+    assert len(set(lines)) == len(lines)
+    for point, line in zip(made, lines, strict=True):
+        changed = kept.settings_of(point, BASE)
+        allowed = {"base": (0,), "batch": (2,), "schedule": (1, 2)}.get(point.axis, (1,))
+        assert len(changed) in allowed
+        assert "my clip.mp4" in shlex.split(line)
+    assert made[0].config == BASE
+    shown = dict(zip((point.name for point in made), lines, strict=True))
+    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-share 0.0")
+    assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
+    assert shown["cutoff radius 2, fitted"].endswith("--support-radius 2.0")
+    assert shown["cutoff radius 2, played"] == (
+        "foldgauss evaluate out/base.safetensors 'my clip.mp4' --support-radius 2.0"
+    )
+
+
+@pytest.mark.parametrize(
+    ("where", "axis", "why"),
+    [
+        ({}, "schedule", "changes nothing at 48x64"),
+        ({"has_alpha": True}, "compositing", "alpha"),
+        ({"num_frames": 3}, "batch", "3 frames"),
+    ],
+)
+def test_turns_that_a_clip_cannot_have_are_left_out(where, axis, why):
+    where = {"num_frames": FRAMES, "has_alpha": False} | where
+    made, left = points(BASE, (axis,), where["num_frames"], SIZE, has_alpha=where["has_alpha"])
+    assert {one.name.split()[0] for one in left} == {axis}
+    assert all(why in one.why for one in left)
+    assert len(made) + len(left) == 1 + len(AXES[axis])
+
+
+@pytest.mark.parametrize("seconds", [50.0, 200.0, 3600.0])
+def test_steps_fill_the_time(seconds):
+    made, _ = points(BASE, tuple(AXES), 132, (320, 640))
+    pace = Pace(start=0.5, step=0.03, look=0.1)
+    steps = steps_within(seconds, made, pace, 132)
+    assert seconds_of(made, steps, pace, 132) <= seconds < seconds_of(made, steps + 1, pace, 132)
+    # Points of the base's model cost no fit.
+    played = [point for point in made if point.played is None]
+    saved = seconds_of(made, steps, pace, 132) - seconds_of(played, steps, pace, 132)
+    assert saved == pytest.approx((len(made) - len(played)) * pace.look)
+
+
+def test_axes_by_name():
+    assert check_axes(["power", "time"]) == ("time", "power")
+    for wrong in (["speed"], [], ["time", "time"]):
+        with pytest.raises(ValueError, match="axes: expected some of time, gaussians"):
+            check_axes(wrong)
+
+
+def test_half_precision_is_kept_and_widened(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 256, (3, 16, 16, 3), np.uint8)
+    model = fit(frames, FitConfig(num_gaussians=20, steps=6)).model
+    save_video_model(tmp_path / "whole.safetensors", model)
+    save_video_model(tmp_path / "half.safetensors", halved(model))
+    again = load_video_model(tmp_path / "half.safetensors")
+    for name in ("loc", "coefficients", "color_dc"):
+        leaf = np.asarray(getattr(again.splats, name))
+        assert leaf.dtype == np.float32
+        np.testing.assert_array_equal(leaf, np.asarray(getattr(model.splats, name)).astype(np.float16))
+    np.testing.assert_array_equal(again.frame_times.logits, model.frame_times.logits)
+    saved = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half")]
+    assert saved[0] - saved[1] == pytest.approx(2 * 20 * 17, abs=16)  # but for the header
+    # What is not stored stays exact: powers that are 0, and who lasts.
+    leaves = {
+        name: np.array(getattr(model.splats, name)) for name in ("coefficients", "log_time_scale", "time_loc_logit")
+    }
+    leaves["coefficients"][:, 1:] = 0
+    leaves["log_time_scale"][:5], leaves["time_loc_logit"][:5] = LASTING, 0
+    lean = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
+    save_video_model(tmp_path / "lean.safetensors", halved(lean))
+    again = load_video_model(tmp_path / "lean.safetensors")
+    assert (again.splats.degrees == 1).all()
+    np.testing.assert_array_equal(again.splats.lasting, lean.splats.lasting)
+    assert again.splats.lasting.sum() == 5
+    # A leaf with a number beyond 16 bits keeps its 32.
+    leaves["coefficients"][3, 0, 0] = 1e5
+    steep = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
+    save_video_model(tmp_path / "steep.safetensors", halved(steep))
+    again = load_video_model(tmp_path / "steep.safetensors")
+    np.testing.assert_array_equal(again.splats.coefficients, leaves["coefficients"])
+    np.testing.assert_array_equal(again.splats.loc, np.asarray(model.splats.loc).astype(np.float16))
+
+
+def test_plot():
+    pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
+    pyplot.switch_backend("Agg")
+    cost, quality = [1.0, 2.0, 16.0, 5.0], [30.0, 36.0, 38.0, 31.0]
+    names = [("time", "1"), ("base", ""), ("time", "9"), ("degree", "0")]
+    (ax,) = plot_tradeoff([Panel("seconds", cost, [0, 1, 2], 1)], quality, names)
+    line = next(line for line in ax.lines if line.get_linestyle() == "-")
+    np.testing.assert_allclose(line.get_xydata(), [(1, 30), (2, 36), (16, 38)])
+    assert {text.get_text() for text in ax.texts} == {"time 1", "knee: base", "time 9"}
+    assert {text.get_text() for text in ax.figure.legends[0].texts} == {"time", "base", "degree"}
+    pyplot.close(ax.figure)
+
+
+# ------------------------------------------------------------------------------------------------ the command
+
+
+def test_everything_is_there(done, clip):
+    record = record_of(done)
+    rows = {name_of(row): row for row in record["points"]}
+    assert {path.name for path in done.iterdir()} == {
+        "base.safetensors",
+        "tradeoff.csv",
+        "tradeoff.json",
+        "tradeoff.png",
+    }
+    assert {row["axis"] for row in rows.values()} == {"base", *AXES} - {"schedule"}
+    assert set(record["left_out"]) == {f"schedule {turn.value}" for turn in AXES["schedule"]}
+    assert {"cpu", "cores", "load_average", "jax"} <= set(record["machine"])
+    assert min(cv2.imread(str(done / "tradeoff.png")).shape[:2]) > 500
+    with open(done / "tradeoff.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [name_of(row) for row in table] == list(rows)
+    for row in table:
+        same = rows[name_of(row)]
+        for name in ("psnr", "ssim", "seconds", "cpu_seconds", "bytes", "floats", "gaussians", "frames_per_second"):
+            assert float(row[name]) == same[name]
+        assert row["command"] == same["command"]
+        for cost in kept.COSTS:
+            assert (name_of(row) in record["fronts"][cost]["front"]) == (cost in row["front"].split())
+            assert (name_of(row) == record["fronts"][cost]["knee"]) == (cost in row["knee"].split())
+    # What is told is so: the model beside it is the base, and more steps are better.
+    base = load_video_model(done / "base.safetensors")
+    scores = evaluate(base, read_video(clip, frames=(1, 6)).frames)
+    assert rows["base"]["psnr"] == pytest.approx(scores.mean_psnr, abs=1e-4)
+    assert rows["base"]["bytes"] == (done / "base.safetensors").stat().st_size
+    assert rows["time 3 steps"]["psnr"] < rows["base"]["psnr"] < rows["time 24 steps"]["psnr"]
+    assert rows["degree 0"]["floats"] == base.num_floats - 6 * base.num_gaussians
+    assert rows["cutoff radius 2, played"]["psnr"] != rows["base"]["psnr"]
+    assert rows["cutoff radius 2, played"]["seconds"] == rows["base"]["seconds"]
+    assert rows["precision float16"]["bytes"] < 0.52 * rows["base"]["bytes"]
+
+
+def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
+    """One of each kind, and all on the fronts: the same PSNR, and where it writes a file the same bytes."""
+    monkeypatch.chdir(tmp_path)
+    record = record_of(done)
+    rows = {name_of(row): row for row in record["points"]}
+    chosen = {name for cost in kept.COSTS for name in record["fronts"][cost]["front"]}
+    chosen |= {"base", "batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played", "ssim 0.5", "compositing sum"}
+    chosen |= {f"precision {turn.value}" for turn in AXES["precision"]}
+    for name in sorted(chosen):
+        words = shlex.split(rows[name]["command"])
+        assert words[0] == "foldgauss"
+        more = ["--json", "scores.json", "--overwrite"] if words[1] == "evaluate" else []
+        assert run(*words[1:], *more) == 0
+        if more:
+            psnr = json.loads(Path("scores.json").read_text())["mean_psnr"]
+        else:
+            path = Path(words[words.index("--out") + 1])
+            psnr = read_metadata(path)["mean_psnr"]
+            assert path.stat().st_size == rows[name]["bytes"]
+        assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
+
+
+def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
+    target, axes = tmp_path / "results", "time,cutoff"
+    arguments = ["tradeoff", str(clip), "--out", str(target), "--axes", axes, *QUICK]
+    process = subprocess.Popen([sys.executable, "-m", "foldgauss", *arguments], stderr=subprocess.DEVNULL)
+    record = target / "tradeoff.json"
+    begun = time.monotonic()
+    while not (record.exists() and len(record_of(target)["points"]) >= 2):
+        assert process.poll() is None
+        assert time.monotonic() - begun < 200
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = record_of(target)["points"]
+    assert len(before) < 14
+    fitted, steps = [], command.fit_steps
+
+    def watched(frames, config):
+        fitted.extend([config.steps] if config.steps > 2 else [])  # else it only compiles
+        return steps(frames, config)
+
+    monkeypatch.setattr(command, "fit_steps", watched)
+    # The base's model is fitted again where it has gone.
+    (target / "base.safetensors").unlink()
+    assert run(*arguments) == 0
+    after = record_of(target)["points"]
+    assert after[: len(before)] == before
+    assert len(after) == 14
+    assert (target / "tradeoff.csv").exists()
+    again = [row for row in after[len(before) :] if row["command"].startswith("foldgauss fit")]
+    assert len(fitted) == len(again) + 1
+    capsys.readouterr()
+    fitted.clear()
+    assert run(*arguments) == 0  # nothing is left to do
+    assert fitted == []
+    assert "The points on the fronts" in capsys.readouterr().out
+    assert record_of(target)["points"] == after
+
+
+def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
+    target, count, looked = tmp_path / "results", [], command.evaluate
+
+    def stopped(*given, **more):
+        count.append(1)
+        if len(count) == 4:  # the first is that of the pace
+            raise KeyboardInterrupt
+        return looked(*given, **more)
+
+    monkeypatch.setattr(command, "evaluate", stopped)
+    assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 1
+    assert "2 of 4 points are kept" in " ".join(capsys.readouterr().err.split())
+    assert len(record_of(target)["points"]) == 2
+    assert sorted(path.name for path in target.iterdir()) == ["base.safetensors", "tradeoff.json"]
+
+
+def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
+    def failing(*given, **more):
+        raise ValueError("max_loss_db: out of reach")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(command, "compress", failing)
+        assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0
+    assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
+    record = record_of(tmp_path / "r")
+    assert [name_of(row) for row in record["points"]] == ["base", "precision float16"]
+    assert set(record["left_out"]) == {"precision compact", "precision compact, mended"}
+    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
+    assert len(record_of(tmp_path / "r")["points"]) == 4
+    assert record_of(tmp_path / "r")["left_out"] == {}
+
+
+@pytest.mark.parametrize(
+    ("minutes", "steps", "told"),
+    [
+        (1e-3, LEAST_STEPS, "warning: --minutes: 0.001 are too few for 5 points"),
+        (1.0, 1000, "about 1.0 minutes"),
+        (60.0, 3000, "note: 3,000 steps are a whole fit"),
+    ],
+)
+def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
+    """At a pace with which all fits take a minute if the base has 1,000 steps."""
+    work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
+    pace = Pace(start=0.0, step=60 / command.SLOWER / (work * 1000.001), look=0.0)
+    monkeypatch.setattr(command._Run, "_pace", lambda self, config: pace)
+    monkeypatch.setattr(command._Run, "measure", lambda self, made, base: (_ for _ in ()).throw(KeyboardInterrupt))
+    arguments = ["--axes", "time,compositing", "--minutes", minutes]
+    assert run("tradeoff", clip, "--out", tmp_path / "r", *arguments) == 1
+    shown = " ".join("".join(capsys.readouterr()).split())
+    assert told in shown
+    assert record_of(tmp_path / "r")["plan"]["steps"] == steps
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--axes", "time,speed"], "--axes: expected some of time, gaussians, degree"),
+        (["--axes", ""], "--axes: expected some of"),
+        (["--clock", "sun"], "--clock: expected one of 'wall', 'cpu'"),
+        (["--minutes", "0"], "--minutes: expected a number above 0"),
+        (["--minutes", "nan"], "--minutes: expected a number above 0"),
+        (["--seed", "-1"], "--seed: expected a whole number >= 0"),
+        (["--size", "9"], "--size: expected HxW"),
+    ],
+)
+def test_wrong_use(clip, tmp_path, capsys, options, told):
+    assert run("tradeoff", clip, "--out", tmp_path / "r", *options) == 2
+    assert told in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "r").exists()
+
+
+def test_other_settings_are_refused(done, clip, tmp_path, capsys):
+    before = {path.name: path.read_bytes() for path in done.iterdir()}
+    for options, told in (
+        (["--frames", "1:6", "--steps", "13"], "steps was 12, is 13"),
+        (["--frames", "1:6", *QUICK, "--seed", "1"], "seed was 0, is 1"),
+        (QUICK, "num_frames was 5, is 6"),
+        (["--frames", "1:6", *QUICK, "--axes", "time"], "axes was"),
+    ):
+        assert run("tradeoff", clip, "--out", done, *options) == 2
+        shown = " ".join(capsys.readouterr().err.split())
+        assert told in shown
+        assert "--overwrite" in shown
+    assert {path.name: path.read_bytes() for path in done.iterdir()} == before
+    # With it they are replaced; what is no result is not.
+    target = tmp_path / "r"
+    target.mkdir()
+    (target / "tradeoff.json").write_text('{"points": [{"axis": "base"}], "settings": {}}')
+    assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 2
+    assert "got something else" in " ".join(capsys.readouterr().err.split())
+    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 0
+    assert len(record_of(target)["points"]) == 2
+    (target / "mine.txt").write_text("mine")
+    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 2
+    assert "'mine.txt' in it" in " ".join(capsys.readouterr().err.split())
+
+
+def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeypatch, tmp_path):
+    for name in ("matplotlib", "matplotlib.figure"):
+        monkeypatch.setitem(sys.modules, name, None)
+    target = tmp_path / "r"
+    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK) == 0
+    assert "no plot" in (shown := capsys.readouterr().err)
+    assert "foldgauss[plot]" in shown
+    assert sorted(path.name for path in target.iterdir()) == ["base.safetensors", "tradeoff.csv", "tradeoff.json"]
+
+
+# --------------------------------------------------------------------------------------- options of the others
+
+
+def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
+    seen, steps = [], fitting.fit_steps
+    monkeypatch.setattr(
+        fitting, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config)
+    )
+    options = ["--ssim-share", 0.3, "--quarter-share", 0.1, "--half-share", 0.2]
+    options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
+    target = tmp_path / "m.safetensors"
+    assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
+    (config,) = seen
+    assert (config.ssim_share, config.quarter_share, config.half_share) == (0.3, 0.1, 0.2)
+    options = load_video_model(target).options
+    assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
+    assert options.low_pass == FitConfig().options.low_pass
+
+
+@pytest.mark.parametrize("words", [["fit"], ["evaluate"], ["render"]])
+@pytest.mark.parametrize("option", ["alpha-cutoff", "support-radius", "transmittance-stop"])
+def test_constants_out_of_bounds(done, clip, tmp_path, capsys, words, option):
+    made = {
+        "fit": ["fit", clip, "--out", tmp_path / "x.safetensors"],
+        "evaluate": ["evaluate", done / "base.safetensors", clip, "--frames", "1:6"],
+        "render": ["render", done / "base.safetensors", "--out", tmp_path / "x.mp4"],
+    }[words[0]]
+    assert run(*made, f"--{option}", "-1") == 2
+    assert f"--{option}: expected a number in" in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_render_with_other_constants(done, tmp_path):
+    for name, options in (("own", []), ("fast", ["--support-radius", 1])):
+        path = tmp_path / f"{name}.png"
+        assert run("render", done / "base.safetensors", "--out", path, "--times", 0.5, *options) == 0
+    pictures = [cv2.imread(str(tmp_path / f"{name}.png")).astype(int) for name in ("own", "fast")]
+    assert np.abs(pictures[0] - pictures[1]).max() > 5
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--out", "m.fgz"], "--out: expected a name for the model"),
+        ([], ""),
+    ],
+)
+def test_compress_to_16_bits_without_the_clip(done, tmp_path, monkeypatch, capsys, options, told):
+    monkeypatch.chdir(tmp_path)
+    assert run("compress", done / "base.safetensors", "--float16", *options) == (2 if told else 0)
+    assert told in " ".join(capsys.readouterr().err.split())
+    if not told:
+        assert [path.name for path in tmp_path.iterdir()] == ["base.float16.safetensors"]
+        assert "mean_psnr" not in read_metadata("base.float16.safetensors")
