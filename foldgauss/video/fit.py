@@ -263,7 +263,7 @@ def _stopped_by(state: FitState, config: FitConfig, frames: np.ndarray) -> str |
         return "minutes"
     if not state.plan or state.step < state.plan:
         return None
-    return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
+    return "minutes" if config.minutes is not None and state.plan != config.steps else "steps"
 
 
 def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
