@@ -2,7 +2,7 @@
 
     python -m benchmarks.economy [--json FILE] [--clip NAME] [--size HxW] [--psnr DB] [--steps N] [--degrees 1,3,7,0]
 
-*Off* is a plain fit: for each degree the number of Gaussians is searched, in steps of a quarter octave, for the
+*Off* is a plain fit: for each degree the number of Gaussians is searched, in steps of an eighth of an octave, for the
 smallest that reaches the PSNR (mean over the frames); each fit that does is also *pruned*, of Gaussians in the order of
 what they add to the pictures, as far as the PSNR allows, nothing fitted again. *On* is the fit with
 `Economy(psnr=...)`. All have as many steps, but the economical one may take half as many again when it falls short,
@@ -26,7 +26,7 @@ from foldgauss.video.regions import Region
 
 SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (1, 3, 7, 0)
 #: Where the search begins, for the default clip, and its step.
-FIRST, RATIO = 13_500, 2**0.25
+FIRST, RATIO = 12_000, 2**0.125
 
 
 def pruned(model: VideoModel, frames: np.ndarray, psnr: float) -> VideoModel:
@@ -70,7 +70,7 @@ class Sweep:
             if self.reaches(num) != there:
                 break
         smallest = num if not there else round(num * RATIO)
-        self.reaches(round(smallest * RATIO**2))
+        self.reaches(round(smallest * RATIO**3))
         return smallest
 
 
@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=_common.size, default=SIZE, metavar="HxW", help="[160x320]")
     parser.add_argument("--psnr", type=float, default=PSNR, help="dB [33]")
     parser.add_argument("--steps", type=_common.whole, default=STEPS, help="[6000]")
-    parser.add_argument("--first", type=_common.whole, default=FIRST, help="Gaussians the search begins with [13500]")
+    parser.add_argument("--first", type=_common.whole, default=FIRST, help="Gaussians the search begins with [12000]")
     parser.add_argument("--degrees", default=",".join(map(str, DEGREES)), help="[1,3,7,0]")
     parser.add_argument("--model", type=Path, help="write the economical model here")
     options = _common.parse(parser, arguments)

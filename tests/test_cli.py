@@ -66,7 +66,7 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     assert run("info", work / "model.safetensors") == 0
     told = capsys.readouterr().out
     assert "400" in told
-    assert "power 2" in told
+    assert "power 1" in told
 
 
 def test_other_rates_speeds_and_times(work, tmp_path, capsys):

@@ -243,6 +243,13 @@ def fit(
         _draw_curves(curves, history)
     scores = evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
     save_video_model(target, model, metadata=about | scores_of(scores))
+    if smallest_at_psnr is not None and info.stopped_by != "smallest_at_psnr":
+        got = f"{scores.mean_psnr:.2f} dB after {info.step:,} steps"
+        err.print(
+            f"warning: --smallest-at-psnr: {smallest_at_psnr:g} dB was not reached, got {got}. "
+            "Give more --steps, or more --gaussians at the start.",
+            soft_wrap=True,
+        )
     figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
     figures |= {"stopped_by": info.stopped_by, "file_bytes": target.stat().st_size}
     if manner == "json":
@@ -412,6 +419,9 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
         )
     budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
     plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
+    if config.economy is not None:
+        wanted = config.economy.psnr
+        plan += ", only what pays" if wanted is None else f", the smallest at {wanted:g} dB"
     if manner == "json":
         about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
         print_json("start", about | {"num_gaussians": num, "degree": config.degree, "threads": num_threads()})

@@ -25,7 +25,7 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, pixels_per_unit
 from foldgauss.render.camera import FIELD_OF_VIEW, THICKNESS
 from foldgauss.render.splats import check_size
 from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.model import SH_C0, FoldedSplats, VideoModel
+from foldgauss.video.model import LASTING, SH_C0, FoldedSplats, VideoModel
 from foldgauss.video.playback import Playback
 from foldgauss.video.shots import out_of_cuts
 
@@ -75,7 +75,7 @@ def read_vegas_ply(
     `size` = (height, width) and `fps` are not in such a file and must be given, the first always, the second where 25
     is wrong; files that `write_vegas_ply` made carry both. What is drawn follows the published constants: power 2, low
     pass 0.3 px^2, alpha up to 0.99 and from 1/255 on, exp(-tau^2 / 2) > 0.01, and standard deviations above 1e-4 of its
-    units (`VideoModel.scale_cutoff`).
+    units (`VideoModel.scale_cutoff`). Files of our own carry what the model had instead.
 
     **Raises:** `FileNotFoundError`, and `FormatError` for a file that is damaged, of another kind, with colours that
     depend on the view, or without a size.
@@ -87,7 +87,7 @@ def read_vegas_ply(
     """
     ply = read_ply(path, ("vertex", "time"))
     _check_vegas(ply)
-    size, fps, options, scale_cutoff = _filled_in(ply, size, fps)
+    size, fps, options, scale_cutoff, power = _filled_in(ply, size, fps)
     degree = _degree(ply)
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(2 * degree))])
@@ -99,27 +99,33 @@ def read_vegas_ply(
         "log_scale": columns[:, 2:4] + math.log(unit),
         "angle_logit": angle,
         "time_loc_logit": time_loc,
-        "log_time_scale": log_time_scale,
+        "log_time_scale": _with_power(log_time_scale, VEGAS_POWER, power),
         "coefficients": plane * columns[:, 11:].reshape(len(columns), degree, 2),
         "opacity_logit": opacity,
         "color_dc": columns[:, 8:11],
     }
     splats = FoldedSplats(
         **{name: _float32(ply, name, leaf) for name, leaf in leaves.items()},
-        envelope=TimeLikelihood(np.float32(VEGAS_POWER), np.float32(0)),
+        envelope=TimeLikelihood(np.float32(power), np.float32(0)),
     )
     return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
 
 
 def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
-    """Write a video as the published VeGaS code keeps it; returns the path. See `read_vegas_ply` for the layout.
+    r"""Write a video as the published VeGaS code keeps it; returns the path. See `read_vegas_ply` for the layout.
 
-    Leaves come back to float32 rounding. The published code draws it with its own constants: a model that was fitted
-    with another low pass than 0.3 px^2 (the presets' is 0.1) looks a little softer there, and Gaussians whose scale,
-    after the envelope, is below 1e-4 of its units (a fifth of a pixel at 1280 wide) are left out there.
+    The envelope has power 2 there. That of another power p > 0 is the same function of time with
 
-    **Raises:** ValueError for a model that the published code cannot draw: another power of the envelope than 2, a
-    floor, compositing "sum", one frame alone; `OutputError` where the path cannot be written.
+    .. math:: \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2))
+
+    Leaves, sigma_t and the power among them, come back here to float32 rounding. The published code draws it with its
+    own constants: a Gaussian up to 3.03 sigma_t' from m_t, where it is a hundredth as wide as at its widest (at p = 1
+    the model itself ends at a tenth); a model that was fitted with another low pass than 0.3 px^2 (the presets' is 0.1)
+    a little softer; and Gaussians whose scale, after the envelope, is below 1e-4 of its units (a fifth of a pixel at
+    1280 wide) not at all.
+
+    **Raises:** ValueError for a model that the published code cannot draw: an envelope of power 0, a floor, compositing
+    "sum", one frame alone; `OutputError` where the path cannot be written.
 
     **Example:** `write_vegas_ply("point_cloud.ply", load_video_model("holiday.safetensors"))`
 
@@ -135,18 +141,29 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     columns |= {f"f_dc_{c}": _float64(splats.color_dc)[:, c] for c in range(3)}
     columns |= {"opacity": splats.opacity_logit, "scale_0": scale[:, 0]}
     columns |= {"scale_1": np.full(len(loc), _VEGAS_ACROSS), "scale_2": scale[:, 1]}
-    columns |= {"rot_0": splats.angle_logit, "m_0": splats.time_loc_logit, "sigma_0": splats.log_time_scale}
+    powers = _float64(splats.envelope.power)
+    spread = _with_power(_float64(splats.log_time_scale), powers, VEGAS_POWER)
+    columns |= {"rot_0": splats.angle_logit, "m_0": splats.time_loc_logit, "sigma_0": spread}
     weights = (plane * _float64(splats.coefficients)).reshape(len(loc), -1)
     columns |= {f"w1_{k}": weights[:, k] for k in range(weights.shape[1])}
     time_weights = {f"time_func_{k}": [weight] for k, weight in enumerate(_float64(model.frame_times.logits))}
     note = {"size": list(model.size), "fps": model.fps, "options": dataclasses.asdict(model.options)}
     note["scale_cutoff"] = model.scale_cutoff
+    if np.unique(powers).size == 1:
+        note["power"] = float(np.unique(powers)[0])
     return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[_NOTE + json.dumps(note)])
 
 
 def is_vegas(ply: Ply) -> bool:
     """Whether a PLY file is a published VeGaS video, by the columns that only those have."""
     return {"m_0", "sigma_0", "rot_0"} <= set(ply.names("vertex"))
+
+
+def _with_power(
+    log_time_scale: Float[np.ndarray, "num"], power: float | Float[np.ndarray, "*#num"], other: float
+) -> Float[np.ndarray, "num"]:
+    """log sigma_t that gives an envelope of the `other` power the same values; what lasts is 1 with either."""
+    return np.where(log_time_scale == LASTING, log_time_scale, log_time_scale + 0.5 * np.log(other / power))
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:
@@ -194,8 +211,8 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, "intervals"]:
 
 def _filled_in(
     ply: Ply, size: tuple[int, int] | None, fps: float | None
-) -> tuple[tuple[int, int], float, RenderOptions, float]:
-    """What the file's columns do not say: as given, or as our own writer noted it, or the default."""
+) -> tuple[tuple[int, int], float, RenderOptions, float, float]:
+    """What the file's columns do not say: as given, or as our own writer noted it, or the published."""
     note = _note(ply)
     if size is None and "size" not in note:
         cure = "Give the size of the video that it was made from, such as size=(480, 854)."
@@ -208,11 +225,14 @@ def _filled_in(
         cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
         if not within(cutoff, "[0, 1]"):
             raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
+        power = note.get("power", VEGAS_POWER)
+        if not within(power, "(0, 1e30]"):
+            raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
         if not within(fps, f"(0, {MAX_FPS}]"):
             raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
     except (TypeError, ValueError) as error:
         raise FormatError(f"{ply.path}: {error}") from error
-    return (int(size[0]), int(size[1])), float(fps), options, float(cutoff)
+    return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)
 
 
 def _note(ply: Ply) -> dict:
@@ -233,7 +253,6 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     envelope = model.splats.envelope
     facts = {
-        "power": (np.unique(envelope.power), VEGAS_POWER, "Fit it with --power 2."),
         "floor": (np.unique(envelope.floor), 0.0, "Fit it without a floor."),
         "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
     }
@@ -246,6 +265,9 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
             raise invalid(f"model's {name}", expected=expected, got=got, cure=cure)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
+    if not (np.asarray(envelope.power) > 0).all():
+        cure = "Fit it with another --power."
+        raise invalid("model's power", expected="above 0, as envelopes of a VeGaS file wane", got="0", cure=cure)
 
 
 def _float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:

@@ -315,10 +315,11 @@ class _Plan:
         self._fits, rest = {}, []
         for name in self._names:
             fit = np.zeros(design.shape[1])
-            if name in first or seen.sum() < _FEW:
+            shows = seen & (sensitivity[name] > _NOTHING)  # by the others, as in black frames, lines would be steep
+            if name in first or shows.sum() < _FEW:
                 fit[0] = levels[name][seen].mean()
             else:
-                fit = np.linalg.lstsq(design[seen], levels[name][seen], rcond=None)[0]
+                fit = np.linalg.lstsq(design[shows], levels[name][shows], rcond=None)[0]
             self._fits[name] = fit
             rest.append(np.clip(levels[name] - design @ fit, -6, 6))
         self._classes = np.rint(np.mean(rest, axis=0)).astype(np.int32)

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from scipy.spatial import cKDTree
 
 from foldgauss._checks import invalid, whole, within
@@ -28,10 +28,13 @@ LASTS = 128
 #: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
 #: lower; and so much higher, in dB, that the end is not missed by a hair.
 YET_TO_COME, SPARE = 0.8, 0.1
-#: Doubling the Gaussians brings so many dB (Bunny 160x320, degree 1: 4,000 28.7, 7,000 30.2); beyond this share of the
-#: plan none are born.
-DOUBLING, LAST_BIRTHS = 1.9, 0.6
-#: Of the Gaussians, in rounds without a PSNR: births; they go on while at least half of the last ones stay.
+#: The squared error falls by so many dB in a whole plan's later part, where nothing is dropped. (Bunny 80x160, 20,000
+#: Gaussians: 5.4 from 0.3 of the plan on.)
+FALLS = 7.0
+#: Doubling the Gaussians brings so many dB (Bunny 160x320, degree 1: 4,000 28.7, 7,000 30.2).
+DOUBLING = 1.9
+#: Of the Gaussians, in the first half of the rounds, without a PSNR: births; they go on while at least half of the last
+#: ones stay.
 BIRTHS = 0.5
 #: Rounds of Lloyd's algorithm, and sizes of palettes tried.
 _LLOYD, _PALETTES = 12, tuple(2**k for k in range(3, 17))
@@ -69,8 +72,12 @@ class Economy:
         for name, interval in bounds.items():
             if not within(getattr(self, name), interval):
                 raise invalid(f"economy.{name}", expected=f"a number in {interval}", got=repr(getattr(self, name)))
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not whole(self.rounds, 1):
             raise invalid("economy.rounds", expected="a whole number >= 1", got=repr(self.rounds))
+        object.__setattr__(self, "rounds", int(self.rounds))
+        if not isinstance(self.grows, bool):
+            raise invalid("economy.grows", expected="True or False", got=repr(self.grows))
         if self.first_share > self.last_share:
             got = f"{self.first_share:g} and {self.last_share:g}"
             raise invalid("economy.first_share, last_share", expected="in this order", got=got)
@@ -85,13 +92,12 @@ class Economy:
         shares = np.linspace(first, self.last_share, num) if num > 1 else np.array([self.last_share])
         return np.clip(np.rint(shares * plan), 1, plan).astype(int)
 
-    def births(self, ledger: Ledger, progress: float, num: int, young: Bool[np.ndarray, "num"] | None) -> int:
-        """How many Gaussians are to be born to `num`; `young`: which of those born last are still there."""
-        if progress > LAST_BIRTHS:
+    def births(self, ledger: Ledger, progress: float, num: int, survived: float) -> int:
+        """How many Gaussians are to be born to `num`; `survived`: the share still there of those born last."""
+        if ledger.squared_error <= ROUNDING * ledger.num_samples:  # nothing to be seen
             return 0
         if self.psnr is None:
-            goes_on = self.grows and (young is None or young.mean() >= 0.5)
-            return round(BIRTHS * num) if goes_on else 0
+            return round(BIRTHS * num) if self.grows and survived >= 0.5 else 0
         missing = self._aim(progress) - ledger.psnr
         return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
 
@@ -150,9 +156,13 @@ class Cut(NamedTuple):
     price: float
 
 
-def price_of(ledger: Ledger, bits: float) -> float:
-    """The squared error that a number has to save: its bits, at d(n / 2 log2 e) / de = n / (2 e ln 2)."""
-    error = max(ledger.squared_error, ROUNDING * ledger.num_samples)
+def price_of(ledger: Ledger, bits: float, progress: float = 1.0) -> float:
+    """The squared error that a number has to save: its bits, at d(n / 2 log2 e) / de = n / (2 e ln 2).
+
+    The error is that of the fit's end, by what is usual at a share `progress` of its plan.
+    """
+    error = ledger.squared_error * 10 ** (-FALLS * (1 - progress) / 10)
+    error = max(error, ROUNDING * ledger.num_samples)
     return bits * 2 * math.log(2) * error / ledger.effective_samples
 
 
@@ -165,15 +175,16 @@ def cut(
     degree: int,
     pixels: float,
     room: float | None = None,
+    progress: float = 1.0,
 ) -> Cut:
-    """What is left of packed rows, by what `ledger` says of them.
+    """What is left of packed rows, by what `ledger` says of them at a share `progress` of the plan.
 
     At the price of `price_of`; or where `room` is given, at the one that adds so much squared error. `pixels`: those
     along a unit of model space. At least one Gaussian is left.
     """
     book = _Book(rows, kinds, ledger, degree, pixels)
     if room is None:
-        return book.at(price_of(ledger, economy.bits), economy.most_dropped)
+        return book.at(price_of(ledger, economy.bits, progress), economy.most_dropped)
     low, high = 0.0, max(ledger.squared_error, 1e-9)
     for _ in range(40):
         middle = (low + high) / 2 if low > 0 else high / 2
@@ -266,6 +277,8 @@ def shared_colors(
         cost = _LEFT * error + stored * price
         if cost < least:
             best, least = index, cost
+        elif best is not None:
+            break
     return best
 
 

@@ -20,7 +20,20 @@ from foldgauss.video.alpha import random_background
 from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
-from foldgauss.video.economy import LEAST_PASSES, Cut, averaged, cut, forget, kinds_at_start, kinds_of, shared_colors
+from foldgauss.video.economy import (
+    LASTS,
+    LEAST_PASSES,
+    NUMBERS,
+    OF_TIME,
+    Cut,
+    Economy,
+    averaged,
+    cut,
+    forget,
+    kinds_at_start,
+    kinds_of,
+    shared_colors,
+)
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
@@ -181,7 +194,7 @@ def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
     for progress in (0.0, 1.0):  # with either loss
         _Stepper(corner, tiny, state)(state, progress)
-    if config.target_psnr is not None:
+    if config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None):
         _mean_psnr(state, tiny, corner)
 
 
@@ -236,20 +249,21 @@ def _stopped_by(state: FitState, config: FitConfig, frames: np.ndarray) -> str |
     # The pace that minutes are planned by is that of the Gaussians at the start, and of steps alone: where they grow,
     # or frames are looked at between steps, the clock decides.
     by_clock = config.growth is not None or config.target_psnr is not None or config.economy is not None
-    if by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes:
-        return "minutes"
-    if not state.plan or state.step < state.plan:
-        return None
-    economy = config.economy
-    if economy is not None and economy.psnr is not None:
-        over = state.step >= OVERTIME * state.plan or (by_clock and state.seconds >= 60 * (config.minutes or math.inf))
-        if not over and (state.step - state.plan) % len(frames):
+    late = by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes
+    wanted = None if config.economy is None else config.economy.psnr
+    if wanted is not None and state.plan:
+        over = late or state.step >= OVERTIME * state.plan
+        if not over and (state.step < state.plan or (state.step - state.plan) % len(frames)):
             return None
-        if np.isfinite(state.rows).all() and _mean_psnr(state, config, frames) >= economy.psnr:
+        if np.isfinite(state.rows).all() and _mean_psnr(state, config, frames) >= wanted:
             return "smallest_at_psnr"
         if not over:
             return None
-    return "minutes" if config.minutes is not None and state.step != config.steps else "steps"
+    if late:
+        return "minutes"
+    if not state.plan or state.step < state.plan:
+        return None
+    return "minutes" if config.minutes is not None and state.plan != config.steps else "steps"
 
 
 def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
@@ -481,7 +495,7 @@ class _Stepper:
         """
         if self.frames.shape[3] == 4:
             self.background = random_background(self.config.seed, state.step)
-        decay = self.config.final_rate**progress if self.config.final_rate > 0 else 1 - progress
+        decay = self.config.final_rate**progress if self.config.final_rate > 0 else max(1 - progress, 0.0)
         times = np.asarray(_frame_times(state.time_logits))
         by_time = np.zeros_like(times)
         losses, alive, squared, errors = [], [], progress >= 1 - self.config.square_share, []
@@ -546,6 +560,8 @@ class _Stepper:
         )
         state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
         state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, self.config.degree)])
+        state.young = np.concatenate([state.young[stay], np.zeros(len(born), bool)])
+        state.palette = np.zeros(0, np.int32)  # those born have colours of their own
         state.statistics = Statistics.zeros(len(state.rows))
         self._make_room(state)
 
@@ -560,23 +576,37 @@ class _Stepper:
         if state.step not in steps:
             return
         ledger, progress = self._ledger(state), state.step / state.plan
-        made = self._cut(state, ledger, economy.room(ledger, progress))
-        young = state.young[made.stay] if state.young.any() else None
+        made = self._cut(state, ledger, economy.room(ledger, progress), economy)
+        survived = 1.0 if state.step == steps[0] else state.young[made.stay].sum() / max(state.young.sum(), 1)
         self._keep(state, made)
-        room = most_gaussians(self.config, self.num_frames) - len(state.rows)
-        num = min(economy.births(ledger, progress, len(state.rows), young), room)
+        at_start = chosen_num_gaussians(self.config, *self.frames.shape[:3])
+        most = min(most_gaussians(self.config, self.num_frames), MOST_BORN * at_start)
+        num = 0
+        if state.step in steps[: len(steps) // 2]:
+            num = min(economy.births(ledger, progress, len(state.rows), survived), most - len(state.rows))
         state.young = np.zeros(len(state.rows), bool)
         if num > 0:
             self._bear(state, ledger, num)
-        if state.step == steps[-1]:
+        elif state.step == steps[-1]:
             color = state.rows[:, columns(degree)["color_dc"]]
             index = shared_colors(color, ledger.by_color[made.stay], made.price, self.config.seed)
             state.palette = np.zeros(0, np.int32) if index is None else index.astype(np.int32)
+        if state.statistics is not None:
+            state.statistics = Statistics.zeros(len(state.rows))
         self._make_room(state)
 
-    def _cut(self, state: FitState, ledger: Ledger, room: float | None) -> Cut:
+    def _squares(self, rows: np.ndarray, window: np.ndarray, k: int, t: float) -> np.ndarray:
+        """(height, width): squared errors of frame k, summed over the channels."""
+        target, behind = self._target(k)
+        done = condition(rows, window, t, self.shapes[-1])
+        leaves = done.mean, done.factor, done.opacity, done.color, behind
+        drawn = {"compositing": self.config.compositing, "options": self.config.options}
+        return ((cpu.forward(*leaves, self.shapes[-1].size, **drawn).image - target) ** 2).sum(0)
+
+    def _cut(self, state: FitState, ledger: Ledger, room: float | None, economy: Economy) -> Cut:
         how = {"degree": self.config.degree, "pixels": pixels_per_unit(self.shapes[-1].size), "room": room}
-        return cut(state.rows, state.kinds, ledger, self.config.economy, **how)
+        how["progress"] = min(state.step / state.plan, 1.0)
+        return cut(state.rows, state.kinds, ledger, economy, **how)
 
     def _keep(self, state: FitState, made: Cut) -> None:
         state.rows, state.kinds = made.rows, made.kinds
@@ -592,25 +622,18 @@ class _Stepper:
         colors = np.ascontiguousarray(self.frames[..., :3])
         self._make_room(state)
 
-        def squares(k: int) -> np.ndarray:
-            target, behind = self._target(k)
-            done = condition(state.rows, self.window, times[k], self.shapes[-1])
-            leaves = done.mean, done.factor, done.opacity, done.color, behind
-            drawn = {"compositing": config.compositing, "options": config.options}
-            return ((cpu.forward(*leaves, self.shapes[-1].size, **drawn).image - target) ** 2).sum(0)
-
         alive = float(np.mean([((self.window[:, 0] < t) & (t < self.window[:, 1])).sum() for t in times]))
         new = newborns(
             num,
             colors,
             times,
             ledger.errors,
-            squares,
+            lambda k: self._squares(state.rows, self.window, k, times[k]),
             alive,
             degree=config.degree,
             envelope=_envelope(config),
             motion=self.flow.motion if config.follow_motion else None,
-            opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
+            opacity=START_OPACITY,
             seed=(config.seed, 3, state.step),
         )
         order = among(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
@@ -632,20 +655,24 @@ class _Stepper:
         return measured(state.rows, self.window, times, self.shapes[-1], self._target, **how)
 
     def trim(self, state: FitState) -> None:
-        """At the end: leave out what the PSNR asked for has no need of, each try measured."""
-        config, ledger = self.config, self._ledger(state)
-        wanted, before = config.economy.psnr, dataclasses.replace(state)
-        most, best = ledger.squared_error * (10 ** (max(ledger.psnr - wanted, 0.0) / 10) - 1), None
-        for share in (1.0, 0.8, 0.6, 0.4, 0.2):
-            tried = dataclasses.replace(before)
-            self._keep(tried, self._cut(tried, ledger, share * most))
-            if _mean_psnr(tried, config, self.frames) >= wanted:
-                best = tried
+        """At the end: leave out what the PSNR asked for has no need of, each try measured, until none succeeds."""
+        for _ in range(TRIMS):
+            if not self._trimmed(state):
                 break
-        if best is not None:
-            for name in ("rows", "kinds", "first", "second", "counts", "young", "palette"):
-                setattr(state, name, getattr(best, name))
             self._make_room(state)
+
+    def _trimmed(self, state: FitState) -> bool:
+        config, ledger = self.config, self._ledger(state)
+        wanted, before, size = config.economy.psnr, dataclasses.replace(state), _numbers(state)
+        room = ledger.squared_error * (10 ** (max(ledger.psnr - wanted, 0.0) / 10) - 1)
+        for share in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
+            tried = dataclasses.replace(before)
+            self._keep(tried, self._cut(tried, ledger, share * room, config.economy))
+            if _numbers(tried) < (1 - LEAST_TRIM) * size and _mean_psnr(tried, config, self.frames) >= wanted:
+                for name in ("rows", "kinds", "first", "second", "counts", "young", "palette"):
+                    setattr(state, name, getattr(tried, name))
+                return True
+        return False
 
     def _batch(self, step: int) -> np.ndarray:
         """Views of a step: every pass visits all once, in an order that depends on seed and pass only.
@@ -730,6 +757,12 @@ class _Between:
         return np.ascontiguousarray(np.moveaxis(guess, -1, 0) * np.float32(1 / 255))
 
 
+def _numbers(state: FitState) -> int:
+    """Those that the Gaussians have, colours counted one by one."""
+    lasts, powers = state.kinds >= LASTS, state.kinds % LASTS
+    return int((NUMBERS + 2 * powers.astype(int) + OF_TIME * ~lasts).sum())
+
+
 def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Splats as the camera opposite sees them, in pixels, left for right; its transpose, for gradients, at width 0."""
     other = np.float32([-1, 1])
@@ -755,6 +788,10 @@ def _envelope(config: FitConfig) -> TimeLikelihood:
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.
 OVERTIME = 1.5
+#: Gaussians born in all are so many times those at the start at most.
+MOST_BORN = 4
+#: Times that a fit is trimmed at its end, and the share of its numbers that is worth another time.
+TRIMS, LEAST_TRIM = 8, 0.002
 #: Births make steps slower by this much, at first.
 GROWN = 1.15
 #: Taking stock of a frame costs as much as so many steps with it: a pass forward and four back.

@@ -39,7 +39,7 @@ class Ledger:
       Gaussian's place, halved; `span` (num,): a length of time to measure u = m_t - t by.
     * `by_color` (num,): half the second derivative by any of a Gaussian's `color_dc`.
     * `by_size` (num, 3): sums of S, S l and S l^2, S the second derivative by the logarithm of the Gaussian's size,
-      halved, and l = log a(t) / 2; `misses` (num,): frames at which the Gaussian is not alive.
+      halved, at its size at its own time, and l = log a(t) / 2; `misses` (num,): frames at which it is not alive.
     """
 
     errors: Float[np.ndarray, "num_frames"]
@@ -177,7 +177,8 @@ def measured(
         u = centre[alive] - t
         powers = (u / span[alive])[:, None] ** np.arange(2 * shape.degree + 1)
         narrowed = _log_envelope(u / spread[alive], shape) / 2
-        weights = np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
+        # By the logarithm of its size, at the size that it would have: that grows as its square.
+        weights = np.exp(-2 * narrowed)[:, None] * np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
         for _ in range(draws):
             signs = rng.integers(0, 2, signs_shape, dtype=np.int8) * np.float32(2) - np.float32(1)
             d_mean, d_factor, d_opacity, d_color, _ = cpu.backward(trace, signs)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.lib import recfunctions
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import load_video_model, save_video_model
+from foldgauss.io import load_video_model, read_pseudomesh, save_video_model, write_pseudomesh
 from foldgauss.io import ply as ply_file
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._ply import FormatError, read_ply, write_ply
@@ -28,7 +28,9 @@ from foldgauss.io.ply import (
     write_vegas_ply,
 )
 from foldgauss.render import Gaussians3D, RenderOptions, Splats2D, cpu
-from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit, psnr
+from foldgauss.video.model import LASTING
+from foldgauss.video.packing import columns as columns_of
 from foldgauss.video.packing import pack, unpack
 from foldgauss.video.playback import Playback
 
@@ -122,6 +124,15 @@ def one_line(caught, *texts):
         assert text in message, message
 
 
+def without_note(path):
+    """The same file as of another program: nothing is known of it but what the published code reads."""
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    lines = [line for line in head.splitlines(keepends=True) if not line.startswith(b"comment foldgauss")]
+    assert len(lines) == len(head.splitlines()) - 1
+    path.write_bytes(b"".join(lines) + b"end_header\n" + body)
+    return path
+
+
 def random_model(seed=0, size=(48, 80), degree=DEGREE, num=NUM, power=2.0, floor=0.0):
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(num, 11 + 2 * degree)).astype(np.float32)
@@ -198,6 +209,77 @@ def test_leaves_come_back_to_rounding(tmp_path, degree, size):
     assert float(again.splats.envelope.power) == 2
 
 
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0, 16.0])
+def test_any_power_is_the_same_envelope_in_the_file(tmp_path, power):
+    """In the file the standard deviations are those of the model at any time, and again here is the model."""
+    model = random_model(power=power)
+    path = write_vegas_ply(tmp_path / "v.ply", model)
+    columns, splats = read_ply(path, ("vertex", "time")).elements["vertex"], model.splats
+    for t in (0.1, 0.5, 0.8):
+        u = 1 / (1 + np.exp(-splats.time_loc_logit.astype(float))) - t
+        published = np.exp(-((u / np.exp(columns["sigma_0"].astype(float))) ** 2) / 2)
+        own = splats.envelope.log_a(u, time_loc=0 * u, time_scale=np.exp(splats.log_time_scale.astype(float)))
+        np.testing.assert_allclose(published, np.exp(np.asarray(own) / 2), rtol=1e-5, atol=1e-12)
+    again = read_vegas_ply(path)
+    np.testing.assert_allclose(pack(again.splats), pack(splats), rtol=3e-7, atol=5e-7)
+    assert float(again.splats.envelope.power) == power
+    if power == 2:
+        np.testing.assert_array_equal(columns["sigma_0"], splats.log_time_scale)
+
+
+def test_pictures_of_power_1_come_back(tmp_path):
+    """Here the very pictures, by the file alone nearly: Gaussians end later there. Unconverted they would be others."""
+    y, x = np.mgrid[0:48, 0:64]
+    blobs = [np.exp(-((x - 12 - 7 * k) ** 2 + (y - 24) ** 2) / 40) for k in range(6)]
+    clip = np.rint(40 + 200 * np.stack([np.stack([blob, 1 - blob, x / 64], -1) for blob in blobs])).astype(np.uint8)
+    model = fit(clip, FitConfig(num_gaussians=300, steps=150, power=1)).model
+    pictures = list(model.frames())
+    same = lambda other: float(np.mean([psnr(*pair) for pair in zip(pictures, other.frames(), strict=True)]))  # noqa: E731
+    path = write_vegas_ply(tmp_path / "v.ply", model)
+    assert same(read_vegas_ply(path)) > 80
+    there = read_vegas_ply(without_note(path), size=model.size)
+    there = dataclasses.replace(there, options=model.options, scale_cutoff=0.0)
+    assert float(there.splats.envelope.power) == 2
+    assert same(there) > 50
+    wrong = eqx.tree_at(lambda m: m.splats.log_time_scale, there, model.splats.log_time_scale)
+    assert same(wrong) < 45
+
+
+def test_powers_of_their_own_are_one_in_the_file(tmp_path):
+    powers = np.linspace(0.5, 2.5, NUM).astype(np.float32)
+    model = random_model()
+    mixed = eqx.tree_at(lambda m: m.splats.envelope, model, TimeLikelihood(powers, np.zeros(NUM, np.float32)))
+    again = read_vegas_ply(write_vegas_ply(tmp_path / "v.ply", mixed))
+    assert float(again.splats.envelope.power) == 2
+    longer = again.splats.log_time_scale - mixed.splats.log_time_scale
+    np.testing.assert_allclose(longer, 0.5 * np.log(2 / powers), atol=1e-6)
+
+
+@pytest.mark.parametrize("power", [0.7, 1.0, 2.0])
+def test_what_lasts_lasts_in_every_format(tmp_path, power):
+    """Gaussians without beginning and end come back to the bit, and are in every frame as they are."""
+    model = random_model(power=power, num=20)
+    rows = pack(model.splats)
+    place = columns_of(DEGREE)
+    rows[::2, place["time_loc_logit"]], rows[::2, place["log_time_scale"]] = 0, LASTING
+    model = dataclasses.replace(model, splats=unpack(rows, DEGREE, model.splats.envelope))
+    assert model.splats.lasting.sum() == 10
+    path = write_vegas_ply(tmp_path / "v.ply", model)
+    for again in (read_vegas_ply(path), read_vegas_ply(without_note(path), size=model.size)):
+        np.testing.assert_array_equal(again.splats.lasting, model.splats.lasting)
+    own = np.exp(np.sort(rows[::2, place["log_scale"]]))
+    write_pseudomesh(tmp_path / "mesh", model, times=[0.0, 1.0])
+    for k, t in enumerate((0.0, 1.0)):
+        alive = np.flatnonzero(np.asarray(model.splats.at(jnp.float32(t)).opacity) > 0)
+        here = np.flatnonzero(model.splats.lasting[alive])
+        assert len(here) == 10
+        scene = read_3dgs_ply(write_3dgs_ply(tmp_path / f"{k}.ply", model, t, depth_step=0))
+        edges = read_pseudomesh(tmp_path / "mesh").triangles[k].edges
+        for scale in (np.linalg.norm(scene.factor[:, :2, :2], axis=1), np.linalg.norm(edges, axis=2)):
+            assert len(scale) == len(alive)
+            np.testing.assert_allclose(np.sort(scale[here]), own, rtol=1e-5)
+
+
 def test_columns_come_back_to_rounding(tmp_path):
     columns, weights = vegas_columns(), time_weights()
     model = read_vegas_ply(write_raw(tmp_path / "a.ply", columns, weights), size=(40, 64))
@@ -212,7 +294,7 @@ def test_columns_come_back_to_rounding(tmp_path):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"power": 1.0}, "--power 2"),
+        ({"power": 0.0}, "--power"),
         ({"floor": 0.01}, "floor"),
     ],
 )
@@ -493,7 +575,8 @@ def test_frame_weights_are_needed(tmp_path):
 
 @pytest.mark.parametrize(
     "note", ['{"size": [1, "a"]}', "[1]", "{", '{"options": 3}', '{"size": [4, 4], "options": {"low_pass": -1}}',
-             '{"size": [4, 4], "options": {"colour": 1}}', '{"size": [4, 4], "fps": "many"}', "[" * 100_000]
+             '{"size": [4, 4], "options": {"colour": 1}}', '{"size": [4, 4], "fps": "many"}', "[" * 100_000,
+             '{"size": [4, 4], "power": 0}', '{"size": [4, 4], "power": "two"}', '{"size": [4, 4], "power": 1e300}']
 )  # fmt: skip
 def test_notes_that_are_none(tmp_path, note):
     tables = {"vertex": vegas_columns(), "time": {f"time_func_{k}": [0.0] for k in range(3)}}

@@ -13,7 +13,9 @@ from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.conditioning import Shape, condition, update_windows
 from foldgauss.video.economy import LASTS, averaged, forget, kinds_of, shared_colors
 from foldgauss.video.economy import cut as cut_rows
+from foldgauss.video.finish import refitted
 from foldgauss.video.fit import fit_steps, to_model
+from foldgauss.video.growth import Growth
 from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.light import LitModel
 from foldgauss.video.packing import columns, pack
@@ -71,7 +73,7 @@ def test_a_path_has_the_degree_that_it_needs(name, degree):
     moving = np.asarray(splats.color_dc)[:, 0] > 0.5
     share = [seen[:, moving & (splats.degrees == k)].sum() / seen[:, moving].sum() for k in range(4)]
     assert share[degree] > 0.7
-    assert sum(share[: degree + 1]) > 0.9  # hardly any with more
+    assert sum(share[: degree + 1]) > 0.85  # few with more
 
 
 def test_what_is_still_beside_it_stands_still():
@@ -92,7 +94,7 @@ def test_gaussians_end_at_a_cut():
 
 def test_noise_ends_growth():
     _, model, _, counts = fitted("noise")
-    assert max(counts) <= 1.2 * 300  # those born once do not pay, and none are born after them
+    assert max(counts) <= 1.5 * 300  # those born once do not pay, and none are born after them
     assert counts[-1] < 0.5 * 300
     assert model.num_gaussians == counts[-1]
 
@@ -290,6 +292,92 @@ def test_at_least_one_is_left():
     assert len(cut_rows(rows, np.full(3, 3, np.uint8), ledger, dear, degree=3, pixels=80.0).stay) == 1
 
 
+@pytest.mark.parametrize("sigma", [0.3, 0.6, 2.0])
+def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
+    """One Gaussian that is there at all frames, against pictures of itself."""
+    row, at = np.zeros((1, 11 + 2), np.float32), columns(1)
+    row[:, at["log_scale"]], row[:, at["opacity_logit"]] = np.log([0.12, 0.08]), 1.0
+    row[:, at["color_dc"]], row[:, at["log_time_scale"]] = 1.0, np.log(sigma)
+    shape, times = Shape(1, 1.0, 0.0, SIZE), np.linspace(0, 1, 9)
+    drawn = {"compositing": "over", "options": FitConfig().options}
+    own = _pictures(row, shape, times, drawn)
+    ledger = _mean_ledger((own, row, shape, times, drawn), draws=4)
+    assert ledger.misses[0] == 0
+    made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0)
+    assert made.kinds.tolist() == [LASTS]
+    cost = _error(made.rows, own, shape, times, drawn)
+    assert cost == pytest.approx(ledger.lasting[0], rel=0.5, abs=1e-6)
+
+
+def test_refitting_keeps_what_a_gaussian_is():
+    frames, model, _, _ = fitted("line")
+    again = refitted(model, lambda k, _: _target(frames)(k), 2)
+    np.testing.assert_array_equal(again.splats.lasting, model.splats.lasting)
+    assert (again.splats.degrees <= model.splats.degrees).all()
+    assert evaluate(again, frames).mean_psnr > 45
+
+
+# ---------------------------------------------------------------------------------------------- settings
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"economy": Economy(rounds=1)},
+        {"economy": Economy(), "growth": Growth(until_step=29_000, from_step=0), "max_gaussians": 200},
+        {"economy": Economy(), "batch_size": 3, "two_cameras": True, "power": 2.0, "floor": 0.1},
+        {"economy": Economy(psnr=25), "minutes": 0.03, "steps": None},
+        {"economy": Economy(), "degree": 0, "learn_frame_times": False, "follow_motion": False},
+    ],
+    ids=str,
+)
+def test_every_setting_ends_well(changes):
+    frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
+    result = fit(frames, FitConfig(**({"num_gaussians": 120, "steps": 200} | changes)))
+    assert result.model.num_gaussians >= 1
+    assert evaluate(result.model, frames).mean_psnr > 22
+
+
+def test_rates_that_have_fallen_to_nothing_stay_there():
+    """In overtime they would else be below 0, and climb."""
+    frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
+    config = FitConfig(num_gaussians=120, steps=200, final_rate=0.0, economy=Economy(psnr=60))
+    states = [(info.step, info.loss) for _, info in fit_steps(frames, config)]
+    assert states[-1][0] == 300
+    late = [loss for step, loss in states if step > 200]
+    assert max(late) < 3 * np.median([loss for step, loss in states if 180 < step <= 200])
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_one_colour_ends_well(value):
+    frames = np.full((6, *SIZE, 3), value, np.uint8)
+    model = fit(frames, FitConfig(num_gaussians=200, steps=300, economy=Economy())).model
+    assert evaluate(model, frames).mean_psnr > 40
+    assert model.num_gaussians <= (20 if value == 0 else 300)  # white has to be covered
+
+
+def test_the_description_gets_shorter():
+    frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
+
+    def length(economy):
+        config = FitConfig(num_gaussians=200, steps=600, economy=economy)
+        model = fit(frames, config).model
+        squares = [((a.astype(float) - b) ** 2).mean() for a, b in zip(frames, model.frames(), strict=True)]
+        return 8 * model.num_floats + frames.size / 2 * np.log2(1 + np.mean(squares) * 12)
+
+    assert length(Economy()) < length(None)
+
+
+def test_large_frames_grow_too():
+    """They are seen at half their size at first, which says nothing of what pays."""
+    frames = np.kron(noise(1)[:, :30, :40], np.ones((1, 8, 8, 1), np.uint8)).repeat(3, 0)
+    counts = [
+        info.num_gaussians
+        for _, info in fit_steps(frames, FitConfig(num_gaussians=60, steps=90, economy=Economy(psnr=60)))
+    ]
+    assert max(counts) > 60
+
+
 # ---------------------------------------------------------------------------------------------- a PSNR asked for
 
 
@@ -306,21 +394,30 @@ def test_a_psnr_out_of_reach_is_told():
     result = fit(noise(4), FitConfig(num_gaussians=60, steps=60, economy=Economy(psnr=60)))
     assert result.history[-1].stopped_by == "steps"
     assert result.history[-1].step == 90  # in vain for half as long again
-    assert result.model.num_gaussians >= 60  # nothing was dropped
+    assert result.model.num_gaussians <= 4 * 60  # births have an end
 
 
-def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "at"),
+    [
+        ({"economy": Economy(rounds=4)}, (30, 60, 110)),
+        ({"economy": Economy(psnr=60)}, (60, 130)),  # in overtime
+        ({"growth": Growth(from_step=0, screen_gradient=1e-6), "economy": Economy(rounds=2)}, (50, 90)),
+    ],
+    ids=["priced", "smallest", "grown"],
+)
+def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
     frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
-    config = FitConfig(num_gaussians=200, steps=120, economy=Economy(rounds=4))
+    config = FitConfig(num_gaussians=200, steps=120, **changes)
     kept = {}
     for state, info in fit_steps(frames, config):
-        if info.step in (30, 60, 110):
+        if info.step in at:
             kept[info.step] = save_checkpoint(tmp_path / f"{info.step}.ck", state, config=config, source={})
     for path in kept.values():
         again = load_checkpoint(path, config=config, source={})
         for state_again, _ in fit_steps(frames, config, again):
             pass
-        for name in ("rows", "kinds", "palette", "time_logits"):
+        for name in ("rows", "first", "second", "counts", "kinds", "young", "palette", "time_logits"):
             np.testing.assert_array_equal(getattr(state_again, name), getattr(state, name))
 
 
@@ -333,6 +430,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path):
         ({"rounds": 0}, r"economy\.rounds"),
         ({"first_share": 0.9}, r"economy\.first_share, last_share"),
         ({"most_dropped": 2}, r"economy\.most_dropped"),
+        ({"grows": "no"}, r"economy\.grows"),
     ],
 )
 def test_bad_numbers_are_refused(changes, name):
@@ -340,9 +438,12 @@ def test_bad_numbers_are_refused(changes, name):
         Economy(**changes)
 
 
-def test_one_psnr_is_enough():
-    with pytest.raises(ValueError, match=r"^economy\.psnr: expected the only PSNR asked for"):
-        FitConfig(target_psnr=30, economy=Economy(psnr=30))
+@pytest.mark.parametrize("psnr", [None, 30])
+def test_a_target_is_not_for_economies(psnr):
+    with pytest.raises(ValueError, match=r"^economy: expected None with compositing 'sum'"):
+        FitConfig(compositing="sum", economy=Economy(psnr=psnr))
+    with pytest.raises(ValueError, match=r"^target_psnr: expected None with an economy"):
+        FitConfig(target_psnr=30, economy=Economy(psnr=psnr))
 
 
 def test_stock_is_taken_once_frames_are_whole_and_not_too_often():

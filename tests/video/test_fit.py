@@ -12,7 +12,7 @@ from test_motion import panning
 
 from foldgauss import _threads
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
+from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
 from foldgauss.video.config import chosen_num_gaussians, planned_steps
 from foldgauss.video.fit import check_frames, start, start_from, to_model
 
@@ -218,6 +218,13 @@ def test_the_first_budget_binds(budgets, binds):
         assert last.step < 400
 
 
+def test_steps_bind_in_overtime_too():
+    """A PSNR out of reach is tried for half as long again; the minutes have not run out by then."""
+    budgets = {"steps": 20, "minutes": 10.0, "economy": Economy(psnr=99.0)}
+    *_, (_, last) = fit_steps(moving_blobs(), dataclasses.replace(CONFIG, **budgets))
+    assert (last.stopped_by, last.step) == ("steps", 30)
+
+
 def white_squares() -> np.ndarray:
     """On transparent ground: over light backgrounds any model looks right."""
     frames = np.zeros((6, 48, 64, 4), np.uint8)
@@ -397,7 +404,7 @@ def test_frame_times_start_where_they_are_told():
     ("changes", "told"),
     [
         ({"degree": 2}, r"config\.degree: expected the model's, 3, got 2"),
-        ({"power": 1.0}, r"config\.power"),
+        ({"power": 2.0}, r"config\.power"),
         ({"floor": 0.1}, r"config\.floor"),
         ({"compositing": "sum"}, r"config\.compositing"),
         ({"options": RenderOptions.standard()}, r"config\.options"),

@@ -243,7 +243,8 @@ def run(config, kept=None):
     numbers = []
     for state, info in fit_steps(FRAMES, config, kept):
         numbers.append(info.num_gaussians)
-        assert len({len(part) for part in (state.rows, state.first, state.second, state.counts)}) == 1
+        parts = (state.rows, state.first, state.second, state.counts, state.kinds, state.young)
+        assert len({len(part) for part in parts}) == 1
     return numbers, state
 
 
