@@ -130,6 +130,8 @@ def test_each_turn_changes_one_thing_and_has_a_command():
     assert made[0].config == BASE
     shown = dict(zip((point.name for point in made), lines, strict=True))
     assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-share 0.0")
+    assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
+    assert shown["economy on"].endswith("--steps 1000 --economy")  # a flag
     assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
     assert shown["cutoff radius 2, fitted"].endswith("--support-radius 2.0")
     assert shown["cutoff radius 2, played"] == (
@@ -265,7 +267,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
     rows = {name_of(row): row for row in record["points"]}
     chosen = {name for cost in kept.COSTS for name in record["fronts"][cost]["front"]}
     chosen |= {"base", "batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played", "ssim 0.5", "compositing sum"}
-    chosen |= {f"precision {turn.value}" for turn in AXES["precision"]}
+    chosen |= {"economy on"} | {f"precision {turn.value}" for turn in AXES["precision"]}
     for name in sorted(chosen):
         words = shlex.split(rows[name]["command"])
         assert words[0] == "foldgauss"
