@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+import itertools
 import json
 import shlex
 from pathlib import Path
@@ -27,6 +28,8 @@ _FIT_FIELDS = ("steps", "degree", "batch_size", "power", "compositing", "ssim_sh
 FIT_OPTIONS = {"num_gaussians": "--gaussians"} | {
     name: f"--{name.replace('_', '-')}" for name in (*_FIT_FIELDS, "seed")
 }
+#: Those without a number: it is there, or it is not.
+FLAGS = {"economy": "--economy"}
 DRAW_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("alpha_cutoff", "support_radius", "transmittance_stop")
 }
@@ -128,13 +131,14 @@ def _changed(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions, 
     """Options for all fields that differ."""
     names = [field.name for field in dataclasses.fields(now) if field.name != "options"]
     changed = [name for name in names if getattr(now, name) != getattr(before, name)]
-    return [word for name in changed for word in (options[name], str(getattr(now, name)))]
+    words = [[FLAGS[name]] if name in FLAGS else [options[name], str(getattr(now, name))] for name in changed]
+    return list(itertools.chain.from_iterable(words))
 
 
 def settings_of(point: Point, base: FitConfig) -> dict[str, Any]:
     """Every setting that differs from the base's."""
     changed = {
-        field.name: getattr(point.config, field.name)
+        field.name: "on" if field.name in FLAGS else getattr(point.config, field.name)
         for field in dataclasses.fields(base)
         if field.name != "options" and getattr(point.config, field.name) != getattr(base, field.name)
     }

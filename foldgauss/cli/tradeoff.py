@@ -41,6 +41,7 @@ from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_step
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, to_model
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
+from foldgauss.video.motion import Motion
 from foldgauss.video.tradeoff import (
     AXES,
     FLOAT16,
@@ -125,6 +126,7 @@ class _Run:
         self.clip, self.record, self.words, self.about = clip, record, words, about
         self.folder = words.folder
         self._kept: VideoModel | None = None  # the base's model
+        self._motion: Motion | None = None  # the clip's, found once for all fits
         self._warm = False  # whether what a fit compiles for this size is there
 
     def planned(self, wanted: FitConfig, axes: tuple[str, ...], minutes: float, steps: int | None) -> FitConfig:
@@ -140,7 +142,7 @@ class _Run:
             least = max(LEAST_STEPS, self.clip.num_frames)  # so that the base sees every frame
             chosen = min(max(allowed, least), full) if steps is None else steps
             expected = SLOWER * seconds_of(made, chosen, pace, self.clip.num_frames) / 60
-            self.record.plan = {"steps": chosen, "expected_minutes": round(expected, 2), "pace": pace._asdict()}
+            self.record.plan |= {"steps": chosen, "expected_minutes": round(expected, 2), "pace": pace._asdict()}
             self._say(len(made), chosen, expected)
             if steps is None:
                 self._say_misfit(len(made), chosen, full, expected, minutes)
@@ -178,12 +180,18 @@ class _Run:
         step = (last.seconds - first.seconds) / max(last.step - first.step, 1)
         return Pace(max(first.seconds - step, 0.0), step, look)
 
-    def _fit(
-        self, config: FitConfig, tell: Callable[[FitInfo], None], frames: np.ndarray | None = None
-    ) -> Iterator[tuple[FitState, FitInfo]]:
-        for state, info in fit_steps(self.clip.frames if frames is None else frames, config):
+    def _fit(self, config: FitConfig, tell: Callable[[FitInfo], None]) -> Iterator[tuple[FitState, FitInfo]]:
+        for state, info in fit_steps(self.clip.frames, config, motion=self._found_motion()):
             tell(info)
             yield state, info
+
+    def _found_motion(self) -> Motion:
+        """The clip's, found once; what that took is kept with the plan: `fit` spends it anew on every model."""
+        if self._motion is None:
+            begun = _Spent.now()
+            self._motion = Motion.of(np.ascontiguousarray(self.clip.frames[..., :3]))
+            self.record.plan.setdefault("motion", _Spent.since(begun)._asdict())
+        return self._motion
 
     def measure(self, made: list[Point], base: FitConfig) -> list[Left]:
         """A row for each point that has none yet, kept as soon as it is there; and the points that cannot be had."""
@@ -264,9 +272,8 @@ class _Run:
             passes=PASSES[point.stored],
             on_step=lambda what, loss: tell(what if math.isnan(loss) else f"{what}, {loss:.3f} dB lost"),
         )
-        now = _Spent.now()
+        spent = fitted.and_also(_Spent.since(begun))
         save_compressed(path, made, self.about)
-        spent = _Spent(fitted.wall + now.wall - begun.wall, fitted.cpu + now.cpu - begun.cpu)
         return made.model, evaluate(made.model, self.clip.frames), spent
 
     def _base(self, base: FitConfig, tell: Tell) -> VideoModel:
@@ -285,13 +292,16 @@ class _Run:
             self._warm = True
         # Kernels are compiled on a corner of the clip: no fit's seconds count that, and neither may its CPU seconds.
         tiny = dataclasses.replace(config, num_gaussians=8, steps=1, follow_motion=False)
-        list(self._fit(tiny, lambda info: None, self.clip.frames[:2, :32, :32].copy()))
+        list(fit_steps(self.clip.frames[:2, :32, :32].copy(), tiny))
+        self._found_motion()  # before the clock runs
         begun = time.process_time()
         for state, info in self._fit(
             config, lambda info: tell(f"step {info.step} of {config.steps}, {info.psnr:.2f} dB")
         ):
             pass
         spent = _Spent(info.seconds, time.process_time() - begun)
+        if config.follow_motion:  # `fit` would have found it in its own time
+            spent = spent.and_also(_Spent(**self.record.plan["motion"]))
         tell("evaluating")
         return to_model(state, config, self.clip.size, self.clip.fps), spent
 
@@ -305,6 +315,14 @@ class _Spent(NamedTuple):
     @classmethod
     def now(cls) -> "_Spent":
         return cls(time.perf_counter(), time.process_time())
+
+    @classmethod
+    def since(cls, begun: "_Spent") -> "_Spent":
+        now = cls.now()
+        return cls(now.wall - begun.wall, now.cpu - begun.cpu)
+
+    def and_also(self, other: "_Spent") -> "_Spent":
+        return _Spent(self.wall + other.wall, self.cpu + other.cpu)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import numpy as np
 from foldgauss._checks import invalid
 from foldgauss.render import RenderOptions
 from foldgauss.video.config import FitConfig
+from foldgauss.video.economy import Economy
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 from foldgauss.video.playback import Playback
@@ -98,9 +99,10 @@ AXES: Mapping[str, tuple[Turn, ...]] = MappingProxyType(
         ),
         "cutoff": _cutoffs(),
         "precision": tuple(Turn(stored, stored=stored) for stored in (FLOAT16, *PASSES)),
-        "power": (Turn("0", fit={"power": 0.0}), Turn("1", fit={"power": 1.0})),
+        "power": (Turn("0", fit={"power": 0.0}), Turn("2", fit={"power": 2.0})),
         "compositing": (Turn("sum", fit={"compositing": "sum"}, work=0.85),),
         "ssim": (Turn("0", fit={"ssim_share": 0.0}, work=0.85), Turn("0.5", fit={"ssim_share": 0.5})),
+        "economy": (Turn("on", fit={"economy": Economy()}, work=1.5),),
     }
 )
 
