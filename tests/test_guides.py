@@ -49,6 +49,12 @@ def test_mixture():
     np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
 
 
+def test_economy():
+    names = _run("economy.md")
+    assert names["degrees"][1] == names["degrees"][1:].max()
+    assert names["throughout"] > 0
+
+
 def test_tradeoff():
     names = _run("tradeoff.md")
     assert names["chosen"] == [0, 1, 2, 3]
