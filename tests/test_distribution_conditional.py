@@ -168,6 +168,7 @@ def test_time_given_space_by_plain_quadrature():
     np.testing.assert_allclose(density.cdf(edges[900]), mass[: 900 * 20].sum(0), atol=1e-8)
 
 
+@pytest.mark.slow  # it compiles for long
 def test_chain_rule_both_ways():
     dist = _dist(2)
     x = _points(dist)
@@ -193,6 +194,7 @@ def test_modes_of_time_are_where_the_parabola_passes():
     np.testing.assert_allclose(density.mean, 0.4, atol=1e-10)
 
 
+@pytest.mark.slow  # it compiles for long
 def test_quantiles_and_samples_of_time():
     dist = _dist(1, 0.0, loc=[0.0], scale_tril=[[0.02]], fold=PolynomialFold([[0.0], [1.0]]))
     density = dist.time_given_space(jnp.array([[0.09], [0.0], [1.0]]))
@@ -254,6 +256,7 @@ def test_space_given_space_against_its_definition():
     np.testing.assert_allclose(np.cov(draws.T), given.covariance_matrix, atol=3e-3)
 
 
+@pytest.mark.slow  # it compiles for long
 def test_conditioning_and_marginals_commute():
     dist = _dist(3)
     x = _points(dist, 5)
@@ -512,6 +515,7 @@ def test_float32_far_out_agrees_with_float64(dim):
     np.testing.assert_allclose(here["first cdf"], there["first cdf"], atol=1e-4)
 
 
+@pytest.mark.slow  # it compiles for long
 def test_points_at_infinity():
     dist = _dist(2)
     space, line, time = dist.marginal([0, 1]), dist.marginal([0]), dist.time_given_space([0.1, -0.4])
@@ -527,6 +531,7 @@ def test_points_at_infinity():
     assert np.isfinite(time.icdf(jnp.array([1e-300, 1 - 1e-16]))).all()
 
 
+@pytest.mark.slow  # it compiles for long
 def test_batches_transformations_and_round_trips():
     dist = _dist(2, loc=jnp.stack([LOC[:2], LOC[:2] + 0.1]))
     marginal, s = dist.marginal([0]), jnp.array([[0.2], [0.5]])

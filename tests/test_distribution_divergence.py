@@ -84,6 +84,7 @@ def test_exact_and_quadrature_agree():
     np.testing.assert_allclose(nearly, exact, rtol=1e-9)
 
 
+@pytest.mark.slow  # it compiles for long
 def test_divergence_is_never_negative():
     rng = np.random.default_rng(0)
     n = 200

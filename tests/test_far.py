@@ -72,6 +72,7 @@ def test_nan_in_nan_out():
     assert np.isnan(jax.grad(_far, argnums=1)(jnp.float32(np.nan), jnp.float32(1.0)))
 
 
+@pytest.mark.slow  # it compiles for long
 def test_tracers_in_a_users_function_are_found():
     x = jnp.array([0.3, -0.2, 0.9])
 

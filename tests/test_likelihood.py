@@ -331,6 +331,7 @@ def test_wrong_arguments_are_named(options, message):
 # --- the degree ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow  # it compiles for long
 def test_select_degree_tells_its_scores_and_its_fit(x64):
     for criterion in ("bic", "aic", "cv"):
         choice = select_degree(_points(300), 3, criterion)

@@ -8,7 +8,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.io.video_model import load_checkpoint, save_checkpoint
-from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video import Economy, FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fit import start, to_model
 from foldgauss.video.pyramid import level_at, levels, shrunk, work_done
 
@@ -73,7 +73,7 @@ def test_the_model_stands_still_between_levels(small, size):
 
 def test_minutes_are_planned_by_the_pace_of_all_levels(small, monkeypatch):
     """Steps of 0.1 s at half and 0.4 s at full size, measured in turn, fill the time together."""
-    pace = fit_module._Pace(dataclasses.replace(HALF, steps=None, minutes=100 / 60), [0.5, 0.5])
+    pace = fit_module._Pace(dataclasses.replace(HALF, steps=None, minutes=100 / 60), [0.5, 0.5], num_frames=6)
     state = start(moving_blobs(), HALF)
     state.plan, state.step, state.seconds = 0, 0, 0.0
     while not state.plan:
@@ -85,6 +85,24 @@ def test_minutes_are_planned_by_the_pace_of_all_levels(small, monkeypatch):
     m, spent = state.step, state.seconds
     coarse, fine = state.plan * 0.5 - m, state.plan * 0.5
     assert spent + (0.1 * coarse + 0.4 * fine) * fit_module.SLOWER == pytest.approx(100, rel=0.02)
+
+
+def test_minutes_are_planned_for_taking_stock():
+    """Ten seconds at 0.01 s a step: an eighth of it goes to two rounds over six frames, at most."""
+    plans = []
+    for economy in (None, Economy(rounds=2)):
+        config = FitConfig(num_gaussians=50, minutes=10 / 60, economy=economy)
+        pace = fit_module._Pace(config, [1.0], num_frames=6)
+        state = start(moving_blobs(), config)
+        state.plan, state.step, state.seconds = 0, 0, 0.0
+        while not state.plan:
+            state.step += 1
+            state.seconds += 0.01
+            state.plan = pace.plan(state, 0, 0.01)
+        plans.append(state.plan)
+    plain, economical = plans
+    rounds = fit_module.ROUND * 2 * 6
+    assert economical == pytest.approx(plain / fit_module.GROWN - rounds, rel=0.05)
 
 
 def test_resumed_at_a_coarse_level(small, tmp_path):
