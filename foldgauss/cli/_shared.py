@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -288,6 +288,20 @@ def as_option(text: str) -> str:
     name, colon, rest = text.partition(":")
     name = name.replace("num_gaussians", "gaussians").replace("economy.psnr", "smallest_at_psnr")
     return f"--{name.replace('_', '-')}{colon}{rest}"
+
+
+def refuse_foreign(folder: Path, own: Collection[str], command: str) -> None:
+    """A command replaces the files that it wrote into a folder, `own`, so nothing else may be among them."""
+    try:
+        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
+    except OSError:  # missing, or no folder: making it says so
+        return
+    foreign = sorted(names - set(own))
+    if foreign:
+        raise WrongUse(
+            f"--out: expected a new folder or one that a {command} wrote, got {folder} with {foreign[0]!r} in it. "
+            "Choose another folder."
+        )
 
 
 def check_picture_path(path: Path, *, others: str = "", single: bool = False) -> None:

@@ -35,6 +35,7 @@ from foldgauss.cli._shared import (
     print_figures,
     provenance,
     refuse_existing,
+    refuse_foreign,
     scores_of,
     with_constants,
     write_json,
@@ -65,7 +66,7 @@ def demo(
     The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files in it is
     left alone.
     """
-    _refuse_foreign(out_dir)
+    refuse_foreign(out_dir, DEMO_FILES, "demo")
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
     make_folder(out_dir)
     out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
@@ -295,20 +296,6 @@ def _check_records(target: Path, video: Path, history: Path | None, preview: Pat
         refuse_existing(path, overwrite, option)
         check_writable(path)
     return curves
-
-
-def _refuse_foreign(folder: Path) -> None:
-    """A demo replaces its own files only, so nothing else may be among them."""
-    try:
-        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
-    except OSError:  # missing, or no folder: making it says so
-        return
-    foreign = sorted(names - DEMO_FILES)
-    if foreign:
-        raise WrongUse(
-            f"--out: expected a new folder or one that a demo wrote, got {folder} with {foreign[0]!r} in it. "
-            "Choose another folder."
-        )
 
 
 def make_folder(path: Path) -> None:

@@ -28,6 +28,7 @@ from foldgauss.cli._shared import (
     out,
     parse_frames,
     parse_size,
+    refuse_foreign,
     scores_of,
 )
 from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Record, Words, report, settings_of
@@ -100,7 +101,7 @@ def tradeoff_command(
         raise WrongUse(as_option(str(error))) from error
     if not within(minutes, "(0, inf)"):
         raise WrongUse(str(invalid("--minutes", expected="a number above 0", got=minutes)))
-    _refuse_foreign(out_dir)
+    refuse_foreign(out_dir, FILES, "tradeoff")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
@@ -354,17 +355,3 @@ def _bar(total: int, done: int) -> Iterator[tuple[Tell, Tell]]:
             err.print(f"{done:>3} of {total}  {text}", soft_wrap=True)
 
         yield tell, advance
-
-
-def _refuse_foreign(folder: Path) -> None:
-    """Results replace results only, so nothing else may be among them."""
-    try:
-        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
-    except OSError:  # missing, or no folder: making it says so
-        return
-    foreign = sorted(names - FILES)
-    if foreign:
-        raise WrongUse(
-            f"--out: expected a new folder or one that a tradeoff wrote, got {folder} with {foreign[0]!r} in it. "
-            "Choose another folder."
-        )
