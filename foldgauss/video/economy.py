@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from scipy.spatial import cKDTree
 
 from foldgauss._checks import invalid, whole, within
 from foldgauss.video.ledger import ROUNDING, Ledger
@@ -36,10 +35,8 @@ DOUBLING = 1.9
 #: Of the Gaussians, in the first half of the rounds, without a PSNR: births; they go on while at least half of the last
 #: ones stay.
 BIRTHS = 0.5
-#: Rounds of Lloyd's algorithm, and sizes of palettes tried.
-_LLOYD, _PALETTES = 12, tuple(2**k for k in range(3, 17))
-#: Of the error that sharing colours adds, what is left once the others have made up for it.
-_LEFT = 0.3
+#: Frames' errors differ by this factor from their geometric mean, as far as it counts: 6 dB.
+_UNLIKE = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +109,20 @@ class Economy:
         return self.psnr + SPARE - YET_TO_COME * (1 - progress)
 
 
+def frame_weights(errors: Float32[np.ndarray, "num_frames"]) -> Float[np.ndarray, "num_frames"]:
+    """What a frame's squared error counts where the mean of the frames' PSNR is what is asked for; 1 on the average.
+
+    A dB of each frame is worth the same, so an error counts by the inverse of what there is: held within `_UNLIKE` of
+    the geometric mean, lest frames that are nearly exact outweigh all others. Errors of 0 are not known yet.
+    """
+    known = errors > 0
+    if not known.any():
+        return np.ones(len(errors))
+    typical = np.exp(np.log(errors[known], dtype=float).mean())
+    inverse = 1 / np.clip(np.where(known, errors, typical), typical / _UNLIKE, typical * _UNLIKE)
+    return inverse / inverse.mean()
+
+
 # ------------------------------------------------------------------------------------------ kinds of Gaussians
 
 
@@ -128,6 +139,11 @@ def kinds_at_start(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8
     """Kinds of rows that have not learned yet: all powers, but for those that last, which stand still."""
     kinds = kinds_of(rows, degree)
     return np.where(kinds >= LASTS, kinds, degree).astype(np.uint8)
+
+
+def numbers_of(kinds: UInt8[np.ndarray, "num"]) -> int:
+    """Those that Gaussians of these kinds have, each counted as if nothing were shared."""
+    return int((NUMBERS + 2 * (kinds % LASTS).astype(int) + OF_TIME * (kinds < LASTS)).sum())
 
 
 def forget(first: np.ndarray, second: np.ndarray, kinds: UInt8[np.ndarray, "num"], degree: int) -> None:
@@ -176,13 +192,15 @@ def cut(
     pixels: float,
     room: float | None = None,
     progress: float = 1.0,
+    sized: bool = False,
 ) -> Cut:
     """What is left of packed rows, by what `ledger` says of them at a share `progress` of the plan.
 
     At the price of `price_of`; or where `room` is given, at the one that adds so much squared error. `pixels`: those
-    along a unit of model space. At least one Gaussian is left.
+    along a unit of model space. Where Gaussians are `sized`, by shapes that they share, sizes stay as they are. At
+    least one Gaussian is left.
     """
-    book = _Book(rows, kinds, ledger, degree, pixels)
+    book = _Book(rows, kinds, ledger, degree, pixels, sized)
     if room is None:
         return book.at(price_of(ledger, economy.bits, progress), economy.most_dropped)
     low, high = 0.0, max(ledger.squared_error, 1e-9)
@@ -197,8 +215,11 @@ def cut(
 class _Book:
     """All that may be done to each Gaussian, with the squared error that it adds and the numbers that it leaves."""
 
-    def __init__(self, rows: np.ndarray, kinds: np.ndarray, ledger: Ledger, degree: int, pixels: float):
+    def __init__(
+        self, rows: np.ndarray, kinds: np.ndarray, ledger: Ledger, degree: int, pixels: float, sized: bool = False
+    ):
         self._rows, self._kinds, self._ledger, self._degree, self._pixels = rows, kinds, ledger, degree, pixels
+        self._grown = np.zeros(len(rows)) if sized else ledger.mean_log_envelope
         self._at, num = columns(degree), len(rows)
         own, lasts = kinds % LASTS, kinds >= LASTS
         place = np.concatenate([rows[:, self._at["loc"]], rows[:, self._at["coefficients"]]], 1)
@@ -209,7 +230,7 @@ class _Book:
             if len(which):
                 added[which, lower, 0] = ledger.lower(self._place, lower, which)[0]
             added[own == lower, lower, 0] = 0
-        added[:, :, 1] = added[:, :, 0] + ledger.lasting[:, None]
+        added[:, :, 1] = added[:, :, 0] + ledger.lasting(self._grown)[:, None]
         added[lasts, :, 1], added[lasts, :, 0] = added[lasts, :, 0], np.inf
         numbers = NUMBERS + 2 * np.arange(degree + 1)[:, None] + OF_TIME * np.array([1, 0])
         self._added, self._numbers = added.reshape(num, -1), numbers.ravel()
@@ -248,54 +269,10 @@ class _Book:
                 place[here] = self._ledger.lower(self._place, degree, stay[here])[1]
         logit = rows[now, at["time_loc_logit"].start].astype(float)
         place[now] = moved_to(place[now], 0.5 - 1 / (1 + np.exp(-logit)))
-        rows[now, at["log_scale"]] += self._ledger.mean_log_envelope[stay[now], None].astype(np.float32)
+        rows[now, at["log_scale"]] += self._grown[stay[now], None].astype(np.float32)
         rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, LASTING
         moved = now | (lower < own % LASTS)
         anew = (place[moved] / self._pixels).astype(np.float32)
         rows[moved, at["loc"]] = anew[:, 0]
         rows[moved, at["coefficients"]] = anew[:, 1:].reshape(len(anew), 2 * self._degree)
         return rows
-
-
-# ------------------------------------------------------------------------------------------ colours shared
-
-
-def shared_colors(
-    color: Float32[np.ndarray, "num 3"], weight: Float[np.ndarray, "num"], price: float, seed: int
-) -> Int[np.ndarray, "num"] | None:
-    """Which Gaussians share a colour: the number of each one's in a palette; None where sharing does not pay.
-
-    `weight` is what the square of an error of a colour adds to the squared error, `price` what a number has to save.
-    Clusters by Lloyd's algorithm (1982), weighted, for palettes of several sizes.
-    """
-    num, best, least = len(color), None, 3 * len(color) * price
-    for size in (size for size in _PALETTES if size < num):
-        index = _clustered(color.astype(float), weight, size, seed)
-        palette = averaged(color, index)
-        error = float((weight * ((color - palette) ** 2).sum(1)).sum())
-        stored = len(np.unique(index)) * 3 + num * (1 if size <= 256 else 2) / 4
-        cost = _LEFT * error + stored * price
-        if cost < least:
-            best, least = index, cost
-        elif best is not None:
-            break
-    return best
-
-
-def averaged(color: Float32[np.ndarray, "num 3"], index: Int[np.ndarray, "num"]) -> Float32[np.ndarray, "num 3"]:
-    """Each row's mean with those of its number."""
-    count = np.maximum(np.bincount(index), 1)
-    sums = np.stack([np.bincount(index, color[:, c]) for c in range(3)], 1)
-    return (sums / count[:, None]).astype(np.float32)[index]
-
-
-def _clustered(color: np.ndarray, weight: np.ndarray, size: int, seed: int) -> np.ndarray:
-    rng = np.random.default_rng([seed, 5])
-    chance = np.maximum(weight, 1e-9 * weight.max() + 1e-300)
-    centre = color[rng.choice(len(color), size, replace=False, p=chance / chance.sum())]
-    for _ in range(_LLOYD):
-        index = cKDTree(centre).query(color)[1]
-        total = np.bincount(index, chance, size)
-        sums = np.stack([np.bincount(index, chance * color[:, c], size) for c in range(3)], 1)
-        centre = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], centre)
-    return cKDTree(centre).query(color)[1]

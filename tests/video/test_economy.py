@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 import pytest
 from scenes_of_motion import SIZE, cut, disc, noise, still
@@ -11,14 +12,17 @@ from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.conditioning import Shape, condition, update_windows
-from foldgauss.video.economy import LASTS, averaged, forget, kinds_of, shared_colors
+from foldgauss.video.economy import LASTS, forget, frame_weights, kinds_of, numbers_of
 from foldgauss.video.economy import cut as cut_rows
 from foldgauss.video.finish import refitted
-from foldgauss.video.fit import fit_steps, to_model
+from foldgauss.video.fit import fit_steps, start, to_model
 from foldgauss.video.growth import Growth
 from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.light import LitModel
 from foldgauss.video.packing import columns, pack
+from foldgauss.video.sharing import Palette, averaged, shared
+from foldgauss.video.sparse_adam import sparse_adam
+from foldgauss.video.stock import _long_axis_first
 
 STEPS = 700
 
@@ -211,7 +215,7 @@ def test_the_lower_path_is_the_best(degree):
     span = 0.7
     moments = ((u / span)[:, None, None] ** np.arange(7)[:, None] * parts[:, None]).sum(0)
     none = np.zeros(1)
-    ledger = Ledger(none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, np.zeros((1, 3)), none)
+    ledger = Ledger(none, none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, none, none, none)
     added, lower = ledger.lower(path[None], degree, np.array([0]))
     powers = u[:, None] ** np.arange(4)
     # sum over frames of |F^T (powers (path - lower))|^2
@@ -270,14 +274,110 @@ def test_forgotten_moments_are_those_of_numbers_that_are_gone():
     assert (first[:, at["color_dc"]] == 1).all()
 
 
-def test_colours_are_shared_where_it_pays():
-    rng = np.random.default_rng(0)
-    few = rng.normal(size=(8, 3))[rng.integers(0, 8, 400)].astype(np.float32)
-    many = rng.normal(size=(400, 3)).astype(np.float32)
-    index = shared_colors(few, np.ones(400), 1e-3, 0)
+@pytest.mark.parametrize("width", [2, 3])
+def test_numbers_are_shared_where_it_pays(width):
+    rng, weight = np.random.default_rng(0), np.ones((400, width))
+    few = rng.normal(size=(8, width))[rng.integers(0, 8, 400)].astype(np.float32)
+    many = rng.normal(size=(400, width)).astype(np.float32)
+    index, added = shared(few, weight, 1e-3, 0)
     np.testing.assert_allclose(averaged(few, index), few, atol=1e-5)
-    assert shared_colors(many, np.ones(400), 1e-6, 0) is None
-    assert len(np.unique(shared_colors(many, np.ones(400), 10.0, 0))) == 8  # dear numbers: few colours
+    assert added < 1e-6
+    assert shared(many, weight, 1e-6, 0) is None
+    index, added = shared(many, weight, 10.0, 0)
+    assert len(np.unique(index)) == 8  # dear numbers: few rows
+    assert 0 < added < ((many - averaged(many, index)) ** 2).sum()
+
+
+def test_what_is_shared_learns_as_one():
+    """Adam on the sum of the gradients of those that took part; who did not moves along."""
+    index = np.array([0, 1, 0, 2, 1])
+    palette, values = Palette.of(index, 2), np.array([[1, 2], [3, 4], [1, 2], [5, 6], [3, 4]], np.float32)
+    grad = np.array([[1, 0], [9, 9], [2, -4], [0.5, 1], [9, 9]], np.float32)
+    before, rate = values.copy(), np.float32([0.1, 0.01])
+    palette.step(values, grad, np.array([0, 2, 3]), rate)
+    moved = values - before
+    np.testing.assert_allclose(moved[[0, 2]], [[-0.1, 0.01]] * 2, rtol=1e-4)  # by the signs of 3 and -4: a first step
+    np.testing.assert_allclose(moved[3], [-0.1, -0.01], rtol=1e-4)
+    assert (moved[[1, 4]] == 0).all()
+    assert (grad[[0, 2, 3]] == 0).all()
+    assert palette.counts.tolist() == [1, 0, 1]
+    np.testing.assert_allclose(palette.first[0], 0.1 * np.array([3, -4]), rtol=1e-5)
+    alone, shown = Palette.of(np.zeros(1, int), 2), np.zeros((1, 2), np.float32)
+    row, grad, moments = np.zeros((1, 11), np.float32), np.zeros((1, 11), np.float32), np.zeros((2, 1, 11), np.float32)
+    counts, rates = np.zeros(1, np.int32), np.full(11, 0.1, np.float32)
+    for gradient in np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32):
+        grad[:, :2] = gradient
+        sparse_adam(row, grad, *moments, counts, np.array([0]), rates)
+        alone.step(shown, gradient.copy(), np.array([0]), np.float32([0.1, 0.1]))
+    np.testing.assert_allclose(shown, row[:, :2], rtol=1e-4)
+
+
+def test_shared_numbers_stay_shared():
+    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
+    config = FitConfig(num_gaussians=400, steps=300, economy=Economy(bits=200.0))
+    for state, _ in fit_steps(frames, config):
+        pass
+    at = columns(config.degree)
+    for palette, leaf in ((state.colors, "color_dc"), (state.shapes, "log_scale")):
+        assert len(palette.index) == len(state.rows)
+        rows = np.unique(state.rows[:, at[leaf]], axis=0)
+        assert len(rows) == len(np.unique(palette.index)) < len(state.rows) / 2
+    model = to_model(state, config, SIZE, 25.0)
+    assert model.num_floats < numbers_of(state.kinds) - len(state.rows)
+
+
+def test_turned_by_a_quarter_is_the_same(scene):
+    frames, rows, shape, times, drawn = scene
+    state = start(frames, FitConfig(num_gaussians=len(rows), steps=1, degree=shape.degree))
+    state.rows = rows.copy()
+    state.first, state.second = (np.random.default_rng(k).random(rows.shape).astype(np.float32) for k in (0, 1))
+    first, at = state.first.copy(), columns(shape.degree)["log_scale"]
+    turned = _long_axis_first(state, shape.degree)
+    assert 0 < turned.sum() < len(rows)
+    assert (state.rows[:, at.start] >= state.rows[:, at.start + 1]).all()
+    for one, other in zip(
+        _pictures(rows, shape, times, drawn), _pictures(state.rows, shape, times, drawn), strict=True
+    ):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+    np.testing.assert_array_equal(state.first[turned][:, at], first[turned][:, at][:, ::-1])
+    np.testing.assert_array_equal(state.rows[~turned], rows[~turned])
+
+
+def test_frames_count_by_what_a_db_of_them_costs():
+    assert (frame_weights(np.zeros(3, np.float32)) == 1).all()
+    weights = frame_weights(np.float32([1e-3, 2e-3, 4e-3, 0]))
+    np.testing.assert_allclose(weights, np.array([4, 2, 1, 2]) / 9 * 4, rtol=1e-6)
+    one_black = frame_weights(np.float32([1e-12] + [1e-3] * 99))
+    assert 3 < one_black[0] / one_black[1] < 6  # an exact frame does not outweigh the others
+    assert one_black.mean() == pytest.approx(1)
+
+
+def test_sums_are_weighted_by_frames(scene):
+    """Linear in the weights, frame by frame: the first frames' and the last frames' add up to all."""
+    frames, rows, shape, times, drawn = scene
+    parts = np.linspace(0.2, 1.8, len(times))
+    ledgers = [_measured(rows, frames, shape, times, drawn, weights=w) for w in (parts, 2 - parts, None)]
+    for name in ("slope", "own", "by_path", "by_color", "by_axes", "by_size", "squared_error"):
+        first, second, plain = (np.asarray(getattr(ledger, name)) for ledger in ledgers)
+        np.testing.assert_allclose(first + second, 2 * plain, rtol=1e-6, atol=1e-9 * np.abs(plain).max())
+    assert not np.allclose(ledgers[0].own, ledgers[2].own, rtol=0.01)
+    assert ledgers[0].psnr == ledgers[2].psnr
+
+
+def test_another_shape_costs_what_it_says(scene):
+    """Against the pictures themselves, one axis longer by a little."""
+    _, rows, shape, times, drawn = scene
+    own = _pictures(rows, shape, times, drawn)
+    ledger, at = _mean_ledger((own, *scene[1:])), columns(shape.degree)["log_scale"]
+    for axis in (0, 1):
+        chosen = np.argsort(-ledger.by_axes[:, axis])[: len(rows) // 2 : 4]
+        cost = []
+        for i in chosen:
+            changed = rows.copy()
+            changed[i, at.start + axis] += 0.05
+            cost.append(_error(changed, own, shape, times, drawn))
+        ratios = np.array(cost) / (0.05**2 * ledger.by_axes[chosen, axis])
+        assert 0.8 < np.median(ratios) < 1.25
 
 
 def test_at_least_one_is_left():
@@ -306,7 +406,7 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0)
     assert made.kinds.tolist() == [LASTS]
     cost = _error(made.rows, own, shape, times, drawn)
-    assert cost == pytest.approx(ledger.lasting[0], rel=0.5, abs=1e-6)
+    assert cost == pytest.approx(ledger.lasting(ledger.mean_log_envelope)[0], rel=0.5, abs=1e-6)
 
 
 def test_refitting_keeps_what_a_gaussian_is():
@@ -428,8 +528,10 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
         again = load_checkpoint(path, config=config, source={})
         for state_again, _ in fit_steps(frames, config, again):
             pass
-        for name in ("rows", "first", "second", "counts", "kinds", "young", "palette", "time_logits"):
+        for name in ("rows", "first", "second", "counts", "kinds", "young", "frame_errors", "time_logits"):
             np.testing.assert_array_equal(getattr(state_again, name), getattr(state, name))
+        for one, other in ((state_again.colors, state.colors), (state_again.shapes, state.shapes)):
+            jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.mark.parametrize(
