@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from foldgauss.render import cpu
 from foldgauss.video.conditioning import condition, narrow_windows, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, LearningRates
-from foldgauss.video.economy import kinds_of
+from foldgauss.video.kinds import kinds_of
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import columns, unpack
 from foldgauss.video.sparse_adam import sparse_adam

@@ -15,10 +15,11 @@ from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
-from foldgauss.video.economy import LEAST_PASSES, frame_weights, kinds_at_start, kinds_of
+from foldgauss.video.economy import LEAST_PASSES, frame_weights
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
+from foldgauss.video.kinds import kinds_at_start, kinds_of
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion

@@ -124,6 +124,14 @@ class Ledger:
         added = second - 2 * grown * first + grown**2 * total
         return np.where(self.misses > 0, np.inf, np.maximum(added, 0))
 
+    def solid(self, opacity: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+        """Squared error that Gaussians of this `opacity` add where no light comes through them any more.
+
+        Pictures are linear in one opacity, so this is exact for each alone.
+        """
+        more = 1 / np.maximum(opacity, np.finfo(float).tiny) - 1
+        return np.maximum(more * (more * self.own - self.slope), 0)
+
     @property
     def mean_log_envelope(self) -> Float[np.ndarray, "num"]:
         """The mean of log a(t) / 2 where it is seen: what the logarithm of a lasting one's size should change by."""

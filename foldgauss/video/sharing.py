@@ -75,10 +75,8 @@ def shared(
     seed: int,
     *,
     progress: float = 0.0,
-) -> tuple[Int[np.ndarray, "num"], float] | None:
-    """Which rows share their values: the number of each one's in a palette, and the squared error that adds.
-
-    None where sharing does not pay.
+) -> Int[np.ndarray, "num"] | None:
+    """Which rows share their values: the number of each one's in a palette; None where sharing does not pay.
 
     `weight` is what the square of an error of a value adds to the squared error, `price` what a stored number has to
     save, `progress` the share of the fit that is done: what is left of it mends part of the error. Clusters by Lloyd's
@@ -86,17 +84,17 @@ def shared(
     """
     num, width = values.shape
     left = 1 - (1 - _LEFT) * min((1 - progress) / _MENDED_IN, 1.0)
-    best, least, added = None, width * num * price, 0.0
+    best, least = None, width * num * price
     for size in (size for size in _PALETTES if size < num):
         index = _clustered(values.astype(float), weight.mean(1), size, seed)
         error = left * float((weight * (values - averaged(values, index)) ** 2).sum())
         stored = len(np.unique(index)) * width + num * (1 if size <= 256 else 2) / 4
         cost = error + stored * price
         if cost < least:
-            best, least, added = index, cost, error
+            best, least = index, cost
         elif best is not None and size != 512:  # indices are longer from there on
             break
-    return None if best is None else (best, added)
+    return best
 
 
 def averaged(

@@ -11,9 +11,10 @@ from foldgauss.video.alpha import random_background
 from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Shape, condition, update_windows
 from foldgauss.video.config import FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.economy import Cut, cut, forget, frame_weights, kinds_at_start, numbers_of
+from foldgauss.video.economy import Cut, cut, frame_weights
 from foldgauss.video.growth import Statistics
 from foldgauss.video.initialize import START_OPACITY
+from foldgauss.video.kinds import forget, kinds_at_start, numbers_of
 from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns
@@ -24,9 +25,9 @@ from foldgauss.video.state import FitState, envelope_of, frame_times, mean_psnr,
 MOST_BORN = 4
 #: Times that a fit is trimmed at its end, and the share of its numbers that is worth another time.
 TRIMS, LEAST_TRIM = 8, 0.002
-#: Rounds that are left when colours and shapes are shared, in plans with enough: they see what that costs.
-AFTER_SHARING = 1
-ACCOUNT = 1.0
+#: Rounds that are left when colours and shapes are shared and opacities left out, in plans with enough: they see what
+#: that costs.
+LATE = 1
 
 
 class StockTaker:
@@ -46,14 +47,12 @@ class StockTaker:
             return False
         growing = state.step in steps[: len(steps) // 2]
         ledger, progress = self._ledger(state), state.step / state.plan
-        room = economy.room(ledger, progress)
-        made = self._cut(state, ledger, room)
-        sharing = state.step == steps[max(len(steps) // 2, len(steps) - 1 - AFTER_SHARING)]
-        if sharing and not growing and state.statistics is None:  # those to be born have their own
-            added = self._share(state, ledger, made.price)
-            made = self._cut(state, ledger, None if room is None else max(room - ACCOUNT * added, 0.0))
+        room, late = economy.room(ledger, progress), steps[max(len(steps) // 2, len(steps) - 1 - LATE)]
+        made = self._cut(state, ledger, room, solid=state.step >= late)
         survived = state.young[made.stay].sum() / max(state.young.sum(), 1) if state.step > steps[0] else 1.0
         _keep(state, made, config.degree)
+        if state.step == late and not growing and state.statistics is None:  # those to be born have their own
+            self._share(state, ledger, made)
         num = 0
         if growing:
             at_start = chosen_num_gaussians(config, *self._frames.shape[:3])
@@ -93,9 +92,11 @@ class StockTaker:
                 return True
         return False
 
-    def _cut(self, state: FitState, ledger: Ledger, room: float | None) -> Cut:
+    def _cut(self, state: FitState, ledger: Ledger, room: float | None, *, solid: bool = True) -> Cut:
         how = {"degree": self._config.degree, "pixels": pixels_per_unit(self._shape.size), "room": room}
         how |= {"progress": min(state.step / state.plan, 1.0), "sized": len(state.shapes.index) > 0}
+        # Growth dims; and whom no light comes through early hides for good what others might become.
+        how |= {"solid": solid and state.statistics is None}
         return cut(state.rows, state.kinds, ledger, self._config.economy, **how)
 
     # ------------------------------------------------------------------------------------------ births
@@ -134,24 +135,19 @@ class StockTaker:
 
     # ------------------------------------------------------------------------------------------ what is shared
 
-    def _share(self, state: FitState, ledger: Ledger, price: float) -> float:
-        """Colours and shapes, each where that pays. Returns the squared error that is added."""
-        degree = self._config.degree
-        turned, total = _long_axis_first(state, degree), 0.0
-        of_axes = np.where(turned[:, None], ledger.by_axes[:, ::-1], ledger.by_axes)
-        of_colors = np.repeat(ledger.by_color[:, None], 3, axis=1)
+    def _share(self, state: FitState, ledger: Ledger, made: Cut) -> None:
+        """Colours and shapes of those that stayed, each where that pays."""
+        degree, stay = self._config.degree, made.stay
+        turned = _long_axis_first(state, degree)
+        of_axes = np.where(turned[:, None], ledger.by_axes[stay, ::-1], ledger.by_axes[stay])
+        of_colors = np.repeat(ledger.by_color[stay, None], 3, axis=1)
         for leaf, name, weight in (("color_dc", "colors", of_colors), ("log_scale", "shapes", of_axes)):
-            at = columns(degree)[leaf]
-            found = shared(
-                state.rows[:, at], weight, price, self._config.seed, progress=min(state.step / state.plan, 1.0)
-            )
-            index, added = (None, 0.0) if found is None else found
+            at, progress = columns(degree)[leaf], min(state.step / state.plan, 1.0)
+            index = shared(state.rows[:, at], weight, made.price, self._config.seed, progress=progress)
             setattr(state, name, Palette.of(index, weight.shape[1]))
-            total += added
             if index is not None:
                 state.rows[:, at] = averaged(state.rows[:, at], index)
                 state.first[:, at] = state.second[:, at] = 0
-        return total
 
     # ------------------------------------------------------------------------------------------ what is measured
 

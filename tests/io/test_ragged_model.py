@@ -15,7 +15,7 @@ from foldgauss.io.model_file import read_header
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, Selection, VideoModel, edit, layers
 from foldgauss.video.edited import EditedVideo
-from foldgauss.video.model import LASTING
+from foldgauss.video.model import LASTING, OPAQUE
 from foldgauss.video.packing import unpack
 
 NUM, NUM_FRAMES = 50, 5
@@ -23,8 +23,13 @@ NUM, NUM_FRAMES = 50, 5
 PLAIN, SHARED = 4 * 4, 4 * (NUM_FRAMES - 1 + 2)
 
 
-def ragged_model(degrees, lasting=False, num_colors=None, num_shapes=None, *, degree=None, seed=0) -> VideoModel:
-    """Random Gaussians of these `degrees` (num,), of which those of `lasting` last, in so many colours and shapes."""
+def ragged_model(
+    degrees, lasting=False, num_colors=None, num_shapes=None, *, solid=False, degree=None, seed=0
+) -> VideoModel:
+    """Random Gaussians of these `degrees` (num,), of which those of `lasting` last, in so many colours and shapes.
+
+    No light comes through those of `solid`.
+    """
     rng = np.random.default_rng(seed)
     degrees = np.asarray(degrees)
     num, degree = len(degrees), int(degrees.max(initial=0)) if degree is None else degree
@@ -33,6 +38,7 @@ def ragged_model(degrees, lasting=False, num_colors=None, num_shapes=None, *, de
     splats.coefficients[np.arange(degree) >= degrees[:, None]] = 0
     splats.time_loc_logit[np.broadcast_to(lasting, num)] = 0
     splats.log_time_scale[np.broadcast_to(lasting, num)] = LASTING
+    splats.opacity_logit[np.broadcast_to(solid, num)] = OPAQUE
     for leaf, rows in ((splats.color_dc, num_colors), (splats.log_scale, num_shapes)):
         if rows is not None:
             own = rng.normal(size=(rows, leaf.shape[1])).astype(np.float32)
@@ -105,6 +111,16 @@ def test_the_same_model_in_the_bytes_that_it_needs(tmp_path, name):
     assert save_video_model(path, again).read_bytes() == first
 
 
+@pytest.mark.parametrize("solid", [True, ALTERNATING], ids=["all", "half"])
+def test_no_opacity_of_those_that_are_solid(tmp_path, solid):
+    model = ragged_model(np.full(NUM, 3), solid=solid)
+    np.testing.assert_array_equal(model.splats.solid, np.broadcast_to(solid, NUM))
+    path = save_video_model(tmp_path / "m.safetensors", model)
+    same(model, load_video_model(path))
+    clear = NUM - np.broadcast_to(solid, NUM).sum()
+    assert tensor_bytes(path) == (PLAIN - 4 + 24 + 8 + 12 + 8) * NUM + 4 * clear + NUM + SHARED
+
+
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     num=st.integers(1, 70),
@@ -119,6 +135,7 @@ def test_round_trip_law(tmp_path, num, degree, share, num_colors, num_shapes, se
     rng = np.random.default_rng(seed)
     degrees = np.where(rng.random(num) < share, rng.integers(0, degree + 1, num), 0)
     model = ragged_model(degrees, rng.random(num) < share, num_colors, num_shapes, degree=degree, seed=seed)
+    model.splats.opacity_logit[rng.random(num) < share] = OPAQUE
     path = save_video_model(tmp_path / "m", model)
     same(model, load_video_model(path))
     assert tensor_bytes(path) <= (PLAIN + 28 + 8 * degree) * num + SHARED
@@ -135,11 +152,12 @@ def test_round_trip_law(tmp_path, num, degree, share, num_colors, num_shapes, se
         ("log_time_scale", np.nextafter(LASTING, np.float32(0))),
         ("color_dc", -0.0),
         ("log_scale", -0.0),
+        ("opacity_logit", np.nextafter(OPAQUE, np.float32(0))),
     ],
 )
 def test_what_differs_in_a_bit_is_kept(tmp_path, leaf, value):
     """Gaussian 3 is all but one of those that have nothing but a place: the bit is not lost with theirs."""
-    model = ragged_model(np.zeros(NUM, int), True, 1, degree=2)
+    model = ragged_model(np.zeros(NUM, int), True, 1, solid=True, degree=2)
     model.splats.color_dc[:] = model.splats.log_scale[:] = 0
     without = model.num_floats
     getattr(model.splats, leaf)[3] = value
@@ -150,8 +168,8 @@ def test_what_differs_in_a_bit_is_kept(tmp_path, leaf, value):
 
 
 def test_no_kinds_beyond_their_room(tmp_path):
-    """Seven bits hold a degree up to 127."""
-    for degree, header in ((127, {"powers": 9, "timed": NUM}), (128, None)):
+    """Six bits hold a degree up to 63."""
+    for degree, header in ((63, {"powers": 9, "timed": NUM, "clear": NUM}), (64, None)):
         model = ragged_model(np.arange(NUM) < 9, degree=degree)
         path = save_video_model(tmp_path / f"{degree}", model)
         same(model, load_video_model(path))
@@ -210,8 +228,8 @@ def test_layers_of_edited_videos(tmp_path):
     path = save_video_model(tmp_path / "m", video)
     same(video, load_video_model(path))
     described = [layer["model"].get("stored") for layer in read_header(path)["header"]["layers"]]
-    assert described[0] == described[2] == {"powers": 0, "timed": 0, "colors": 4}
-    assert described[1].keys() == {"powers", "timed"}
+    assert described[0] == described[2] == {"powers": 0, "timed": 0, "clear": NUM, "colors": 4}
+    assert described[1].keys() == {"powers", "timed", "clear"}
     assert video.num_floats == 2 * still.num_floats + moving.num_floats
 
 
@@ -267,7 +285,10 @@ HEADERS = {
     "timed that is no whole number": put(timed=25.0),
     "more timed": put(timed=26),
     "timed beyond all": put(timed=NUM + 1),
-    "timed alone": lambda header: header["stored"].pop("powers"),
+    "more clear": put(clear=41),
+    "clear that is no whole number": put(clear=40.0),
+    "no clear": lambda header: header["stored"].pop("clear"),
+    "no powers": lambda header: header["stored"].pop("powers"),
     "no timed": lambda header: header["stored"].pop("timed"),
     "no colours": put(colors=0),
     "other colours": put(colors=7),
@@ -284,17 +305,19 @@ HEADERS = {
     "no dictionary": lambda header: header.update(stored=[60, 25, 6, 4]),
     "null": lambda header: header.update(stored=None),
     "another word": put(normals=3),
-    "degree beyond the bits": lambda header: header.update(degree=128),
-    "degree below the Gaussians'": lambda header: header.update(degree=1, stored={"powers": 50, "timed": 25}),
+    "degree beyond the bits": lambda header: header.update(degree=64),
+    "degree below the Gaussians'": lambda header: header.update(
+        degree=1, stored={"powers": 50, "timed": 25, "clear": 40}
+    ),
 }
 
 
 @pytest.fixture
 def hostile(tmp_path):
-    """A good file, to be made a bad one: 50 Gaussians, 60 powers, 25 timed, 6 colours, 4 shapes."""
+    """A good file, to be made a bad one: 50 Gaussians, 60 powers, 25 timed, 40 clear, 6 colours, 4 shapes."""
     degrees = np.where(np.arange(NUM) < 20, 3, 0)
-    path = save_video_model(tmp_path / "m", ragged_model(degrees, ALTERNATING, 6, 4))
-    assert read_header(path)["header"]["stored"] == {"powers": 60, "timed": 25, "colors": 6, "shapes": 4}
+    path = save_video_model(tmp_path / "m", ragged_model(degrees, ALTERNATING, 6, 4, solid=np.arange(NUM) < 10))
+    assert read_header(path)["header"]["stored"] == {"powers": 60, "timed": 25, "clear": 40, "colors": 6, "shapes": 4}
     load_video_model(path)
     return path
 
@@ -317,11 +340,12 @@ def _at(place, value):
 @pytest.mark.parametrize(
     ("tensors", "match"),
     [
-        ({"kinds": _at(0, 4 + 128)}, "greatest degree in kinds: expected a whole number from 0 to 3, got 4"),
+        ({"kinds": _at(0, 4 + 64 + 128)}, "greatest degree in kinds: expected a whole number from 0 to 3, got 4"),
         ({"kinds": _at(slice(None), 255)}, "greatest degree in kinds"),
-        ({"kinds": _at(0, 2 + 128)}, "expected 60 powers, as many as are stored, got 59"),
+        ({"kinds": _at(0, 2 + 64 + 128)}, "expected 60 powers, as many as are stored, got 59"),
         ({"kinds": _at(slice(None), 3)}, "expected 60 powers, as many as are stored, got 150"),
-        ({"kinds": _at(0, 3)}, "expected 25 Gaussians that do not last, as many as are stored, got 26"),
+        ({"kinds": _at(0, 3 + 128)}, "expected 40 Gaussians that light comes through, as many as are stored, got 41"),
+        ({"kinds": _at(0, 3 + 64)}, "expected 25 Gaussians that do not last, as many as are stored, got 26"),
         ({"color_index": _at(-1, 6)}, "color_index: expected a whole number from 0 to 5, got 6"),
         ({"color_index": _at(0, 255)}, "color_index: .* got 255"),
         ({"shape_index": _at(7, 4)}, "shape_index: expected a whole number from 0 to 3, got 4"),
@@ -358,15 +382,18 @@ def test_any_changed_byte_gives_a_model_or_an_error(hostile):
 
 def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     degrees = np.where(np.arange(NUM) < 20, 3, 0)
-    path = save_video_model(tmp_path / "m.safetensors", ragged_model(degrees, ALTERNATING, 6, 4))
+    path = save_video_model(
+        tmp_path / "m.safetensors", ragged_model(degrees, ALTERNATING, 6, 4, solid=np.arange(NUM) < 10)
+    )
     assert run("info", path) == 0
     told = capsys.readouterr().out
     assert "0 of 30 Gaussians, 3 of 20 Gaussians" in told
     assert "25 of 50 Gaussians, throughout the clip" in told
     assert "6 of 50 Gaussians" in told
     assert "4 of 50 Gaussians" in told
+    assert "10 of 50 Gaussians, no light comes through" in told
     assert f"{load_video_model(path).num_floats:,}" in told
     assert f"{path.stat().st_size:,} bytes" in told
     run("info", save_video_model(tmp_path / "whole.safetensors", ragged_model(np.full(NUM, 3))))
     told = capsys.readouterr().out
-    assert not any(name in told for name in ("degrees", "lasting", "colours", "shapes"))
+    assert not any(name in told for name in ("degrees", "lasting", "colours", "shapes", "solid"))

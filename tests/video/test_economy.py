@@ -12,13 +12,15 @@ from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.conditioning import Shape, condition, update_windows
-from foldgauss.video.economy import LASTS, forget, frame_weights, kinds_of, numbers_of
 from foldgauss.video.economy import cut as cut_rows
+from foldgauss.video.economy import frame_weights
 from foldgauss.video.finish import refitted
 from foldgauss.video.fit import fit_steps, start, to_model
 from foldgauss.video.growth import Growth
+from foldgauss.video.kinds import LASTS, SOLID, degrees_of, forget, is_solid, kinds_of, lasts, numbers_of
 from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.light import LitModel
+from foldgauss.video.model import OPAQUE
 from foldgauss.video.packing import columns, pack
 from foldgauss.video.sharing import Palette, averaged, shared
 from foldgauss.video.sparse_adam import sparse_adam
@@ -246,10 +248,11 @@ def test_neighbours_that_err_alike_count_once():
 
 def test_kinds_are_those_of_the_stored_model():
     _, model, state, _ = fitted("line")
-    kinds = model.splats.degrees + LASTS * model.splats.lasting
+    kinds = model.splats.degrees + LASTS * model.splats.lasting + SOLID * model.splats.solid
     np.testing.assert_array_equal(kinds_of(state.rows, model.degree), kinds)
-    np.testing.assert_array_equal(state.kinds >= LASTS, model.splats.lasting)
-    assert (state.kinds % LASTS >= model.splats.degrees).all()  # a power may be there and be 0
+    np.testing.assert_array_equal(lasts(state.kinds), model.splats.lasting)
+    np.testing.assert_array_equal(is_solid(state.kinds), model.splats.solid)
+    assert (degrees_of(state.kinds) >= model.splats.degrees).all()  # a power may be there and be 0
 
 
 def test_what_a_kind_has_not_got_never_moves():
@@ -259,18 +262,21 @@ def test_what_a_kind_has_not_got_never_moves():
         pass
     at, kinds = columns(config.degree), state.kinds
     powers = np.repeat(np.arange(1, config.degree + 1), 2)
-    assert (kinds % LASTS < config.degree).any()
-    assert (state.rows[:, at["coefficients"]][powers > (kinds % LASTS)[:, None]] == 0).all()
-    assert (kinds >= LASTS).any()
+    assert (degrees_of(kinds) < config.degree).any()
+    assert (state.rows[:, at["coefficients"]][powers > degrees_of(kinds)[:, None]] == 0).all()
+    assert lasts(kinds).any()
+    assert is_solid(kinds).any()
+    assert (state.rows[is_solid(kinds), at["opacity_logit"].start] == OPAQUE).all()
 
 
 def test_forgotten_moments_are_those_of_numbers_that_are_gone():
     first, second = np.ones((2, 3, 11 + 4), np.float32)
-    forget(first, second, np.array([2, 1, LASTS], np.uint8), 2)
+    forget(first, second, np.array([2, 1 + SOLID, LASTS], np.uint8), 2)
     at = columns(2)
     assert first[:, at["coefficients"]].tolist() == [[1, 1, 1, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
     assert second[:, at["log_time_scale"].start].tolist() == [1, 1, 0]
     assert second[:, at["time_loc_logit"].start].tolist() == [1, 1, 0]
+    assert second[:, at["opacity_logit"].start].tolist() == [1, 0, 1]
     assert (first[:, at["color_dc"]] == 1).all()
 
 
@@ -279,13 +285,9 @@ def test_numbers_are_shared_where_it_pays(width):
     rng, weight = np.random.default_rng(0), np.ones((400, width))
     few = rng.normal(size=(8, width))[rng.integers(0, 8, 400)].astype(np.float32)
     many = rng.normal(size=(400, width)).astype(np.float32)
-    index, added = shared(few, weight, 1e-3, 0)
-    np.testing.assert_allclose(averaged(few, index), few, atol=1e-5)
-    assert added < 1e-6
+    np.testing.assert_allclose(averaged(few, shared(few, weight, 1e-3, 0)), few, atol=1e-5)
     assert shared(many, weight, 1e-6, 0) is None
-    index, added = shared(many, weight, 10.0, 0)
-    assert len(np.unique(index)) == 8  # dear numbers: few rows
-    assert 0 < added < ((many - averaged(many, index)) ** 2).sum()
+    assert len(np.unique(shared(many, weight, 10.0, 0))) == 8  # dear numbers: few rows
 
 
 def test_what_is_shared_learns_as_one():
@@ -392,6 +394,51 @@ def test_at_least_one_is_left():
     assert len(cut_rows(rows, np.full(3, 3, np.uint8), ledger, dear, degree=3, pixels=80.0).stay) == 1
 
 
+def test_numbers_are_those_that_are_stored():
+    """Of each kind, one Gaussian among others of its own, so that kinds are told."""
+    model = _fitted_model()
+    kinds = kinds_of(pack(model.splats), model.degree)
+    assert len(np.unique(kinds)) > 5
+    alone = dataclasses.replace(model.splats, color_dc=distinct(model, 3), log_scale=distinct(model, 2))
+    whole = dataclasses.replace(model, splats=alone)
+    others = 2 + model.num_frames - 1  # of the envelope and the frame times
+    assert whole.num_floats == numbers_of(kinds) + -(-len(kinds) // 4) + others
+
+
+def distinct(model, width) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(model.num_gaussians, width)).astype(np.float32)
+
+
+def _fitted_model():
+    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
+    return fit(frames, FitConfig(num_gaussians=400, steps=300, economy=Economy())).model
+
+
+def test_no_light_coming_through_costs_what_it_says(scene):
+    """Exactly, for one at a time: pictures are linear in an opacity."""
+    frames, rows, shape, times, drawn = scene
+    at = columns(shape.degree)["opacity_logit"].start
+    ledger, before = _mean_ledger(scene), _error(rows, frames, shape, times, drawn)
+    told = ledger.solid(1 / (1 + np.exp(-rows[:, at].astype(float))))
+    chosen = np.flatnonzero(told > 0)[:: max(len(rows) // 15, 1)]
+    cost = []
+    for i in chosen:
+        changed = rows.copy()
+        changed[i, at] = OPAQUE
+        cost.append(_error(changed, frames, shape, times, drawn) - before)
+    assert len(cost) >= 8
+    assert np.corrcoef(told[chosen], cost)[0, 1] > 0.97
+    assert np.abs(told[chosen] - cost).max() < 0.25 * max(map(abs, cost))
+
+
+def test_opacities_stay_where_they_are_asked_for():
+    frames, rows, shape, times, drawn = _scene()
+    ledger, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
+    kinds, how = np.full(len(rows), shape.degree, np.uint8), {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
+    assert is_solid(cut_rows(rows, kinds, ledger, dear, **how).kinds).any()
+    assert not is_solid(cut_rows(rows, kinds, ledger, dear, **how, solid=False).kinds).any()
+
+
 @pytest.mark.parametrize("sigma", [0.3, 0.6, 2.0])
 def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     """One Gaussian that is there at all frames, against pictures of itself."""
@@ -403,7 +450,7 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     own = _pictures(row, shape, times, drawn)
     ledger = _mean_ledger((own, row, shape, times, drawn), draws=4)
     assert ledger.misses[0] == 0
-    made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0)
+    made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0, solid=False)
     assert made.kinds.tolist() == [LASTS]
     cost = _error(made.rows, own, shape, times, drawn)
     assert cost == pytest.approx(ledger.lasting(ledger.mean_log_envelope)[0], rel=0.5, abs=1e-6)
