@@ -4,12 +4,12 @@ from collections.abc import Callable, Collection
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 
 from foldgauss.render import cpu
 from foldgauss.video.conditioning import condition, narrow_windows, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, LearningRates
-from foldgauss.video.economy import kinds_of
+from foldgauss.video.economy import averaged, kinds_of
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import columns, unpack
 from foldgauss.video.sparse_adam import sparse_adam
@@ -29,13 +29,15 @@ def refitted(
     passes: int,
     *,
     free: Collection[str] | None = None,
+    shared: Int32[np.ndarray, "num"] | None = None,
     seed: int = 0,
     on_pass: Callable[[], None] = lambda: None,
 ) -> VideoModel:
     """The model after `passes` over its frames in random order, by least squares; only leaves `free` change.
 
     `target(k, step)` gives what frame k is compared with. `free` None: all. Frame times stay.
-    Deterministic; Adam as in the fit.
+    `shared`: the number of each Gaussian's colour, where those of a number stay alike. Deterministic; Adam as in the
+    fit.
     """
     stage = Stage(model, model.size)
     rows, window, shape = stage.rows, stage.window, stage.shape
@@ -61,6 +63,9 @@ def refitted(
         pull_back(rows, done, cpu.backward(trace, by_image)[:4], shape, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
         sparse_adam(rows, grad, first, second, counts, done.alive, rates * rate, kinds=kinds, unit_time=UNIT_TIME)
+        if shared is not None:
+            colors = columns(model.degree)["color_dc"]
+            rows[:, colors] = averaged(rows[:, colors], shared)
         if free is None:
             update_windows(rows, done.alive, window)
             if model.scale_cutoff > 0:

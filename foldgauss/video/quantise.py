@@ -4,7 +4,8 @@ Each Gaussian is described by numbers that matter to the picture each on its own
 (mean and half difference of the logarithms of its standard deviations, the longer axis first), duration, opacity, time,
 angle modulo half a turn, colour along fixed axes, and its path over the span of time in which it is seen, as Legendre
 polynomials. A column's step follows from columns before it, by a rule that the file states, so Gaussians that are
-hardly seen get coarse steps and need few bits.
+hardly seen get coarse steps and need few bits. What a Gaussian has not got is in no column: powers of its path above
+its own degree, times of one that lasts; and colours that many share are described once.
 
 The way back uses additions, multiplications, divisions and comparisons of float64 alone, in a stated order: they are
 rounded alike everywhere, so every decoder gives the same bits. See docs/format.md.
@@ -15,13 +16,13 @@ import functools
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
 from foldgauss._checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.model import TAU_MAX, FoldedSplats, VideoModel
+from foldgauss.video.model import LASTING, TAU_MAX, FoldedSplats, VideoModel
 
 #: Above, sums of Legendre polynomials lose digits; no fit here goes beyond 7.
 MAX_DEGREE = 15
@@ -29,7 +30,14 @@ MAX_DEGREE = 15
 LARGEST = 2**30 - 1
 #: Columns that the steps of others may follow.
 FEATURES = ("class", "size", "stretch", "duration", "opacity")
-_FIRST = (*FEATURES, "time", "angle", "luma", "blue", "green")
+#: Columns of plain whole numbers: the cell of space and time, how much it shows, whether it lasts, its path's degree.
+WHOLE = ("cell", "class", "lasting", "degree")
+_FIRST = (*WHOLE, *FEATURES[1:], "time")
+COLORS = ("luma", "blue", "green")
+#: What a Gaussian that lasts counts as among the features: sigma_t = 1, the clip's length.
+LASTING_FEATURE = 0.0
+#: More shared colours than this are not told apart from colours of each one's own; cells have no more bits.
+MOST_SHARED, MOST_CELL_BITS = 4096, 24
 #: Orthonormal axes of colour, rows: brightness, blue against red, green against both.
 AXES = np.array(
     [
@@ -47,9 +55,15 @@ _FARTHEST = 120
 _WIDEST = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
 
 
-def column_names(degree: int) -> tuple[str, ...]:
-    """The columns of a model in their order."""
-    return _FIRST + tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
+def column_names(degree: int, shared: int = 0) -> tuple[str, ...]:
+    """The columns of a model in their order; `shared` is the number of colours, if they are shared."""
+    path = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
+    return (*_FIRST, *path, "angle", *(("shade",) if shared else ()), *COLORS)
+
+
+def is_whole(name: str) -> bool:
+    """Whether a column's numbers are meant as they are: it has no rule."""
+    return name in WHOLE or name == "shade"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,10 +95,16 @@ def steps_of(halves: Int32[np.ndarray, "num"], name: str = "") -> Float[np.ndarr
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """What all Gaussians share."""
+    """What all Gaussians share.
+
+    `cells`: binary logarithms of the numbers of cells along x, y and time. `shared`: the number of colours, where
+    Gaussians share them; 0 where each has its own.
+    """
 
     num_gaussians: int
     degree: int
+    cells: tuple[int, int, int]
+    shared: int
     power: float
     floor: float
     reach: float
@@ -111,27 +131,102 @@ class Quantised:
 class Unrolling:
     """Columns to values, one after another in their order: each step may follow the values before."""
 
-    def __init__(self, rules: dict[str, Rule], num: int):
-        self._rules, self._num = rules, num
+    def __init__(self, rules: dict[str, Rule], facts: Facts):
+        self._rules, self._facts = rules, facts
         self._features: list[np.ndarray] = []
         self.values: dict[str, np.ndarray] = {}
 
-    def halves(self, name: str) -> Int32[np.ndarray, "num"]:
-        """2 log2 step of the column that comes next."""
-        return self._rules[name].halves(self._features, self._num)
+    def has(self, name: str) -> Bool[np.ndarray, "rows"]:
+        """Who has a number in the column that comes next; the others' is 0."""
+        if name in ("duration", "time"):
+            return self.values["lasting"] == 0
+        if name[0] in "xy" and name[1:] not in ("0", "1"):
+            return self.values["degree"] >= int(name[1:])
+        if name in ("x1", "y1"):
+            return self.values["degree"] >= 1
+        return np.ones(self.rows(name), bool)
 
-    def add(self, name: str, numbers: Int32[np.ndarray, "num"], halves: Int32[np.ndarray, "num"]) -> None:
-        self.values[name] = self._rules[name].origin + numbers * steps_of(halves, name)
-        if name in FEATURES:
-            self._features.append(self.values[name])
+    def rows(self, name: str) -> int:
+        return self._facts.shared if name in COLORS and self._facts.shared else self._facts.num_gaussians
+
+    def halves(self, name: str) -> Int32[np.ndarray, "rows"]:
+        """2 log2 step of the column that comes next."""
+        if is_whole(name):
+            return np.zeros(self.rows(name), np.int32)
+        features = [] if name in COLORS and self._facts.shared else self._features
+        return self._rules[name].halves(features, self.rows(name))
+
+    def origin(self, name: str) -> Float[np.ndarray, "rows"]:
+        """What numbers of the column that comes next count from: the middle of the cell, if that says."""
+        axis = {"x0": 0, "y0": 1, "time": 2}.get(name)
+        if axis is not None and self._facts.cells[axis]:
+            return cell_middles(self.values["cell"].astype(np.int64), self._facts)[axis]
+        return np.full(self.rows(name), 0.0 if is_whole(name) else self._rules[name].origin)
+
+    def add(self, name: str, numbers: Int32[np.ndarray, "rows"], halves: Int32[np.ndarray, "rows"]) -> None:
+        value = self.origin(name) + numbers * steps_of(halves, name)
+        if name in ("duration", "time"):
+            lasting = self.values["lasting"] == 1
+            value = np.where(lasting, float(LASTING) if name == "duration" else 0.5, value)
+            if name == "duration":
+                self._features.append(np.where(lasting, LASTING_FEATURE, value))
+        elif name in FEATURES:
+            self._features.append(value)
+        if name[0] in "xy":
+            value = np.where(self.has(name), value, 0.0)
+        self.values[name] = value
 
 
 def values_of(quantised: Quantised) -> dict[str, Float[np.ndarray, "num"]]:
-    """The values of all columns."""
-    unrolling = Unrolling(quantised.rules, quantised.facts.num_gaussians)
-    for name in column_names(quantised.facts.degree):
+    """The values of all columns, of each Gaussian."""
+    facts, unrolling = quantised.facts, Unrolling(quantised.rules, quantised.facts)
+    for name in column_names(facts.degree, facts.shared):
         unrolling.add(name, quantised.columns[name], unrolling.halves(name))
-    return unrolling.values
+    values = unrolling.values
+    if facts.shared:
+        values |= {name: values[name][quantised.columns["shade"]] for name in COLORS}
+    return values
+
+
+# ------------------------------------------------------------------------------------------ cells
+
+
+def _sides(facts: Facts) -> tuple[float, float, float]:
+    """Extent of the picture along x and y in model space, and of time."""
+    height, width = facts.size
+    longer = max(height, width)
+    return width / longer, height / longer, 1.0
+
+
+def cells_at(
+    x: Float[np.ndarray, "num"], y: Float[np.ndarray, "num"], time: Float[np.ndarray, "num"], facts: Facts
+) -> Int32[np.ndarray, "num"]:
+    """Numbers of the cells that places lie in, or next to; bits of x, y and time in turns, the lowest first."""
+    out, place = np.zeros(len(x), np.int64), 0
+    along = []
+    for value, middle, side, bits in zip((x, y, time), (0.0, 0.0, 0.5), _sides(facts), facts.cells, strict=True):
+        index = np.floor(((value - middle) / side + 0.5) * 2**bits)
+        along.append(np.clip(index, 0, 2**bits - 1).astype(np.int64))
+    for k in range(max(facts.cells)):
+        for index, bits in zip(along, facts.cells, strict=True):
+            if k < bits:
+                out |= ((index >> k) & 1) << place
+                place += 1
+    return out.astype(np.int32)
+
+
+def cell_middles(cell: Int[np.ndarray, "num"], facts: Facts) -> list[Float[np.ndarray, "num"]]:
+    """The middles of cells along x, y and time."""
+    along, place = [np.zeros(len(cell), np.int64) for _ in range(3)], 0
+    for k in range(max(facts.cells)):
+        for axis, bits in enumerate(facts.cells):
+            if k < bits:
+                along[axis] |= ((cell >> place) & 1) << k
+                place += 1
+    out = []
+    for index, middle, side, bits in zip(along, (0.0, 0.0, 0.5), _sides(facts), facts.cells, strict=True):
+        out.append(middle + ((index + 0.5) / 2**bits - 0.5) * side)
+    return out
 
 
 def in_clip(time: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
@@ -149,7 +244,7 @@ def dequantise(quantised: Quantised) -> VideoModel:
     color = np.stack([luma * AXES[0, c] + blue * AXES[1, c] + green * AXES[2, c] for c in range(3)], 1)
 
     def single(array: np.ndarray) -> np.ndarray:
-        return array.astype(np.float32)
+        return array.astype(np.float32) + np.float32(0)  # no -0: what is absent is 0
 
     splats = FoldedSplats(
         loc=single(place[:, 0]),
@@ -244,6 +339,8 @@ class Described:
     facts: Facts
     swapped: Bool[np.ndarray, "num"]
     turn: Float[np.ndarray, "num"]
+    lasting: Bool[np.ndarray, "num"]
+    shade: Int32[np.ndarray, "num"] | None
     values: dict[str, Float[np.ndarray, "num"]]
     place: Float[np.ndarray, "num degree+1 2"]
     logits: Float[np.ndarray, "intervals"]
@@ -252,7 +349,9 @@ class Described:
 def describe(model: VideoModel) -> Described:
     """The values of every column but the path's, float64. Raises ValueError for what the format cannot hold."""
     facts = _facts_of(model)
-    splats = model.splats
+    splats, shade = model.splats, shades(model)
+    if shade is not None:
+        facts = dataclasses.replace(facts, shared=int(shade.max()) + 1)
 
     def leaf(name: str) -> np.ndarray:
         return np.asarray(getattr(splats, name), np.float64)
@@ -270,7 +369,19 @@ def describe(model: VideoModel) -> Described:
     }
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
     place = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
-    return Described(facts, swapped, turn, values, place, np.asarray(model.frame_times.logits, np.float64))
+    own = swapped, turn, splats.lasting, shade
+    return Described(facts, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
+
+
+def shades(model: VideoModel) -> Int32[np.ndarray, "num"] | None:
+    """The number of each Gaussian's colour among those that there are, dark ones first; None if few share one."""
+    color = np.asarray(model.splats.color_dc, np.float64)
+    found, index = np.unique(color, axis=0, return_inverse=True)
+    if 2 * len(found) > len(color) or len(found) > MOST_SHARED:
+        return None
+    rank = np.empty(len(found), np.int32)
+    rank[np.argsort(found @ AXES[0], kind="stable")] = np.arange(len(found))
+    return rank[index.ravel()]
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -294,6 +405,8 @@ def _facts_of(model: VideoModel) -> Facts:
     return Facts(
         num_gaussians=model.num_gaussians,
         degree=model.degree,
+        cells=_cells_for(model),
+        shared=0,
         power=power,
         floor=float(floor[0]),
         reach=reach,
@@ -303,6 +416,15 @@ def _facts_of(model: VideoModel) -> Facts:
         compositing=model.compositing,
         scale_cutoff=float(model.scale_cutoff),
     )
+
+
+def _cells_for(model: VideoModel) -> tuple[int, int, int]:
+    """Some eight Gaussians a cell; a quarter of the bits for time."""
+    total = min(max(round(math.log2(model.num_gaussians / 8)), 0), MOST_CELL_BITS)
+    of_time = total // 4
+    fewer, more = (total - of_time) // 2, (total - of_time + 1) // 2
+    height, width = model.size
+    return (more, fewer, of_time) if width >= height else (fewer, more, of_time)
 
 
 def path_matrix(
@@ -329,19 +451,64 @@ def moved_to(
     return place
 
 
-def quantise(described: Described, classes: Int32[np.ndarray, "num"], rules: dict[str, Rule]) -> Quantised:
-    """Round every column by its rule; each is rounded against what is decoded of those before it."""
+def quantise(
+    described: Described,
+    classes: Int32[np.ndarray, "num"],
+    rules: dict[str, Rule],
+    cells: Int32[np.ndarray, "num"] | None = None,
+) -> Quantised:
+    """Round every column by its rule; each is rounded against what is decoded of those before it.
+
+    `cells`: where to count places from (default: the cells that they are in).
+    """
     facts, columns = described.facts, {}
-    unrolling = Unrolling(rules, facts.num_gaussians)
-    values = described.values | {"class": classes.astype(np.float64)}
-    for name in column_names(facts.degree):
+    if cells is None:
+        cells = cells_of(described)
+    values = described.values | {"class": classes, "cell": cells, "lasting": described.lasting.astype(np.int32)}
+    if facts.shared:
+        first = np.unique(described.shade, return_index=True)[1]
+        values |= {name: values[name][first] for name in COLORS} | {"shade": described.shade}
+    # The path comes first: its degree is that of what is left of it when it is rounded.
+    names = column_names(facts.degree, facts.shared)
+    whole = {"degree": np.full(facts.num_gaussians, facts.degree, np.int32)}
+    columns = _rounded(names, values | whole, described, rules)
+    degrees = _degrees(columns, facts.degree)
+    columns["degree"] = degrees
+    for k in range(1, facts.degree + 1):
+        for axis in "xy":
+            columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
+    logits = described.logits - described.logits.max(initial=-np.inf)
+    return Quantised(facts, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
+
+
+def cells_of(described: Described) -> Int32[np.ndarray, "num"]:
+    """The cells that Gaussians are in, by the middles of their paths."""
+    values = described.values
+    path = _paths(described, values | {"duration": np.where(described.lasting, float(LASTING), values["duration"])})
+    return cells_at(path["x0"], path["y0"], in_clip(values["time"]), described.facts)
+
+
+def _degrees(columns: dict[str, np.ndarray], degree: int) -> Int32[np.ndarray, "num"]:
+    """The last power with a number that is not 0."""
+    out = np.zeros(len(columns["x0"]), np.int32)
+    for k in range(1, degree + 1):
+        out[(columns[f"x{k}"] != 0) | (columns[f"y{k}"] != 0)] = k
+    return out
+
+
+def _rounded(
+    names: tuple[str, ...], values: dict[str, np.ndarray], described: Described, rules: dict[str, Rule]
+) -> dict[str, Int32[np.ndarray, "rows"]]:
+    """The numbers of all columns."""
+    unrolling, columns = Unrolling(rules, described.facts), {}
+    for name in names:
         if name == "x0":
-            values |= _paths(described, unrolling.values)
+            values = values | _paths(described, unrolling.values)
         halves = unrolling.halves(name)
-        numbers = (values[name] - rules[name].origin) / steps_of(halves, name)
-        numbers = np.rint(numbers)
+        origin, steps = unrolling.origin(name), steps_of(halves, name)
+        numbers = np.where(unrolling.has(name), np.rint((values[name] - origin) / steps), 0)
         if name == "angle":  # held within its half turn, so that what is decoded is rounded to itself
-            low, high = (np.ceil((end - rules[name].origin) / steps_of(halves, name)) for end in (0.25, 0.75))
+            low, high = (np.ceil((end - origin) / steps) for end in (0.25, 0.75))
             numbers = np.minimum(np.maximum(numbers, low), high - 1)
         if not (np.abs(numbers) <= LARGEST).all():
             worst = int(np.argmax(~(np.abs(numbers) <= LARGEST)))
@@ -349,8 +516,7 @@ def quantise(described: Described, classes: Int32[np.ndarray, "num"], rules: dic
             raise invalid("model", expected="numbers within the reach of their steps", got=got, cure="Remove it first.")
         columns[name] = numbers.astype(np.int32)
         unrolling.add(name, columns[name], halves)
-    logits = described.logits - described.logits.max(initial=-np.inf)
-    return Quantised(facts, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
+    return columns
 
 
 def _paths(described: Described, decoded: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
