@@ -38,7 +38,7 @@ from foldgauss.video.quantise import (
     describe,
     in_clip,
     is_whole,
-    moved_to,
+    lower_paths,
     quantise,
     shades,
     values_of,
@@ -267,12 +267,11 @@ def _some(model: VideoModel, kept: Bool[np.ndarray, "num"] | Int[np.ndarray, "so
 
 def _freed(quantised: Quantised, described: Described, *, path: bool) -> VideoModel:
     """The model as decoded, but with colours, and paths if asked for, not rounded."""
-    model, values = dequantise(quantised), values_of(quantised)
+    model = dequantise(quantised)
     color = np.stack([described.values[name] for name in COLORS], 1) @ AXES
     splats = eqx.tree_at(lambda s: s.color_dc, model.splats, color.astype(np.float32))
     if path:
-        shift = in_clip(values["time"]) - described.values["time"]
-        place = moved_to(described.place, shift).astype(np.float32)
+        place = lower_paths(quantised, described).astype(np.float32)
         splats = eqx.tree_at(lambda s: (s.loc, s.coefficients), splats, (place[:, 0], place[:, 1:]))
     return eqx.tree_at(lambda m: m.splats, model, splats)
 

@@ -49,6 +49,9 @@ AXES = np.array(
 _LN2, _SQRT2 = 0.6931471805599453, 1.4142135623730951
 #: Steps of frame times' weights: a thousandth of an interval.
 TIME_STEP = 2.0**-10
+#: The squared error, in steps, that a path's last power must save: its two numbers need some eight bits, and where
+#: steps are fine a bit saves 2 ln 2 / 12.
+POWER_WORTH = 0.9
 #: The farthest power of sqrt(2) that a step may be.
 _FARTHEST = 120
 #: Largest steps of time and angle (turns): a step keeps them where their logits are finite.
@@ -471,9 +474,8 @@ def quantise(
     # The path comes first: its degree is that of what is left of it when it is rounded.
     names = column_names(facts.degree, facts.shared)
     whole = {"degree": np.full(facts.num_gaussians, facts.degree, np.int32)}
-    columns = _rounded(names, values | whole, described, rules)
-    degrees = _degrees(columns, facts.degree)
-    columns["degree"] = degrees
+    columns, saved = _rounded(names, values | whole, described, rules)
+    columns["degree"] = degrees = _degrees(saved)
     for k in range(1, facts.degree + 1):
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
@@ -488,25 +490,34 @@ def cells_of(described: Described) -> Int32[np.ndarray, "num"]:
     return cells_at(path["x0"], path["y0"], in_clip(values["time"]), described.facts)
 
 
-def _degrees(columns: dict[str, np.ndarray], degree: int) -> Int32[np.ndarray, "num"]:
-    """The last power with a number that is not 0."""
-    out = np.zeros(len(columns["x0"]), np.int32)
-    for k in range(1, degree + 1):
-        out[(columns[f"x{k}"] != 0) | (columns[f"y{k}"] != 0)] = k
-    return out
+def _degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarray, "num"]:
+    """The last power that is worth its bits; `saved` is the squared error that each one saves, in steps."""
+    worth = np.arange(len(saved), dtype=np.int32)[:, None] * (saved > POWER_WORTH)
+    return worth.max(axis=0, initial=0).astype(np.int32)
+
+
+def lower_paths(quantised: Quantised, described: Described) -> Float[np.ndarray, "num degree+1 2"]:
+    """Paths not rounded, seen from the times that a decoder has, as powers of u; of the degrees that are stored."""
+    facts, values = quantised.facts, values_of(quantised)
+    path = _paths(described, values)
+    place = np.stack([np.stack([path[f"{axis}{k}"] for axis in "xy"], 1) for k in range(facts.degree + 1)], 1)
+    place[np.arange(facts.degree + 1) > quantised.columns["degree"][:, None]] = 0
+    return path_matrix(in_clip(values["time"]), values["duration"], facts) @ place
 
 
 def _rounded(
     names: tuple[str, ...], values: dict[str, np.ndarray], described: Described, rules: dict[str, Rule]
-) -> dict[str, Int32[np.ndarray, "rows"]]:
-    """The numbers of all columns."""
+) -> tuple[dict[str, Int32[np.ndarray, "rows"]], Float[np.ndarray, "degree+1 num"]]:
+    """The numbers of all columns; and the squared error, in steps, that the path's powers save."""
     unrolling, columns = Unrolling(rules, described.facts), {}
+    saved = np.zeros((described.facts.degree + 1, described.facts.num_gaussians))
     for name in names:
         if name == "x0":
             values = values | _paths(described, unrolling.values)
         halves = unrolling.halves(name)
         origin, steps = unrolling.origin(name), steps_of(halves, name)
-        numbers = np.where(unrolling.has(name), np.rint((values[name] - origin) / steps), 0)
+        exact = np.where(unrolling.has(name), (values[name] - origin) / steps, 0)
+        numbers = np.rint(exact)
         if name == "angle":  # held within its half turn, so that what is decoded is rounded to itself
             low, high = (np.ceil((end - origin) / steps) for end in (0.25, 0.75))
             numbers = np.minimum(np.maximum(numbers, low), high - 1)
@@ -516,7 +527,9 @@ def _rounded(
             raise invalid("model", expected="numbers within the reach of their steps", got=got, cure="Remove it first.")
         columns[name] = numbers.astype(np.int32)
         unrolling.add(name, columns[name], halves)
-    return columns
+        if name[0] in "xy":
+            saved[int(name[1:])] += exact**2 - (exact - numbers) ** 2
+    return columns, saved
 
 
 def _paths(described: Described, decoded: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
