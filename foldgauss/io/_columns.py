@@ -3,12 +3,14 @@
 Both sides walk the columns in their order and come to the same, since all of it follows from columns before.
 """
 
+import dataclasses
+
 import numba as nb
 import numpy as np
 from jaxtyping import Float, Int, Int32, UInt8
 
 from foldgauss.io._range_coder import Column
-from foldgauss.video.quantise import COLORS, Facts, Unrolling, in_clip, is_whole, span_of, steps_of
+from foldgauss.video.quantise import COLORS, Facts, Rule, Unrolling, in_clip, power_of, span_of, steps_of
 
 #: Gaussians nearby that say what to expect; candidates for them in each square of a grid; what time counts as length.
 NEIGHBOURS, CANDIDATES, TIME = 4, 16, 0.3
@@ -19,30 +21,31 @@ _kernel = nb.njit(nogil=True, cache=True, error_model="numpy")
 
 
 class Walk:
-    """The columns of a file, one after another."""
+    """The columns of a file, one after another: ask for `column`, then `add` its numbers."""
 
-    def __init__(self, rules: dict, facts: Facts):
+    def __init__(self, rules: dict[str, Rule], facts: Facts):
         self._facts, self._unrolling = facts, Unrolling(rules, facts)
         self._numbers: dict[str, np.ndarray] = {}
-        self._degrees: np.ndarray | None = None
+        self._in_cell = self._nearest = np.zeros((facts.num_gaussians, 0), np.int32)
+        self._half = np.ones(facts.num_gaussians)
 
     def column(self, name: str) -> Column:
         """The one that comes next."""
-        unrolling, facts = self._unrolling, self._facts
-        rows, halves = unrolling.rows(name), unrolling.halves(name)
-        if name == "cell" or rows != facts.num_gaussians:
-            column = Column.plain(rows)
-            near = np.arange(-1, rows - 1, dtype=np.int32)[:, None]
-            if name == "cell":
-                return column
-            return Column(column.present, column.contexts, unrolling.origin(name), steps_of(halves), column.scale, near)
-        path = name[0] in "xy"
-        near = self._nearest if name in (*COLORS, "shade", "angle") or (path and name[1:] != "0") else self._in_cell
+        unrolling = self._unrolling
+        rows = unrolling.rows(name)
+        if name == "cell":
+            return Column.plain(rows)
+        halves = unrolling.halves(name)
+        known = {"origin": unrolling.origin(name), "step": steps_of(halves, name)}
+        if name in COLORS and self._facts.shared:
+            return dataclasses.replace(Column.plain(rows), near=np.arange(-1, rows - 1)[:, None], **known)
+        power = power_of(name)
+        near = self._nearest if power or name in ("angle", "shade", *COLORS) else self._in_cell
         scale = np.ones(rows)
-        for k in range(int(name[1:]) if path else 0):  # not a power, whose last bit libraries do not agree on
-            scale = scale * self._half if k else self._half
-        origin, steps = unrolling.origin(name), steps_of(halves, name)
-        return Column(unrolling.has(name), self._contexts(name, halves), origin, steps, scale, near)
+        for _ in range(power):  # not a power, whose last bit libraries do not agree on
+            scale = scale * self._half
+        contexts = self._contexts(name, power, halves)
+        return Column(present=unrolling.has(name), contexts=contexts, scale=scale, near=near, **known)
 
     def add(self, name: str, numbers: Int32[np.ndarray, "rows"]) -> None:
         """Its numbers."""
@@ -57,26 +60,27 @@ class Walk:
             bits = max(facts.cells[:2]) + 1
             self._nearest = nearest_of(v["x0"], v["y0"], TIME * middle, bits)
 
-    def _contexts(self, name: str, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
-        q, classes = self._numbers, self._numbers["class"] & 31 if "class" in self._numbers else 0
-        first = (halves >> 1) & 31
-        if name in ("class", "lasting"):
-            second = classes
-        elif name == "degree" or is_whole(name):
-            second = classes + 32 * q["lasting"]
-        elif name[0] in "xy" and name[1:] != "0":
-            k = int(name[1:])
-            first = first + 32 * (q["degree"] == k)
-            high = level(q[f"x{k}"]) if name[0] == "y" else level(q[f"y{k - 1}"]) if k > 1 else q["degree"]
-            low = level(q[f"{name[0]}{k - 1}"]) if k > 1 else q["degree"]
+    def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
+        """The first and the second context of each number."""
+        q, first = self._numbers, (halves >> 1) & 31
+        if name == "class":
+            second = 0
+        elif name == "lasting":
+            second = q["class"] & 31
+        elif power:
+            first = first + 32 * (q["degree"] == power)
+            # The other axis's number that comes before, and this one's of the power before.
+            other = f"x{power}" if name[0] == "y" else f"y{power - 1}"
+            high = q["degree"] if name == "x1" else level(q[other])
+            low = q["degree"] if power == 1 else level(q[f"{name[0]}{power - 1}"])
             second = 16 * high + low
         elif name == "blue":
             second = 16 * level(q["luma"])
         elif name == "green":
             second = 16 * level(q["luma"]) + level(q["blue"])
         else:
-            second = classes + 32 * q["lasting"]
-        return np.stack(np.broadcast_arrays(first, second, halves)[:2], 1).astype(np.uint8)
+            second = (q["class"] & 31) + 32 * q["lasting"]
+        return np.stack(np.broadcast_arrays(first, second), 1).astype(np.uint8)
 
 
 def level(numbers: Int32[np.ndarray, "num"]) -> Int[np.ndarray, "num"]:

@@ -219,7 +219,7 @@ def _facts(header: dict) -> Facts:
     _check(whole(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
     cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
     _check(isinstance(cells, list) and len(cells) == 3 and all(whole(n, 0) for n in cells), "cells", cells)
-    _check(sum(cells) <= MOST_CELL_BITS and 1 << sum(cells) <= num, "cells", cells)
+    _check(sum(cells) <= MOST_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
     _check(whole(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():

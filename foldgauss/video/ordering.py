@@ -27,14 +27,12 @@ _EMPTY = -1
 Overlaps = tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]
 
 
-def free_order(lit: LitModel, cell: Int32[np.ndarray, "num"], found: Overlaps, room: float) -> Int[np.ndarray, "num"]:
+def free_order(cell: Int32[np.ndarray, "num"], found: Overlaps, room: float) -> Int[np.ndarray, "num"]:
     """The numbers of Gaussians in a new order, sweep after sweep through the cells; `found` is of `overlaps`.
 
     `room`: what the pairs that are let go may add to the squared error, were all of them to change places; colours
     about [0, 1], summed over frames, pixels and channels.
     """
-    if lit.model.compositing == "sum":
-        return np.argsort(cell, kind="stable")
     front, back, cost = found
     cheapest = np.argsort(cost, kind="stable")
     matters = cheapest[np.searchsorted(np.cumsum(cost[cheapest]), room, side="right") :]

@@ -64,6 +64,11 @@ def column_names(degree: int, shared: int = 0) -> tuple[str, ...]:
     return (*_FIRST, *path, "angle", *(("shade",) if shared else ()), *COLORS)
 
 
+def power_of(name: str) -> int:
+    """The power of a path's column; 0 for others."""
+    return int(name[1:]) if name[0] in "xy" else 0
+
+
 def is_whole(name: str) -> bool:
     """Whether a column's numbers are meant as they are: it has no rule."""
     return name in WHOLE or name == "shade"
@@ -143,10 +148,8 @@ class Unrolling:
         """Who has a number in the column that comes next; the others' is 0."""
         if name in ("duration", "time"):
             return self.values["lasting"] == 0
-        if name[0] in "xy" and name[1:] not in ("0", "1"):
-            return self.values["degree"] >= int(name[1:])
-        if name in ("x1", "y1"):
-            return self.values["degree"] >= 1
+        if power := power_of(name):
+            return self.values["degree"] >= power
         return np.ones(self.rows(name), bool)
 
     def rows(self, name: str) -> int:
@@ -175,7 +178,7 @@ class Unrolling:
                 self._features.append(np.where(lasting, LASTING_FEATURE, value))
         elif name in FEATURES:
             self._features.append(value)
-        if name[0] in "xy":
+        if power_of(name):
             value = np.where(self.has(name), value, 0.0)
         self.values[name] = value
 
@@ -464,7 +467,7 @@ def quantise(
 
     `cells`: where to count places from (default: the cells that they are in).
     """
-    facts, columns = described.facts, {}
+    facts = described.facts
     if cells is None:
         cells = cells_of(described)
     values = described.values | {"class": classes, "cell": cells, "lasting": described.lasting.astype(np.int32)}
@@ -527,8 +530,8 @@ def _rounded(
             raise invalid("model", expected="numbers within the reach of their steps", got=got, cure="Remove it first.")
         columns[name] = numbers.astype(np.int32)
         unrolling.add(name, columns[name], halves)
-        if name[0] in "xy":
-            saved[int(name[1:])] += exact**2 - (exact - numbers) ** 2
+        if power_of(name):
+            saved[power_of(name)] += exact**2 - (exact - numbers) ** 2
     return columns, saved
 
 

@@ -485,6 +485,8 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("cells", [0, 0, -1]),
         ("cells", [30, 30, 30]),
         ("cells", [2, 2, 2]),
+        ("cells", [5, 0, 0]),
+        ("cells", [0, 3, 0]),
         ("cells", 5),
         ("shared", -1),
         ("shared", 41),
