@@ -5,19 +5,16 @@ Both sides walk the columns in their order and come to the same, since all of it
 
 import dataclasses
 
-import numba as nb
 import numpy as np
 from jaxtyping import Float, Int, Int32, UInt8
 
+from foldgauss._kernels import exact_kernel
 from foldgauss.io._range_coder import Column
 from foldgauss.video.quantise import COLORS, Facts, Rule, Unrolling, in_clip, power_of, span_of, steps_of
 
 #: Gaussians nearby that say what to expect; candidates for them in each square of a grid; what time counts as length.
 NEIGHBOURS, CANDIDATES, TIME = 4, 16, 0.3
 _LEVELS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
-
-#: Without the liberties that other kernels take with floating-point numbers.
-_kernel = nb.njit(nogil=True, cache=True, error_model="numpy")
 
 
 class Walk:
@@ -95,7 +92,7 @@ def latest_in(cell: Int32[np.ndarray, "num"], num_cells: int) -> Int32[np.ndarra
     return out
 
 
-@_kernel
+@exact_kernel
 def _latest(cell, last, before, out):
     for i in range(len(cell)):
         j, count = last[cell[i]], 0
@@ -120,7 +117,7 @@ def nearest_of(
     return out
 
 
-@_kernel
+@exact_kernel
 def _nearest(x, y, time, column, row, last, before, most, out):
     best = np.empty(out.shape[1])
     for i in range(len(x)):

@@ -16,6 +16,8 @@ import numba as nb
 import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
 
+from foldgauss._kernels import exact_kernel
+
 #: Magnitudes stay below 2^LARGEST_BITS.
 LARGEST_BITS = 30
 #: Probabilities of one context: zero flag, sign, unary exponent, and 1 + 2 for the leading bits of each exponent.
@@ -37,8 +39,6 @@ _KNOTS = [
 ]  # fmt: skip
 
 _i = nb.int64
-#: Without the liberties that other kernels take with floating-point numbers.
-_kernel = nb.njit(nogil=True, cache=True, error_model="numpy")
 
 
 def _logistic() -> np.ndarray:
@@ -86,7 +86,7 @@ class Column:
 # ------------------------------------------------------------------------------------------ what both sides do
 
 
-@_kernel
+@exact_kernel
 def _expected(i, near, seen, origin, step, scale):
     """The context of what rows nearby lead to expect: 0 for nothing, else 16 and the sign times the size."""
     total, count = 0.0, 0
@@ -104,7 +104,7 @@ def _expected(i, near, seen, origin, step, scale):
     return 16 + level if ratio >= 0 else 16 - level
 
 
-@_kernel
+@exact_kernel
 def _mixed(node, own, chances, weights, logits, logistic, logit):
     """The probability of a one at a node, times 65536; `own` are the contexts."""
     total = 0
@@ -115,7 +115,7 @@ def _mixed(node, own, chances, weights, logits, logistic, logit):
     return min(max(p, MARGIN), 65536 - MARGIN)
 
 
-@_kernel
+@exact_kernel
 def _learn(node, own, chances, weights, logits, p, bit):
     """A chance is (probability of one times 65536, bits seen + 2)."""
     error = (65536 if bit else 0) - p
@@ -130,7 +130,7 @@ def _learn(node, own, chances, weights, logits, p, bit):
             chance[1] += 1
 
 
-@_kernel
+@exact_kernel
 def _middle(low, high, p):
     """Where the interval is parted: below lie ones, of probability p / 65536."""
     span = high - low
@@ -140,7 +140,7 @@ def _middle(low, high, p):
 # ------------------------------------------------------------------------------------------ numbers to bytes
 
 
-@_kernel
+@exact_kernel
 def _put(out, place, interval, p, bit):
     middle = _middle(interval[0], interval[1], p)
     if bit:
@@ -155,7 +155,7 @@ def _put(out, place, interval, p, bit):
     return place
 
 
-@_kernel
+@exact_kernel
 def _put_learned(out, place, interval, state, node, bit):
     own, chances, weights, logits, logistic, logit = state
     p = _mixed(node, own, chances, weights, logits, logistic, logit)
@@ -164,7 +164,7 @@ def _put_learned(out, place, interval, state, node, bit):
     return place
 
 
-@_kernel
+@exact_kernel
 def _encode(values, present, contexts, origin, step, scale, near, fill, state, out):
     interval, place, seen, own = np.zeros(2, np.int64), 0, np.full(len(values), fill), state[0]
     interval[1] = 0xFFFFFFFF
@@ -202,7 +202,7 @@ def _encode(values, present, contexts, origin, step, scale, near, fill, state, o
 # ------------------------------------------------------------------------------------------ and back
 
 
-@_kernel
+@exact_kernel
 def _get(data, reader, p):
     """One bit; the reader is (low, high, code, next byte)."""
     middle = _middle(reader[0], reader[1], p)
@@ -220,7 +220,7 @@ def _get(data, reader, p):
     return bit
 
 
-@_kernel
+@exact_kernel
 def _get_learned(data, reader, state, node):
     own, chances, weights, logits, logistic, logit = state
     p = _mixed(node, own, chances, weights, logits, logistic, logit)
@@ -229,7 +229,7 @@ def _get_learned(data, reader, state, node):
     return bit
 
 
-@_kernel
+@exact_kernel
 def _decode(data, present, contexts, origin, step, scale, near, fill, most, state, values):
     """Whether the data is one that the encoder may have written."""
     reader, seen, own = np.zeros(4, np.int64), np.full(len(values), fill), state[0]

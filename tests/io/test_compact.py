@@ -25,12 +25,14 @@ from foldgauss.video.model import LASTING
 from foldgauss.video.quantise import (
     AXES,
     Rule,
+    _degrees,
     _log,
     column_names,
     dequantise,
     describe,
     is_whole,
     legendre,
+    lower_paths,
     moved_to,
     path_matrix,
     quantise,
@@ -163,6 +165,19 @@ def test_kinds_outlive_fitting_anew(tmp_path, passes):
     assert again.splats.lasting.sum() >= 12
     assert len(np.unique(again.splats.color_dc, axis=0)) <= 10
     assert again.num_floats <= model.num_floats
+
+
+def test_a_power_that_saves_little_goes():
+    """Its squared error, in steps, against what a number's bits are worth."""
+    saved = np.array([[9.0, 9.0, 9.0], [1.0, 0.5, 0.2], [0.8, 0.2, 4.0]])
+    np.testing.assert_array_equal(_degrees(saved), [1, 0, 2])
+    model = soft_model(degree=3)
+    coarse = fine(model, -7.0)
+    degrees = dequantise(coarse).splats.degrees
+    np.testing.assert_array_equal(degrees, coarse.columns["degree"])
+    assert 0 < (degrees < 3).sum() < len(degrees)
+    place = lower_paths(coarse, describe(model))
+    np.testing.assert_array_equal((place[:, 1:] != 0).any(2), np.arange(3) < degrees[:, None])
 
 
 def test_kinds_save_bytes():
