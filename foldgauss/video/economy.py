@@ -55,7 +55,7 @@ class Economy:
     psnr: float | None = None
     bits: float = 8.0
     rounds: int = 8
-    first_share: float = 0.2
+    first_share: float = 0.15
     last_share: float = 0.88
     most_dropped: float = 0.3
     grows: bool = True
