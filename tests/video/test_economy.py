@@ -600,7 +600,7 @@ def test_bad_numbers_are_refused(changes, name):
 
 @pytest.mark.parametrize("psnr", [None, 30])
 def test_a_target_is_not_for_economies(psnr):
-    with pytest.raises(ValueError, match=r"^economy: expected None with compositing 'sum'"):
+    with pytest.raises(ValueError, match=r"^compositing: expected 'over' with an economy"):
         FitConfig(compositing="sum", economy=Economy(psnr=psnr))
     with pytest.raises(ValueError, match=r"^target_psnr: expected None with an economy"):
         FitConfig(target_psnr=30, economy=Economy(psnr=psnr))
