@@ -3,6 +3,7 @@
 import json
 import re
 
+import equinox as eqx
 import numpy as np
 import pytest
 from commands import run
@@ -69,6 +70,17 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
     assert load_video_model("edited.safetensors").num_gaussians < load_video_model("model.fgz").num_gaussians
     with pytest.raises(ValueError, match="foldgauss compress"):
         save_video_model("again.fgz", load_video_model("model.fgz"))
+
+
+def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):
+    """Baked edits leave a plain model; fitted anew to the clip as it was, it becomes that again."""
+    model = load_video_model(work / "model.safetensors")
+    bright = eqx.tree_at(lambda m: m.splats.color_dc, model, np.asarray(model.splats.color_dc) + 1)
+    path = save_video_model(tmp_path / "bright.safetensors", bright)
+    assert run("compress", path, work / "clip", "--passes", 2) == 0
+    assert re.search(r"warning: the compact file is \d+\.\d dB nearer to the clip", capsys.readouterr().err)
+    assert run("compress", path, work / "clip", "--passes", 0, "--out", tmp_path / "rounded.fgz") == 0
+    assert "nearer" not in capsys.readouterr().err
 
 
 def test_without_the_clip(work, tmp_path, capsys):

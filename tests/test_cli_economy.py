@@ -54,7 +54,7 @@ def test_a_psnr_out_of_reach_is_told(clip, tmp_path, capsys):
     [
         (("--smallest-at-psnr", 0), "--smallest-at-psnr: expected a number in (0, 100], got 0.0"),
         (("--economy", "--target-psnr", 30), "--target-psnr: expected None with an economy"),
-        (("--economy", "--compositing", "sum"), "--economy: expected None with compositing 'sum'"),
+        (("--economy", "--compositing", "sum"), "--compositing: expected 'over' with an economy, got 'sum'"),
     ],
 )
 def test_what_does_not_go_together(clip, tmp_path, capsys, options, told):

@@ -29,6 +29,8 @@ from foldgauss.video.model import VideoModel
 from foldgauss.video.tradeoff import halved
 
 Score = Callable[[VideoModel], Evaluation]
+#: dB by which a compact file may be better than its model without a word.
+NEARER = 0.5
 
 
 @app.command(name="compress")
@@ -132,6 +134,12 @@ def _compressed(
 
         given = None if clip is None else clip.frames
         made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
+    if made.loss_db < -NEARER:
+        err.print(
+            f"warning: the compact file is {-made.loss_db:.1f} dB nearer to the clip than the model was. Its fit had "
+            "not come to its end; or it was edited, and fitting anew has taken that back. --passes 0 only rounds.",
+            soft_wrap=True,
+        )
     save_compressed(target, made, about, known=clip is not None or told is not None)
     if clip is None:
         source = "that is noted in the file" if told is not None else "that is assumed"

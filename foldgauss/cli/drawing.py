@@ -243,7 +243,9 @@ def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
         told["solid"] = f"{solid:,} of {len(degrees):,} Gaussians, no light comes through"
     counted = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
     for what, name in (("colors", "colours"), ("shapes", "shapes")):
-        shared = [f"{counts[what]:,} of {num:,} Gaussians" for num, counts in counted if what in counts]
+        # Where most have their own, what is alike is so by chance, as of rounded numbers.
+        few = [(num, counts[what]) for num, counts in counted if 2 * counts.get(what, num) <= num]
+        shared = [f"{count:,}, shared by {num:,} Gaussians" for num, count in few]
         if shared:
             told[name] = ", ".join(shared)
     return told

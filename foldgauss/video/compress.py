@@ -33,6 +33,7 @@ from foldgauss.video.quantise import (
     Described,
     Quantised,
     Rule,
+    cells_for,
     cells_of,
     column_names,
     dequantise,
@@ -414,7 +415,8 @@ class _Plan:
 
 def subset(described: Described, kept: Bool[np.ndarray, "num"]) -> Described:
     """Some of a model's Gaussians, in their order."""
-    facts = dataclasses.replace(described.facts, num_gaussians=int(kept.sum()))
+    num = int(kept.sum())
+    facts = dataclasses.replace(described.facts, num_gaussians=num, cells=cells_for(num, described.facts.size))
     values = {name: value[kept] for name, value in described.values.items()}
     shade = described.shade
     if shade is not None:

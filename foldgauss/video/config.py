@@ -187,13 +187,15 @@ class FitConfig:
             kinds |= {"economy": Economy}
             if self.compositing == "sum":
                 # Overlapping contributions add up: what each is worth says nothing of what several are.
-                raise invalid("economy", expected="None with compositing 'sum'", got="one", cure="Take 'over'.")
+                cure = "Leave the economy out, or take 'over'."
+                raise invalid("compositing", expected="'over' with an economy", got="'sum'", cure=cure)
             if self.target_psnr is not None:
                 cure = "The smallest model at a PSNR: Economy(psnr=...), or --smallest-at-psnr, alone."
                 raise invalid("target_psnr", expected="None with an economy", got=self.target_psnr, cure=cure)
         for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
-                raise invalid(name, expected=f"a {kind.__name__}", got=repr(getattr(self, name)))
+                article = "an" if kind.__name__[0] in "AEIOU" else "a"
+                raise invalid(name, expected=f"{article} {kind.__name__}", got=repr(getattr(self, name)))
         if self.initialization == "uniform" and self.follow_motion:
             raise invalid("follow_motion", expected="False with initialization 'uniform'", got=True)
 

@@ -32,6 +32,11 @@ DOUBLING = 1.9
 #: Of the Gaussians, in the first half of the rounds, without a PSNR: births; they go on while at least half of the last
 #: ones stay.
 BIRTHS = 0.5
+#: dB that a round gives up at most: farther away estimates to second order tell little.
+MOST_AT_ONCE = 3.0
+#: Of the Gaussians, those that light no longer comes through after a round: what is behind one depends on the others,
+#: and the ledger tells what each costs alone.
+MOST_SOLID = 0.25
 #: Frames' errors differ by this factor from their geometric mean, as far as it counts: 6 dB.
 _UNLIKE = 4.0
 
@@ -87,20 +92,23 @@ class Economy:
         shares = np.linspace(first, self.last_share, num) if num > 1 else np.array([self.last_share])
         return np.clip(np.rint(shares * plan), 1, plan).astype(int)
 
-    def births(self, ledger: Ledger, progress: float, num: int, survived: float) -> int:
-        """How many Gaussians are to be born to `num`; `survived`: the share still there of those born last."""
+    def births(self, ledger: Ledger, psnr: float, progress: float, num: int, survived: float) -> int:
+        """How many Gaussians are to be born to `num`; `survived`: the share still there of those born last.
+
+        `psnr`: what is reached now, dB.
+        """
         if ledger.squared_error <= ROUNDING * ledger.num_samples:  # nothing to be seen
             return 0
         if self.psnr is None:
             return round(BIRTHS * num) if self.grows and survived >= 0.5 else 0
-        missing = self._aim(progress) - ledger.psnr
+        missing = self._aim(progress) - psnr
         return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
 
-    def room(self, ledger: Ledger, progress: float) -> float | None:
-        """The squared error that a round may add; None where the price decides."""
+    def room(self, ledger: Ledger, psnr: float, progress: float) -> float | None:
+        """The squared error that a round may add at a PSNR of so many dB; None where the price decides."""
         if self.psnr is None:
             return None
-        return ledger.squared_error * (10 ** ((ledger.psnr - self._aim(progress)) / 10) - 1)
+        return ledger.squared_error * (10 ** (min(psnr - self._aim(progress), MOST_AT_ONCE) / 10) - 1)
 
     def _aim(self, progress: float) -> float:
         """dB that a round aims at: the rest of the fit brings more."""
@@ -207,8 +215,8 @@ class _Book:
         added[lasting, :, 1], added[lasting, :, 0] = added[lasting, :, 0], np.inf
         opacity = 1 / (1 + np.exp(-rows[:, self._at["opacity_logit"].start].astype(float)))
         added[:, :, :, 1] = added[:, :, :, 0] + (ledger.solid(opacity)[:, None, None] if solid else np.inf)
-        already = is_solid(kinds)
-        added[already, :, :, 1], added[already, :, :, 0] = added[already, :, :, 0], np.inf
+        self._solid = is_solid(kinds)
+        added[self._solid, :, :, 1], added[self._solid, :, :, 0] = added[self._solid, :, :, 0], np.inf
         powers = OF_POWER * np.arange(degree + 1)[:, None, None]
         numbers = NUMBERS + powers - OF_TIME * np.array([0, 1])[:, None] - OF_OPACITY * np.array([0, 1])
         self._added, self._numbers = added.reshape(num, -1), numbers.ravel()
@@ -225,7 +233,17 @@ class _Book:
             out = out[np.argsort(-gain[out], kind="stable")[:most]]
         stays = np.ones(num, bool)
         stays[out] = False
+        best = self._few_solid(best, stays)
         return stays, best, float(removed[out].sum() + self._added[stays, best[stays]].sum())
+
+    def _few_solid(self, best: np.ndarray, stays: np.ndarray) -> np.ndarray:
+        """What is best for each, where no more than `MOST_SOLID` become solid: those whom it costs least."""
+        which = np.flatnonzero(stays & (best % 2 == 1) & ~self._solid)
+        most = math.ceil(MOST_SOLID * len(self._rows))
+        if len(which) > most:
+            cost = self._added[which, best[which]] - self._added[which, best[which] - 1]
+            best[which[np.argsort(cost, kind="stable")[most:]]] -= 1  # the same, but clear
+        return best
 
     def added(self, price: float, most_dropped: float) -> float:
         return self._chosen(price, most_dropped)[2]

@@ -67,7 +67,7 @@ class Ledger:
     def psnr(self) -> float:
         """dB, mean over the frames."""
         samples = self.num_samples / len(self.errors)
-        return float(np.mean(-10 * np.log10(np.maximum(self.errors / samples, 1e-12))))
+        return float(np.mean(-10 * np.log10(np.maximum(self.errors / samples, 1e-10))))
 
     @property
     def effective_samples(self) -> float:

@@ -243,7 +243,7 @@ def check_model(model: object) -> None:
     """Raise unless it is a `VideoModel`."""
     if not isinstance(model, VideoModel):
         cures = {
-            "EditedVideo": "Select in each layer's own model, before layers and edits are put together.",
+            "EditedVideo": "Take each layer's own model, before layers and edits are put together.",
             "Edit": "End the chain with .video().",
         }
         cure = cures.get(type(model).__name__, "The model comes first.")

@@ -415,7 +415,7 @@ def _facts_of(model: VideoModel) -> Facts:
     return Facts(
         num_gaussians=model.num_gaussians,
         degree=model.degree,
-        cells=_cells_for(model),
+        cells=cells_for(model.num_gaussians, model.size),
         shared=0,
         power=power,
         floor=float(floor[0]),
@@ -428,12 +428,12 @@ def _facts_of(model: VideoModel) -> Facts:
     )
 
 
-def _cells_for(model: VideoModel) -> tuple[int, int, int]:
+def cells_for(num_gaussians: int, size: tuple[int, int]) -> tuple[int, int, int]:
     """Some eight Gaussians a cell; a quarter of the bits for time."""
-    total = min(max(round(math.log2(model.num_gaussians / 8)), 0), MOST_CELL_BITS)
+    total = min(max(round(math.log2(num_gaussians / 8)), 0), MOST_CELL_BITS)
     of_time = total // 4
     fewer, more = (total - of_time) // 2, (total - of_time + 1) // 2
-    height, width = model.size
+    height, width = size
     return (more, fewer, of_time) if width >= height else (fewer, more, of_time)
 
 

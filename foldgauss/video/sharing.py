@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import numpy as np
@@ -75,11 +76,13 @@ def shared(
     seed: int,
     *,
     progress: float = 0.0,
+    most: float = math.inf,
 ) -> Int[np.ndarray, "num"] | None:
     """Which rows share their values: the number of each one's in a palette; None where sharing does not pay.
 
     `weight` is what the square of an error of a value adds to the squared error, `price` what a stored number has to
-    save, `progress` the share of the fit that is done: what is left of it mends part of the error. Clusters by Lloyd's
+    save, `progress` the share of the fit that is done: what is left of it mends part of the error, which
+    is `most` at most before. Clusters by Lloyd's
     algorithm (1982), weighted by the mean of a row's weights, for palettes of several sizes.
     """
     num, width = values.shape
@@ -87,9 +90,11 @@ def shared(
     best, least = None, width * num * price
     for size in (size for size in _PALETTES if size < num):
         index = _clustered(values.astype(float), weight.mean(1), size, seed)
-        error = left * float((weight * (values - averaged(values, index)) ** 2).sum())
+        error = float((weight * (values - averaged(values, index)) ** 2).sum())
+        if error > most:
+            continue
         stored = len(np.unique(index)) * width + num * (1 if size <= 256 else 2) / 4
-        cost = error + stored * price
+        cost = left * error + stored * price
         if cost < least:
             best, least = index, cost
         elif best is not None and size != 512:  # indices are longer from there on

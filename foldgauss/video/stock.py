@@ -28,6 +28,8 @@ TRIMS, LEAST_TRIM = 8, 0.002
 #: Rounds that are left when colours and shapes are shared and opacities left out, in plans with enough: they see what
 #: that costs.
 LATE = 1
+#: Of the squared error, what sharing colours, and sharing shapes, may add before it is mended.
+MOST_BY_SHARING = 0.25
 
 
 class StockTaker:
@@ -47,7 +49,8 @@ class StockTaker:
             return False
         growing = state.step in steps[: len(steps) // 2]
         ledger, progress = self._ledger(state), state.step / state.plan
-        room, late = economy.room(ledger, progress), steps[max(len(steps) // 2, len(steps) - 1 - LATE)]
+        psnr = self._psnr(state, ledger)
+        room, late = economy.room(ledger, psnr, progress), steps[max(len(steps) // 2, len(steps) - 1 - LATE)]
         made = self._cut(state, ledger, room, solid=state.step >= late)
         survived = state.young[made.stay].sum() / max(state.young.sum(), 1) if state.step > steps[0] else 1.0
         _keep(state, made, config.degree)
@@ -57,7 +60,7 @@ class StockTaker:
         if growing:
             at_start = chosen_num_gaussians(config, *self._frames.shape[:3])
             most = min(most_gaussians(config, len(self._frames)), MOST_BORN * at_start)
-            num = min(economy.births(ledger, progress, len(state.rows), survived), most - len(state.rows))
+            num = min(economy.births(ledger, psnr, progress, len(state.rows), survived), most - len(state.rows))
         state.young = np.zeros(len(state.rows), bool)
         if num > 0:
             self._bear(state, ledger, num)
@@ -81,7 +84,7 @@ class StockTaker:
     def _trimmed(self, state: FitState) -> bool:
         config, ledger = self._config, self._ledger(state)
         wanted, size = config.economy.psnr, numbers_of(state.kinds)
-        room = ledger.squared_error * (10 ** (max(ledger.psnr - wanted, 0.0) / 10) - 1)
+        room = ledger.squared_error * (10 ** (max(self._psnr(state, ledger) - wanted, 0.0) / 10) - 1)
         for share in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
             tried = dataclasses.replace(state)
             _keep(tried, self._cut(tried, ledger, share * room), config.degree)
@@ -143,7 +146,8 @@ class StockTaker:
         of_colors = np.repeat(ledger.by_color[stay, None], 3, axis=1)
         for leaf, name, weight in (("color_dc", "colors", of_colors), ("log_scale", "shapes", of_axes)):
             at, progress = columns(degree)[leaf], min(state.step / state.plan, 1.0)
-            index = shared(state.rows[:, at], weight, made.price, self._config.seed, progress=progress)
+            how = {"progress": progress, "most": MOST_BY_SHARING * ledger.squared_error}
+            index = shared(state.rows[:, at], weight, made.price, self._config.seed, **how)
             setattr(state, name, Palette.of(index, weight.shape[1]))
             if index is not None:
                 state.rows[:, at] = averaged(state.rows[:, at], index)
@@ -156,6 +160,11 @@ class StockTaker:
         weights = None if self._config.economy.psnr is None else frame_weights(state.frame_errors)
         how = self._drawn() | {"seed": state.step, "weights": weights}
         return measured(state.rows, _windows(state.rows), times, self._shape, self._target, **how)
+
+    def _psnr(self, state: FitState, ledger: Ledger) -> float:
+        """dB, as the fit is held to it: frames with alpha are shown over black, and measured over other colours."""
+        alpha = self._frames.shape[3] == 4 and self._config.economy.psnr is not None
+        return mean_psnr(state, self._config, self._frames) if alpha else ledger.psnr
 
     def _target(self, k: int) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
         """Frame k, whole; with alpha over one colour for good, which is told too."""

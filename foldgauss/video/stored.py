@@ -115,6 +115,7 @@ def stored_skeleton(
         _check_count("degree", splats.degree, 0, DEGREES)
         _check_count("powers", powers, 0, num * splats.degree)
         _check_count("timed", timed, 0, num)
+        clear = num if clear is None else clear  # files from before there were solid ones
         _check_count("clear", clear, 0, num)
         leaves |= {"kinds": _shape(np.uint8, num), "coefficients": _shape(np.float32, powers, 2)}
         leaves |= {name: _shape(np.float32, timed) for name in ("time_loc_logit", "log_time_scale")}

@@ -171,6 +171,19 @@ def test_kinds_outlive_fitting_anew(tmp_path, passes):
     assert again.num_floats <= model.num_floats
 
 
+@pytest.mark.parametrize("told", ["faint", "coarse"])
+def test_few_that_are_left_can_be_read(tmp_path, told):
+    """Cells are counted anew, for those that stay."""
+    model = crowd(soft_model(degree=3), 40)
+    if told == "faint":
+        opacity = np.asarray(model.splats.opacity_logit).copy()
+        opacity[np.arange(len(opacity)) % 10 > 0] = -12
+        model = eqx.tree_at(lambda m: m.splats.opacity_logit, model, opacity)
+    made = compress(model, max_loss_db=0.2 if told == "faint" else 40)
+    assert made.model.num_gaussians < model.num_gaussians / 4
+    same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantised)), made.model)
+
+
 def test_a_power_that_saves_little_goes():
     """Its squared error, in steps, against what a number's bits are worth."""
     saved = np.array([[9.0, 9.0, 9.0], [1.0, 0.5, 0.2], [0.8, 0.2, 4.0]])

@@ -389,8 +389,8 @@ def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "0 of 30 Gaussians, 3 of 20 Gaussians" in told
     assert "25 of 50 Gaussians, throughout the clip" in told
-    assert "6 of 50 Gaussians" in told
-    assert "4 of 50 Gaussians" in told
+    assert "6, shared by 50 Gaussians" in told
+    assert "4, shared by 50 Gaussians" in told
     assert "10 of 50 Gaussians, no light comes through" in told
     assert f"{load_video_model(path).num_floats:,}" in told
     assert f"{path.stat().st_size:,} bytes" in told

@@ -12,8 +12,8 @@ from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.conditioning import Shape, condition, update_windows
+from foldgauss.video.economy import MOST_SOLID, frame_weights
 from foldgauss.video.economy import cut as cut_rows
-from foldgauss.video.economy import frame_weights
 from foldgauss.video.finish import refitted
 from foldgauss.video.fit import fit_steps, start, to_model
 from foldgauss.video.growth import Growth
@@ -288,6 +288,10 @@ def test_numbers_are_shared_where_it_pays(width):
     np.testing.assert_allclose(averaged(few, shared(few, weight, 1e-3, 0)), few, atol=1e-5)
     assert shared(many, weight, 1e-6, 0) is None
     assert len(np.unique(shared(many, weight, 10.0, 0))) == 8  # dear numbers: few rows
+    bounded = shared(many, weight, 10.0, 0, most=0.05 * width * 400)  # of an error of about width a row
+    assert len(np.unique(bounded)) > 8
+    assert ((many - averaged(many, bounded)) ** 2).sum() <= 0.05 * width * 400
+    assert shared(many, weight, 10.0, 0, most=0.0) is None
 
 
 def test_what_is_shared_learns_as_one():
@@ -431,6 +435,20 @@ def test_no_light_coming_through_costs_what_it_says(scene):
     assert np.abs(told[chosen] - cost).max() < 0.25 * max(map(abs, cost))
 
 
+def test_few_become_solid_at_once():
+    """However dear a number: what is behind one solid Gaussian depends on the others."""
+    frames, rows, shape, times, drawn = _scene()
+    ledger, kinds = _measured(rows, frames, shape, times, drawn), np.full(len(rows), shape.degree, np.uint8)
+    how = {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
+    made = cut_rows(rows, kinds, ledger, Economy(bits=1e6, most_dropped=1e-9), **how)
+    solid = is_solid(made.kinds)
+    assert 0 < solid.sum() <= np.ceil(MOST_SOLID * len(rows))
+    told = ledger.solid(1 / (1 + np.exp(-rows[:, columns(2)["opacity_logit"].start].astype(float))))[made.stay]
+    assert told[solid].max() <= told[~solid].min()
+    again = cut_rows(made.rows, made.kinds, _measured(made.rows, frames, shape, times, drawn), Economy(), **how)
+    assert is_solid(again.kinds).sum() >= is_solid(made.kinds)[again.stay].sum()  # those that are stay so
+
+
 def test_opacities_stay_where_they_are_asked_for():
     frames, rows, shape, times, drawn = _scene()
     ledger, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
@@ -548,6 +566,16 @@ def test_the_smallest_at_a_psnr():
     assert smallest.model.num_floats < 0.35 * plain.num_floats
 
 
+def test_what_is_shown_over_black_counts():
+    """Frames with alpha are measured over other colours than they are held to: half of them are seen through."""
+    shape = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
+    alpha = np.where(np.abs(shape.astype(int) - shape[0, 0, 0]).max(-1, keepdims=True) > 20, 255, 0).astype(np.uint8)
+    frames = np.concatenate([shape * (alpha > 0), alpha], -1)
+    result = fit(frames, FitConfig(num_gaussians=200, steps=400, economy=Economy(psnr=26)))
+    assert result.history[-1].stopped_by == "smallest_at_psnr"
+    assert 26 <= evaluate(result.model, frames).mean_psnr < 28
+
+
 def test_a_psnr_out_of_reach_is_told():
     result = fit(noise(4), FitConfig(num_gaussians=60, steps=60, economy=Economy(psnr=60)))
     assert result.history[-1].stopped_by == "steps"
@@ -600,7 +628,7 @@ def test_bad_numbers_are_refused(changes, name):
 
 @pytest.mark.parametrize("psnr", [None, 30])
 def test_a_target_is_not_for_economies(psnr):
-    with pytest.raises(ValueError, match=r"^economy: expected None with compositing 'sum'"):
+    with pytest.raises(ValueError, match=r"^compositing: expected 'over' with an economy"):
         FitConfig(compositing="sum", economy=Economy(psnr=psnr))
     with pytest.raises(ValueError, match=r"^target_psnr: expected None with an economy"):
         FitConfig(target_psnr=30, economy=Economy(psnr=psnr))
