@@ -3,20 +3,21 @@
     python -m benchmarks.ablation [--json FILE] [--size HxW] [--minutes M | --steps N] [--preset paper|standard]
                                   [--clip bunny|bikes|carphone|PATH] [--frames A:B] [--seed S]
 
-Batches of 1, 3, 5 by degrees 1, 3, 5, 7, 9 (table:bs-pol), and 0.1 to 0.6 million Gaussians at the start (table:init-gauss;
-batches of 3, degree 7): 20 fits, as the two tables have one in common. (The paper's has 38.53 dB and 0.62 million
-Gaussians in both tables: so all of table:bs-pol starts from 0.1 million.)
+Batches of 1, 3, 5 by degrees 1, 3, 5, 7, 9 (table:bs-pol), and 0.1 to 0.6 million Gaussians at the start
+(table:init-gauss; batches of 3, degree 7): 20 fits, as the two tables have one in common. (The paper's has 38.53 dB and
+0.62 million Gaussians in both tables: so all of table:bs-pol starts from 0.1 million.)
 
 Without options: *Bunny* at 160x320, all fits within 60 minutes together. Numbers of Gaussians, given for 640x1280, are
 in proportion to the pixels. All fits take the same number of steps: as many as the minutes allow by a short timing of
-each batch size with as many Gaussians as the paper's ended with, or --steps. A step of batch 5 sees five times the frames
-of one of batch 1, in the paper as here: frames seen stand beside the steps. With --json each fit that is done is kept
-there, and the same command goes on after it, with the same steps.
+each batch size with as many Gaussians as the paper's ended with, or --steps. A step of batch 5 sees five times the
+frames of one of batch 1, in the paper as here: frames seen stand beside the steps. With --json each fit that is done is
+kept there, and the same command goes on after it, with the same steps.
 
 PSNR is of 8-bit pictures, mean over all frames. `benchmarks.ideas` asks the same of the ideas of the default fit.
 """
 
 import dataclasses
+import statistics
 from pathlib import Path
 
 from benchmarks import _common, fit_clip, presets
@@ -49,8 +50,8 @@ PAPER_STARTS = {
 PAPER_STEPS = 30_000
 #: Of the minutes, what fits may take by the estimate: the rest is evaluation, and slow minutes.
 USABLE = 0.85
-#: A difference below this says nothing: seeds differ by as much.
-NOTHING = 0.1
+#: dB: a difference that says nothing, as seeds differ by as much; and what is little beyond degree 3.
+NOTHING, LITTLE = 0.1, 0.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,30 +138,42 @@ def show_starts(made: dict[Cell, Run], size: tuple[int, int], steps: int) -> Non
 def trend(made: dict[Cell, Run]) -> list[str]:
     """Whether what the paper finds is so here, in words: by the numbers alone."""
     grid = {(batch, degree): made[Cell(batch, degree, STARTS[0])]["psnr"] for batch in BATCHES for degree in DEGREES}
-    starts = {start: made[Cell(BATCH, DEGREE, start)]["psnr"] for start in STARTS}
-    best = max(grid, key=grid.get)
-    means = {batch: sum(grid[batch, degree] for degree in DEGREES) / len(DEGREES) for batch in BATCHES}
+    return [_best_batch(grid), _best_cell(grid), _higher_degrees(grid), _best_start(made)]
+
+
+def _said(claim: str, holds: bool, figures: str) -> str:
+    return f"{claim}: {'holds' if holds else 'does not hold'}. {figures}"
+
+
+def _best_batch(grid: dict[tuple[int, int], float]) -> str:
+    means = {batch: statistics.fmean(grid[batch, degree] for degree in DEGREES) for batch in BATCHES}
     first, *others = sorted(means, key=means.get, reverse=True)
+    over = " and ".join(f"{means[first] - means[other]:.2f} dB over batch {other}" for other in others)
+    return _said(f"Batch {BATCH} best, mean over degrees", first == BATCH, f"Batch {first} is, by {over}.")
+
+
+def _best_cell(grid: dict[tuple[int, int], float]) -> str:
+    batch, degree = max(grid, key=grid.get)
+    short = grid[batch, degree] - grid[BATCH, DEGREE]
+    figures = f"Batch {batch} with degree {degree} is, by {short:.2f} dB over that"
+    figures += ", which says nothing." if 0 < short < NOTHING else "."
+    return _said(f"Batch {BATCH} with degree {DEGREE} best of all", short == 0, figures if short else "")
+
+
+def _higher_degrees(grid: dict[tuple[int, int], float]) -> str:
     beyond = {batch: max(grid[batch, degree] for degree in DEGREES if degree > 3) - grid[batch, 3] for batch in BATCHES}
-    up_to = {batch: grid[batch, 3] - grid[batch, 1] for batch in BATCHES}
+    up_to = ", ".join(f"{grid[batch, 3] - grid[batch, 1]:+.2f}" for batch in BATCHES)
+    figures = ", ".join(f"{gain:+.2f} dB with batch {batch}" for batch, gain in beyond.items())
+    figures = f"The best higher degree brings {figures}; degree 3 over degree 1 {up_to}."
+    return _said(f"Below {LITTLE:g} dB beyond degree 3 (the paper: 0.22)", max(beyond.values()) < LITTLE, figures)
+
+
+def _best_start(made: dict[Cell, Run]) -> str:
+    starts = {start: made[Cell(BATCH, DEGREE, start)]["psnr"] for start in STARTS}
     top = max(starts, key=starts.get)
-    short = grid[best] - grid[BATCH, DEGREE]
-    return [
-        f"Batch {BATCH} best, mean over degrees: {'holds' if first == BATCH else 'does not hold'}. "
-        + f"Batch {first} is, by {means[first] - means[others[0]]:.2f} dB over batch {others[0]} "
-        + f"and {means[first] - means[others[1]]:.2f} over batch {others[1]}.",
-        f"Batch {BATCH} with degree {DEGREE} best of all: "
-        + ("holds." if best == (BATCH, DEGREE) else f"does not hold. Batch {best[0]}, degree {best[1]} is")
-        + ("" if best == (BATCH, DEGREE) else f", by {short:.2f} dB{', which says nothing' * (short < NOTHING)}."),
-        f"Little beyond degree 3 (the paper: at most 0.22 dB): {'holds' if max(beyond.values()) < 0.3 else 'does not hold'}. "
-        + "The best higher degree brings "
-        + ", ".join(f"{gain:+.2f} dB with batch {batch}" for batch, gain in beyond.items())
-        + "; degree 3 over degree 1 "
-        + ", ".join(f"{gain:+.2f}" for gain in up_to.values())
-        + ".",
-        f"Half a million at the start best: {'holds' if top == 0.5 else 'does not hold'}. {top:g} M is, "
-        + f"{starts[top] - starts[0.1]:.2f} dB over 0.1 M (the paper: 0.49), {starts[top] - starts[0.5]:.2f} over 0.5 M.",
-    ]
+    figures = f"{top:g} M is, by {starts[top] - starts[0.1]:.2f} dB over 0.1 M (the paper: 0.49)"
+    figures += "." if top == 0.5 else f" and {starts[top] - starts[0.5]:.2f} over 0.5 M."
+    return _said("Half a million at the start best", top == 0.5, figures)
 
 
 def count(num: float) -> str:
