@@ -82,7 +82,9 @@ def scores(model: Any, frames: np.ndarray, *, with_ssim: bool = True) -> Run:
     """Mean PSNR, and SSIM, over all frames, of 8-bit pictures of anything that has `frames()`."""
     pairs = [(psnr(*pair), ssim(*pair) if with_ssim else 0.0) for pair in zip(frames, model.frames(), strict=True)]
     by_psnr, by_ssim = zip(*pairs, strict=True)
-    return {"psnr": statistics.fmean(by_psnr)} | ({"ssim": statistics.fmean(by_ssim)} if with_ssim else {})
+    return {"psnr": statistics.fmean(by_psnr), "worst_psnr": min(by_psnr)} | (
+        {"ssim": statistics.fmean(by_ssim)} if with_ssim else {}
+    )
 
 
 def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True) -> tuple[VideoModel, Run]:

@@ -34,7 +34,7 @@ SMALL, FULL = ("480p",), ("Full-Resolution", "1080p")  # names of folders: DAVIS
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table of the paper: (PSNR, SSIM) by method and sequence, SSIM None where it is not given; its own average last."""
+    """A table of the paper: (PSNR, SSIM) by method and sequence, its own average last; SSIM None where not given."""
 
     label: str
     sequences: tuple[str, ...]  # as DAVIS calls them
