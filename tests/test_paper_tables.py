@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import statistics
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 from benchmarks import ablation, davis, folding_gain, frame_times, presets
 from benchmarks._runs import Runs, kept_setting, scaled, scores, seconds_per_step
 from foldgauss.io.video_file import Clip, write_video
-from foldgauss.video import FitConfig
+from foldgauss.video import FitConfig, psnr, ssim
 
 SIZE, NUM_FRAMES = (24, 32), 6
 
@@ -30,8 +31,8 @@ def clip(tmp_path_factory):
 
 
 def printed(capsys):
-    """All that was printed, a space between words."""
-    return " ".join(capsys.readouterr().out.split())
+    """All that was printed, a space between words, without the lines of tables."""
+    return " ".join(re.sub("[│┃|]", " ", capsys.readouterr().out).split())
 
 
 class TestRuns:
@@ -82,14 +83,18 @@ class TestRuns:
         assert scaled(1, (1, 1)) == 1
 
     def test_scores_are_means(self):
-        class Shown:
-            def frames(self):
-                yield from blob() + np.uint8(2)
+        shown = [np.clip(frame.astype(int) + 2 + k, 0, 255).astype(np.uint8) for k, frame in enumerate(blob())]
 
-        found = scores(Shown(), blob())
-        assert found["worst_psnr"] <= found["psnr"] < 45
-        assert 0.9 < found["ssim"] < 1
-        assert "ssim" not in scores(Shown(), blob(), with_ssim=False)
+        class Model:
+            def frames(self):
+                yield from shown
+
+        found = scores(Model(), blob())
+        each = [psnr(*pair) for pair in zip(blob(), shown, strict=True)]
+        assert found["psnr"] == pytest.approx(np.mean(each))
+        assert found["worst_psnr"] == min(each) == each[-1]
+        assert found["ssim"] == pytest.approx(np.mean([ssim(*pair) for pair in zip(blob(), shown, strict=True)]))
+        assert scores(Model(), blob(), with_ssim=False) == {name: found[name] for name in ("psnr", "worst_psnr")}
 
     def test_the_pace_is_that_of_the_number_given(self, monkeypatch):
         asked = []
@@ -140,11 +145,11 @@ class TestAblation:
         assert config.growth is not None
 
     def test_steps_fill_the_minutes(self):
-        pace = {1: 0.01, 3: 0.03, 5: 0.05}
+        pace = {1: 0.01, 3: 0.03, 5: 0.04}
         steps = ablation.steps_within(60, pace)
         seconds = steps * sum(pace[cell.batch] for cell in ablation.cells())
         assert 0.75 * 3600 < seconds <= 0.85 * 3600
-        assert steps == 5100
+        assert steps == 5500
         assert ablation.steps_within(1e-6, pace) == 1
 
     def paper(self):
@@ -167,7 +172,7 @@ class TestAblation:
         made[ablation.Cell(3, 7, 0.6)] = {"psnr": 39.5}
         words = ablation.trend(made)
         assert [": does not hold. " in each for each in words] == [True] * 4
-        assert "Batch 1 is, by 0.31 dB over batch 3" in words[0]
+        assert "Batch 1 is, by 0.42 dB over batch 3" in words[0]
         assert "Batch 1 with degree 9 is, by 6.47 dB over that." in words[1]
         assert "0.6 M is, by 0.97 dB over 0.1 M (the paper: 0.49) and 0.48 over 0.5 M." in words[3]
         made[ablation.Cell(1, 9, 0.1)] = {"psnr": 38.58}
@@ -203,7 +208,6 @@ class TestAblation:
             ablation.main([*command, "--seed", "1"])
         assert "seed 0 instead of 1" in capsys.readouterr().err
 
-    @pytest.mark.slow
     def test_tiny(self, clip, capsys):
         ablation.main(["--clip", str(clip), "--size", "24x32", "--steps", "20"])
         assert "What the paper finds" in capsys.readouterr().out
@@ -258,11 +262,12 @@ class TestDavis:
 
     @pytest.mark.parametrize("table", davis.TABLES.values(), ids=lambda table: table.label)
     def test_the_papers_averages_are_those_of_its_figures(self, table):
-        """So a figure copied wrongly shows."""
+        """So a figure copied wrongly shows. (That of VeGaS-480p is 0.017 dB off in the paper itself.)"""
         for method, values in table.paper.items():
             assert len(values) == len(table.sequences) + 1, method
             for kind, error in ((0, 0.006), (1, 0.0011)):
                 *own, average = (value[kind] for value in values)
+                error = 0.018 if method == "VeGaS-480p" else error
                 if average is not None:
                     assert statistics.fmean(own) == pytest.approx(average, abs=error), method
 
@@ -393,7 +398,7 @@ class TestFrameTimes:
         assert (true["step_where_doubled"], true["step_elsewhere"]) == (pytest.approx(0), pytest.approx(1))
         assert true["step_where_dropped"] >= 2
         even = frame_times.recovered(np.linspace(0, 1, len(shown)), shown)
-        assert even["rmse"] == even["rmse_even"] == true["rmse_even"]
+        assert even["rmse"] == pytest.approx(even["rmse_even"]) == true["rmse_even"]
         assert (even["correlation"], even["step_where_doubled"]) == (0, pytest.approx(shown[-1] / (len(shown) - 1)))
 
     def test_tiny(self, clip, tmp_path, capsys):
@@ -407,12 +412,13 @@ class TestFrameTimes:
         assert min(cv2.imread(str(tmp_path / "t.png")).shape[:2]) > 300
         assert "1 left out, 1 shown twice" in printed(capsys)
 
-    @pytest.mark.slow
     def test_learned_times_find_what_was_done(self, tmp_path):
         """A blob at a constant pace: the true times are what makes its fold simple."""
         write_video(tmp_path / "long", blob(24, (32, 64)), 12.0)
         command = ["--clip", str(tmp_path / "long"), "--gaussians", "300", "--steps", "2000"]
         frame_times.main([*command, "--json", str(tmp_path / "t.json")])
         figures = json.loads((tmp_path / "t.json").read_text())["figures"]
-        assert figures["step_where_doubled"] < 0.5 < figures["step_elsewhere"]
         assert figures["correlation_of_steps"] > 0.7
+        assert figures["step_where_doubled"] < figures["step_elsewhere"] < figures["step_where_dropped"]
+        assert figures["rmse"] < 0.85 * figures["rmse_even"]
+        assert figures["gain"] > 0.5
