@@ -1,13 +1,14 @@
 """What folds bring: a folded video against every frame its own Gaussians (eq:miragevideo), at equal numbers stored.
 
     python -m benchmarks.folding_gain [--json FILE] [--clip bunny|bikes|carphone|PATH ...] [--size HxW] [--frames A:B]
-                                      [--minutes M | --steps N] [--gaussians N] [--seed S]
+                                      [--minutes M | --steps N] [--longer F] [--gaussians N] [--seed S]
 
 Without options: *bunny* at 160x320, *bikes* and *carphone* at their own sizes, 3 minutes for each of the two fits, some
 20 minutes in all. The default fit first; then `independent_frames` with as many numbers (a Gaussian of one frame takes
 9: it has no time, no sigma_t and no fold) in as many seconds of fitting. With --json each fit that is done is kept
 there, and the same command goes on after it. With --steps both see every frame equally often instead: a try, not a fair
-match, since a step of a few hundred Gaussians costs less.
+match, since a step of a few hundred Gaussians costs less. `--longer F` adds the control with F times the time or steps:
+what it comes to if it may.
 
 PSNR and SSIM are of 8-bit pictures, mean over all frames.
 """
@@ -34,15 +35,19 @@ def of_frames(clip: Clip, num_floats: int, config: FitConfig) -> Run:
     return run | {"steps": made.steps, "frames_seen": made.steps * config.batch_size, "seconds": made.seconds}
 
 
-def measure(name: str, clip: Clip, config: FitConfig, runs: Runs) -> dict[str, Run]:
-    """Both fits of a clip."""
+def measure(name: str, clip: Clip, config: FitConfig, runs: Runs, longer: float | None = None) -> dict[str, Run]:
+    """Both fits of a clip; and with `longer` the control with so many times the budget."""
     folded = runs.get(f"{name} {FOLDED}", lambda: fitted(clip, config)[1])
-    own = dataclasses.replace(config, num_gaussians=None)
-    if config.minutes is not None:
-        own = dataclasses.replace(own, minutes=folded["seconds"] / 60)
-    else:
-        own = dataclasses.replace(own, steps=max(round(folded["steps"] / clip.num_frames), 1))
-    return {FOLDED: folded, ALONE: runs.get(f"{name} {ALONE}", lambda: of_frames(clip, folded["floats"], own))}
+    times = {ALONE: 1.0} | ({f"{ALONE}, {longer:g} times as long": longer} if longer else {})
+    made = {FOLDED: folded}
+    for title, factor in times.items():
+        if config.minutes is not None:
+            budget = {"minutes": factor * folded["seconds"] / 60}
+        else:
+            budget = {"steps": max(round(factor * folded["steps"] / clip.num_frames), 1)}
+        own = dataclasses.replace(config, num_gaussians=None, **budget)
+        made[title] = runs.get(f"{name} {title}", lambda own=own: of_frames(clip, folded["floats"], own))
+    return made
 
 
 def show(title: str, made: dict[str, Run]) -> None:
@@ -53,7 +58,8 @@ def show(title: str, made: dict[str, Run]) -> None:
         counts = (f"{run[count]:,}" for count in ("gaussians", "floats", "frames_seen"))
         table.add_row(name, *quality, *counts, f"{run['seconds'] / 60:.2f}")
     table.add_section()
-    table.add_row("what folding brings", f"{made[FOLDED]['psnr'] - made[ALONE]['psnr']:+.2f}")
+    for name, run in list(made.items())[1:]:
+        table.add_row(f"folded above {name}", f"{made[FOLDED]['psnr'] - run['psnr']:+.2f}")
     console.print(table)
 
 
@@ -71,9 +77,11 @@ def main(arguments: list[str] | None = None) -> None:
         path = sample_clip(name) if name in fit_clip.SAMPLES else Path(name)
         clip = read_video(path, frames=options.frames, size=options.size or SIZES.get(name))
         config = FitConfig(num_gaussians=options.gaussians, seed=options.seed, **budget)
-        made = measure(path.name, clip, config, runs)
+        made = measure(path.name, clip, config, runs, options.longer)
         show(f"{path.stem}: {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, seed {options.seed}", made)
-        figures[f"gain_{Path(name).stem}"] = made[FOLDED]["psnr"] - made[ALONE]["psnr"]
+        for title, run in list(made.items())[1:]:
+            end = "" if title == ALONE else f"_over_{options.longer:g}_times_as_long"
+            figures[f"gain_{Path(name).stem}{end}"] = made[FOLDED]["psnr"] - run["psnr"]
     _common.finish(None, figures, _common.machine())
     runs.write(figures=figures)
 
@@ -87,6 +95,7 @@ def _parser():
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--minutes", type=presets.minutes, default=MINUTES, help=f"of each fit [{MINUTES:g}]")
     length.add_argument("--steps", type=_common.whole, help="of the folded fit, instead of minutes")
+    parser.add_argument("--longer", type=presets.minutes, metavar="F", help="the control again, F times as long")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     return parser
 

@@ -333,7 +333,7 @@ class TestDavis:
             (("--sequences", "bear,cat"), "--sequences: expected some of"),
             (("--root", "nowhere"), "--root: expected a folder with JPEGImages"),
             (("--sequences", "train"), "--root: expected any of train"),
-            (("--minutes", "0"), "expected a number of minutes > 0"),
+            (("--minutes", "0"), "--minutes: expected a number > 0"),
         ],
     )
     def test_wrong_use(self, root, capsys, arguments, said):
@@ -356,7 +356,7 @@ class TestFoldingGain:
         assert folded["floats"] - 9 < alone["floats"] + 9 * 5  # the rest is less than a Gaussian in each frame
         assert alone["floats"] <= folded["floats"]
         assert kept["figures"]["gain_clip"] == pytest.approx(folded["psnr"] - alone["psnr"])
-        assert "what folding brings" in printed(capsys)
+        assert "folded above independent frames" in printed(capsys)
 
     def test_the_control_gets_what_the_fold_had(self, clip, monkeypatch):
         asked = []
@@ -367,7 +367,10 @@ class TestFoldingGain:
         command = ["--clip", str(clip), "--size", "24x32", "--gaussians", "60", "--seed", "5"]
         folding_gain.main([*command, "--minutes", "3"])
         folding_gain.main([*command, "--steps", "1200"])
-        (num, timed), (_, counted) = asked
+        folding_gain.main([*command, "--minutes", "3", "--longer", "4"])
+        (num, timed), (_, counted), (_, again), (_, longer) = asked
+        assert again == timed
+        assert longer == FitConfig(minutes=4 * 42 / 60, seed=5)
         assert num == 9 * 120
         assert timed == FitConfig(minutes=42 / 60, seed=5)
         assert counted == FitConfig(steps=200, seed=5)  # as often as the fold sees each of the six frames
