@@ -17,7 +17,16 @@ def kernel(function: Callable) -> Callable:
     Numba looks at the function's own file to tell whether kept code is stale: a constant from another module must be
     handed in as an argument. Where nothing can be written, code is compiled anew by every process.
     """
+    return _compiled(function, _OPTIONS)
+
+
+def exact_kernel(function: Callable) -> Callable:
+    """As `kernel`, but every operation is rounded as IEEE 754 says, in the order written: the same bits everywhere."""
+    return _compiled(function, {"error_model": "numpy"})
+
+
+def _compiled(function: Callable, options: dict) -> Callable:
     try:
-        return nb.njit(nogil=True, cache=True, **_OPTIONS)(function)
+        return nb.njit(nogil=True, cache=True, **options)(function)
     except RuntimeError:  # no place to keep it: a read-only installation with no home
-        return nb.njit(nogil=True, **_OPTIONS)(function)
+        return nb.njit(nogil=True, **options)(function)

@@ -239,9 +239,13 @@ def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
         told["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
     if lasting := sum(int(splats.lasting.sum()) for splats in parts):
         told["lasting"] = f"{lasting:,} of {len(degrees):,} Gaussians, throughout the clip"
-    shared = [(splats.num_gaussians, stored_counts(to_stored(splats)).get("colors")) for splats in parts]
-    if any(num_colors for _, num_colors in shared):
-        told["colours"] = ", ".join(f"{colors:,} of {num:,} Gaussians" for num, colors in shared if colors)
+    if solid := sum(int(splats.solid.sum()) for splats in parts):
+        told["solid"] = f"{solid:,} of {len(degrees):,} Gaussians, no light comes through"
+    counted = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
+    for what, name in (("colors", "colours"), ("shapes", "shapes")):
+        shared = [f"{counts[what]:,} of {num:,} Gaussians" for num, counts in counted if what in counts]
+        if shared:
+            told[name] = ", ".join(shared)
     return told
 
 

@@ -17,24 +17,27 @@ import numpy as np
 from foldgauss._checks import invalid, one_of, whole, within
 from foldgauss.io import _range_coder
 from foldgauss.io._atomic import atomic_path, checked_path
+from foldgauss.io._columns import Walk
 from foldgauss.io.model_file import ModelFileError, plain, to_json
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.model import VideoModel
 from foldgauss.video.quantise import (
     FEATURES,
     MAX_DEGREE,
+    MOST_CELL_BITS,
+    MOST_SHARED,
     Facts,
     Quantised,
     Rule,
-    Unrolling,
     column_names,
     dequantise,
+    is_whole,
 )
 
 COMPACT_SUFFIX = ".fgz"
 #: As PNG's: a byte that no text has, line ends of both kinds that a careless transfer would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
-VERSION = 1
+VERSION = 2
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
 #: No byte may hold more Gaussians or frames, so that a small file cannot ask for much memory: filled up with spaces.
@@ -63,17 +66,20 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
 
 def packed(quantised: Quantised, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    facts, unrolling = quantised.facts, Unrolling(quantised.rules, quantised.facts.num_gaussians)
+    facts, walk = quantised.facts, Walk(quantised.rules, quantised.facts)
     streams, described = [], []
-    for name in column_names(facts.degree):
-        halves, numbers, rule = unrolling.halves(name), quantised.columns[name], quantised.rules[name]
-        streams.append(_range_coder.encode(numbers, _contexts(halves)))
-        unrolling.add(name, numbers, halves)
-        own = {"origin": rule.origin, "exponent": rule.exponent, "slopes": list(rule.slopes)}
-        described.append(own | {"name": name, "bytes": len(streams[-1])})
-    streams.append(_range_coder.encode(quantised.intervals, np.zeros(len(quantised.intervals), np.uint8)))
+    for name in column_names(facts.degree, facts.shared):
+        numbers = quantised.columns[name]
+        column = walk.column(name)
+        streams.append(_range_coder.encode(_steps(numbers, facts) if name == "cell" else numbers, column))
+        walk.add(name, numbers)
+        rule = quantised.rules.get(name)
+        own = [] if is_whole(name) else [rule.origin, rule.exponent, *rule.slopes]
+        described.append([len(streams[-1]), *own])
+    intervals = quantised.intervals
+    streams.append(_range_coder.encode(intervals, _range_coder.Column.plain(len(intervals))))
     header = dataclasses.asdict(facts) | {
-        "num_frames": len(quantised.intervals) + 1,
+        "num_frames": len(intervals) + 1,
         "columns": described,
         "intervals": len(streams[-1]),
         "metadata": plain(metadata or {}),
@@ -86,9 +92,13 @@ def packed(quantised: Quantised, metadata: dict | None = None) -> bytes:
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
-def _contexts(halves: np.ndarray) -> np.ndarray:
-    """Numbers of like steps are of like size, and share their probabilities."""
-    return ((halves >> 1) & (_range_coder.CONTEXTS - 1)).astype(np.uint8)
+def _steps(cells: np.ndarray, facts: Facts) -> np.ndarray:
+    """From each cell to the next, around the end."""
+    return np.diff(cells, prepend=0) & ((1 << sum(facts.cells)) - 1)
+
+
+def _cells(steps: np.ndarray, facts: Facts) -> np.ndarray:
+    return (np.cumsum(steps, dtype=np.int64) & ((1 << sum(facts.cells)) - 1)).astype(np.int32)
 
 
 # ---------------------------------------------------------------------------------------------- reading
@@ -152,7 +162,7 @@ def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
                     "path",
                     expected=f"a compact model of version {VERSION}, which this program reads",
                     got=f"version {version} in {str(path)!r}",
-                    cure="Update foldgauss.",
+                    cure="Compress the model again." if version < VERSION else "Update foldgauss.",
                 )
             )
         )
@@ -177,20 +187,29 @@ def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
     num, num_frames = facts.num_gaussians, header["num_frames"]
     _check(whole(num_frames, 1), "num_frames", num_frames)
     _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
-    names = column_names(facts.degree)
+    names = column_names(facts.degree, facts.shared)
     described = header["columns"]
-    _check(isinstance(described, list) and [own["name"] for own in described] == list(names), "columns", "others")
-    lengths = [own["bytes"] for own in described] + [header["intervals"]]
+    _check(isinstance(described, list) and len(described) == len(names), "columns", "others")
+    lengths = [own[0] for own in described] + [header["intervals"]]
     _check(all(whole(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
-    rules = {own["name"]: _rule(own, k) for k, own in enumerate(described)}
-    unrolling, columns, start = Unrolling(rules, num), {}, 0
+    rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_whole(name)}
+    _check(all(is_whole(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)), "rule", "none")
+    walk, columns, start = Walk(rules, facts), {}, 0
     for name, length in zip(names, lengths[:-1], strict=True):
-        halves = unrolling.halves(name)
-        columns[name] = _range_coder.decode(body[start : start + length], _contexts(halves))
-        unrolling.add(name, columns[name], halves)
+        numbers = _range_coder.decode(body[start : start + length], walk.column(name))
+        columns[name] = _cells(numbers, facts) if name == "cell" else numbers
+        _check_numbers(name, columns[name], facts)
+        walk.add(name, columns[name])
         start += length
-    intervals = _range_coder.decode(body[start:], np.zeros(num_frames - 1, np.uint8))
+    intervals = _range_coder.decode(body[start:], _range_coder.Column.plain(num_frames - 1))
     return Quantised(facts, rules, columns, intervals)
+
+
+def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:
+    """Numbers that others are looked up by."""
+    most = {"without": 3, "degree": facts.degree, "shade": facts.shared - 1}.get(name)
+    if most is not None:
+        _check(numbers.min() >= 0 and numbers.max() <= most, name, "numbers out of range")
 
 
 def _facts(header: dict) -> Facts:
@@ -198,18 +217,24 @@ def _facts(header: dict) -> Facts:
     _check(isinstance(size, list) and len(size) == 2 and all(whole(n, 1) and n <= _SIDE for n in size), "size", size)
     _check(whole(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
     _check(whole(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
+    cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
+    _check(isinstance(cells, list) and len(cells) == 3 and all(whole(n, 0) for n in cells), "cells", cells)
+    _check(sum(cells) <= MOST_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
+    _check(whole(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
         _check(within(header[name], interval), name, header[name])
     one_of("compositing", header["compositing"], COMPOSITINGS)
     names = [field.name for field in dataclasses.fields(Facts)]
-    return Facts(**{name: header[name] for name in names} | {"size": tuple(size), "options": RenderOptions(**options)})
+    return Facts(
+        **{name: header[name] for name in names}
+        | {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**options)}
+    )
 
 
-def _rule(own: dict, place: int) -> Rule:
-    numbers = [own["origin"], own["exponent"], *own["slopes"]]
-    known = min(place, len(FEATURES))
-    _check(len(own["slopes"]) <= known and all(within(x, "[-1e9, 1e9]") for x in numbers), "rule", own["name"])
+def _rule(name: str, numbers: list) -> Rule:
+    known = FEATURES.index(name) if name in FEATURES else len(FEATURES)
+    _check(2 <= len(numbers) <= 2 + known and all(within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
     return Rule(numbers[0], numbers[1], tuple(numbers[2:]))
 
 

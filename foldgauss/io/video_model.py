@@ -20,12 +20,13 @@ from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
 from foldgauss.video.edit import Edit
 from foldgauss.video.edited import EditedVideo, Layer
-from foldgauss.video.fit import TIME_ADAM, FitState
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Statistics
 from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
+from foldgauss.video.sharing import Palette
+from foldgauss.video.state import TIME_ADAM, FitState
 from foldgauss.video.stored import from_stored, stored_counts, stored_skeleton, to_stored
 
 MODEL_SUFFIX = ".safetensors"
@@ -224,12 +225,24 @@ def _describe_checkpoint(state: FitState) -> dict:
         "width": width,
         "num_intervals": len(state.time_logits),
         "growing": state.statistics is not None,
-        "num_shared": len(state.palette),
+        "colors": _counts(state.colors),
+        "shapes": _counts(state.shapes),
         "step": state.step,
         "plan": state.plan,
         "seconds": state.seconds,
         "error": state.error,
     }
+
+
+def _counts(palette: Palette) -> list[int]:
+    return [len(palette.index), len(palette.counts)]
+
+
+def _palette_skeleton(counts: list[int], width: int) -> Palette:
+    num, entries = counts
+    integers = [jax.ShapeDtypeStruct((count,), np.int32) for count in (num, entries)]
+    moments = jax.ShapeDtypeStruct((entries, width), np.float32)
+    return Palette(integers[0], moments, moments, integers[1])
 
 
 def _checkpoint_skeleton(header: dict) -> FitState:
@@ -246,7 +259,9 @@ def _checkpoint_skeleton(header: dict) -> FitState:
         counts=counts,
         kinds=jax.ShapeDtypeStruct((num,), np.uint8),
         young=jax.ShapeDtypeStruct((num,), np.bool_),
-        palette=jax.ShapeDtypeStruct((header["num_shared"],), np.int32),
+        colors=_palette_skeleton(header["colors"], 3),
+        shapes=_palette_skeleton(header["shapes"], 2),
+        frame_errors=floats(intervals + 1),
         time_logits=floats(intervals),
         time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
         statistics=Statistics(floats(num), floats(num), counts) if header["growing"] else None,

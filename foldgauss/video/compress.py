@@ -2,12 +2,14 @@
 
 Each number's step is chosen by what its error does to the picture (`sensitivities`): in the optimum of coding theory,
 where bits and errors trade at one rate, every number adds the same error. One factor scales all steps; it is found by
-bisection, each try rendered and measured. Gaussians whose loss costs less than their bits are worth are left out, and
-what is not rounded yet is fitted to the clip anew (`finish`), to make up for what is.
+bisection, each try rendered and measured. Gaussians whose loss costs less than their bits are worth are left out, the
+others put into an order that is cheap to tell (`ordering`), and what is not rounded yet is fitted to the clip anew
+(`finish`), to make up for what is.
 """
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable
 
 import equinox as eqx
@@ -21,19 +23,25 @@ from foldgauss.video.finish import COLOR, PATH_AND_COLOR, refitted
 from foldgauss.video.light import LitModel
 from foldgauss.video.metrics import psnr as psnr_of
 from foldgauss.video.model import SH_C0, VideoModel, check_model
+from foldgauss.video.ordering import free_order, overlaps
 from foldgauss.video.playback import Playback
 from foldgauss.video.quantise import (
+    ABSENT,
     AXES,
+    COLORS,
     FEATURES,
     Described,
     Quantised,
     Rule,
+    cells_of,
     column_names,
     dequantise,
     describe,
     in_clip,
-    moved_to,
+    is_whole,
+    lower_paths,
     quantise,
+    shades,
     values_of,
 )
 from foldgauss.video.sensitivity import sensitivities
@@ -54,11 +62,16 @@ _WORTH = 40.0
 _COARSER, _SLOPE = 1.7, 0.7
 #: Tries with mending, each of passes / 2 + passes / 4 passes; and the share of the loss allowed that ends them.
 _TRIES, _ENOUGH = 5, 0.9
+#: Of the loss allowed, what leaving Gaussians out may cost once the others are fitted anew; else the next try leaves
+#: out as many as steps finer by so many powers of two would.
+_MISSED, _FEWER = 0.4, 0.7
+#: Of the squared error allowed, what new places in the order may add, were all pairs that are let go to change places;
+#: and of the loss allowed, what they may cost.
+_ORDERING = 0.3
 #: Fewer Gaussians than this tell nothing of how steps follow geometry.
 _FEW = 100
 _NOTHING = 1e-4  # of sensitivity: of Gaussians that no picture shows
 _SOLID = 0.03  # of light left: less is none
-_COLORS = ("luma", "blue", "green")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +108,9 @@ def compress(
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own pictures.
 
+    Gaussians change places in the order where that hardly shows. What they have not got (`FoldedSplats.degrees`,
+    `lasting`, `solid`) stays away, and colours that several have in common stay so.
+
     With the clip, `passes` over its frames mend what is lost: all leaves once Gaussians have been left out; in half as
     many, paths and colours once geometry is rounded; in a quarter, colours once paths are. What is gained so allows for
     coarser steps. With 0 nothing is mended: every number is the model's own, rounded. `on_step(what, loss_db)` is
@@ -114,12 +130,14 @@ def compress(
         raise invalid("passes", expected="a whole number >= 0", got=passes)
     on_step("looking at what each number does", math.nan)
     loss = _Loss(model, frames, psnr)
-    plan = _Plan(model)
-    made = _rounded(plan, loss, max_loss_db, on_step)
+    made = None
     if passes and frames is not None:
-        factor = made.factor + _COARSER
-        mended = _mended(_some(model, plan.kept(factor)), factor, made.factor, loss, max_loss_db, passes, on_step)
-        made = made if mended is None else mended
+        plan = _Plan(model)
+        rounded = _rounded(plan, loss, max_loss_db, on_step)
+        factor = rounded.factor + _COARSER
+        made = _mended(model, plan, factor, rounded.factor, loss, max_loss_db, passes, on_step)
+    if made is None:
+        made = _rounded(_Plan(_ordered(model, loss, max_loss_db)), loss, max_loss_db, on_step)
     dropped = model.num_gaussians - made.model.num_gaussians
     return Compressed(made.quantised, made.model, made.loss_db, loss.psnr, loss.measured_by, dropped)
 
@@ -158,6 +176,7 @@ def _rounded(plan: "_Plan", loss: "_Loss", most: float, on_step: Callable) -> _T
 
 def _mended(
     model: VideoModel,
+    whole: "_Plan",
     factor: float,
     least: float,
     loss: "_Loss",
@@ -166,6 +185,7 @@ def _mended(
     on_step: Callable,
 ) -> _Try | None:
     """The coarsest steps found that lose no more than `most` once mended, `factor` first; None if not above `least`."""
+    every = np.arange(loss.num_frames)
 
     def mend(model: VideoModel, share: float, what: str, **how: object) -> VideoModel:
         def tell() -> None:
@@ -173,17 +193,24 @@ def _mended(
 
         return refitted(model, loss.target, math.ceil(share * passes), on_pass=tell, **how)
 
-    left = mend(model, 1, "fitting without those left out", seed=0)
-    plan, every = _Plan(left), np.arange(loss.num_frames)
+    while True:
+        left = _some(model, whole.kept(factor))
+        left = mend(left, 1, "fitting without those left out", seed=0, shared=shades(left))
+        found = loss(left, every)
+        if found <= _MISSED * most or factor - _FEWER <= least:
+            break
+        factor -= _FEWER  # so many cannot be made up for
+    plan = _Plan(_ordered(left, loss, most))
     best, tried = None, {}
     for _ in range(_TRIES):
         quantised = plan.at(factor)
         described = plan.described
         for what, free, share in (("paths and colours", PATH_AND_COLOR, 0.5), ("colours", COLOR, 0.25)):
             begun = _freed(quantised, described, path=free is PATH_AND_COLOR)
-            again = mend(begun, share, f"mending {what}", free=free, seed=1)
+            again = mend(begun, share, f"mending {what}", free=free, seed=1, shared=described.shade)
             described = _settled(quantised, again, path=free is PATH_AND_COLOR, before=described)
-            quantised = quantise(described, quantised.columns["class"], quantised.rules)
+            columns = quantised.columns
+            quantised = quantise(described, columns["class"], quantised.rules, columns["cell"])
         decoded = dequantise(quantised)
         tried[factor] = found = loss(decoded, every)
         on_step("mended", found)
@@ -207,14 +234,36 @@ def _next(tried: dict[float, float], most: float, least: float) -> float | None:
             return None
         share = (aim - tried[below]) / (tried[above] - tried[below])
         return below + min(max(share, 0.1), 0.9) * (above - below)
-    known = above if below is None else below
-    factor = known + (aim - tried[known]) / _SLOPE
+    nearest, *others = sorted(tried, key=lambda factor: abs(tried[factor] - aim))
+    slope = _SLOPE
+    if others:
+        slope = (tried[others[0]] - tried[nearest]) / (others[0] - nearest)
+        slope = min(max(slope, 0.3 * _SLOPE), 2 * _SLOPE)
+    factor = nearest + (aim - tried[nearest]) / slope
     return factor if least < factor <= _COARSEST + 2 else None
 
 
-def _some(model: VideoModel, kept: Bool[np.ndarray, "num"]) -> VideoModel:
+def _ordered(model: VideoModel, loss: "_Loss", most: float) -> VideoModel:
+    """Its Gaussians in an order that needs fewer bits, as long as that costs a small share of the loss allowed."""
+    samples = 3 * model.num_frames * math.prod(model.size)
+    room = _ORDERING * samples * (10 ** ((most - loss.psnr) / 10) - 10 ** (-loss.psnr / 10))
+    cells, every = cells_of(describe(model)), np.arange(loss.num_frames)
+    if model.compositing == "sum":  # which has no order
+        return _some(model, np.argsort(cells, kind="stable"))
+    before, found = loss(model, every), overlaps(LitModel(model))
+    for share in (1.0, 0.1, 0.0):
+        ordered = _some(model, free_order(cells, found, share * room))
+        if loss(ordered, every) <= before + _ORDERING * most:
+            return ordered
+    return model
+
+
+def _some(model: VideoModel, kept: Bool[np.ndarray, "num"] | Int[np.ndarray, "some"]) -> VideoModel:
+    """Its Gaussians of a mask, or of these numbers."""
+    num = model.num_gaussians
+
     def cut(leaf: np.ndarray) -> np.ndarray:
-        return np.asarray(leaf)[kept] if np.shape(leaf)[:1] == kept.shape else leaf
+        return np.asarray(leaf)[kept] if np.shape(leaf)[:1] == (num,) else leaf
 
     splats = model.splats
     envelope = splats.envelope
@@ -224,12 +273,11 @@ def _some(model: VideoModel, kept: Bool[np.ndarray, "num"]) -> VideoModel:
 
 def _freed(quantised: Quantised, described: Described, *, path: bool) -> VideoModel:
     """The model as decoded, but with colours, and paths if asked for, not rounded."""
-    model, values = dequantise(quantised), values_of(quantised)
-    color = np.stack([described.values[name] for name in _COLORS], 1) @ AXES
+    model = dequantise(quantised)
+    color = np.stack([described.values[name] for name in COLORS], 1) @ AXES
     splats = eqx.tree_at(lambda s: s.color_dc, model.splats, color.astype(np.float32))
     if path:
-        shift = in_clip(values["time"]) - described.values["time"]
-        place = moved_to(described.place, shift).astype(np.float32)
+        place = lower_paths(quantised, described).astype(np.float32)
         splats = eqx.tree_at(lambda s: (s.loc, s.coefficients), splats, (place[:, 0], place[:, 1:]))
     return eqx.tree_at(lambda m: m.splats, model, splats)
 
@@ -237,7 +285,7 @@ def _freed(quantised: Quantised, described: Described, *, path: bool) -> VideoMo
 def _settled(quantised: Quantised, again: VideoModel, *, path: bool, before: Described) -> Described:
     """What is to be rounded next: the numbers that were rounded, which stay, and those of `again` for the others."""
     now, values = describe(again), values_of(quantised)
-    values = {name: values[name] for name in before.values} | {name: now.values[name] for name in _COLORS}
+    values = {name: values[name] for name in before.values} | {name: now.values[name] for name in COLORS}
     values["time"] = in_clip(values["time"])
     # Paths that stay are rounded again from the same place, hence to the same numbers.
     place, time = (now.place, values["time"]) if path else (before.place, before.values["time"])
@@ -291,7 +339,7 @@ class _Plan:
     def __init__(self, model: VideoModel):
         self.described = describe(model)
         sensitivity, best = sensitivities(LitModel(model), self.described)
-        self._names = [name for name in column_names(self.described.facts.degree) if name != "class"]
+        self._names = [name for name in column_names(self.described.facts.degree) if not is_whole(name)]
         self._seen = best > 0
         if not self._seen.any():
             cure = "There is nothing to see in it at any frame."
@@ -306,27 +354,38 @@ class _Plan:
 
     def _fit(self, sensitivity: dict[str, Float[np.ndarray, "num"]]) -> None:
         """Logarithms of sensitivities as lines in the features; classes hold what all columns of a Gaussian share."""
-        seen, first = self._seen, FEATURES[1:]
+        first = FEATURES[1:]
         raw = np.stack([self.described.values[name] for name in first], 1)
+        for name in set(first) & set(ABSENT):
+            raw[~self.described.has(name), first.index(name)] = ABSENT[name][2]
         # Beyond the bulk a line through it says nothing: steps of odd Gaussians would run away.
-        features = np.clip(raw, *np.quantile(raw[seen], [0.001, 0.999], axis=0))
+        features = np.clip(raw, *np.quantile(raw[self._seen], [0.001, 0.999], axis=0))
         levels = {name: 0.5 * np.log2(np.maximum(sensitivity[name], _NOTHING)) for name in self._names}
         design = np.concatenate([np.ones((len(features), 1)), features], 1)
         self._fits, rest = {}, []
         for name in self._names:
-            fit = np.zeros(design.shape[1])
+            fit, seen = np.zeros(design.shape[1]), self._seen & self.described.has(name)
             shows = seen & (sensitivity[name] > _NOTHING)  # by the others, as in black frames, lines would be steep
             if name in first or shows.sum() < _FEW:
-                fit[0] = levels[name][seen].mean()
+                fit[0] = levels[name][seen].mean() if seen.any() else 0.0
             else:
                 fit = np.linalg.lstsq(design[shows], levels[name][shows], rcond=None)[0]
             self._fits[name] = fit
-            rest.append(np.clip(levels[name] - design @ fit, -6, 6))
-        self._classes = np.rint(np.mean(rest, axis=0)).astype(np.int32)
+            rest.append(np.where(seen, np.clip(levels[name] - design @ fit, -6, 6), np.nan))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of those that nobody sees
+            self._classes = np.rint(np.nan_to_num(np.nanmean(rest, axis=0), nan=-6.0)).astype(np.int32)
         for name, fit in self._fits.items():
             # The same error from every column: the mean, not the typical, sensitivity by the square of the step.
+            seen = self._seen & self.described.has(name)
+            if not seen.any():
+                continue
             told = np.concatenate([np.ones((len(raw), 1)), raw], 1) @ fit + self._classes
             fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][seen] * 4.0 ** -np.clip(told[seen], -30, 30)) + 1e-30)
+        if self.described.facts.shared:
+            for name in COLORS:  # the steps of a colour that many share are those of one that shows as all of them do
+                summed = np.bincount(self.described.shade, sensitivity[name])
+                self._fits[name] = np.array([0.5 * np.log2(np.mean(summed) + 1e-30)])
 
     def kept(self, factor: float) -> Bool[np.ndarray, "num"]:
         """The Gaussians that are worth their bits at such steps; one at least."""
@@ -338,14 +397,18 @@ class _Plan:
         """The Gaussians `kept` (None: all), steps times 2^factor; the error of a number is then about 4^factor / 12."""
         kept = np.ones(len(self._own), bool) if kept is None else kept
         described = subset(self.described, kept)
-        rules = {"class": Rule(0.0, 0.0)}
+        rules, shared = {}, described.facts.shared
         for name in self._names:
             exponent, *slopes = np.round(self._fits[name], 4).tolist()
             given = described.values.get(name)
+            if name in ABSENT:
+                given = given[described.has(name)]
             # Stretch has its origin at 0, so that none is rounded below.
-            origin = 0.0 if given is None or name == "stretch" else round(float(np.median(given)), 4)
-            slopes = () if name in FEATURES else tuple(-slope for slope in slopes)
-            rules[name] = Rule(origin, round(factor - exponent, 4), (-1.0, *slopes))
+            origin = 0.0 if given is None or not given.size or name == "stretch" else round(float(np.median(given)), 4)
+            slopes = (-1.0,) if name in FEATURES else (-1.0, *(-slope for slope in slopes))
+            if name in COLORS and shared:
+                slopes = ()
+            rules[name] = Rule(origin, round(factor - exponent, 4), slopes)
         return quantise(described, self._classes[kept], rules)
 
 
@@ -353,5 +416,9 @@ def subset(described: Described, kept: Bool[np.ndarray, "num"]) -> Described:
     """Some of a model's Gaussians, in their order."""
     facts = dataclasses.replace(described.facts, num_gaussians=int(kept.sum()))
     values = {name: value[kept] for name, value in described.values.items()}
-    own = described.swapped[kept], described.turn[kept], values, described.place[kept]
+    shade = described.shade
+    if shade is not None:
+        used, shade = np.unique(shade[kept], return_inverse=True)
+        facts, shade = dataclasses.replace(facts, shared=len(used)), shade.ravel().astype(np.int32)
+    own = described.swapped[kept], described.turn[kept], described.without[kept], shade, values, described.place[kept]
     return Described(facts, *own, described.logits)

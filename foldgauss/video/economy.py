@@ -11,20 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from scipy.spatial import cKDTree
 
 from foldgauss._checks import invalid, whole, within
+from foldgauss.video.kinds import LASTS, NUMBERS, OF_OPACITY, OF_POWER, OF_TIME, SOLID, degrees_of, is_solid, lasts
 from foldgauss.video.ledger import ROUNDING, Ledger
-from foldgauss.video.model import LASTING
+from foldgauss.video.model import LASTING, OPAQUE
 from foldgauss.video.packing import columns
 from foldgauss.video.quantise import moved_to
 
-#: Numbers of a Gaussian that lasts and stands still; m_t and sigma_t of one that comes and goes.
-NUMBERS, OF_TIME = 9, 2
 #: A round costs as much as some two passes over the frames: there is one in so many passes of the plan at most.
 LEAST_PASSES = 5
-#: The bit of a kind that says: it lasts.
-LASTS = 128
 #: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
 #: lower; and so much higher, in dB, that the end is not missed by a hair.
 YET_TO_COME, SPARE = 0.8, 0.1
@@ -36,18 +32,17 @@ DOUBLING = 1.9
 #: Of the Gaussians, in the first half of the rounds, without a PSNR: births; they go on while at least half of the last
 #: ones stay.
 BIRTHS = 0.5
-#: Rounds of Lloyd's algorithm, and sizes of palettes tried.
-_LLOYD, _PALETTES = 12, tuple(2**k for k in range(3, 17))
-#: Of the error that sharing colours adds, what is left once the others have made up for it.
-_LEFT = 0.3
+#: Frames' errors differ by this factor from their geometric mean, as far as it counts: 6 dB.
+_UNLIKE = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Economy:
     """What a fit pays for: at `rounds` points of its plan, evenly from `first_share` to `last_share`, it takes stock.
 
-    * Without `psnr`: a Gaussian, a power of its path, a beginning and an end of its life, a colour of its own stay if
-      they save more than `bits` for each of their numbers. (Compact files hold a number in 8 bits on the average.)
+    * Without `psnr`: a Gaussian, a power of its path, a beginning and an end of its life, its opacity, a colour and a
+      shape of its own stay if they save more than `bits` for each of their numbers. (Compact files hold a number in
+      8 bits on the average.)
       With `grows`, a `BIRTHS` share of Gaussians are born where the error is, as long as half of them stay.
     * With `psnr`, dB: what is dropped is what costs the least, until the mean over all frames is that; where it seems
       out of reach, Gaussians are born.
@@ -60,7 +55,7 @@ class Economy:
     psnr: float | None = None
     bits: float = 8.0
     rounds: int = 8
-    first_share: float = 0.2
+    first_share: float = 0.15
     last_share: float = 0.88
     most_dropped: float = 0.3
     grows: bool = True
@@ -112,32 +107,18 @@ class Economy:
         return self.psnr + SPARE - YET_TO_COME * (1 - progress)
 
 
-# ------------------------------------------------------------------------------------------ kinds of Gaussians
+def frame_weights(errors: Float32[np.ndarray, "num_frames"]) -> Float[np.ndarray, "num_frames"]:
+    """What a frame's squared error counts where the mean of the frames' PSNR is what is asked for; 1 on the average.
 
-
-def kinds_of(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8[np.ndarray, "num"]:
-    """The last power that each packed row has, and `LASTS` more for one that lasts."""
-    at, num = columns(degree), len(rows)
-    there = (rows[:, at["coefficients"]].reshape(num, degree, 2) != 0).any(2)
-    last = np.max(there * np.arange(1, degree + 1), axis=1, initial=0)
-    lasts = (rows[:, at["log_time_scale"].start] == LASTING) & (rows[:, at["time_loc_logit"].start] == 0)
-    return (last + LASTS * lasts).astype(np.uint8)
-
-
-def kinds_at_start(rows: Float32[np.ndarray, "num width"], degree: int) -> UInt8[np.ndarray, "num"]:
-    """Kinds of rows that have not learned yet: all powers, but for those that last, which stand still."""
-    kinds = kinds_of(rows, degree)
-    return np.where(kinds >= LASTS, kinds, degree).astype(np.uint8)
-
-
-def forget(first: np.ndarray, second: np.ndarray, kinds: UInt8[np.ndarray, "num"], degree: int) -> None:
-    """Adam's moments of numbers that a kind does not have become 0, in place."""
-    at = columns(degree)
-    gone = np.repeat(np.arange(1, degree + 1), 2) > (kinds % LASTS)[:, None]
-    for moments in (first, second):
-        moments[:, at["coefficients"]][gone] = 0
-        for name in ("time_loc_logit", "log_time_scale"):
-            moments[kinds >= LASTS, at[name].start] = 0
+    A dB of each frame is worth the same, so an error counts by the inverse of what there is: held within `_UNLIKE` of
+    the geometric mean, lest frames that are nearly exact outweigh all others. Errors of 0 are not known yet.
+    """
+    known = errors > 0
+    if not known.any():
+        return np.ones(len(errors))
+    typical = np.exp(np.log(errors[known], dtype=float).mean())
+    inverse = 1 / np.clip(np.where(known, errors, typical), typical / _UNLIKE, typical * _UNLIKE)
+    return inverse / inverse.mean()
 
 
 # ------------------------------------------------------------------------------------------ what is dropped
@@ -176,13 +157,16 @@ def cut(
     pixels: float,
     room: float | None = None,
     progress: float = 1.0,
+    sized: bool = False,
+    solid: bool = True,
 ) -> Cut:
     """What is left of packed rows, by what `ledger` says of them at a share `progress` of the plan.
 
     At the price of `price_of`; or where `room` is given, at the one that adds so much squared error. `pixels`: those
-    along a unit of model space. At least one Gaussian is left.
+    along a unit of model space. Where Gaussians are `sized`, by shapes that they share, sizes stay as they are;
+    without `solid`, all keep their opacities. At least one Gaussian is left.
     """
-    book = _Book(rows, kinds, ledger, degree, pixels)
+    book = _Book(rows, kinds, ledger, degree, pixels, sized, solid)
     if room is None:
         return book.at(price_of(ledger, economy.bits, progress), economy.most_dropped)
     low, high = 0.0, max(ledger.squared_error, 1e-9)
@@ -197,21 +181,36 @@ def cut(
 class _Book:
     """All that may be done to each Gaussian, with the squared error that it adds and the numbers that it leaves."""
 
-    def __init__(self, rows: np.ndarray, kinds: np.ndarray, ledger: Ledger, degree: int, pixels: float):
+    def __init__(
+        self,
+        rows: np.ndarray,
+        kinds: np.ndarray,
+        ledger: Ledger,
+        degree: int,
+        pixels: float,
+        sized: bool = False,
+        solid: bool = True,
+    ):
         self._rows, self._kinds, self._ledger, self._degree, self._pixels = rows, kinds, ledger, degree, pixels
+        self._grown = np.zeros(len(rows)) if sized else ledger.mean_log_envelope
         self._at, num = columns(degree), len(rows)
-        own, lasts = kinds % LASTS, kinds >= LASTS
+        own, lasting = degrees_of(kinds), lasts(kinds)
         place = np.concatenate([rows[:, self._at["loc"]], rows[:, self._at["coefficients"]]], 1)
         self._place = place.reshape(num, degree + 1, 2).astype(float) * pixels
-        added = np.full((num, degree + 1, 2), np.inf)
+        added = np.full((num, degree + 1, 2, 2), np.inf)  # by degree, whether it lasts, whether it is solid
         for lower in range(degree + 1):
             which = np.flatnonzero(own > lower)
             if len(which):
-                added[which, lower, 0] = ledger.lower(self._place, lower, which)[0]
-            added[own == lower, lower, 0] = 0
-        added[:, :, 1] = added[:, :, 0] + ledger.lasting[:, None]
-        added[lasts, :, 1], added[lasts, :, 0] = added[lasts, :, 0], np.inf
-        numbers = NUMBERS + 2 * np.arange(degree + 1)[:, None] + OF_TIME * np.array([1, 0])
+                added[which, lower, 0, 0] = ledger.lower(self._place, lower, which)[0]
+            added[own == lower, lower, 0, 0] = 0
+        added[:, :, 1, 0] = added[:, :, 0, 0] + ledger.lasting(self._grown)[:, None]
+        added[lasting, :, 1], added[lasting, :, 0] = added[lasting, :, 0], np.inf
+        opacity = 1 / (1 + np.exp(-rows[:, self._at["opacity_logit"].start].astype(float)))
+        added[:, :, :, 1] = added[:, :, :, 0] + (ledger.solid(opacity)[:, None, None] if solid else np.inf)
+        already = is_solid(kinds)
+        added[already, :, :, 1], added[already, :, :, 0] = added[already, :, :, 0], np.inf
+        powers = OF_POWER * np.arange(degree + 1)[:, None, None]
+        numbers = NUMBERS + powers - OF_TIME * np.array([0, 1])[:, None] - OF_OPACITY * np.array([0, 1])
         self._added, self._numbers = added.reshape(num, -1), numbers.ravel()
 
     def _chosen(self, price: float, most_dropped: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -235,67 +234,24 @@ class _Book:
         """The cheapest at a price of a number, in squared error."""
         stays, best, added = self._chosen(price, most_dropped)
         stay = np.flatnonzero(stays)
-        lower, lasts = np.divmod(best[stay], 2)
-        kinds = (lower + LASTS * lasts).astype(np.uint8)
-        return Cut(stay, self._changed(stay, lower, lasts == 1), kinds, added, price)
+        lower, lasting, solid = np.unravel_index(best[stay], (self._degree + 1, 2, 2))
+        kinds = (lower + LASTS * lasting + SOLID * solid).astype(np.uint8)
+        return Cut(stay, self._changed(stay, lower, lasting == 1, solid == 1), kinds, added, price)
 
-    def _changed(self, stay: np.ndarray, lower: np.ndarray, lasts: np.ndarray) -> np.ndarray:
-        rows, own, at = self._rows[stay].copy(), self._kinds[stay], self._at
-        place, now = self._place[stay], lasts & (own < LASTS)
+    def _changed(self, stay: np.ndarray, lower: np.ndarray, lasting: np.ndarray, solid: np.ndarray) -> np.ndarray:
+        rows, own, at = self._rows[stay].copy(), degrees_of(self._kinds[stay]), self._at
+        place, now = self._place[stay], lasting & ~lasts(self._kinds[stay])
         for degree in range(self._degree):
-            here = np.flatnonzero((lower == degree) & (own % LASTS > degree))
+            here = np.flatnonzero((lower == degree) & (own > degree))
             if len(here):
                 place[here] = self._ledger.lower(self._place, degree, stay[here])[1]
         logit = rows[now, at["time_loc_logit"].start].astype(float)
         place[now] = moved_to(place[now], 0.5 - 1 / (1 + np.exp(-logit)))
-        rows[now, at["log_scale"]] += self._ledger.mean_log_envelope[stay[now], None].astype(np.float32)
+        rows[now, at["log_scale"]] += self._grown[stay[now], None].astype(np.float32)
         rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, LASTING
-        moved = now | (lower < own % LASTS)
+        rows[solid, at["opacity_logit"].start] = OPAQUE
+        moved = now | (lower < own)
         anew = (place[moved] / self._pixels).astype(np.float32)
         rows[moved, at["loc"]] = anew[:, 0]
         rows[moved, at["coefficients"]] = anew[:, 1:].reshape(len(anew), 2 * self._degree)
         return rows
-
-
-# ------------------------------------------------------------------------------------------ colours shared
-
-
-def shared_colors(
-    color: Float32[np.ndarray, "num 3"], weight: Float[np.ndarray, "num"], price: float, seed: int
-) -> Int[np.ndarray, "num"] | None:
-    """Which Gaussians share a colour: the number of each one's in a palette; None where sharing does not pay.
-
-    `weight` is what the square of an error of a colour adds to the squared error, `price` what a number has to save.
-    Clusters by Lloyd's algorithm (1982), weighted, for palettes of several sizes.
-    """
-    num, best, least = len(color), None, 3 * len(color) * price
-    for size in (size for size in _PALETTES if size < num):
-        index = _clustered(color.astype(float), weight, size, seed)
-        palette = averaged(color, index)
-        error = float((weight * ((color - palette) ** 2).sum(1)).sum())
-        stored = len(np.unique(index)) * 3 + num * (1 if size <= 256 else 2) / 4
-        cost = _LEFT * error + stored * price
-        if cost < least:
-            best, least = index, cost
-        elif best is not None:
-            break
-    return best
-
-
-def averaged(color: Float32[np.ndarray, "num 3"], index: Int[np.ndarray, "num"]) -> Float32[np.ndarray, "num 3"]:
-    """Each row's mean with those of its number."""
-    count = np.maximum(np.bincount(index), 1)
-    sums = np.stack([np.bincount(index, color[:, c]) for c in range(3)], 1)
-    return (sums / count[:, None]).astype(np.float32)[index]
-
-
-def _clustered(color: np.ndarray, weight: np.ndarray, size: int, seed: int) -> np.ndarray:
-    rng = np.random.default_rng([seed, 5])
-    chance = np.maximum(weight, 1e-9 * weight.max() + 1e-300)
-    centre = color[rng.choice(len(color), size, replace=False, p=chance / chance.sum())]
-    for _ in range(_LLOYD):
-        index = cKDTree(centre).query(color)[1]
-        total = np.bincount(index, chance, size)
-        sums = np.stack([np.bincount(index, chance * color[:, c], size) for c in range(3)], 1)
-        centre = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], centre)
-    return cKDTree(centre).query(color)[1]

@@ -4,14 +4,15 @@ from collections.abc import Callable, Collection
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 
 from foldgauss.render import cpu
 from foldgauss.video.conditioning import condition, narrow_windows, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, LearningRates
-from foldgauss.video.economy import kinds_of
+from foldgauss.video.kinds import kinds_of
 from foldgauss.video.model import VideoModel
 from foldgauss.video.packing import columns, unpack
+from foldgauss.video.sharing import Palette
 from foldgauss.video.sparse_adam import sparse_adam
 from foldgauss.video.stage import Stage
 
@@ -29,13 +30,15 @@ def refitted(
     passes: int,
     *,
     free: Collection[str] | None = None,
+    shared: Int32[np.ndarray, "num"] | None = None,
     seed: int = 0,
     on_pass: Callable[[], None] = lambda: None,
 ) -> VideoModel:
     """The model after `passes` over its frames in random order, by least squares; only leaves `free` change.
 
     `target(k, step)` gives what frame k is compared with. `free` None: all. Frame times stay.
-    Deterministic; Adam as in the fit.
+    `shared`: the number of each Gaussian's colour, where those of a number stay alike. Deterministic; Adam as in the
+    fit.
     """
     stage = Stage(model, model.size)
     rows, window, shape = stage.rows, stage.window, stage.shape
@@ -44,6 +47,7 @@ def refitted(
         rates[place] = getattr(own, name) if free is None or name in free else 0.0
     first, second, grad = np.zeros_like(rows), np.zeros_like(rows), np.zeros_like(rows)
     kinds = kinds_of(rows, model.degree)  # what a Gaussian has not got stays away
+    palette, colors = Palette.of(shared, 3), columns(model.degree)["color_dc"]  # what is shared learns as one
     counts, times = np.zeros(len(rows), np.int32), np.asarray(model.frame_times.times())
     drawn = {"compositing": model.compositing, "options": model.options}
     steps = passes * model.num_frames
@@ -60,6 +64,7 @@ def refitted(
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
         pull_back(rows, done, cpu.backward(trace, by_image)[:4], shape, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
+        palette.step(rows[:, colors], grad[:, colors], done.alive, rate * rates[colors])
         sparse_adam(rows, grad, first, second, counts, done.alive, rates * rate, kinds=kinds, unit_time=UNIT_TIME)
         if free is None:
             update_windows(rows, done.alive, window)

@@ -1,52 +1,44 @@
 """The fit: a loop of steps, each yielding (state, info). It knows arrays only; files and bars watch from outside."""
 
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from foldgauss._checks import invalid, whole, within
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
-from foldgauss.video.births import among, newborns
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
-from foldgauss.video.economy import (
-    LASTS,
-    LEAST_PASSES,
-    NUMBERS,
-    OF_TIME,
-    Cut,
-    Economy,
-    averaged,
-    cut,
-    forget,
-    kinds_at_start,
-    kinds_of,
-    shared_colors,
-)
+from foldgauss.video.economy import LEAST_PASSES, frame_weights
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
-from foldgauss.video.ledger import Ledger, measured
+from foldgauss.video.kinds import kinds_at_start, kinds_of
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
-from foldgauss.video.metrics import psnr
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion
-from foldgauss.video.packing import columns, pack, unpack
-from foldgauss.video.playback import Playback
+from foldgauss.video.packing import columns, pack
 from foldgauss.video.pyramid import Level, level_at, levels, shrunk, work_done
+from foldgauss.video.sharing import Palette
 from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
+from foldgauss.video.state import (
+    TIME_ADAM,
+    FitState,
+    envelope_of,
+    frame_times,
+    mean_psnr,
+    planar,
+    running_psnr,
+    to_model,
+)
+from foldgauss.video.stock import StockTaker
 
 
 class FitInfo(NamedTuple):
@@ -61,42 +53,6 @@ class FitInfo(NamedTuple):
     seconds: float  # spent fitting so far
     seconds_left: float  # by the pace so far
     stopped_by: str | None  # at the last step, what bound: "steps", "minutes", "target_psnr" or "smallest_at_psnr"
-
-
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "rows",
-        "first",
-        "second",
-        "counts",
-        "kinds",
-        "young",
-        "palette",
-        "time_logits",
-        "time_moments",
-        "statistics",
-    ],
-    meta_fields=["step", "plan", "seconds", "error"],
-)
-@dataclasses.dataclass
-class FitState:
-    """The arrays of a running fit. A step consumes its state: as with donated buffers, arrays are updated in place."""
-
-    rows: np.ndarray  # float32 (num, width): see `packing`
-    first: np.ndarray  # Adam's moments, likewise
-    second: np.ndarray
-    counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
-    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `economy.kinds_of`
-    young: np.ndarray  # bool (num,): born the last time that stock was taken
-    palette: np.ndarray  # int32 (num,): whose colours are one and the same; (0,): each has its own
-    time_logits: np.ndarray  # float32 (num_frames - 1,)
-    time_moments: optax.OptState
-    statistics: Statistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
-    step: int
-    plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
-    seconds: float
-    error: float  # running mean of the squared error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +129,7 @@ def fit_steps(
         if state.statistics is not None and state.plan:
             step.grow(state)
         if config.economy is not None and state.plan:
-            step.economise(state)
+            step.take_stock(state)
         passed = time.perf_counter() - begun
         state.seconds += passed
         if not state.plan:
@@ -181,7 +137,7 @@ def fit_steps(
         begun = time.perf_counter()
         stopped_by = _stopped_by(state, config, frames)
         if stopped_by == "smallest_at_psnr":
-            step.trim(state)
+            step.stock.trim(state)
         state.seconds += time.perf_counter() - begun
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
@@ -195,7 +151,7 @@ def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
     for progress in (0.0, 1.0):  # with either loss
         _Stepper(corner, tiny, state)(state, progress)
     if config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None):
-        _mean_psnr(state, tiny, corner)
+        mean_psnr(state, tiny, corner)
 
 
 class _Pace:
@@ -255,7 +211,7 @@ def _stopped_by(state: FitState, config: FitConfig, frames: np.ndarray) -> str |
         over = late or state.step >= OVERTIME * state.plan
         if not over and (state.step < state.plan or (state.step - state.plan) % len(frames)):
             return None
-        if np.isfinite(state.rows).all() and _mean_psnr(state, config, frames) >= wanted:
+        if np.isfinite(state.rows).all() and mean_psnr(state, config, frames) >= wanted:
             return "smallest_at_psnr"
         if not over:
             return None
@@ -274,23 +230,12 @@ def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarr
     """
     steps = -(-_num_views(config, len(frames)) // config.batch_size)  # of a pass
     due = state.step > 0 and state.step % (LOOK_PASSES * steps) == 0
-    return due and bool(np.isfinite(state.rows).all()) and _mean_psnr(state, config, frames) >= target
-
-
-def _mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
-    """dB, mean over all frames as they are shown, over black."""
-    playback = Playback(to_model(state, config, frames.shape[1:3], 1.0))
-    return float(np.mean([psnr(frame[..., :3], shown) for frame, shown in zip(frames, playback.frames(), strict=True)]))
+    return due and bool(np.isfinite(state.rows).all()) and mean_psnr(state, config, frames) >= target
 
 
 def _num_views(config: FitConfig, num_frames: int) -> int:
     """Views of a pass: every frame, then with two cameras every frame mirrored."""
     return 2 * num_frames if config.two_cameras else num_frames
-
-
-def running_psnr(state: FitState) -> float:
-    """dB, by the running mean of the squared error; at most 100, as of pictures that are equal (`psnr`)."""
-    return -10 * math.log10(max(state.error, 1e-10))
 
 
 class _Outlook:
@@ -340,7 +285,9 @@ def _started(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, f
         counts=np.zeros(len(rows), np.int32),
         kinds=kinds_at_start(rows, config.degree),
         young=np.zeros(len(rows), bool),
-        palette=np.zeros(0, np.int32),
+        colors=Palette.of(None, 3),
+        shapes=Palette.of(None, 2),
+        frame_errors=np.zeros(num_frames, np.float32),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         statistics=None if config.growth is None else Statistics.zeros(len(rows)),
@@ -374,7 +321,9 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
         counts=np.zeros(len(rows), np.int32),
         kinds=kinds_of(rows, config.degree),
         young=np.zeros(len(rows), bool),
-        palette=np.zeros(0, np.int32),
+        colors=Palette.of(None, 3),
+        shapes=Palette.of(None, 2),
+        frame_errors=np.zeros(model.num_frames, np.float32),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
         statistics=None,
@@ -408,23 +357,11 @@ def _splats(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: M
     """Where the Gaussians start."""
     num, shape = chosen_num_gaussians(config, *frames.shape[:3]), {"degree": config.degree, "seed": config.seed}
     if config.initialization == "uniform":
-        return initialize_uniform(num, frames.shape[1:3], envelope=_envelope(config), **shape)
+        return initialize_uniform(num, frames.shape[1:3], envelope=envelope_of(config), **shape)
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity, "lasting": config.economy is not None}
-    return initialize(frames, num, envelope=_envelope(config), **clip, **shape)
-
-
-def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
-    """The model as it stands in `state` (arrays are copied)."""
-    return VideoModel(
-        splats=unpack(state.rows, config.degree, _envelope(config)),
-        frame_times=FrameTimes(state.time_logits.copy()),
-        size=tuple(int(n) for n in size),
-        fps=float(fps),
-        options=config.options,
-        compositing=config.compositing,
-    )
+    return initialize(frames, num, envelope=envelope_of(config), **clip, **shape)
 
 
 def check_frames(frames: np.ndarray) -> None:
@@ -480,6 +417,9 @@ class _Stepper:
             self.falling[place] = config.falling in ("all", name)
         self.flow = _Flow(frames) if flow is None else flow
         self.between = _Between(frames, config, self.flow.motion) if config.between_share > 0 else None
+        if config.economy is not None:
+            coarse = 1 - self.levels[-1].share
+            self.stock = StockTaker(frames, config, self.shapes[-1], coarse, lambda: self.flow.motion)
         self._make_room(state)
 
     def _make_room(self, state: FitState) -> None:
@@ -496,7 +436,7 @@ class _Stepper:
         if self.frames.shape[3] == 4:
             self.background = random_background(self.config.seed, state.step)
         decay = self.config.final_rate**progress if self.config.final_rate > 0 else max(1 - progress, 0.0)
-        times = np.asarray(_frame_times(state.time_logits))
+        times = np.asarray(frame_times(state.time_logits))
         by_time = np.zeros_like(times)
         losses, alive, squared, errors = [], [], progress >= 1 - self.config.square_share, []
         views = None if state.statistics is None else []
@@ -506,7 +446,7 @@ class _Stepper:
             share = None if self.between is None else self.between.share(state.step, k)
             how = {"squared": squared, "mirrored": mirrored, "views": views, "share": share}
             t = times[k] if share is None else (1 - share) * times[k] + share * times[k + 1]
-            loss, done, d_time = self._frame(state.rows, k, t, self.shapes[level], **how)
+            loss, done, d_time = self._frame(state, k, t, self.shapes[level], **how)
             if share is None:
                 by_time[k] += d_time  # a batch may hold a frame twice
                 errors.append(loss.mean_squared_error)
@@ -521,10 +461,10 @@ class _Stepper:
         rates = np.where(self.falling, self.rates * np.float32(decay), self.rates)
         moments = state.first, state.second, state.counts
         unit = UNIT_TIME if self.config.own_time else 0.0
+        for name, palette in (("color_dc", state.colors), ("log_scale", state.shapes)):
+            at = columns(self.config.degree)[name]
+            palette.step(state.rows[:, at], self.grad[:, at], touched, rates[at])
         sparse_adam(state.rows, self.grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit)
-        if len(state.palette):
-            at = columns(self.config.degree)["color_dc"]
-            state.rows[:, at] = averaged(state.rows[:, at], state.palette)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
             rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0))
@@ -561,118 +501,18 @@ class _Stepper:
         state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
         state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, self.config.degree)])
         state.young = np.concatenate([state.young[stay], np.zeros(len(born), bool)])
-        state.palette = np.zeros(0, np.int32)  # those born have colours of their own
+        state.colors, state.shapes = Palette.of(None, 3), Palette.of(None, 2)  # those born have their own
         state.statistics = Statistics.zeros(len(state.rows))
         self._make_room(state)
 
-    def economise(self, state: FitState) -> None:
-        """Take stock where that is due: drop what does not pay, bear where it does, share colours at the last."""
-        economy, degree = self.config.economy, self.config.degree
-        coarse = 1 - self.levels[-1].share
-        if self.config.growth is not None:
-            coarse = max(coarse, self.config.growth.for_plan(state.plan).until_step / state.plan)
-        passes = state.plan * self.config.batch_size / self.num_frames
-        steps = economy.steps(state.plan, passes=passes, coarse=coarse)
-        if state.step not in steps:
-            return
-        ledger, progress = self._ledger(state), state.step / state.plan
-        made = self._cut(state, ledger, economy.room(ledger, progress), economy)
-        survived = 1.0 if state.step == steps[0] else state.young[made.stay].sum() / max(state.young.sum(), 1)
-        self._keep(state, made)
-        at_start = chosen_num_gaussians(self.config, *self.frames.shape[:3])
-        most = min(most_gaussians(self.config, self.num_frames), MOST_BORN * at_start)
-        num = 0
-        if state.step in steps[: len(steps) // 2]:
-            num = min(economy.births(ledger, progress, len(state.rows), survived), most - len(state.rows))
-        state.young = np.zeros(len(state.rows), bool)
-        if num > 0:
-            self._bear(state, ledger, num)
-        elif state.step == steps[-1]:
-            color = state.rows[:, columns(degree)["color_dc"]]
-            index = shared_colors(color, ledger.by_color[made.stay], made.price, self.config.seed)
-            state.palette = np.zeros(0, np.int32) if index is None else index.astype(np.int32)
-        if state.statistics is not None:
-            state.statistics = Statistics.zeros(len(state.rows))
-        self._make_room(state)
+    def _weight(self, errors: np.ndarray, k: int) -> float:
+        """Of frame k's loss. For the mean PSNR what counts is by how many dB a frame gets better."""
+        wanted = self.config.economy is not None and self.config.economy.psnr is not None
+        return float(frame_weights(errors)[k]) if wanted else 1.0
 
-    def _squares(self, rows: np.ndarray, window: np.ndarray, k: int, t: float) -> np.ndarray:
-        """(height, width): squared errors of frame k, summed over the channels."""
-        target, behind = self._target(k)
-        done = condition(rows, window, t, self.shapes[-1])
-        leaves = done.mean, done.factor, done.opacity, done.color, behind
-        drawn = {"compositing": self.config.compositing, "options": self.config.options}
-        return ((cpu.forward(*leaves, self.shapes[-1].size, **drawn).image - target) ** 2).sum(0)
-
-    def _cut(self, state: FitState, ledger: Ledger, room: float | None, economy: Economy) -> Cut:
-        how = {"degree": self.config.degree, "pixels": pixels_per_unit(self.shapes[-1].size), "room": room}
-        how["progress"] = min(state.step / state.plan, 1.0)
-        return cut(state.rows, state.kinds, ledger, economy, **how)
-
-    def _keep(self, state: FitState, made: Cut) -> None:
-        state.rows, state.kinds = made.rows, made.kinds
-        state.first, state.second, state.counts, state.young = (
-            part[made.stay] for part in (state.first, state.second, state.counts, state.young)
-        )
-        state.palette = state.palette[made.stay] if len(state.palette) else state.palette
-        forget(state.first, state.second, state.kinds, self.config.degree)
-
-    def _bear(self, state: FitState, ledger: Ledger, num: int) -> None:
-        """Gaussians where the error is, in depth anywhere between the others."""
-        config, times = self.config, np.asarray(_frame_times(state.time_logits))
-        colors = np.ascontiguousarray(self.frames[..., :3])
-        self._make_room(state)
-
-        alive = float(np.mean([((self.window[:, 0] < t) & (t < self.window[:, 1])).sum() for t in times]))
-        new = newborns(
-            num,
-            colors,
-            times,
-            ledger.errors,
-            lambda k: self._squares(state.rows, self.window, k, times[k]),
-            alive,
-            degree=config.degree,
-            envelope=_envelope(config),
-            motion=self.flow.motion if config.follow_motion else None,
-            opacity=START_OPACITY,
-            seed=(config.seed, 3, state.step),
-        )
-        order = among(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
-        state.rows = np.concatenate([state.rows, new])[order]
-        for name in ("first", "second"):
-            setattr(state, name, np.concatenate([getattr(state, name), np.zeros_like(new)])[order])
-        state.counts = np.concatenate([state.counts, np.zeros(num, np.int32)])[order]
-        state.young = np.concatenate([state.young, np.ones(num, bool)])[order]
-        state.kinds = np.concatenate([state.kinds, kinds_at_start(new, config.degree)])[order]
-
-    def _target(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frame k, whole, as the ledger sees it: with alpha over one colour for good."""
-        behind = random_background(self.config.seed, k) if self.frames.shape[3] == 4 else self.background
-        return _planar(self.frames[k], behind), behind
-
-    def _ledger(self, state: FitState) -> Ledger:
-        times = np.asarray(_frame_times(state.time_logits))
-        how = {"compositing": self.config.compositing, "options": self.config.options, "seed": state.step}
-        return measured(state.rows, self.window, times, self.shapes[-1], self._target, **how)
-
-    def trim(self, state: FitState) -> None:
-        """At the end: leave out what the PSNR asked for has no need of, each try measured, until none succeeds."""
-        for _ in range(TRIMS):
-            if not self._trimmed(state):
-                break
+    def take_stock(self, state: FitState) -> None:
+        if self.stock.take(state):
             self._make_room(state)
-
-    def _trimmed(self, state: FitState) -> bool:
-        config, ledger = self.config, self._ledger(state)
-        wanted, before, size = config.economy.psnr, dataclasses.replace(state), _numbers(state)
-        room = ledger.squared_error * (10 ** (max(ledger.psnr - wanted, 0.0) / 10) - 1)
-        for share in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
-            tried = dataclasses.replace(before)
-            self._keep(tried, self._cut(tried, ledger, share * room, config.economy))
-            if _numbers(tried) < (1 - LEAST_TRIM) * size and _mean_psnr(tried, config, self.frames) >= wanted:
-                for name in ("rows", "kinds", "first", "second", "counts", "young", "palette"):
-                    setattr(state, name, getattr(tried, name))
-                return True
-        return False
 
     def _batch(self, step: int) -> np.ndarray:
         """Views of a step: every pass visits all once, in an order that depends on seed and pass only.
@@ -689,7 +529,7 @@ class _Stepper:
 
     def _frame(
         self,
-        rows: np.ndarray,
+        state: FitState,
         k: int,
         t: np.float32,
         shape: Shape,
@@ -705,9 +545,10 @@ class _Stepper:
         To `views`, where asked for, comes what `Statistics.add` wants.
         """
         if share is None:
-            target = _planar(shrunk(self.frames[k], shape.size), self.background)
+            target = planar(shrunk(self.frames[k], shape.size), self.background)
         else:
             target = self.between.target(k, share, shape.size)
+        rows = state.rows
         done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
         if mirrored:
@@ -727,7 +568,11 @@ class _Stepper:
             loss = squared_loss(trace.image, target)
         else:
             loss = image_loss(trace.image, target, ssim_share=self.config.ssim_share)
-        d_mean, d_factor, *others, _ = cpu.backward(trace, loss.gradient / np.float32(self.config.batch_size))
+        weight = 1.0
+        if share is None:
+            state.frame_errors[k] = loss.mean_squared_error
+            weight = self._weight(state.frame_errors, k)
+        d_mean, d_factor, *others, _ = cpu.backward(trace, loss.gradient * np.float32(weight / self.config.batch_size))
         if mirrored:
             d_mean, d_factor = _mirrored(d_mean, d_factor, 0)
         if views is not None:
@@ -757,41 +602,16 @@ class _Between:
         return np.ascontiguousarray(np.moveaxis(guess, -1, 0) * np.float32(1 / 255))
 
 
-def _numbers(state: FitState) -> int:
-    """Those that the Gaussians have, colours counted one by one."""
-    lasts, powers = state.kinds >= LASTS, state.kinds % LASTS
-    return int((NUMBERS + 2 * powers.astype(int) + OF_TIME * ~lasts).sum())
-
-
 def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Splats as the camera opposite sees them, in pixels, left for right; its transpose, for gradients, at width 0."""
     other = np.float32([-1, 1])
     return mean * other + np.float32([width, 0]), factor * other[:, None]
 
 
-def _planar(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Bytes (height, width, 3) as floats (3, height, width), as the kernels want them; with alpha over `background`."""
-    out = np.empty((3, *frame.shape[:2]), np.float32)
-    *colors, last = cv2.split(frame)
-    for plane, own in zip(out, colors if frame.shape[2] == 4 else (*colors, last), strict=True):
-        np.multiply(own, np.float32(1 / 255), out=plane)
-    if frame.shape[2] == 4:
-        out += background[:, None, None] * (1 - last * np.float32(1 / 255))
-    return out
-
-
-def _envelope(config: FitConfig) -> TimeLikelihood:
-    return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
-
-
 #: A fit to a target looks at all frames once in so many passes, which is a tenth of its time.
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.
 OVERTIME = 1.5
-#: Gaussians born in all are so many times those at the start at most.
-MOST_BORN = 4
-#: Times that a fit is trimmed at its end, and the share of its numbers that is worth another time.
-TRIMS, LEAST_TRIM = 8, 0.002
 #: Births make steps slower by this much, at first.
 GROWN = 1.15
 #: Taking stock of a frame costs as much as so many steps with it: a pass forward and four back.
@@ -801,12 +621,6 @@ ROUND = 2.0
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05
 #: Steps of the whole fit are slower than the first ones by this: Gaussians grow longer in time.
 SLOWER = 1.05
-TIME_ADAM = optax.scale_by_adam(eps=1e-15)
-
-
-@jax.jit
-def _frame_times(logits):
-    return FrameTimes(logits).times()
 
 
 @jax.jit

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.video.conditioning import Conditioned, Shape, condition
+from foldgauss.video.conditioning import Shape, condition
 from foldgauss.video.model import SH_C0, TAU_MAX
 from foldgauss.video.packing import columns
 
@@ -31,18 +31,21 @@ Target = Callable[[int], tuple[Float32[np.ndarray, "3 height width"], Float32[np
 class Ledger:
     """Sums over all frames, pixels and channels; colours are about [0, 1], lengths pixels, float64.
 
-    * `errors` (num_frames,): squared error of each frame; `num_samples`: numbers that the pictures have.
+    * `errors` (num_frames,): squared error of each frame; `num_samples`: numbers that the pictures have; `weights`
+      (num_frames,): how much a frame's errors count in all that follows, 1 on the average.
     * `alike` (3,): correlation of the errors of neighbours in time, along columns and along rows.
     * `slope` (num,): its change by leaving a Gaussian out, to first order; `own` (num,): to second, which is what the
       Gaussian adds to the pictures, squared.
     * `by_path` (num, 2 degree + 1, 3): sum over frames of (u / span)^m M, M the second derivatives (xx, xy, yy) by the
       Gaussian's place, halved; `span` (num,): a length of time to measure u = m_t - t by.
-    * `by_color` (num,): half the second derivative by any of a Gaussian's `color_dc`.
+    * `by_color` (num,): half the second derivative by any of a Gaussian's `color_dc`; `by_axes` (num, 2): by the
+      logarithms of its standard deviations.
     * `by_size` (num, 3): sums of S, S l and S l^2, S the second derivative by the logarithm of the Gaussian's size,
       halved, at its size at its own time, and l = log a(t) / 2; `misses` (num,): frames at which it is not alive.
     """
 
     errors: Float[np.ndarray, "num_frames"]
+    weights: Float[np.ndarray, "num_frames"]
     num_samples: int
     size: tuple[int, int]
     alike: Float[np.ndarray, "3"]
@@ -51,12 +54,14 @@ class Ledger:
     by_path: Float[np.ndarray, "num moments 3"]
     span: Float[np.ndarray, "num"]
     by_color: Float[np.ndarray, "num"]
+    by_axes: Float[np.ndarray, "num 2"]
     by_size: Float[np.ndarray, "num 3"]
     misses: Float[np.ndarray, "num"]
 
     @property
     def squared_error(self) -> float:
-        return float(self.errors.sum())
+        """Weighted by frames."""
+        return float(self.weights @ self.errors)
 
     @property
     def psnr(self) -> float:
@@ -73,7 +78,7 @@ class Ledger:
         log2(1 + (v / q)^2) / 4, q the variance of rounding: none where pictures are rounded to the same, and
         log2(v / q) / 2 beyond. So a number counts v^2 / (v^2 + q^2), and a picture that stands still is paid for once.
         """
-        mean = self.squared_error / self.num_samples
+        mean = float(self.errors.sum()) / self.num_samples
         in_time, *in_space = 1 - np.clip(self.alike, 0, 1) ** 2
         once = mean * float(np.prod(in_space))
         each = once * float(in_time)
@@ -109,19 +114,27 @@ class Ledger:
         path[:, high] = 0
         return np.maximum(added, 0), path / scale
 
-    @property
-    def lasting(self) -> Float[np.ndarray, "num"]:
-        """Squared error that an end to a Gaussian's waxing and waning adds: its size is then the same throughout.
+    def lasting(self, grown: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+        """Squared error that an end to waxing and waning adds, where the logarithm of a Gaussian's size is `grown`.
 
-        Infinite where it is not alive at every frame, where there is another picture behind it.
+        Least by `mean_log_envelope`. Infinite where it is not alive at every frame, where there is another picture
+        behind it.
         """
         total, first, second = self.by_size.T
-        added = second - first**2 / np.maximum(total, np.finfo(float).tiny)
+        added = second - 2 * grown * first + grown**2 * total
         return np.where(self.misses > 0, np.inf, np.maximum(added, 0))
+
+    def solid(self, opacity: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+        """Squared error that Gaussians of this `opacity` add where no light comes through them any more.
+
+        Pictures are linear in one opacity, so this is exact for each alone.
+        """
+        more = 1 / np.maximum(opacity, np.finfo(float).tiny) - 1
+        return np.maximum(more * (more * self.own - self.slope), 0)
 
     @property
     def mean_log_envelope(self) -> Float[np.ndarray, "num"]:
-        """The mean of log a(t) / 2 where it is seen: what the logarithm of a lasting one's size changes by."""
+        """The mean of log a(t) / 2 where it is seen: what the logarithm of a lasting one's size should change by."""
         total, first, _ = self.by_size.T
         return first / np.maximum(total, np.finfo(float).tiny)
 
@@ -142,10 +155,11 @@ def measured(
     *,
     compositing: str,
     options: RenderOptions,
+    weights: Float[np.ndarray, "num_frames"] | None = None,
     seed: int = 0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Ledger:
-    """The ledger of packed rows against frames.
+    """The ledger of packed rows against frames, whose errors count by `weights`; None: all the same.
 
     Squares of the pictures' derivatives are estimated without bias by random signs, as in `sensitivities`.
     """
@@ -153,8 +167,9 @@ def measured(
     centre = 1 / (1 + np.exp(-rows[:, place["time_loc_logit"]][:, 0].astype(float)))
     spread = np.exp(rows[:, place["log_time_scale"]][:, 0].astype(float))
     span = np.minimum(TAU_MAX * spread, 1.0)
-    slope, own, misses = np.zeros((3, num))
-    by_path, by_size, by_color = np.zeros((num, 2 * shape.degree + 1, 3)), np.zeros((num, 3)), np.zeros(num)
+    slope, own, misses, by_color = np.zeros((4, num))
+    by_path, by_size, by_axes = np.zeros((num, 2 * shape.degree + 1, 3)), np.zeros((num, 3)), np.zeros((num, 2))
+    weights = np.ones(len(times)) if weights is None else weights
     draws = max(DRAWS, -(-LEAST_DRAWS // len(times)))
     errors, products, before = np.zeros(len(times)), np.zeros(3), None
     signs_shape = (3, *shape.size)
@@ -173,24 +188,27 @@ def measured(
         on_frame()
         if not len(alive):
             continue
-        slope[alive] -= 2 * done.opacity * cpu.backward(trace, residual)[2]
+        slope[alive] -= 2 * weights[k] * done.opacity * cpu.backward(trace, residual)[2]
         u = centre[alive] - t
         powers = (u / span[alive])[:, None] ** np.arange(2 * shape.degree + 1)
         narrowed = _log_envelope(u / spread[alive], shape) / 2
         # By the logarithm of its size, at the size that it would have: that grows as its square.
-        weights = np.exp(-2 * narrowed)[:, None] * np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
+        by_narrowed = np.exp(-2 * narrowed)[:, None] * np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
+        share = weights[k] / draws
         for _ in range(draws):
             signs = rng.integers(0, 2, signs_shape, dtype=np.int8) * np.float32(2) - np.float32(1)
             d_mean, d_factor, d_opacity, d_color, _ = cpu.backward(trace, signs)
-            own[alive] += (done.opacity * d_opacity).astype(float) ** 2 / draws
-            by_path[alive] += powers[:, :, None] * _outer(d_mean.astype(float))[:, None] / draws
-            by_size[alive] += weights * _by_log_size(done, d_factor)[:, None] ** 2 / draws
-            by_color[alive] += SH_C0**2 * (d_color.astype(float) ** 2).mean(1) / draws
+            own[alive] += share * (done.opacity * d_opacity).astype(float) ** 2
+            by_path[alive] += share * powers[:, :, None] * _outer(d_mean.astype(float))[:, None]
+            by_scale = (done.factor * d_factor).sum(1).astype(float)  # by the logarithms
+            by_size[alive] += share * by_narrowed * by_scale.sum(1, keepdims=True) ** 2
+            by_axes[alive] += share * by_scale**2
+            by_color[alive] += share * SH_C0**2 * (d_color.astype(float) ** 2).mean(1)
     num_samples = len(times) * 3 * math.prod(shape.size)
     lines = np.array([len(times), *shape.size])
     alike = products * lines / np.maximum(lines - 1, 1) / max(errors.sum(), np.finfo(float).tiny)
-    facts = errors, num_samples, shape.size, alike
-    return Ledger(*facts, slope, own, by_path, span, by_color, by_size, misses)
+    facts = errors, weights, num_samples, shape.size, alike
+    return Ledger(*facts, slope, own, by_path, span, by_color, by_axes, by_size, misses)
 
 
 def _products(residual: np.ndarray, before: np.ndarray | None) -> list[float]:
@@ -211,7 +229,3 @@ def _outer(vectors: Float[np.ndarray, "num 2"]) -> Float[np.ndarray, "num 3"]:
     x, y = vectors.T
     round_part = 0.25 * (x * x + y * y)
     return np.stack([0.5 * x * x + round_part, 0.5 * x * y, 0.5 * y * y + round_part], 1)
-
-
-def _by_log_size(done: Conditioned, d_factor: np.ndarray) -> np.ndarray:
-    return (done.factor * d_factor).sum((1, 2)).astype(float)

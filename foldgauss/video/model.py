@@ -30,6 +30,8 @@ TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
 #: log sigma_t of a Gaussian that is there throughout the clip: with m_t = 0.5 its |tau| is at most 1/2048, and the
 #: envelope, of power 2 or less, is 1 to 3e-7. Neither is stored.
 LASTING = np.float32(np.log(1024))
+#: Logit of the opacity of a Gaussian that no light comes through, 0.9997. It is not stored.
+OPAQUE = np.float32(8)
 #: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
 PEAK_OPACITY = 0.99
 
@@ -84,6 +86,11 @@ class FoldedSplats(eqx.Module):
     def lasting(self) -> Bool[np.ndarray, "num"]:
         """Who is there throughout the clip: m_t = 0.5 and log sigma_t = `LASTING` exactly. Neither is stored."""
         return (np.asarray(self.log_time_scale) == LASTING) & ~_holds_bits(self.time_loc_logit)
+
+    @property
+    def solid(self) -> Bool[np.ndarray, "num"]:
+        """Whom no light comes through: an opacity's logit of `OPAQUE` exactly, which is not stored."""
+        return np.asarray(self.opacity_logit) == OPAQUE
 
     def gaussians(self) -> FoldedGaussian:
         """The batch of Folded-Gaussians, batch shape (num,), event shape (3,)."""

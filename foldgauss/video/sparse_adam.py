@@ -10,6 +10,7 @@ import numpy as np
 
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
+from foldgauss.video.kinds import DEGREES, LASTS, SOLID
 from foldgauss.video.packing import columns
 
 CHUNK = 2048  # rows per task
@@ -26,18 +27,22 @@ _UNBIAS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(_UNBIAS))[:,
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, kinds, rates, unit, spread, time, fold, unbias):
+def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, unit, at, unbias):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     width, own = _u(rows.shape[1]), rates.copy()
+    spread, time, opacity, fold = at
+    lasting, solid, degrees = bits
     for k in range(start, stop):
         i = touched[k]
         counts[i] += 1
         taken = min(counts[i], len(unbias) - 1)
         unbias1, unbias2 = unbias[taken, 0], unbias[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
-        lasts, powers = kinds[i] >= 128, kinds[i] & 127
+        lasts, powers = kinds[i] & lasting, kinds[i] & degrees
         if lasts:  # its times stay
             g[time], g[spread] = _f(0.0), _f(0.0)
+        if kinds[i] & solid:
+            g[opacity] = _f(0.0)
         for c in range(fold + 2 * powers, width):
             g[c] = _f(0.0)
         if unit > _f(0.0):
@@ -71,14 +76,14 @@ def sparse_adam(
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps each row
     has taken; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which columns a row has, by
-    `economy.kinds_of` (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the
+    `kinds.kinds_of` (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the
     fold are those at sigma_t = `unit_time`, and others' as `config.LearningRates` says.
     """
     place = columns(0)  # the fold comes last, so its degree moves none of these
-    at = place["log_time_scale"].start, place["time_loc_logit"].start, place["coefficients"].start
+    at = tuple(place[name].start for name in ("log_time_scale", "time_loc_logit", "opacity_logit", "coefficients"))
     num = len(touched)
     if kinds is None:
-        kinds = np.full(len(rows), (rows.shape[1] - at[2]) // 2, np.uint8)
+        kinds = np.full(len(rows), (rows.shape[1] - at[-1]) // 2, np.uint8)
 
     def work(start: int) -> None:
         _update(
@@ -91,9 +96,10 @@ def sparse_adam(
             second,
             counts,
             kinds,
+            (LASTS, SOLID, DEGREES),
             rates,
             np.float32(unit_time),
-            *at,
+            at,
             _UNBIAS,
         )
 

@@ -21,14 +21,18 @@ from foldgauss.io.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import compress, layers
 from foldgauss.video.metrics import evaluate
+from foldgauss.video.model import LASTING, OPAQUE
 from foldgauss.video.quantise import (
     AXES,
     Rule,
+    _degrees,
     _log,
     column_names,
     dequantise,
     describe,
+    is_whole,
     legendre,
+    lower_paths,
     moved_to,
     path_matrix,
     quantise,
@@ -45,7 +49,7 @@ def clip_of(model, noise=6.0):
 
 def fine(model, exponent=-22.0):
     """Quantised by even steps of 2^exponent."""
-    rules = {name: Rule(0.0, exponent) for name in column_names(model.degree)} | {"class": Rule(0.0, 0.0)}
+    rules = {name: Rule(0.0, exponent) for name in column_names(model.degree) if not is_whole(name)}
     return quantise(describe(model), np.zeros(model.num_gaussians, np.int32), rules)
 
 
@@ -95,6 +99,95 @@ def test_frame_times_and_cut_are_kept():
     model = eqx.tree_at(lambda m: m.frame_times.logits, model, logits)
     again = dequantise(fine(model))
     np.testing.assert_allclose(again.frame_times.times(), model.frame_times.times(), atol=1e-3)
+
+
+def of_kinds(model, seed=0):
+    """Paths of several degrees, a third of the Gaussians lasting, half solid, and colours that four share."""
+    rng, splats = np.random.default_rng(seed), model.splats
+    num, degree = model.num_gaussians, model.degree
+    lasting = np.arange(num) % 3 == 0
+    coefficients = np.where(np.arange(degree) < rng.integers(0, degree + 1, num)[:, None], 1, 0)[..., None]
+    leaves = {
+        "coefficients": (np.asarray(splats.coefficients) * coefficients + 0).astype(np.float32),
+        "time_loc_logit": np.where(lasting, np.float32(0), splats.time_loc_logit),
+        "log_time_scale": np.where(lasting, LASTING, splats.log_time_scale),
+        "opacity_logit": np.where(np.arange(num) % 2 == 0, OPAQUE, splats.opacity_logit),
+        "color_dc": np.asarray(splats.color_dc)[np.arange(num) // 4],
+    }
+    for name, leaf in leaves.items():
+        model = eqx.tree_at(lambda m, name=name: getattr(m.splats, name), model, leaf)
+    return model
+
+
+def crowd(model, copies=10, seed=1):
+    """More Gaussians, like its own."""
+    rng = np.random.default_rng(seed)
+
+    def more(leaf):
+        leaf = np.asarray(leaf)
+        if not leaf.ndim:
+            return leaf
+        return (np.repeat(leaf, copies, 0) + 0.1 * rng.normal(size=(copies * len(leaf), *leaf.shape[1:]))).astype("f4")
+
+    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(more, model.splats))
+
+
+def same_kinds(again, model):
+    assert (again.splats.degrees <= model.splats.degrees).all()
+    np.testing.assert_array_equal(again.splats.lasting, model.splats.lasting)
+    np.testing.assert_array_equal(again.splats.solid, model.splats.solid)
+    index = [np.unique(own.splats.color_dc, axis=0, return_inverse=True)[1].ravel() for own in (again, model)]
+    pairs = np.unique(np.stack(index), axis=1)
+    assert pairs.shape[1] == index[0].max() + 1 == index[1].max() + 1
+
+
+def test_kinds_are_kept(tmp_path):
+    """What is absent stays so, to the bit, and what is shared stays shared."""
+    model = of_kinds(soft_model(degree=3))
+    again = load_video_model(save_compact(tmp_path / "m.fgz", fine(model)))
+    same_kinds(again, model)
+    np.testing.assert_array_equal(again.splats.degrees, model.splats.degrees)
+    assert again.num_floats == model.num_floats
+    lasting = model.splats.lasting
+    assert lasting.sum() == 14
+    assert model.splats.solid.sum() == 20
+    np.testing.assert_array_equal(again.splats.log_time_scale[lasting], LASTING)
+    np.testing.assert_array_equal(np.asarray(again.splats.time_loc_logit)[lasting].view(np.int32), 0)
+    absent = np.arange(3) >= model.splats.degrees[:, None]
+    np.testing.assert_array_equal(np.asarray(again.splats.coefficients).view(np.int32)[absent], 0)
+    for t in (0.0, 0.37, 1.0):
+        np.testing.assert_allclose(again.render(t), model.render(t), atol=2e-3)
+
+
+@pytest.mark.parametrize("passes", [0, 2])
+def test_kinds_outlive_fitting_anew(tmp_path, passes):
+    model = of_kinds(soft_model(degree=3, options=RenderOptions()))
+    made = compress(model, clip_of(model), passes=passes)
+    again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantised))
+    same(again, made.model)
+    assert again.splats.lasting.sum() >= 12
+    assert again.splats.solid.sum() >= 18
+    assert len(np.unique(again.splats.color_dc, axis=0)) <= 10
+    assert again.num_floats <= model.num_floats
+
+
+def test_a_power_that_saves_little_goes():
+    """Its squared error, in steps, against what a number's bits are worth."""
+    saved = np.array([[9.0, 9.0, 9.0], [1.0, 0.5, 0.2], [0.8, 0.2, 4.0]])
+    np.testing.assert_array_equal(_degrees(saved), [1, 0, 2])
+    model = soft_model(degree=3)
+    coarse = fine(model, -7.0)
+    degrees = dequantise(coarse).splats.degrees
+    np.testing.assert_array_equal(degrees, coarse.columns["degree"])
+    assert 0 < (degrees < 3).sum() < len(degrees)
+    place = lower_paths(coarse, describe(model))
+    np.testing.assert_array_equal((place[:, 1:] != 0).any(2), np.arange(3) < degrees[:, None])
+
+
+def test_kinds_save_bytes():
+    plain = crowd(soft_model(degree=3))
+    model = of_kinds(plain)
+    assert len(packed(fine(model))) < 0.8 * len(packed(fine(plain)))
 
 
 # ------------------------------------------------------------------------------------ stated loss
@@ -184,7 +277,8 @@ def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
 def test_a_decoded_model_by_the_same_rules_is_the_same_file():
     """Quantising is a projection: what was rounded is not rounded further."""
     quantised = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantised
-    again = quantise(describe(dequantise(quantised)), quantised.columns["class"], quantised.rules)
+    columns = quantised.columns
+    again = quantise(describe(dequantise(quantised)), columns["class"], quantised.rules, columns["cell"])
     assert packed(again) == packed(quantised)
 
 
@@ -222,9 +316,15 @@ def test_paths_are_legendre_series_over_the_span():
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="the decoder for browsers is run by node")
-@pytest.mark.parametrize("how", [{"degree": 0}, {"degree": 3, "power": 1.0}, {"degree": 7}, {"num_frames": 1}])
+@pytest.mark.parametrize(
+    "how", [{"degree": 0}, {"degree": 3, "power": 1.0}, {"degree": 7}, {"num_frames": 1}, "crowd", "crowd of kinds"]
+)
 def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
-    model = soft_model(options=RenderOptions(), **how)
+    model = soft_model(options=RenderOptions(), **({} if isinstance(how, str) else how))
+    if isinstance(how, str):
+        model = crowd(model)
+    if how == "crowd of kinds":
+        model = of_kinds(model)
     path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantised)
     decoder = Path(compact.__file__).with_suffix(".js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
@@ -361,7 +461,15 @@ def test_damaged_everywhere(tmp_path, good):
 def test_later_version(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 9
-    refused(tmp_path, bytes(data), r"expected a compact model of version 1, .* got version 9 .* Update foldgauss")
+    refused(tmp_path, bytes(data), r"expected a compact model of version 2, .* got version 9 .* Update foldgauss")
+
+
+def test_version_before(tmp_path, good):
+    data = bytearray(good)
+    data[len(MAGIC)] = 1
+    refused(
+        tmp_path, bytes(data), r"expected a compact model of version 2, .* got version 1 .* Compress the model again"
+    )
 
 
 def test_changed_by_a_transfer_as_text(tmp_path, good):
@@ -392,6 +500,17 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("options", {"unknown": 1}),
         ("columns", []),
         ("columns", 5),
+        ("cells", [0, 0]),
+        ("cells", [0, 0, -1]),
+        ("cells", [30, 30, 30]),
+        ("cells", [2, 2, 2]),
+        ("cells", [5, 0, 0]),
+        ("cells", [0, 3, 0]),
+        ("cells", 5),
+        ("shared", -1),
+        ("shared", 41),
+        ("shared", 7),
+        ("shared", "a"),
         ("intervals", 0),
         ("metadata", 5),
         ("scale_cutoff", True),
@@ -405,15 +524,23 @@ def test_header_of_a_stranger(tmp_path, good, key, value):
 
 
 def test_columns_of_a_stranger(tmp_path, good):
+    def changed(own):
+        return lambda header: header["columns"].__setitem__(5, own)
+
+    whole = json.loads(good[20 : 20 + int.from_bytes(good[12:16], "little")])["columns"][5]
     for own in (
-        {"bytes": 10**9},
-        {"bytes": -1},
-        {"slopes": [1.0] * 9},
-        {"exponent": 1e300},
-        {"slopes": 5},
-        {"name": 1},
+        [10**9, *whole[1:]],
+        [-1, *whole[1:]],
+        [*whole, *[1.0] * 9],
+        [whole[0], 0.0, 1e300],
+        [whole[0], 0.0],
+        [whole[0]],
+        [],
+        5,
+        {"bytes": whole[0]},
     ):
-        refused(tmp_path, resealed(good, lambda header, own=own: header["columns"][3].update(own)), "compact model")
+        refused(tmp_path, resealed(good, changed(own)), "compact model")
+    refused(tmp_path, resealed(good, lambda header: header["columns"][0].append(0.0)), "compact model")
     refused(tmp_path, resealed(good, cut=-3), "compact model")
     for key in json.loads(good[20 : 20 + int.from_bytes(good[12:16], "little")]):
         refused(tmp_path, resealed(good, lambda header, key=key: header.pop(key)), "compact model")
@@ -435,11 +562,22 @@ def test_streams_of_a_stranger(tmp_path, good):
         assert model.num_gaussians == 40
 
 
+@pytest.mark.parametrize(
+    ("name", "number"), [("without", 4), ("without", -1), ("degree", 4), ("degree", -1), ("shade", 10), ("shade", -1)]
+)
+def test_kinds_of_a_stranger(tmp_path, name, number):
+    quantised = fine(of_kinds(soft_model(degree=3)), -12.0)
+    columns = quantised.columns | {name: quantised.columns[name].copy()}
+    columns[name][7] = number
+    data = packed(dataclasses.replace(quantised, columns=columns))
+    refused(tmp_path, data, "compact model")
+
+
 def test_a_byte_for_every_eight_gaussians(tmp_path):
     """All alike, they need next to nothing, and the file is filled up: none may claim more than its length allows."""
     described = describe(only(soft_model(degree=0), np.full(100_000, 20)))
     origins = {name: float(value[0]) for name, value in described.values.items()}
-    rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0)}
+    rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0) if not is_whole(name)}
     path = save_compact(tmp_path / "m.fgz", quantise(described, np.zeros(100_000, np.int32), rules))
     assert 100_000 / 8 <= path.stat().st_size < 100_000 / 8 + 30
     assert load_video_model(path).num_gaussians == 100_000

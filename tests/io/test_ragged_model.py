@@ -15,16 +15,21 @@ from foldgauss.io.model_file import read_header
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, Selection, VideoModel, edit, layers
 from foldgauss.video.edited import EditedVideo
-from foldgauss.video.model import LASTING
+from foldgauss.video.model import LASTING, OPAQUE
 from foldgauss.video.packing import unpack
 
 NUM, NUM_FRAMES = 50, 5
-#: Bytes of a Gaussian besides coefficients, times and colour; those of frame times and envelope.
-PLAIN, SHARED = 4 * 6, 4 * (NUM_FRAMES - 1 + 2)
+#: Bytes of a Gaussian besides coefficients, times, colour and shape; those of frame times and envelope.
+PLAIN, SHARED = 4 * 4, 4 * (NUM_FRAMES - 1 + 2)
 
 
-def ragged_model(degrees, lasting=False, num_colors=None, *, degree=None, seed=0) -> VideoModel:
-    """Random Gaussians of these `degrees` (num,), of which those of `lasting` last, in `num_colors` colours."""
+def ragged_model(
+    degrees, lasting=False, num_colors=None, num_shapes=None, *, solid=False, degree=None, seed=0
+) -> VideoModel:
+    """Random Gaussians of these `degrees` (num,), of which those of `lasting` last, in so many colours and shapes.
+
+    No light comes through those of `solid`.
+    """
     rng = np.random.default_rng(seed)
     degrees = np.asarray(degrees)
     num, degree = len(degrees), int(degrees.max(initial=0)) if degree is None else degree
@@ -33,9 +38,11 @@ def ragged_model(degrees, lasting=False, num_colors=None, *, degree=None, seed=0
     splats.coefficients[np.arange(degree) >= degrees[:, None]] = 0
     splats.time_loc_logit[np.broadcast_to(lasting, num)] = 0
     splats.log_time_scale[np.broadcast_to(lasting, num)] = LASTING
-    if num_colors is not None:
-        own = rng.normal(size=(num_colors, 3)).astype(np.float32)
-        splats.color_dc[:] = own[rng.permutation(np.arange(num) % num_colors)]
+    splats.opacity_logit[np.broadcast_to(solid, num)] = OPAQUE
+    for leaf, rows in ((splats.color_dc, num_colors), (splats.log_scale, num_shapes)):
+        if rows is not None:
+            own = rng.normal(size=(rows, leaf.shape[1])).astype(np.float32)
+            leaf[:] = own[rng.permutation(np.arange(num) % rows)]
     times = FrameTimes(rng.normal(size=NUM_FRAMES - 1).astype(np.float32))
     return VideoModel(splats, times, (48, 80), 29.97, RenderOptions(low_pass=0.123))
 
@@ -58,28 +65,39 @@ def mixed(num: int, degree: int, *, seed: int = 1) -> tuple[np.ndarray, np.ndarr
 
 
 ALTERNATING, SEVENTEEN = np.arange(NUM) % 2 == 0, np.arange(NUM) % 17
-# Name: degrees, who lasts, colours, and the bytes of coefficients, times, colours, kinds and indices that are stored.
+# Name: degrees, who lasts, colours, shapes; stored bytes of coefficients, times, colours, shapes, kinds with indices.
 CASES = {
-    "all whole": (np.full(NUM, 3), False, None, (24 * NUM, 8 * NUM, 12 * NUM, 0)),
-    "degree 0, all timed": (np.zeros(NUM, int), False, None, (0, 8 * NUM, 12 * NUM, 0)),
-    "none moves, all last, one colour": (np.zeros(NUM, int), True, 1, (0, 0, 12, 2 * NUM)),
-    "all last": (np.full(NUM, 3), True, None, (24 * NUM, 0, 12 * NUM, NUM)),
-    "half last": (np.full(NUM, 2), ALTERNATING, None, (16 * NUM, 4 * NUM, 12 * NUM, NUM)),
-    "half stand still": (2 * ALTERNATING, False, None, (8 * NUM, 8 * NUM, 12 * NUM, NUM)),
-    "one stands still": (np.where(np.arange(NUM) == 7, 2, 3), False, None, (24 * NUM, 8 * NUM, 12 * NUM, 0)),
-    "few colours": (np.full(NUM, 1), False, 6, (8 * NUM, 8 * NUM, 12 * 6, NUM)),
-    "too many colours": (np.full(NUM, 1), False, NUM - 1, (8 * NUM, 8 * NUM, 12 * NUM, 0)),
-    "256 colours": (np.ones(600, int), False, 256, (8 * 600, 8 * 600, 12 * 256, 600)),
-    "257 colours": (np.ones(600, int), False, 257, (8 * 600, 8 * 600, 12 * 257, 2 * 600)),
-    "one Gaussian": ([0], True, None, (0, 0, 12, 1)),
-    "highest degree": (SEVENTEEN, ALTERNATING, 5, (8 * SEVENTEEN.sum(), 4 * NUM, 12 * 5, 2 * NUM)),
+    "all whole": (np.full(NUM, 3), False, None, None, (24 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
+    "degree 0, all timed": (np.zeros(NUM, int), False, None, None, (0, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
+    "none moves, all last, one colour": (np.zeros(NUM, int), True, 1, None, (0, 0, 12, 8 * NUM, 2 * NUM)),
+    "all last": (np.full(NUM, 3), True, None, None, (24 * NUM, 0, 12 * NUM, 8 * NUM, NUM)),
+    "half last": (np.full(NUM, 2), ALTERNATING, None, None, (16 * NUM, 4 * NUM, 12 * NUM, 8 * NUM, NUM)),
+    "half stand still": (2 * ALTERNATING, False, None, None, (8 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, NUM)),
+    "one stands still": (
+        np.where(np.arange(NUM) == 7, 2, 3),
+        False,
+        None,
+        None,
+        (24 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0),
+    ),
+    "few colours": (np.full(NUM, 1), False, 6, None, (8 * NUM, 8 * NUM, 12 * 6, 8 * NUM, NUM)),
+    "too many colours": (np.full(NUM, 1), False, NUM - 1, None, (8 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
+    "256 colours": (np.ones(600, int), False, 256, None, (8 * 600, 8 * 600, 12 * 256, 8 * 600, 600)),
+    "257 colours": (np.ones(600, int), False, 257, None, (8 * 600, 8 * 600, 12 * 257, 8 * 600, 2 * 600)),
+    "one Gaussian": ([0], True, None, None, (0, 0, 12, 8, 1)),
+    "highest degree": (SEVENTEEN, ALTERNATING, 5, None, (8 * SEVENTEEN.sum(), 4 * NUM, 12 * 5, 8 * NUM, 2 * NUM)),
+    "few shapes": (np.full(NUM, 1), False, None, 6, (8 * NUM, 8 * NUM, 12 * NUM, 8 * 6, NUM)),
+    "too many shapes": (np.full(NUM, 1), False, None, NUM - 1, (8 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
+    "257 shapes": (np.ones(900, int), False, None, 257, (8 * 900, 8 * 900, 12 * 900, 8 * 257, 2 * 900)),
+    "few of all": (ALTERNATING, ALTERNATING, 5, 7, (4 * NUM, 4 * NUM, 12 * 5, 8 * 7, 3 * NUM)),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_same_model_in_the_bytes_that_it_needs(tmp_path, name):
-    degrees, lasting, num_colors, parts = CASES[name]
-    model = ragged_model(degrees, lasting, num_colors)
+    degrees, lasting, num_colors, num_shapes, parts = CASES[name]
+    degrees = np.asarray(degrees).astype(int)
+    model = ragged_model(degrees, lasting, num_colors, num_shapes)
     np.testing.assert_array_equal(model.splats.degrees, degrees)
     np.testing.assert_array_equal(model.splats.lasting, np.broadcast_to(lasting, len(degrees)))
     path = save_video_model(tmp_path / "m.safetensors", model)
@@ -87,10 +105,20 @@ def test_the_same_model_in_the_bytes_that_it_needs(tmp_path, name):
     same(model, again)
     assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
     assert tensor_bytes(path) == PLAIN * len(degrees) + SHARED + sum(parts)
-    assert 0 <= 4 * model.num_floats - tensor_bytes(path) < 4 * 2  # kinds and indices, each rounded up
+    assert 0 <= 4 * model.num_floats - tensor_bytes(path) < 4 * 3  # kinds and indices, each rounded up
     assert model.num_floats == again.num_floats
     first = path.read_bytes()
     assert save_video_model(path, again).read_bytes() == first
+
+
+@pytest.mark.parametrize("solid", [True, ALTERNATING], ids=["all", "half"])
+def test_no_opacity_of_those_that_are_solid(tmp_path, solid):
+    model = ragged_model(np.full(NUM, 3), solid=solid)
+    np.testing.assert_array_equal(model.splats.solid, np.broadcast_to(solid, NUM))
+    path = save_video_model(tmp_path / "m.safetensors", model)
+    same(model, load_video_model(path))
+    clear = NUM - np.broadcast_to(solid, NUM).sum()
+    assert tensor_bytes(path) == (PLAIN - 4 + 24 + 8 + 12 + 8) * NUM + 4 * clear + NUM + SHARED
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -99,17 +127,19 @@ def test_the_same_model_in_the_bytes_that_it_needs(tmp_path, name):
     degree=st.integers(0, 16),
     share=st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]),
     num_colors=st.none() | st.integers(1, 20),
+    num_shapes=st.none() | st.integers(1, 20),
     seed=st.integers(0, 1000),
 )
-def test_round_trip_law(tmp_path, num, degree, share, num_colors, seed):
+def test_round_trip_law(tmp_path, num, degree, share, num_colors, num_shapes, seed):
     """Any mixture, its dense degree above what any Gaussian has, and never more bytes than one by one."""
     rng = np.random.default_rng(seed)
     degrees = np.where(rng.random(num) < share, rng.integers(0, degree + 1, num), 0)
-    model = ragged_model(degrees, rng.random(num) < share, num_colors, degree=degree, seed=seed)
+    model = ragged_model(degrees, rng.random(num) < share, num_colors, num_shapes, degree=degree, seed=seed)
+    model.splats.opacity_logit[rng.random(num) < share] = OPAQUE
     path = save_video_model(tmp_path / "m", model)
     same(model, load_video_model(path))
-    assert tensor_bytes(path) <= (PLAIN + 20 + 8 * degree) * num + SHARED
-    assert 0 <= 4 * model.num_floats - tensor_bytes(path) < 4 * 2
+    assert tensor_bytes(path) <= (PLAIN + 28 + 8 * degree) * num + SHARED
+    assert 0 <= 4 * model.num_floats - tensor_bytes(path) < 4 * 3
 
 
 @pytest.mark.parametrize(
@@ -121,12 +151,14 @@ def test_round_trip_law(tmp_path, num, degree, share, num_colors, seed):
         ("time_loc_logit", 1e-45),
         ("log_time_scale", np.nextafter(LASTING, np.float32(0))),
         ("color_dc", -0.0),
+        ("log_scale", -0.0),
+        ("opacity_logit", np.nextafter(OPAQUE, np.float32(0))),
     ],
 )
 def test_what_differs_in_a_bit_is_kept(tmp_path, leaf, value):
     """Gaussian 3 is all but one of those that have nothing but a place: the bit is not lost with theirs."""
-    model = ragged_model(np.zeros(NUM, int), True, 1, degree=2)
-    model.splats.color_dc[:] = 0
+    model = ragged_model(np.zeros(NUM, int), True, 1, solid=True, degree=2)
+    model.splats.color_dc[:] = model.splats.log_scale[:] = 0
     without = model.num_floats
     getattr(model.splats, leaf)[3] = value
     path = save_video_model(tmp_path / "m", model)
@@ -136,8 +168,8 @@ def test_what_differs_in_a_bit_is_kept(tmp_path, leaf, value):
 
 
 def test_no_kinds_beyond_their_room(tmp_path):
-    """Seven bits hold a degree up to 127."""
-    for degree, header in ((127, {"powers": 9, "timed": NUM}), (128, None)):
+    """Six bits hold a degree up to 63."""
+    for degree, header in ((63, {"powers": 9, "timed": NUM, "clear": NUM}), (64, None)):
         model = ragged_model(np.arange(NUM) < 9, degree=degree)
         path = save_video_model(tmp_path / f"{degree}", model)
         same(model, load_video_model(path))
@@ -196,8 +228,8 @@ def test_layers_of_edited_videos(tmp_path):
     path = save_video_model(tmp_path / "m", video)
     same(video, load_video_model(path))
     described = [layer["model"].get("stored") for layer in read_header(path)["header"]["layers"]]
-    assert described[0] == described[2] == {"powers": 0, "timed": 0, "colors": 4}
-    assert described[1].keys() == {"powers", "timed"}
+    assert described[0] == described[2] == {"powers": 0, "timed": 0, "clear": NUM, "colors": 4}
+    assert described[1].keys() == {"powers", "timed", "clear"}
     assert video.num_floats == 2 * still.num_floats + moving.num_floats
 
 
@@ -211,7 +243,7 @@ def test_a_selection_fits_the_model_before_and_after(tmp_path):
 
 def test_a_model_whose_leaves_do_not_fit_is_not_written(tmp_path):
     model = ragged_model(np.zeros(NUM, int), True, 1, degree=2)
-    for leaf in ("coefficients", "log_time_scale", "color_dc"):
+    for leaf in ("coefficients", "log_time_scale", "color_dc", "log_scale"):
         splats = jax.tree_util.tree_map(lambda array: array, model.splats)
         object.__setattr__(splats, leaf, getattr(splats, leaf)[:-1])
         broken = VideoModel(splats, model.frame_times, model.size, model.fps, model.options)
@@ -253,30 +285,39 @@ HEADERS = {
     "timed that is no whole number": put(timed=25.0),
     "more timed": put(timed=26),
     "timed beyond all": put(timed=NUM + 1),
-    "timed alone": lambda header: header["stored"].pop("powers"),
+    "more clear": put(clear=41),
+    "clear that is no whole number": put(clear=40.0),
+    "no clear": lambda header: header["stored"].pop("clear"),
+    "no powers": lambda header: header["stored"].pop("powers"),
     "no timed": lambda header: header["stored"].pop("timed"),
     "no colours": put(colors=0),
     "other colours": put(colors=7),
     "colours beyond all": put(colors=NUM + 1),
     "colours that are no number": put(colors="many"),
     "colours beyond any index": lambda h: h.update(num_gaussians=10**13, stored={"colors": 10**12}),
-    "kinds, undescribed": lambda header: header.update(stored={"colors": 6}),
+    "no shapes": put(shapes=0),
+    "other shapes": put(shapes=5),
+    "shapes beyond all": put(shapes=NUM + 1),
+    "shapes, undescribed": lambda header: header["stored"].pop("shapes"),
+    "kinds, undescribed": lambda header: header.update(stored={"colors": 6, "shapes": 4}),
     "palette, undescribed": lambda header: header["stored"].pop("colors"),
     "nothing described": lambda header: header.pop("stored"),
-    "no dictionary": lambda header: header.update(stored=[60, 25, 6]),
+    "no dictionary": lambda header: header.update(stored=[60, 25, 6, 4]),
     "null": lambda header: header.update(stored=None),
     "another word": put(normals=3),
-    "degree beyond the bits": lambda header: header.update(degree=128),
-    "degree below the Gaussians'": lambda header: header.update(degree=1, stored={"powers": 50, "timed": 25}),
+    "degree beyond the bits": lambda header: header.update(degree=64),
+    "degree below the Gaussians'": lambda header: header.update(
+        degree=1, stored={"powers": 50, "timed": 25, "clear": 40}
+    ),
 }
 
 
 @pytest.fixture
 def hostile(tmp_path):
-    """A good file, to be made a bad one: 50 Gaussians, 60 powers, 25 timed, 6 colours."""
+    """A good file, to be made a bad one: 50 Gaussians, 60 powers, 25 timed, 40 clear, 6 colours, 4 shapes."""
     degrees = np.where(np.arange(NUM) < 20, 3, 0)
-    path = save_video_model(tmp_path / "m", ragged_model(degrees, ALTERNATING, 6))
-    assert read_header(path)["header"]["stored"] == {"powers": 60, "timed": 25, "colors": 6}
+    path = save_video_model(tmp_path / "m", ragged_model(degrees, ALTERNATING, 6, 4, solid=np.arange(NUM) < 10))
+    assert read_header(path)["header"]["stored"] == {"powers": 60, "timed": 25, "clear": 40, "colors": 6, "shapes": 4}
     load_video_model(path)
     return path
 
@@ -299,13 +340,15 @@ def _at(place, value):
 @pytest.mark.parametrize(
     ("tensors", "match"),
     [
-        ({"kinds": _at(0, 4 + 128)}, "greatest degree in kinds: expected a whole number from 0 to 3, got 4"),
+        ({"kinds": _at(0, 4 + 64 + 128)}, "greatest degree in kinds: expected a whole number from 0 to 3, got 4"),
         ({"kinds": _at(slice(None), 255)}, "greatest degree in kinds"),
-        ({"kinds": _at(0, 2 + 128)}, "expected 60 powers, as many as are stored, got 59"),
+        ({"kinds": _at(0, 2 + 64 + 128)}, "expected 60 powers, as many as are stored, got 59"),
         ({"kinds": _at(slice(None), 3)}, "expected 60 powers, as many as are stored, got 150"),
-        ({"kinds": _at(0, 3)}, "expected 25 Gaussians that do not last, as many as are stored, got 26"),
+        ({"kinds": _at(0, 3 + 128)}, "expected 40 Gaussians that light comes through, as many as are stored, got 41"),
+        ({"kinds": _at(0, 3 + 64)}, "expected 25 Gaussians that do not last, as many as are stored, got 26"),
         ({"color_index": _at(-1, 6)}, "color_index: expected a whole number from 0 to 5, got 6"),
         ({"color_index": _at(0, 255)}, "color_index: .* got 255"),
+        ({"shape_index": _at(7, 4)}, "shape_index: expected a whole number from 0 to 3, got 4"),
     ],
 )
 def test_tensors_that_do_not_fit_each_other(hostile, tensors, match):
@@ -319,7 +362,7 @@ def test_tensors_that_do_not_fit_each_other(hostile, tensors, match):
 def test_any_changed_byte_gives_a_model_or_an_error(hostile):
     """Every byte of the header's JSON, and of kinds and indices."""
     data = bytearray(hostile.read_bytes())
-    rng, tail = np.random.default_rng(0), 2 * NUM  # kinds and indices, of one byte each, end the file
+    rng, tail = np.random.default_rng(0), 3 * NUM  # kinds and indices, of one byte each, end the file
     length = int.from_bytes(data[:8], "little")
     loaded = 0
     for place in (*rng.choice(8 + length, 150, replace=False), *range(len(data) - tail, len(data))):
@@ -331,7 +374,7 @@ def test_any_changed_byte_gives_a_model_or_an_error(hostile):
             loaded += 1
         except ModelFileError:
             continue
-    assert loaded < 150
+    assert loaded < 200
 
 
 # ----------------------------------------------------------------------------------------------------------- the shell
@@ -339,14 +382,18 @@ def test_any_changed_byte_gives_a_model_or_an_error(hostile):
 
 def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     degrees = np.where(np.arange(NUM) < 20, 3, 0)
-    path = save_video_model(tmp_path / "m.safetensors", ragged_model(degrees, ALTERNATING, 6))
+    path = save_video_model(
+        tmp_path / "m.safetensors", ragged_model(degrees, ALTERNATING, 6, 4, solid=np.arange(NUM) < 10)
+    )
     assert run("info", path) == 0
     told = capsys.readouterr().out
     assert "0 of 30 Gaussians, 3 of 20 Gaussians" in told
     assert "25 of 50 Gaussians, throughout the clip" in told
     assert "6 of 50 Gaussians" in told
+    assert "4 of 50 Gaussians" in told
+    assert "10 of 50 Gaussians, no light comes through" in told
     assert f"{load_video_model(path).num_floats:,}" in told
     assert f"{path.stat().st_size:,} bytes" in told
     run("info", save_video_model(tmp_path / "whole.safetensors", ragged_model(np.full(NUM, 3))))
     told = capsys.readouterr().out
-    assert not any(name in told for name in ("degrees", "lasting", "colours"))
+    assert not any(name in told for name in ("degrees", "lasting", "colours", "shapes", "solid"))

@@ -1,5 +1,7 @@
 """The coder of compact files: exact, close to the entropy, safe with any bytes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -22,9 +24,19 @@ def columns():
 @pytest.mark.parametrize(("name", "values"), [pytest.param(*one, id=one[0]) for one in columns()])
 def test_round_trip(name, values):
     values = np.rint(values).astype(np.int32)
-    contexts = (np.arange(len(values)) % coder.CONTEXTS).astype(np.uint8)
-    for own in (contexts, np.zeros_like(contexts)):
+    plain = coder.Column.plain(len(values))
+    for own in (plain, known(values, 0)):
+        values = np.where(own.present, values, 0)
         np.testing.assert_array_equal(coder.decode(coder.encode(values, own), own), values)
+
+
+def known(values, seed):
+    """A column of which something is known, at random."""
+    rng, num = np.random.default_rng(seed), len(values)
+    near = np.minimum(rng.integers(-1, max(num, 1), (num, 3)), np.arange(num)[:, None] - 1).astype(np.int32)
+    contexts = rng.integers(0, coder.CONTEXTS, (num, 2)).astype(np.uint8)
+    numbers = rng.normal(size=num), np.exp(rng.normal(size=num)), np.exp(rng.normal(size=num))
+    return coder.Column(rng.random(num) < 0.8, contexts, *numbers, near, 0.5)
 
 
 @pytest.mark.parametrize("scale", [0.2, 1.0, 5.0, 50.0])
@@ -33,26 +45,43 @@ def test_close_to_the_entropy(scale):
     values = np.rint(np.random.default_rng(1).laplace(size=20_000) * scale).astype(np.int32)
     counts = np.unique(values, return_counts=True)[1]
     entropy = -(counts * np.log2(counts / len(values))).sum() / 8
-    assert len(coder.encode(values, np.zeros(len(values), np.uint8))) < 1.02 * entropy + 100
+    assert len(coder.encode(values, coder.Column.plain(len(values)))) < 1.02 * entropy + 100
+
+
+def test_what_is_near_saves_bits():
+    """Numbers that those before lead to expect, and contexts that tell their size."""
+    rng = np.random.default_rng(3)
+    scale = 4.0 ** rng.integers(0, 4, 20_000)
+    values = np.rint(rng.laplace(size=20_000) * scale).astype(np.int32)
+    plain = coder.Column.plain(len(values))
+    contexts = np.stack([np.log2(scale), 0 * scale], 1).astype(np.uint8)
+    told = len(coder.encode(values, dataclasses.replace(plain, contexts=contexts)))
+    assert told < 0.92 * len(coder.encode(values, plain))
+    walk = np.rint(np.cumsum(rng.laplace(size=20_000))).astype(np.int32) // 8
+    before = np.arange(-1, len(walk) - 1, dtype=np.int32)[:, None]
+    near = len(coder.encode(walk, dataclasses.replace(plain, near=before)))
+    assert near < 0.9 * len(coder.encode(walk, plain))
 
 
 def test_the_bytes_are_those_of_the_format():
     """Another implementation must come to these: docs/format.md."""
     values = np.array([0, 1, -1, 5, -300, 70_000, 0, 0, 2**30 - 1], np.int32)
     contexts = np.array([0, 0, 1, 1, 2, 2, 31, 0, 0], np.uint8)
-    assert coder.encode(values, contexts).hex() == EXPECTED
+    near = np.array([-1, 0, 1, 2, 3, 4, 5, 6, 7], np.int32)[:, None]
+    column = dataclasses.replace(coder.Column.plain(9), contexts=np.stack([contexts, contexts[::-1]], 1), near=near)
+    assert coder.encode(values, column).hex() == EXPECTED
 
 
-EXPECTED = "7dd4e02bdb8037b363fb2bc0040df90000"
+EXPECTED = "7de4f9466c75820fbe54c26801f7a5ac00"
 
 
 def test_any_bytes_decode_or_are_refused():
     rng = np.random.default_rng(2)
-    contexts, refused = np.zeros(300, np.uint8), 0
+    refused = 0
     for _ in range(200):
         data = rng.integers(0, 256, rng.integers(0, 400), dtype=np.uint8).tobytes()
         try:
-            assert np.abs(coder.decode(data, contexts).astype(np.int64)).max() < 2**coder.LARGEST_BITS
+            assert np.abs(coder.decode(data, coder.Column.plain(300)).astype(np.int64)).max() < 2**coder.LARGEST_BITS
         except ValueError:
             refused += 1
     assert refused > 20

@@ -9,8 +9,8 @@ from clips import moving_blobs
 
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.alpha import checked_background, composited, random_background
-from foldgauss.video.fit import _planar, to_model
 from foldgauss.video.playback import Playback
+from foldgauss.video.state import planar, to_model
 
 CONFIG = FitConfig(num_gaussians=800, steps=250)
 WHITE, GREEN = (1.0, 1.0, 1.0), (0.0, 1.0, 0.0)
@@ -39,10 +39,10 @@ def test_composited_by_hand():
 
 def test_targets_are_the_frames_over_the_background():
     frame, background = clip()[2], np.float32([0.2, 0.7, 1.0])
-    target = np.moveaxis(_planar(frame, background), 0, -1)
+    target = np.moveaxis(planar(frame, background), 0, -1)
     np.testing.assert_allclose(255 * target, composited(frame, background), atol=0.51)
     np.testing.assert_array_equal(
-        _planar(frame[..., :3].copy(), background), _planar(frame[..., :3].copy(), 0 * background)
+        planar(frame[..., :3].copy(), background), planar(frame[..., :3].copy(), 0 * background)
     )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 import pytest
 from scenes_of_motion import SIZE, cut, disc, noise, still
@@ -11,14 +12,19 @@ from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.conditioning import Shape, condition, update_windows
-from foldgauss.video.economy import LASTS, averaged, forget, kinds_of, shared_colors
 from foldgauss.video.economy import cut as cut_rows
+from foldgauss.video.economy import frame_weights
 from foldgauss.video.finish import refitted
-from foldgauss.video.fit import fit_steps, to_model
+from foldgauss.video.fit import fit_steps, start, to_model
 from foldgauss.video.growth import Growth
+from foldgauss.video.kinds import LASTS, SOLID, degrees_of, forget, is_solid, kinds_of, lasts, numbers_of
 from foldgauss.video.ledger import Ledger, measured
 from foldgauss.video.light import LitModel
+from foldgauss.video.model import OPAQUE
 from foldgauss.video.packing import columns, pack
+from foldgauss.video.sharing import Palette, averaged, shared
+from foldgauss.video.sparse_adam import sparse_adam
+from foldgauss.video.stock import _long_axis_first
 
 STEPS = 700
 
@@ -211,7 +217,7 @@ def test_the_lower_path_is_the_best(degree):
     span = 0.7
     moments = ((u / span)[:, None, None] ** np.arange(7)[:, None] * parts[:, None]).sum(0)
     none = np.zeros(1)
-    ledger = Ledger(none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, np.zeros((1, 3)), none)
+    ledger = Ledger(none, none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, none, none, none)
     added, lower = ledger.lower(path[None], degree, np.array([0]))
     powers = u[:, None] ** np.arange(4)
     # sum over frames of |F^T (powers (path - lower))|^2
@@ -242,10 +248,11 @@ def test_neighbours_that_err_alike_count_once():
 
 def test_kinds_are_those_of_the_stored_model():
     _, model, state, _ = fitted("line")
-    kinds = model.splats.degrees + LASTS * model.splats.lasting
+    kinds = model.splats.degrees + LASTS * model.splats.lasting + SOLID * model.splats.solid
     np.testing.assert_array_equal(kinds_of(state.rows, model.degree), kinds)
-    np.testing.assert_array_equal(state.kinds >= LASTS, model.splats.lasting)
-    assert (state.kinds % LASTS >= model.splats.degrees).all()  # a power may be there and be 0
+    np.testing.assert_array_equal(lasts(state.kinds), model.splats.lasting)
+    np.testing.assert_array_equal(is_solid(state.kinds), model.splats.solid)
+    assert (degrees_of(state.kinds) >= model.splats.degrees).all()  # a power may be there and be 0
 
 
 def test_what_a_kind_has_not_got_never_moves():
@@ -255,29 +262,124 @@ def test_what_a_kind_has_not_got_never_moves():
         pass
     at, kinds = columns(config.degree), state.kinds
     powers = np.repeat(np.arange(1, config.degree + 1), 2)
-    assert (kinds % LASTS < config.degree).any()
-    assert (state.rows[:, at["coefficients"]][powers > (kinds % LASTS)[:, None]] == 0).all()
-    assert (kinds >= LASTS).any()
+    assert (degrees_of(kinds) < config.degree).any()
+    assert (state.rows[:, at["coefficients"]][powers > degrees_of(kinds)[:, None]] == 0).all()
+    assert lasts(kinds).any()
+    assert is_solid(kinds).any()
+    assert (state.rows[is_solid(kinds), at["opacity_logit"].start] == OPAQUE).all()
 
 
 def test_forgotten_moments_are_those_of_numbers_that_are_gone():
     first, second = np.ones((2, 3, 11 + 4), np.float32)
-    forget(first, second, np.array([2, 1, LASTS], np.uint8), 2)
+    forget(first, second, np.array([2, 1 + SOLID, LASTS], np.uint8), 2)
     at = columns(2)
     assert first[:, at["coefficients"]].tolist() == [[1, 1, 1, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
     assert second[:, at["log_time_scale"].start].tolist() == [1, 1, 0]
     assert second[:, at["time_loc_logit"].start].tolist() == [1, 1, 0]
+    assert second[:, at["opacity_logit"].start].tolist() == [1, 0, 1]
     assert (first[:, at["color_dc"]] == 1).all()
 
 
-def test_colours_are_shared_where_it_pays():
-    rng = np.random.default_rng(0)
-    few = rng.normal(size=(8, 3))[rng.integers(0, 8, 400)].astype(np.float32)
-    many = rng.normal(size=(400, 3)).astype(np.float32)
-    index = shared_colors(few, np.ones(400), 1e-3, 0)
-    np.testing.assert_allclose(averaged(few, index), few, atol=1e-5)
-    assert shared_colors(many, np.ones(400), 1e-6, 0) is None
-    assert len(np.unique(shared_colors(many, np.ones(400), 10.0, 0))) == 8  # dear numbers: few colours
+@pytest.mark.parametrize("width", [2, 3])
+def test_numbers_are_shared_where_it_pays(width):
+    rng, weight = np.random.default_rng(0), np.ones((400, width))
+    few = rng.normal(size=(8, width))[rng.integers(0, 8, 400)].astype(np.float32)
+    many = rng.normal(size=(400, width)).astype(np.float32)
+    np.testing.assert_allclose(averaged(few, shared(few, weight, 1e-3, 0)), few, atol=1e-5)
+    assert shared(many, weight, 1e-6, 0) is None
+    assert len(np.unique(shared(many, weight, 10.0, 0))) == 8  # dear numbers: few rows
+
+
+def test_what_is_shared_learns_as_one():
+    """Adam on the sum of the gradients of those that took part; who did not moves along."""
+    index = np.array([0, 1, 0, 2, 1])
+    palette, values = Palette.of(index, 2), np.array([[1, 2], [3, 4], [1, 2], [5, 6], [3, 4]], np.float32)
+    grad = np.array([[1, 0], [9, 9], [2, -4], [0.5, 1], [9, 9]], np.float32)
+    before, rate = values.copy(), np.float32([0.1, 0.01])
+    palette.step(values, grad, np.array([0, 2, 3]), rate)
+    moved = values - before
+    np.testing.assert_allclose(moved[[0, 2]], [[-0.1, 0.01]] * 2, rtol=1e-4)  # by the signs of 3 and -4: a first step
+    np.testing.assert_allclose(moved[3], [-0.1, -0.01], rtol=1e-4)
+    assert (moved[[1, 4]] == 0).all()
+    assert (grad[[0, 2, 3]] == 0).all()
+    assert palette.counts.tolist() == [1, 0, 1]
+    np.testing.assert_allclose(palette.first[0], 0.1 * np.array([3, -4]), rtol=1e-5)
+    alone, shown = Palette.of(np.zeros(1, int), 2), np.zeros((1, 2), np.float32)
+    row, grad, moments = np.zeros((1, 11), np.float32), np.zeros((1, 11), np.float32), np.zeros((2, 1, 11), np.float32)
+    counts, rates = np.zeros(1, np.int32), np.full(11, 0.1, np.float32)
+    for gradient in np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32):
+        grad[:, :2] = gradient
+        sparse_adam(row, grad, *moments, counts, np.array([0]), rates)
+        alone.step(shown, gradient.copy(), np.array([0]), np.float32([0.1, 0.1]))
+    np.testing.assert_allclose(shown, row[:, :2], rtol=1e-4)
+
+
+def test_shared_numbers_stay_shared():
+    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
+    config = FitConfig(num_gaussians=400, steps=300, economy=Economy(bits=200.0))
+    for state, _ in fit_steps(frames, config):
+        pass
+    at = columns(config.degree)
+    for palette, leaf in ((state.colors, "color_dc"), (state.shapes, "log_scale")):
+        assert len(palette.index) == len(state.rows)
+        rows = np.unique(state.rows[:, at[leaf]], axis=0)
+        assert len(rows) == len(np.unique(palette.index)) < len(state.rows) / 2
+    model = to_model(state, config, SIZE, 25.0)
+    assert model.num_floats < numbers_of(state.kinds) - len(state.rows)
+
+
+def test_turned_by_a_quarter_is_the_same(scene):
+    frames, rows, shape, times, drawn = scene
+    state = start(frames, FitConfig(num_gaussians=len(rows), steps=1, degree=shape.degree))
+    state.rows = rows.copy()
+    state.first, state.second = (np.random.default_rng(k).random(rows.shape).astype(np.float32) for k in (0, 1))
+    first, at = state.first.copy(), columns(shape.degree)["log_scale"]
+    turned = _long_axis_first(state, shape.degree)
+    assert 0 < turned.sum() < len(rows)
+    assert (state.rows[:, at.start] >= state.rows[:, at.start + 1]).all()
+    for one, other in zip(
+        _pictures(rows, shape, times, drawn), _pictures(state.rows, shape, times, drawn), strict=True
+    ):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+    np.testing.assert_array_equal(state.first[turned][:, at], first[turned][:, at][:, ::-1])
+    np.testing.assert_array_equal(state.rows[~turned], rows[~turned])
+
+
+def test_frames_count_by_what_a_db_of_them_costs():
+    assert (frame_weights(np.zeros(3, np.float32)) == 1).all()
+    weights = frame_weights(np.float32([1e-3, 2e-3, 4e-3, 0]))
+    np.testing.assert_allclose(weights, np.array([4, 2, 1, 2]) / 9 * 4, rtol=1e-6)
+    one_black = frame_weights(np.float32([1e-12] + [1e-3] * 99))
+    assert 3 < one_black[0] / one_black[1] < 6  # an exact frame does not outweigh the others
+    assert one_black.mean() == pytest.approx(1)
+
+
+def test_sums_are_weighted_by_frames(scene):
+    """Linear in the weights, frame by frame: the first frames' and the last frames' add up to all."""
+    frames, rows, shape, times, drawn = scene
+    parts = np.linspace(0.2, 1.8, len(times))
+    ledgers = [_measured(rows, frames, shape, times, drawn, weights=w) for w in (parts, 2 - parts, None)]
+    for name in ("slope", "own", "by_path", "by_color", "by_axes", "by_size", "squared_error"):
+        first, second, plain = (np.asarray(getattr(ledger, name)) for ledger in ledgers)
+        np.testing.assert_allclose(first + second, 2 * plain, rtol=1e-6, atol=1e-9 * np.abs(plain).max())
+    assert not np.allclose(ledgers[0].own, ledgers[2].own, rtol=0.01)
+    assert ledgers[0].psnr == ledgers[2].psnr
+
+
+def test_another_shape_costs_what_it_says(scene):
+    """Against the pictures themselves, one axis longer by a little."""
+    _, rows, shape, times, drawn = scene
+    own = _pictures(rows, shape, times, drawn)
+    ledger, at = _mean_ledger((own, *scene[1:])), columns(shape.degree)["log_scale"]
+    for axis in (0, 1):
+        chosen = np.argsort(-ledger.by_axes[:, axis])[: len(rows) // 2 : 4]
+        cost = []
+        for i in chosen:
+            changed = rows.copy()
+            changed[i, at.start + axis] += 0.05
+            cost.append(_error(changed, own, shape, times, drawn))
+        ratios = np.array(cost) / (0.05**2 * ledger.by_axes[chosen, axis])
+        assert 0.8 < np.median(ratios) < 1.25
 
 
 def test_at_least_one_is_left():
@@ -292,6 +394,51 @@ def test_at_least_one_is_left():
     assert len(cut_rows(rows, np.full(3, 3, np.uint8), ledger, dear, degree=3, pixels=80.0).stay) == 1
 
 
+def test_numbers_are_those_that_are_stored():
+    """Of each kind, one Gaussian among others of its own, so that kinds are told."""
+    model = _fitted_model()
+    kinds = kinds_of(pack(model.splats), model.degree)
+    assert len(np.unique(kinds)) > 5
+    alone = dataclasses.replace(model.splats, color_dc=distinct(model, 3), log_scale=distinct(model, 2))
+    whole = dataclasses.replace(model, splats=alone)
+    others = 2 + model.num_frames - 1  # of the envelope and the frame times
+    assert whole.num_floats == numbers_of(kinds) + -(-len(kinds) // 4) + others
+
+
+def distinct(model, width) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(model.num_gaussians, width)).astype(np.float32)
+
+
+def _fitted_model():
+    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
+    return fit(frames, FitConfig(num_gaussians=400, steps=300, economy=Economy())).model
+
+
+def test_no_light_coming_through_costs_what_it_says(scene):
+    """Exactly, for one at a time: pictures are linear in an opacity."""
+    frames, rows, shape, times, drawn = scene
+    at = columns(shape.degree)["opacity_logit"].start
+    ledger, before = _mean_ledger(scene), _error(rows, frames, shape, times, drawn)
+    told = ledger.solid(1 / (1 + np.exp(-rows[:, at].astype(float))))
+    chosen = np.flatnonzero(told > 0)[:: max(len(rows) // 15, 1)]
+    cost = []
+    for i in chosen:
+        changed = rows.copy()
+        changed[i, at] = OPAQUE
+        cost.append(_error(changed, frames, shape, times, drawn) - before)
+    assert len(cost) >= 8
+    assert np.corrcoef(told[chosen], cost)[0, 1] > 0.97
+    assert np.abs(told[chosen] - cost).max() < 0.25 * max(map(abs, cost))
+
+
+def test_opacities_stay_where_they_are_asked_for():
+    frames, rows, shape, times, drawn = _scene()
+    ledger, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
+    kinds, how = np.full(len(rows), shape.degree, np.uint8), {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
+    assert is_solid(cut_rows(rows, kinds, ledger, dear, **how).kinds).any()
+    assert not is_solid(cut_rows(rows, kinds, ledger, dear, **how, solid=False).kinds).any()
+
+
 @pytest.mark.parametrize("sigma", [0.3, 0.6, 2.0])
 def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     """One Gaussian that is there at all frames, against pictures of itself."""
@@ -303,10 +450,10 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     own = _pictures(row, shape, times, drawn)
     ledger = _mean_ledger((own, row, shape, times, drawn), draws=4)
     assert ledger.misses[0] == 0
-    made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0)
+    made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0, solid=False)
     assert made.kinds.tolist() == [LASTS]
     cost = _error(made.rows, own, shape, times, drawn)
-    assert cost == pytest.approx(ledger.lasting[0], rel=0.5, abs=1e-6)
+    assert cost == pytest.approx(ledger.lasting(ledger.mean_log_envelope)[0], rel=0.5, abs=1e-6)
 
 
 def test_refitting_keeps_what_a_gaussian_is():
@@ -428,8 +575,10 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
         again = load_checkpoint(path, config=config, source={})
         for state_again, _ in fit_steps(frames, config, again):
             pass
-        for name in ("rows", "first", "second", "counts", "kinds", "young", "palette", "time_logits"):
+        for name in ("rows", "first", "second", "counts", "kinds", "young", "frame_errors", "time_logits"):
             np.testing.assert_array_equal(getattr(state_again, name), getattr(state, name))
+        for one, other in ((state_again.colors, state.colors), (state_again.shapes, state.shapes)):
+            jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.mark.parametrize(

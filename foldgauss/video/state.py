@@ -1,0 +1,105 @@
+"""The arrays of a running fit, and what they amount to."""
+
+import dataclasses
+import functools
+import math
+
+import cv2
+import jax
+import numpy as np
+import optax
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.config import FitConfig
+from foldgauss.video.frame_times import FrameTimes
+from foldgauss.video.growth import Statistics
+from foldgauss.video.metrics import psnr
+from foldgauss.video.model import VideoModel
+from foldgauss.video.packing import unpack
+from foldgauss.video.playback import Playback
+from foldgauss.video.sharing import Palette
+
+TIME_ADAM = optax.scale_by_adam(eps=1e-15)
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "rows",
+        "first",
+        "second",
+        "counts",
+        "kinds",
+        "young",
+        "colors",
+        "shapes",
+        "frame_errors",
+        "time_logits",
+        "time_moments",
+        "statistics",
+    ],
+    meta_fields=["step", "plan", "seconds", "error"],
+)
+@dataclasses.dataclass
+class FitState:
+    """The arrays of a running fit. A step consumes its state: as with donated buffers, arrays are updated in place."""
+
+    rows: np.ndarray  # float32 (num, width): see `packing`
+    first: np.ndarray  # Adam's moments, likewise
+    second: np.ndarray
+    counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
+    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `kinds.kinds_of`
+    young: np.ndarray  # bool (num,): born the last time that stock was taken
+    colors: Palette  # which colours are one and the same
+    shapes: Palette  # likewise of the two standard deviations
+    frame_errors: np.ndarray  # float32 (num_frames,): mean squared error when last seen, 0 before
+    time_logits: np.ndarray  # float32 (num_frames - 1,)
+    time_moments: optax.OptState
+    statistics: Statistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
+    step: int
+    plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
+    seconds: float
+    error: float  # running mean of the squared error
+
+
+def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
+    """The model as it stands in `state` (arrays are copied)."""
+    return VideoModel(
+        splats=unpack(state.rows, config.degree, envelope_of(config)),
+        frame_times=FrameTimes(state.time_logits.copy()),
+        size=tuple(int(n) for n in size),
+        fps=float(fps),
+        options=config.options,
+        compositing=config.compositing,
+    )
+
+
+def running_psnr(state: FitState) -> float:
+    """dB, by the running mean of the squared error; at most 100, as of pictures that are equal (`psnr`)."""
+    return -10 * math.log10(max(state.error, 1e-10))
+
+
+def mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
+    """dB, mean over all frames as they are shown, over black."""
+    playback = Playback(to_model(state, config, frames.shape[1:3], 1.0))
+    return float(np.mean([psnr(frame[..., :3], shown) for frame, shown in zip(frames, playback.frames(), strict=True)]))
+
+
+def envelope_of(config: FitConfig) -> TimeLikelihood:
+    return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
+
+
+@jax.jit
+def frame_times(logits):
+    return FrameTimes(logits).times()
+
+
+def planar(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Bytes (height, width, 3) as floats (3, height, width), as the kernels want them; with alpha over `background`."""
+    out = np.empty((3, *frame.shape[:2]), np.float32)
+    *colors, last = cv2.split(frame)
+    for plane, own in zip(out, colors if frame.shape[2] == 4 else (*colors, last), strict=True):
+        np.multiply(own, np.float32(1 / 255), out=plane)
+    if frame.shape[2] == 4:
+        out += background[:, None, None] * (1 - last * np.float32(1 / 255))
+    return out

@@ -1,0 +1,60 @@
+"""A new order of Gaussians: cheap to tell, and the same pictures."""
+
+import equinox as eqx
+import jax
+import numpy as np
+from soft_models import soft_model
+
+from foldgauss.render import RenderOptions
+from foldgauss.video.light import LitModel
+from foldgauss.video.metrics import psnr
+from foldgauss.video.ordering import free_order, overlaps, swept
+
+
+def in_order(model, order):
+    def cut(leaf):
+        return np.asarray(leaf)[order] if np.ndim(leaf) else leaf
+
+    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
+
+
+def narrow(model):
+    """Small Gaussians: many do not overlap."""
+    return eqx.tree_at(lambda m: m.splats.log_scale, model, np.asarray(model.splats.log_scale) - np.float32(0.9))
+
+
+def far_apart(one, other):
+    return min(psnr(a, b) for a, b in zip(one.frames(), other.frames(), strict=True))
+
+
+def test_sweeps_keep_pairs_in_order():
+    rng = np.random.default_rng(0)
+    cell = rng.integers(0, 16, 300)
+    front, back = np.sort(rng.integers(0, 300, (2, 500)), axis=0)
+    front, back = front[front < back], back[front < back]
+    order = swept(cell, front, back)
+    assert sorted(order) == list(range(300))
+    place = np.argsort(order)
+    assert (place[front] < place[back]).all()
+    none = np.zeros(0, int)
+    np.testing.assert_array_equal(cell[swept(cell, none, none)], np.sort(cell))
+
+
+def test_pictures_stay():
+    model = narrow(soft_model(options=RenderOptions()))
+    lit, cell = LitModel(model), np.random.default_rng(1).integers(0, 4, model.num_gaussians)
+    order = free_order(cell, overlaps(lit), 0.0)
+    assert (order != np.arange(len(order))).sum() > 10
+    assert far_apart(in_order(model, order), model) > 48
+    mixed = np.argsort(cell, kind="stable")
+    assert far_apart(in_order(model, mixed), model) < 40  # where any may pass any
+
+
+def test_costs_are_what_changing_places_costs():
+    """Of two Gaussians, by the pictures."""
+    model = in_order(soft_model(options=RenderOptions()), np.array([20, 30]))
+    lit = LitModel(model)
+    front, back, cost = overlaps(lit)
+    assert (front.tolist(), back.tolist()) == ([0], [1])
+    shown = [np.stack(list(one.frames())) / 255.0 for one in (model, in_order(model, np.array([1, 0])))]
+    np.testing.assert_allclose(cost[0], ((shown[0] - shown[1]) ** 2).sum(), rtol=0.2)
