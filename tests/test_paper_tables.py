@@ -146,11 +146,12 @@ class TestAblation:
 
     def test_steps_fill_the_minutes(self):
         pace = {1: 0.01, 3: 0.03, 5: 0.04}
-        steps = ablation.steps_within(60, pace)
+        steps = ablation.steps_within(10, pace)
         seconds = steps * sum(pace[cell.batch] for cell in ablation.cells())
-        assert 0.75 * 3600 < seconds <= 0.85 * 3600
-        assert steps == 5500
+        assert 0.75 * 600 < seconds <= 0.85 * 600
+        assert steps == 920
         assert ablation.steps_within(1e-6, pace) == 1
+        assert ablation.steps_within(60, pace) == ablation.STEPS
 
     def paper(self):
         made = {
@@ -188,15 +189,15 @@ class TestAblation:
             return 30 + config.degree / 10
 
         configs = fake_fits(monkeypatch, ablation, psnr_of)
-        command = ["--clip", str(clip), "--size", "24x32", "--minutes", "2", "--json", str(tmp_path / "a.json")]
+        command = ["--clip", str(clip), "--size", "24x32", "--minutes", "1", "--json", str(tmp_path / "a.json")]
         with pytest.raises(KeyboardInterrupt):
             ablation.main(command)
-        assert (len(configs), timed) == (5, [scaled(1e6 * num, SIZE) for num in (1.73, 0.59, 0.32)])
+        assert (len(configs), timed) == (5, [scaled(ablation.GROWN[batch], SIZE, (160, 320)) for batch in (1, 3, 5)])
         broken[0] = False
         ablation.main(command)
         assert (len(configs), len(timed)) == (5 + 16, 3)
         steps = {config.steps for config in configs}
-        assert steps == {int(120 * 0.85 / (20 * 0.05)) // 10 * 10}
+        assert steps == {int(60 * 0.85 / (20 * 0.05))}
         shown = printed(capsys)
         assert "estimated minutes" in shown
         assert "does not hold" in shown
