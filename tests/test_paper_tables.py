@@ -189,7 +189,7 @@ class TestAblation:
             return 30 + config.degree / 10
 
         configs = fake_fits(monkeypatch, ablation, psnr_of)
-        command = ["--clip", str(clip), "--size", "24x32", "--minutes", "1", "--json", str(tmp_path / "a.json")]
+        command = ["--clip", str(clip), "--size", "24x32", "--minutes", "1.2", "--json", str(tmp_path / "a.json")]
         with pytest.raises(KeyboardInterrupt):
             ablation.main(command)
         assert (len(configs), timed) == (5, [scaled(ablation.GROWN[batch], SIZE, (160, 320)) for batch in (1, 3, 5)])
@@ -197,7 +197,7 @@ class TestAblation:
         ablation.main(command)
         assert (len(configs), len(timed)) == (5 + 16, 3)
         steps = {config.steps for config in configs}
-        assert steps == {int(60 * 0.85 / (20 * 0.05))}
+        assert steps == {61}
         shown = printed(capsys)
         assert "estimated minutes" in shown
         assert "does not hold" in shown
