@@ -318,7 +318,8 @@ def test_commands_are_listed_as_one_comes_to_need_them(capsys):
     assert run("--help") == 0
     lines = capsys.readouterr().out.partition("Commands:\n")[2].splitlines()
     assert [line.split()[0] for line in lines if line.strip()] == [
-        "fit", "render", "evaluate", "info", "uncertainty", "edit", "compress", "tradeoff", "export", "import", "demo",
+        "fit", "render", "evaluate", "info", "figure", "uncertainty", "edit", "compress", "tradeoff", "export",
+        "import", "demo",
     ]  # fmt: skip
     assert not any("..." in line for line in lines)  # none is cut
     assert run("evaluate", "--help") == 0

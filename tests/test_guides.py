@@ -55,6 +55,13 @@ def test_economy():
     assert names["throughout"] > 0
 
 
+@pytest.mark.slow
+def test_results():
+    names = _run("results.md")
+    assert names["control"].num_floats <= names["model"].num_floats
+    assert names["gain"] > 0
+
+
 def test_tradeoff():
     names = _run("tradeoff.md")
     assert names["chosen"] == [0, 1, 2, 3]

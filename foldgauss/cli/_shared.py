@@ -41,7 +41,19 @@ class _InOrderOfUse(typer.core.TyperGroup):
     """The commands as one comes to need them; typer has them as they were registered."""
 
     _ORDER = (
-        *("fit", "render", "evaluate", "info", "uncertainty", "edit", "compress", "tradeoff", "export", "import"),
+        *(
+            "fit",
+            "render",
+            "evaluate",
+            "info",
+            "figure",
+            "uncertainty",
+            "edit",
+            "compress",
+            "tradeoff",
+            "export",
+            "import",
+        ),
         "demo",
     )
 

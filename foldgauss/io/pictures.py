@@ -13,14 +13,24 @@ def comparison(originals: list[np.ndarray], reconstructions: list[np.ndarray], c
 
     Pictures are uint8 RGB of one size; `captions` stand above each row. Returns uint8 (height, width, 3).
     """
-    rows = []
+    rows, titles = [], []
     for original, picture, caption in zip(originals, reconstructions, captions, strict=True):
         error = np.abs(original.astype(np.int16) - picture)
-        error = np.clip(error * ERROR_GAIN, 0, 255).astype(np.uint8)
-        titles = [f"original, {caption}", "reconstruction", f"error x {ERROR_GAIN}"]
-        tiles = [_titled(tile, title) for tile, title in zip((original, picture, error), titles, strict=True)]
-        rows.append(np.concatenate(tiles, axis=1))
-    return np.pad(np.concatenate(rows), ((0, _MARGIN), (0, _MARGIN), (0, 0)), constant_values=_PAPER)
+        rows.append([original, picture, np.clip(error * ERROR_GAIN, 0, 255).astype(np.uint8)])
+        titles.append([f"original, {caption}", "reconstruction", f"error x {ERROR_GAIN}"])
+    return sheet(rows, titles)
+
+
+def sheet(rows: list[list[np.ndarray]], titles: list[list[str]]) -> np.ndarray:
+    """Rows of pictures, uint8 RGB of one size, as many in each row, and a line of text above each picture.
+
+    Returns uint8 (height, width, 3).
+    """
+    lines = [
+        np.concatenate([_titled(*pair) for pair in zip(row, above, strict=True)], axis=1)
+        for row, above in zip(rows, titles, strict=True)
+    ]
+    return np.pad(np.concatenate(lines), ((0, _MARGIN), (0, _MARGIN), (0, 0)), constant_values=_PAPER)
 
 
 def _titled(picture: np.ndarray, title: str) -> np.ndarray:

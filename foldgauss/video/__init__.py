@@ -9,6 +9,7 @@ from foldgauss.video.edited import EditedVideo, Layer, layers
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.growth import Growth
+from foldgauss.video.independent import IndependentFrames, independent_frames
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.overlays import SelectedGaussians
@@ -41,6 +42,7 @@ __all__ = [
     "FoldedSplats",
     "FrameTimes",
     "Growth",
+    "IndependentFrames",
     "Layer",
     "LearningRates",
     "SelectedGaussians",
@@ -60,6 +62,7 @@ __all__ = [
     "evaluate",
     "fit",
     "fit_steps",
+    "independent_frames",
     "influence",
     "interpolated_times",
     "layers",

@@ -1,0 +1,113 @@
+"""Long tables, run by run: what is finished is kept in a file, and the same command goes on after it."""
+
+import dataclasses
+import datetime
+import json
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._common import console, machine
+from foldgauss.io._atomic import atomic_path
+from foldgauss.io.video_file import Clip
+from foldgauss.video import FitConfig, VideoModel, fit, fit_steps, psnr, ssim
+
+Run = dict[str, Any]
+
+
+class Runs:
+    """Finished runs by name, in `path` (None: nowhere). After each one the file is written anew and renamed into place.
+
+    `setting` is what all runs have in common. Raises ValueError for a file of runs with another setting, or of no runs.
+    """
+
+    def __init__(self, path: Path | None, setting: dict[str, Any]):
+        self.path = path
+        self.setting = json.loads(json.dumps(setting))  # as it is read back: tuples are lists
+        self.done: dict[str, Run] = {}
+        if path is not None and path.exists():
+            self.done = _read(path, self.setting)
+            console.print(f"{path}: {len(self.done)} finished runs are taken over", style="dim", soft_wrap=True)
+
+    def get(self, name: str, make: Callable[[], Run]) -> Run:
+        """A finished run, or the one that `make` makes now."""
+        if name not in self.done:
+            made = make() | {"date": datetime.datetime.now(datetime.UTC).date().isoformat()}
+            self.done[name] = made
+            self.write()
+            console.print(f"{name}: {told(made)}", style="dim", soft_wrap=True)
+        return self.done[name]
+
+    def write(self, **more: Any) -> None:
+        """The file, with `more` beside the runs."""
+        if self.path is not None:
+            whole = {"setting": self.setting, "runs": self.done, "machine": machine(), **more}
+            with atomic_path(self.path) as temporary:
+                temporary.write_text(json.dumps(whole, indent=2) + "\n")
+
+
+def _read(path: Path, setting: dict[str, Any]) -> dict[str, Run]:
+    try:
+        found = json.loads(path.read_text())
+        runs, kept = found["runs"], found["setting"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"--json: expected a file of finished runs, got {path}. Choose another name.") from error
+    other = [name for name in {**kept, **setting} if kept.get(name) != setting.get(name)]
+    if other:
+        was = ", ".join(f"{name} {kept.get(name)} instead of {setting.get(name)}" for name in other)
+        raise ValueError(f"--json: {path} holds runs with {was}. Choose another file, or the same options.")
+    return runs
+
+
+def kept_setting(path: Path | None, name: str) -> Any:
+    """A setting of the runs in `path`; None where there is none."""
+    if path is None or not path.exists():
+        return None
+    try:
+        return json.loads(path.read_text())["setting"].get(name)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None  # `Runs` says what is wrong
+
+
+def told(run: Run) -> str:
+    """A run in one line."""
+    shown = {"psnr": "{:.2f} dB", "gaussians": "{:,} Gaussians", "steps": "{:,} steps", "seconds": "{:.0f} s"}
+    return ", ".join(form.format(run[name]) for name, form in shown.items() if name in run)
+
+
+def scores(model: Any, frames: np.ndarray, *, with_ssim: bool = True) -> Run:
+    """Mean PSNR, and SSIM, over all frames, of 8-bit pictures of anything that has `frames()`."""
+    pairs = [(psnr(*pair), ssim(*pair) if with_ssim else 0.0) for pair in zip(frames, model.frames(), strict=True)]
+    by_psnr, by_ssim = zip(*pairs, strict=True)
+    return {"psnr": statistics.fmean(by_psnr), "worst_psnr": min(by_psnr)} | (
+        {"ssim": statistics.fmean(by_ssim)} if with_ssim else {}
+    )
+
+
+def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True) -> tuple[VideoModel, Run]:
+    """A fit, its quality and what it took; `seconds` are those of fitting, starts and motion included."""
+    result = fit(clip.frames, config, fps=clip.fps)
+    seconds, steps = result.history[-1].seconds, result.history[-1].step
+    run = scores(result.model, clip.frames, with_ssim=with_ssim)
+    run |= {"gaussians": result.model.num_gaussians, "floats": result.model.num_floats, "steps": steps}
+    return result.model, run | {"frames_seen": steps * config.batch_size, "seconds": seconds}
+
+
+#: Steps that a pace is measured by, after some in which kernels are loaded.
+TIMED, UNTIMED = 12, 4
+
+
+def seconds_per_step(clip: Clip, config: FitConfig, num_gaussians: int) -> float:
+    """The median of some steps at full size with so many Gaussians, none of them born or dead."""
+    still = {"num_gaussians": num_gaussians, "growth": None, "quarter_share": 0.0, "half_share": 0.0}
+    timed = dataclasses.replace(config, steps=UNTIMED + TIMED, minutes=None, **still)
+    seconds = [info.seconds for _, info in fit_steps(clip.frames, timed)]
+    return statistics.median(np.diff(seconds[UNTIMED - 1 :]))
+
+
+def scaled(count: float, size: tuple[int, int], full: tuple[int, int] = (640, 1280)) -> int:
+    """A number of Gaussians given for frames of `full` size, in proportion to the pixels of frames of `size`."""
+    return max(round(count * size[0] * size[1] / (full[0] * full[1])), 1)
