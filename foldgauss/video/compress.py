@@ -62,7 +62,9 @@ _WORTH = 40.0
 #: How much coarser the steps are, in powers of two, that mending is first tried with; and what such a power costs, dB.
 _COARSER, _SLOPE = 1.7, 0.7
 #: Tries with mending, each of passes / 2 + passes / 4 passes; and the share of the loss allowed that ends them.
-_TRIES, _ENOUGH = 5, 0.9
+_TRIES, _ENOUGH = 6, 0.9
+#: Powers of two that a try goes beyond all before it, at most.
+_FARTHER = 2.0
 #: Of the loss allowed, what leaving Gaussians out may cost once the others are fitted anew; else the next try leaves
 #: out as many as steps finer by so many powers of two would.
 _MISSED, _FEWER = 0.4, 0.7
@@ -226,21 +228,26 @@ def _mended(
 
 
 def _next(tried: dict[float, float], most: float, least: float) -> float | None:
-    """Where to try next: between the tries on either side of `most`, or beyond the last one by the usual slope."""
+    """Where to try next: between the tries on either side of `most`, or beyond the last one, but not far.
+
+    The squared error is some of its own and that of rounding, which grows as 4^factor.
+    """
     aim = 0.95 * most
     below = max((factor for factor, loss in tried.items() if loss <= most), default=None)
     above = min((factor for factor, loss in tried.items() if loss > most), default=None)
     if below is not None and above is not None:
         if above - below < 0.5 * _CLOSE:
             return None
-        share = (aim - tried[below]) / (tried[above] - tried[below])
-        return below + min(max(share, 0.1), 0.9) * (above - below)
+        wanted, less, more = (10 ** (loss / 10) for loss in (aim, tried[below], tried[above]))
+        share = (wanted - less) / max(more - less, 1e-9)
+        factor = math.log(max(4.0**below + share * (4.0**above - 4.0**below), 1e-9), 4)
+        return below + min(max(factor - below, 0.1 * (above - below)), 0.9 * (above - below))
     nearest, *others = sorted(tried, key=lambda factor: abs(tried[factor] - aim))
     slope = _SLOPE
     if others:
         slope = (tried[others[0]] - tried[nearest]) / (others[0] - nearest)
         slope = min(max(slope, 0.3 * _SLOPE), 2 * _SLOPE)
-    factor = nearest + (aim - tried[nearest]) / slope
+    factor = nearest + min((aim - tried[nearest]) / slope, _FARTHER)
     return factor if least < factor <= _COARSEST + 2 else None
 
 
