@@ -336,7 +336,8 @@ def test_the_screen_gradient_is_in_units_of_half_the_picture():
         rows = state.rows.copy()
         rows[0, PLACE["loc"]] += np.float32([dx * 20 / unit, dy * 12 / unit])
         step = stepper_of(state)
-        return step._frame(rows, k, np.float32(k), step.shapes[-1], squared=False, mirrored=False, views=None)[0].value
+        moved = dataclasses.replace(state, rows=rows)
+        return step._frame(moved, k, np.float32(k), step.shapes[-1], squared=False, mirrored=False, views=None)[0].value
 
     small = 0.02
     slope = [(loss(small, 0) - loss(-small, 0)) / (2 * small), (loss(0, small) - loss(0, -small)) / (2 * small)]

@@ -154,7 +154,7 @@ def test_both_views_give_the_same_gradients():
     for mirrored in (False, True):
         step = fit_module._Stepper(FRAMES, config, state)
         loss, _, by_time = step._frame(
-            state.rows, 2, np.float32(0.6), step.shapes[-1], squared=False, mirrored=mirrored, views=None
+            state, 2, np.float32(0.6), step.shapes[-1], squared=False, mirrored=mirrored, views=None
         )
         gradients.append(np.append(step.grad, by_time))
         losses.append(loss.value)
