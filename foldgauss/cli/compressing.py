@@ -134,7 +134,7 @@ def _compressed(
 
         given = None if clip is None else clip.frames
         made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
-    if made.loss_db < -NEARER:
+    if passes and made.loss_db < -NEARER:
         err.print(
             f"warning: the compact file is {-made.loss_db:.1f} dB nearer to the clip than the model was. Its fit had "
             "not come to its end; or it was edited, and fitting anew has taken that back. --passes 0 only rounds.",
