@@ -328,7 +328,7 @@ def test_paths_are_legendre_series_over_the_span():
         np.testing.assert_allclose(by_matrix, np.tile(expected, (len(u), 1)), atol=1e-8)
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="the decoder for browsers is run by node")
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the decoder for browsers")
 @pytest.mark.parametrize(
     "how", [{"degree": 0}, {"degree": 3, "power": 1.0}, {"degree": 7}, {"num_frames": 1}, "crowd", "crowd of kinds"]
 )
