@@ -82,8 +82,8 @@ def shared(
 
     `weight` is what the square of an error of a value adds to the squared error, `price` what a stored number has to
     save, `progress` the share of the fit that is done: what is left of it mends part of the error, which is
-    `most` at most before. Clusters by Lloyd's algorithm (1982), weighted by the mean of a row's weights, for palettes of
-    several sizes.
+    `most` at most before. Clusters by Lloyd's algorithm (1982), weighted by the mean of a row's weights, for palettes
+    of several sizes.
     """
     num, width = values.shape
     left = 1 - (1 - _LEFT) * min((1 - progress) / _MENDED_IN, 1.0)
