@@ -10,6 +10,9 @@ from pathlib import Path
 
 from foldgauss._checks import invalid, short_repr
 
+#: Characters of an output's name that its temporary file bears.
+KEPT = 40
+
 
 class OutputError(OSError):
     """An output path cannot be written; the message is one line and says what to do."""
@@ -39,7 +42,7 @@ def _check_target(path: Path) -> None:
 def temporary_name(path: Path, suffix: str) -> Path:
     """A fresh hidden name beside `path`: the rename then stays within one file system."""
     # The stem is cut: with a long one the random part would pass the file system's limit of 255 bytes.
-    return path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}{suffix}")
+    return path.with_name(f".{path.stem[:KEPT]}.tmp-{secrets.token_hex(4)}{suffix}")
 
 
 def not_writable(path: Path, error: OSError) -> OutputError:

@@ -1,0 +1,64 @@
+"""One writer at a time: of a long work's output, and of what it keeps on the way."""
+
+import hashlib
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from foldgauss.io._atomic import KEPT, OutputError, check_writable, not_writable
+
+#: Seconds after which an unfinished file beside an output is one that a killed process left.
+LEFT = 3600.0
+
+
+@contextmanager
+def only_writer(path: Path, *, own: tuple[Path, ...] = ()) -> Iterator[None]:
+    """Keep others that ask likewise from writing `path`, until the block or the process ends, however it does.
+
+    `own`: files that nobody writes but who holds the lock. Unfinished ones of theirs, left by a kill, are removed, and
+    those of `path` once they are an hour old. Raises `OutputError` at once where another holds the lock, or `path`
+    cannot be written.
+    """
+    check_writable(path)  # the lock would make a folder that is missing
+    file = path.with_name(f".{_short(path.name)}.lock")
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise OutputError(
+            f"path: expected an output that nobody else is writing, got {str(path)!r}, which another fit is. "
+            "Wait for that one, or choose another name."
+        ) from error
+    except OSError as error:
+        raise not_writable(path, error) from error
+    try:
+        for target in own:
+            _remove_unfinished(target, 0.0 if _is_told_whole(target) else LEFT)
+        _remove_unfinished(path, LEFT)
+        yield
+    finally:
+        file.unlink(missing_ok=True)  # while it is held: who opened it before finds that it is another's or none's
+        lock.release()
+
+
+def _remove_unfinished(path: Path, age: float) -> None:
+    """What `atomic_path(path)` left in a process that was killed."""
+    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.tmp-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+    for found in path.parent.iterdir():
+        with suppress(FileNotFoundError):  # another was faster
+            if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:
+                found.unlink()
+
+
+def _is_told_whole(path: Path) -> bool:
+    """Whether its unfinished files bear all of its name, and so are no other's."""
+    return len(path.stem) <= KEPT
+
+
+def _short(name: str) -> str:
+    """A name that leaves room for more within the 255 bytes that file systems have."""
+    return name if len(name.encode()) <= 240 else hashlib.sha256(name.encode()).hexdigest()[:32]

@@ -1,0 +1,81 @@
+"""One writer at a time, whoever dies."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from foldgauss.io._atomic import OutputError
+from foldgauss.io._lock import LEFT, only_writer
+
+HOLDING = """
+import pathlib, sys, time
+from foldgauss.io._lock import only_writer
+with only_writer(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that writes m.safetensors."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDING, tmp_path / "m.safetensors"], stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def test_a_second_writer_is_refused_until_the_first_is_gone(tmp_path, holder):
+    path = tmp_path / "m.safetensors"
+    with pytest.raises(OutputError, match="which another fit is"), only_writer(path):
+        pass
+    with only_writer(tmp_path / "other.safetensors"):
+        pass
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    with only_writer(path):
+        pass
+    assert os.listdir(tmp_path) == []  # no locks are left lying about
+
+
+def test_within_a_process_too(tmp_path):
+    path = tmp_path / "m.safetensors"
+    with only_writer(path), pytest.raises(OutputError, match="another fit"), only_writer(path):
+        pass
+    with only_writer(path):
+        pass
+
+
+def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
+    path, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
+    mine = tmp_path / ".m.safetensors.tmp-01ab23cd.checkpoint"
+    stale, fresh = tmp_path / ".m.tmp-01ab23cd.safetensors", tmp_path / ".m.tmp-11ab23cd.safetensors"
+    others = [
+        tmp_path / name
+        for name in (".m.safetensors.notes.checkpoint", ".n.tmp-01ab23cd.safetensors", ".m.20240131.safetensors")
+    ]
+    others += [path, kept, fresh]
+    for file in (mine, stale, *others):
+        file.write_text("x")
+    long_ago = time.time() - LEFT - 60
+    os.utime(stale, (long_ago, long_ago))
+    with only_writer(path, own=(kept,)):
+        assert not mine.exists()
+        assert not stale.exists()
+    assert all(file.exists() for file in others)
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with (
+        pytest.raises(OutputError, match="expected an existing folder"),
+        only_writer(tmp_path / "no" / "m.safetensors"),
+    ):
+        pass
+    assert os.listdir(tmp_path) == []
