@@ -45,6 +45,8 @@ MAX_DEGREE = 16
 FINE = RenderOptions(low_pass=0.1)
 #: Where Gaussians start, and which rates fall.
 INITIALIZATIONS, FALLING = ("clip", "uniform"), ("all", "loc")
+#: What a fit does that comes apart, see `guard`.
+ON_DIVERGENCE = ("back-off", "stop")
 #: The published rates, those of lengths in our unit; published positions learn in units of the scene's extent.
 PUBLISHED_RATES = LearningRates(
     loc=1.6e-4 * EXTENT,
@@ -101,41 +103,44 @@ class FitConfig:
     fidelity to the paper.
     """
 
-    num_gaussians: int | None = None  # at the start; None: by size and number of the frames, `default_num_gaussians`
-    max_gaussians: int | None = None  # at any time; None: `MAX_GAUSSIANS`
+    num_gaussians: int | None = None  #: at the start; None: by size and number of the frames, `default_num_gaussians`
+    max_gaussians: int | None = None  #: at any time; None: `MAX_GAUSSIANS`
     degree: int = 3
     steps: int | None = None
     minutes: float | None = None
-    target_psnr: float | None = None  # dB, mean over all frames; no coarse levels then
-    max_size_mb: float | None = None  # 10^6 bytes
+    target_psnr: float | None = None  #: dB, mean over all frames; no coarse levels then
+    max_size_mb: float | None = None  #: 10^6 bytes
     batch_size: int = 1
-    power: float = 1.0  # of the envelope: 1 as in the paper's text, 2 as in its code
-    floor: float = 0.0  # of the envelope
+    power: float = 1.0  #: of the envelope: 1 as in the paper's text, 2 as in its code
+    floor: float = 0.0  #: of the envelope
     ssim_share: float = 0.2
     seed: int = 0
     learn_frame_times: bool = True
     #: Drawn from the "clip", its detail and its colours, or "uniform" over frame and time, see `initialize_uniform`.
     initialization: str = "clip"
-    follow_motion: bool = True  # start along the optical flow, shot by shot; False: at rest
-    own_time: bool = True  # rates in units of each Gaussian's own time, see `LearningRates`
+    follow_motion: bool = True  #: start along the optical flow, shot by shot; False: at rest
+    own_time: bool = True  #: rates in units of each Gaussian's own time, see `LearningRates`
     #: Of the plan, at its beginning: frames at a quarter, then at half of their size, as far as they are large enough.
     quarter_share: float = 0.2
     half_share: float = 0.4
-    square_share: float = 0.3  # of the plan, at its end: squared error alone, which is what PSNR measures
+    square_share: float = 0.3  #: of the plan, at its end: squared error alone, which is what PSNR measures
     #: Of the steps: a time between two frames, where what the optical flow knows of it is learned instead of a frame.
     #: Better slow motion, and less quality at the frames.
     between_share: float = 0.0
     #: Adam's steps are for Gaussians alive in the batch; False: for all, by momentum, as published.
     only_alive: bool = True
     rates: LearningRates = LearningRates()
-    final_rate: float = 0.07  # rates fall exponentially to this share of themselves
-    falling: str = "all"  # which do: all, or "loc", that of positions alone
-    two_cameras: bool = False  # see above
-    growth: Growth | None = None  # None: the number of Gaussians stays
-    economy: Economy | None = None  # None: nothing is dropped
+    final_rate: float = 0.07  #: rates fall exponentially to this share of themselves
+    falling: str = "all"  #: which do: all, or "loc", that of positions alone
+    two_cameras: bool = False  #: see above
+    growth: Growth | None = None  #: None: the number of Gaussians stays
+    economy: Economy | None = None  #: None: nothing is dropped
     #: "over": front to back as 3DGS and VeGaS; "sum": contributions added up, in any order, as GaussianImage.
     compositing: str = "over"
     options: RenderOptions = FINE
+    #: Where numbers become infinite or pictures much worse: "back-off" to the last sound state, with lower rates, or
+    #: "stop" with `FitDiverged`.
+    on_divergence: str = "back-off"
 
     def __post_init__(self) -> None:
         numbers = {"num_gaussians": 1, "max_gaussians": 1, "degree": 0, "steps": 1, "batch_size": 1, "seed": 0}
@@ -175,6 +180,7 @@ class FitConfig:
             object.__setattr__(self, name, float(value))
         one_of("initialization", self.initialization, INITIALIZATIONS)
         one_of("falling", self.falling, FALLING)
+        one_of("on_divergence", self.on_divergence, ON_DIVERGENCE)
         one_of("compositing", self.compositing, COMPOSITINGS)
         if self.quarter_share + self.half_share > 1:
             got = f"{self.quarter_share:g} and {self.half_share:g}"

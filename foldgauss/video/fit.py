@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from foldgauss import _display
 from foldgauss._checks import invalid, whole, within
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
@@ -18,6 +19,7 @@ from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, m
 from foldgauss.video.economy import LEAST_PASSES, frame_weights
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.growth import Growth, Statistics, dim, grown
+from foldgauss.video.guard import LOWERED, Guard
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.kinds import kinds_at_start, kinds_of
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
@@ -42,25 +44,37 @@ from foldgauss.video.stock import StockTaker
 
 
 class FitInfo(NamedTuple):
-    """What one step tells its observers."""
+    """What one step tells its observers: loss of its batch, running PSNR in dB, counts, seconds."""
 
-    step: int  # steps done
-    progress: float  # share of the plan that is done, in [0, 1]
-    loss: float  # of this step's batch
-    psnr: float  # dB, running mean over about one pass through the frames, at the size they are seen at
+    step: int  #: steps done
+    progress: float  #: share of the plan that is done, in [0, 1]
+    loss: float  #: of this step's batch
+    psnr: float  #: dB, running mean over about one pass through the frames, at the size they are seen at
     num_gaussians: int
-    num_alive: int  # Gaussians that took part in this step
-    seconds: float  # spent fitting so far
-    seconds_left: float  # by the pace so far
-    stopped_by: str | None  # at the last step, what bound: "steps", "minutes", "target_psnr" or "smallest_at_psnr"
+    num_alive: int  #: Gaussians that took part in this step
+    seconds: float  #: spent fitting so far
+    seconds_left: float  #: by the pace so far
+    stopped_by: str | None  #: at the last step, what bound: "steps", "minutes", "target_psnr" or "smallest_at_psnr"
 
 
 @dataclasses.dataclass(frozen=True)
 class FitResult:
-    """The fitted model, and the info of the steps that were kept (every `every`-th)."""
+    """What `fit` returns: the `model`, and as `history` the `FitInfo` of every `every`-th step and the last one."""
 
     model: VideoModel
     history: list[FitInfo]
+
+    def __repr__(self) -> str:
+        model, last = self.model, self.history[-1] if self.history else None
+        height, width = model.size
+        told = f"{model.num_frames} frames of {height}x{width}, {model.num_gaussians:,} Gaussians"
+        if last is not None:
+            told += f"; {last.psnr:.2f} dB after {last.step:,} steps, {last.seconds:.1f} s"
+        return f"{type(self).__name__}({told})"
+
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows: the course of the fit."""
+        return _display.history_png(self.history)
 
 
 def fit(
@@ -114,6 +128,9 @@ def fit_steps(
     step = _Stepper(frames, config, state, flow)
     pace = _Pace(config, [level.share for level in step.levels], len(frames))
     outlook = _Outlook(state, config, step.levels)
+    guard = Guard(state, config, step.steps_per_pass, alpha=frames.shape[3] == 4)
+    if state.step == 0 and guard.comparable and config.initialization == "clip":
+        guard.start_errors = step.errors_at_start(state)
     stopped_by = _stopped_by(state, config, frames)
     if stopped_by:  # a kept state that needs no more steps
         yield state, _info(state, config, outlook, math.nan, 0, stopped_by)
@@ -122,10 +139,20 @@ def fit_steps(
         level = _level(state, step.levels)
         loss, squared_error, num_alive = step(state, _progress(state, config), level)
         another = state.plan > 0 and level != level_at(step.levels, (state.step - 1) / state.plan)
-        memory = max(1 - config.batch_size / len(frames), 0.5) if state.step and not another else 0.0
+        memory = max(1 - config.batch_size / len(frames), 0.5) if state.error and not another else 0.0
+        error_before = state.error
         if not math.isnan(squared_error) or not math.isfinite(loss):
             state.error = memory * state.error + (1 - memory) * squared_error
         state.step += 1
+        if another or not state.plan:  # without a plan yet, levels take turns
+            guard.restart(state.step)
+            state.best_error = 0.0
+        fault = guard.fault(state, loss)
+        if fault:
+            guard.back_off(state, fault, error_before)
+            step = _Stepper(frames, config, state, flow)
+        else:
+            guard.remember(state)
         if state.statistics is not None and state.plan:
             step.grow(state)
         if config.economy is not None and state.plan:
@@ -228,9 +255,13 @@ def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarr
     The running one says little of it: it lags, is that of a mean over unlike frames, and with alpha one over random
     backgrounds.
     """
-    steps = -(-_num_views(config, len(frames)) // config.batch_size)  # of a pass
+    steps = _steps_per_pass(config, len(frames))
     due = state.step > 0 and state.step % (LOOK_PASSES * steps) == 0
     return due and bool(np.isfinite(state.rows).all()) and mean_psnr(state, config, frames) >= target
+
+
+def _steps_per_pass(config: FitConfig, num_frames: int) -> int:
+    return -(-_num_views(config, num_frames) // config.batch_size)
 
 
 def _num_views(config: FitConfig, num_frames: int) -> int:
@@ -458,7 +489,8 @@ class _Stepper:
         num_alive = len(touched)
         if not self.config.only_alive:
             touched = np.arange(len(state.rows))
-        rates = np.where(self.falling, self.rates * np.float32(decay), self.rates)
+        slower = LOWERED**-state.backoffs
+        rates = np.where(self.falling, self.rates * np.float32(decay), self.rates) * np.float32(slower)
         moments = state.first, state.second, state.counts
         unit = UNIT_TIME if self.config.own_time else 0.0
         for name, palette in (("color_dc", state.colors), ("log_scale", state.shapes)):
@@ -467,10 +499,24 @@ class _Stepper:
         sparse_adam(state.rows, self.grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
-            rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0))
+            rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0) * slower)
             state.time_logits, state.time_moments = _update_times(state.time_logits, state.time_moments, by_time, rate)
         squared_error = float(np.mean(errors)) if errors else math.nan
         return float(np.mean([loss.value for loss in losses])), squared_error, num_alive
+
+    @property
+    def steps_per_pass(self) -> int:
+        return _steps_per_pass(self.config, self.num_frames)
+
+    def errors_at_start(self, state: FitState) -> dict[int, float]:
+        """Mean squared errors of some frames at full size, by frame; takes time, which is the fit's."""
+        begun, shape, errors = time.perf_counter(), self.shapes[-1], {}
+        times = np.asarray(frame_times(state.time_logits))
+        for k in np.unique(np.linspace(0, self.num_frames - 1, LOOKED_AT).round().astype(int)):
+            image = self._drawn(condition(state.rows, self.window, times[k], shape), shape).image
+            errors[int(k)] = float(np.mean(np.square(image - planar(self.frames[k], self.background))))
+        state.seconds += time.perf_counter() - begun
+        return errors
 
     def grow(self, state: FitState) -> None:
         """Births, deaths and resets that are due now that the plan is known; after the last, statistics end."""
@@ -554,16 +600,7 @@ class _Stepper:
         if mirrored:
             target = np.ascontiguousarray(target[:, :, ::-1])
             mean, factor = _mirrored(mean, factor, shape.size[1])
-        trace = cpu.forward(
-            mean,
-            factor,
-            done.opacity,
-            done.color,
-            self.background,
-            shape.size,
-            compositing=self.config.compositing,
-            options=self.config.options,
-        )
+        trace = self._drawn(dataclasses.replace(done, mean=mean, factor=factor), shape)
         if squared:
             loss = squared_loss(trace.image, target)
         else:
@@ -580,6 +617,18 @@ class _Stepper:
             half = np.float32(shape.size[::-1]) / 2
             views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
         return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), shape, self.grad)
+
+    def _drawn(self, done: Conditioned, shape: Shape) -> cpu.Trace:
+        return cpu.forward(
+            done.mean,
+            done.factor,
+            done.opacity,
+            done.color,
+            self.background,
+            shape.size,
+            compositing=self.config.compositing,
+            options=self.config.options,
+        )
 
 
 class _Between:
@@ -608,6 +657,8 @@ def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndar
     return mean * other + np.float32([width, 0]), factor * other[:, None]
 
 
+#: Frames that tell how good the start is.
+LOOKED_AT = 16
 #: A fit to a target looks at all frames once in so many passes, which is a tenth of its time.
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.

@@ -13,7 +13,7 @@ from foldgauss.video.shots import is_cut
 class FrameTimes(eqx.Module):
     r"""Times of n frames in [0, 1], learned through n - 1 softmax weights; one frame alone is at 0.
 
-    .. math:: t_k = \sum_{i \le k} \frac{e^{w_i}}{\sum_j e^{w_j}}, \qquad t_0 = 0,\; t_{n-1} = 1
+    $$ t_k = \sum_{i \le k} \frac{e^{w_i}}{\sum_j e^{w_j}}, \qquad t_0 = 0,\; t_{n-1} = 1 $$
 
     `logits` has shape (n - 1,); equal logits are equally spaced frames. The order of the frames cannot change.
 

@@ -48,22 +48,22 @@ class Growth:
     published constants. Raises ValueError for numbers out of range.
     """
 
-    from_step: int = 500  # 3DGS
-    until_step: int = 15_000  # 3DGS
-    every: int = 100  # 3DGS
-    screen_gradient: float = 2e-4  # 3DGS
+    from_step: int = 500  #: 3DGS
+    until_step: int = 15_000  #: 3DGS
+    every: int = 100  #: 3DGS
+    screen_gradient: float = 2e-4  #: 3DGS
     #: VeGaS; its value is not in the paper. The screen's own is the plainest reading of "by either". Few Gaussians
     #: then pass by time alone: the median time gradient is a quarter of the median screen gradient (Bunny, 80x160).
     time_gradient: float = 2e-4
-    clone_below: float = 0.01 * EXTENT  # the larger standard deviation; 3DGS
-    shrinking: float = 1.6  # halves of a split are smaller by this; 3DGS
-    prune_opacity: float = 0.01  # VeGaS; 3DGS has 0.005
-    big_from: int = 3000  # after this step the big are pruned, too: 3DGS
+    clone_below: float = 0.01 * EXTENT  #: the larger standard deviation; 3DGS
+    shrinking: float = 1.6  #: halves of a split are smaller by this; 3DGS
+    prune_opacity: float = 0.01  #: VeGaS; 3DGS has 0.005
+    big_from: int = 3000  #: after this step the big are pruned, too: 3DGS
     #: In pixels, 3 standard deviations at a Gaussian's own time, where it is largest: 3DGS.
     prune_radius: float = 20.0
-    prune_scale: float = 0.1 * EXTENT  # the larger standard deviation; 3DGS
-    reset_every: int = 3000  # 3DGS
-    reset_opacity: float = 0.01  # 3DGS
+    prune_scale: float = 0.1 * EXTENT  #: the larger standard deviation; 3DGS
+    reset_every: int = 3000  #: 3DGS
+    reset_opacity: float = 0.01  #: 3DGS
 
     def __post_init__(self) -> None:
         for name, least in {"from_step": 0, "until_step": 0, "every": 1, "big_from": 0, "reset_every": 1}.items():
@@ -113,9 +113,9 @@ class Growth:
 class Statistics(NamedTuple):
     """Sums of the steps since the last births; (num,) each."""
 
-    screen: np.ndarray  # float32: of screen gradients
-    time: np.ndarray  # float32: of time gradients
-    seen: np.ndarray  # int32: steps in which the Gaussian was seen
+    screen: np.ndarray  #: float32: of screen gradients
+    time: np.ndarray  #: float32: of time gradients
+    seen: np.ndarray  #: int32: steps in which the Gaussian was seen
 
     @classmethod
     def zeros(cls, num: int) -> "Statistics":

@@ -1,6 +1,6 @@
 r"""The loss of 3DGS and VeGaS with its gradient, in one pass over the picture.
 
-.. math:: L = (1 - \lambda)\,\mathrm{mean}|x - y| + \lambda\,(1 - \mathrm{mean}\,\mathrm{SSIM}(x, y))
+$$ L = (1 - \lambda)\,\mathrm{mean}|x - y| + \lambda\,(1 - \mathrm{mean}\,\mathrm{SSIM}(x, y)) $$
 
 SSIM: Wang et al. 2004, with the published rasterisers' choices: 11 Gaussian taps of sigma 1.5, zero padding, population
 covariance, data range 1. In XLA this loss costs more than the splats; here strips of rows go through the cache once.

@@ -12,7 +12,11 @@ from foldgauss.video.model import VideoModel
 
 
 def psnr(target: np.ndarray, picture: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of two uint8 pictures; equal pictures give 100 dB, not infinity."""
+    """Peak signal-to-noise ratio in dB of two uint8 pictures; equal pictures give 100 dB, not infinity.
+
+    Shapes: both (height, width, channels), or any that are equal. Raises ValueError where they differ.
+    Example: `psnr(clip.frames[0], next(model.frames()))`. Source: scikit-image.
+    """
     if np.array_equal(target, picture):
         return 100.0
     return float(peak_signal_noise_ratio(target, picture, data_range=255))
@@ -24,6 +28,8 @@ SSIM_WINDOW, SSIM_REACH = 11, 5
 
 def ssim(target: np.ndarray, picture: np.ndarray) -> float:
     """Mean SSIM of two uint8 pictures (height, width, 3), with the weights of Wang et al. 2004.
+
+    1 is equal. Example: `ssim(clip.frames[0], next(model.frames()))`. Raises ValueError where sizes differ.
 
     The mean is over the pixels whose window of 11 px lies within the picture; along a side shorter than that, over all,
     the picture being mirrored at its border.
@@ -44,7 +50,7 @@ def ssim(target: np.ndarray, picture: np.ndarray) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """Quality of every frame of a model: dB and SSIM, one entry per frame."""
+    """Quality of every frame of a model, one entry per frame: `psnr` in dB, `ssim` up to 1, and their means."""
 
     psnr: tuple[float, ...]
     ssim: tuple[float, ...]
@@ -70,6 +76,8 @@ def evaluate(
     Both stand over `background`: black says whether what is seen is right, white besides whether nothing else is.
     Pictures are rounded to 8 bits first, as anyone who watches them gets them. `on_frame` is called with each picture.
     Raises ValueError if number or size of the frames differ from the model's.
+
+    Example: `evaluate(model, clip.frames).mean_psnr`.
     """
     expected = (model.num_frames, *model.size)
     if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4) or frames.dtype != np.uint8:

@@ -38,7 +38,7 @@ TIME_ADAM = optax.scale_by_adam(eps=1e-15)
         "time_moments",
         "statistics",
     ],
-    meta_fields=["step", "plan", "seconds", "error"],
+    meta_fields=["step", "plan", "seconds", "error", "best_error", "backoffs"],
 )
 @dataclasses.dataclass
 class FitState:
@@ -60,6 +60,8 @@ class FitState:
     plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
     seconds: float
     error: float  # running mean of the squared error
+    best_error: float = 0.0  # the least one that a later one is compared with, see `guard`; 0: none known
+    backoffs: int = 0  # how often the fit was taken back, and its rates lowered
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:

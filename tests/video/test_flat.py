@@ -1,0 +1,56 @@
+"""Layers as one plain model: the same pictures, or a clear refusal."""
+
+import jax
+import numpy as np
+import pytest
+from soft_models import NUM, OBJECT, soft_model
+
+from foldgauss.render import Camera, RenderOptions
+from foldgauss.video import FrameTimes, VideoModel, edit, layers
+from foldgauss.video.flat import flattened
+from foldgauss.video.playback import Playback
+from foldgauss.video.shots import time_logits
+
+
+def test_layers_become_one_model_of_the_same_pictures():
+    front = edit(soft_model(degree=1, options=RenderOptions())).select(OBJECT).move((0.2, 0.1)).video()
+    video = layers(front, soft_model(seed=3, num_frames=9, options=RenderOptions()))
+    flat = flattened(video)
+    assert isinstance(flat, VideoModel)
+    assert (flat.num_gaussians, flat.degree, flat.num_frames) == (2 * NUM, 3, 9)
+    for t in (0.0, 0.31, 1.0):
+        np.testing.assert_array_equal(Playback(flat).frame(t), Playback(video).frame(t))
+
+
+def test_plain_models_stay_as_they_are():
+    model = soft_model()
+    assert flattened(model) is model
+    assert flattened(layers(model)) is model
+
+
+def _with_a_cut():
+    model = soft_model()
+    shared = (model.size, model.fps, model.options, model.compositing)
+    return VideoModel(model.splats, FrameTimes(time_logits(7, (3,))), *shared)
+
+
+@pytest.mark.parametrize(
+    "video",
+    [
+        lambda: edit(soft_model()).select(OBJECT).move((0.1, 0), times=(0.5, 1)).video(),
+        lambda: edit(soft_model()).select(OBJECT).freeze(2).video(),
+        lambda: edit(soft_model()).seen_from(Camera.front(40 / 64)).video(),
+        lambda: layers(soft_model(), soft_model(power=1.0)),
+        lambda: layers(soft_model(), soft_model(floor=0.1)),
+        lambda: layers(_with_a_cut(), soft_model()),
+    ],
+)
+def test_what_no_plain_model_holds_is_refused(video):
+    with pytest.raises(ValueError, match=r"model: expected .*foldgauss render"):
+        flattened(video())
+
+
+def test_a_cut_of_the_leading_layer_stays():
+    flat = flattened(layers(soft_model(), _with_a_cut()))
+    assert len(jax.tree.leaves(flat.frame_times)) == 1
+    assert flat.num_frames == 7

@@ -1,0 +1,159 @@
+"""Fits that come apart: seen, named, taken back; and no others."""
+
+import dataclasses
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video.fit import _Stepper
+from foldgauss.video.guard import MOST_BACKOFFS, Guard
+from foldgauss.video.packing import columns
+from foldgauss.video.state import running_psnr, to_model
+
+CLIP = moving_blobs()
+CONFIG = FitConfig(num_gaussians=200, steps=240)
+RATES = LearningRates()
+
+
+@pytest.fixture(scope="module")
+def usual() -> float:
+    """dB of the fit that nothing happens to."""
+    return evaluate(fit(CLIP, CONFIG).model, CLIP).mean_psnr
+
+
+def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
+    """dB of a fit whose state is changed after a step."""
+    for state, info in fit_steps(CLIP, config):
+        if info.step == at:
+            change(state)
+    assert np.isfinite(state.rows).all()
+    assert info.step == config.steps
+    return evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("leaf", ["loc", "opacity_logit", "coefficients", "log_time_scale"])
+def test_a_number_that_is_none_is_named_and_made_good(usual, leaf, value):
+    def spoil(state):
+        state.rows[17, columns(CONFIG.degree)[leaf]] = value
+
+    with pytest.warns(DivergenceWarning, match=rf"step 101: .*no finite {leaf} in 1 Gaussians, the first of them 17"):
+        got = _fit_with(spoil)
+    assert got > usual - 3  # 240 steps, half of them at a quarter of the rates
+
+
+def test_frame_times_that_are_none_are_named():
+    def spoil(state):
+        state.time_logits = state.time_logits + np.float32(np.nan)
+
+    with pytest.warns(DivergenceWarning, match="no finite frame times"):
+        _fit_with(spoil)
+
+
+def test_it_may_stop_instead_and_then_hands_over_what_was_sound():
+    config = dataclasses.replace(CONFIG, on_divergence="stop")
+
+    def spoil(state):
+        state.rows[:, columns(CONFIG.degree)["log_scale"]] = np.nan
+
+    with pytest.raises(FitDiverged, match=r"no finite log_scale in 200 Gaussians.*of step 100") as error:
+        _fit_with(spoil, config, at=120)
+    state = error.value.state
+    assert state.step == 120  # as was told last: what watched goes on from there
+    assert running_psnr(state) > 20
+    assert np.isfinite(state.rows).all()
+    assert evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr > 20
+
+
+# Of the others a thousand times as much is borne: they come to an end of what they can do.
+@pytest.mark.parametrize("leaf", ["loc", "color_dc", "log_scale", "log_time_scale"])
+def test_rates_far_too_high_are_lowered_until_it_fits(leaf):
+    rates = dataclasses.replace(RATES, **{leaf: 1000 * getattr(RATES, leaf)})
+    with pytest.warns(DivergenceWarning, match=r"worse than they were|worse than at the start|no finite"):
+        model = fit(CLIP, dataclasses.replace(CONFIG, rates=rates)).model
+    start = evaluate(fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model, CLIP).mean_psnr
+    assert evaluate(model, CLIP).mean_psnr > start
+
+
+def test_folds_that_explode_are_named(usual):
+    def explode(state):
+        state.rows[:, columns(CONFIG.degree)["coefficients"]] *= 1e6
+
+    with pytest.warns(DivergenceWarning, match="dB worse than they were, coefficients having moved most"):
+        got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_share=0, half_share=0))
+    assert got > usual - 3
+
+
+def test_a_fit_that_cannot_be_saved_says_so():
+    def spoiled():
+        for state, _ in fit_steps(CLIP, CONFIG):
+            state.rows[:] = np.nan
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", DivergenceWarning)
+        with pytest.raises(FitDiverged, match="lower these"):
+            spoiled()
+    assert sum(issubclass(one.category, DivergenceWarning) for one in told) == MOST_BACKOFFS
+
+
+def test_a_broken_state_is_not_gone_on_with():
+    for state, info in fit_steps(CLIP, CONFIG):
+        if info.step == 5:
+            break
+    state.rows[3] = np.nan
+    with pytest.raises(FitDiverged, match="state: expected finite numbers"):
+        next(fit_steps(CLIP, CONFIG, state))
+
+
+def _clips():
+    rng = np.random.default_rng(0)
+    flash = CLIP.copy()
+    flash[3] = 255
+    half_black = np.concatenate([np.zeros_like(CLIP), CLIP])
+    hard = np.repeat(CLIP[:1], 8, axis=0)
+    hard[5] = rng.integers(0, 256, CLIP.shape[1:], np.uint8)
+    two = np.stack([np.zeros_like(CLIP[0]), hard[5]])
+    text = np.zeros((3, 48, 64, 4), np.uint8)
+    text[:, 20:28, 10:50, 3] = 255  # black, over what is random
+    return {
+        "black": np.zeros_like(CLIP),
+        "white": np.full_like(CLIP, 255),
+        "noise": rng.integers(0, 256, CLIP.shape, np.uint8),
+        "flash": flash,
+        "half black": half_black,
+        "cut": np.concatenate([CLIP, 255 - CLIP]),
+        "one frame": CLIP[:1],
+        "one frame of noise": hard,
+        "one of two of noise": two,
+        "alpha": text,
+        "alpha, one frame": text[:1],
+    }
+
+
+@pytest.mark.parametrize("name", list(_clips()))
+@pytest.mark.parametrize("num", [3, 200])
+def test_fits_that_are_well_are_left_alone(name, num):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DivergenceWarning)
+        fit(_clips()[name], FitConfig(num_gaussians=num, steps=150))
+
+
+def test_watching_changes_no_bit(monkeypatch):
+    watched = fit(CLIP, CONFIG).model
+    monkeypatch.setattr(Guard, "fault", lambda self, state, loss: "")
+    monkeypatch.setattr(Guard, "remember", lambda self, state: None)
+    monkeypatch.setattr(_Stepper, "errors_at_start", lambda self, state: {})
+    alone = fit(CLIP, CONFIG).model
+    for one, other in zip(jax.tree.leaves(watched), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_opacity_resets_are_none_of_its_business():
+    config = FitConfig.preset("paper", initialization="clip", num_gaussians=200, max_gaussians=400, steps=300, degree=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DivergenceWarning)
+        fit(CLIP, config)
