@@ -48,40 +48,52 @@ export function plain(num) {
   };
 }
 
+const START = 32768 * 512 + 2;
+
+/** A node's state, p 512 + n, after it has seen a bit. */
+function after(state, one) {
+  const p = state >> 9, n = state & 511;
+  const next = one ? p + Math.floor((65536 - p) / n) : p - Math.floor(p / n);
+  return next * 512 + (n < MEMORY ? n + 1 : n);
+}
+
 /** A column's numbers, Int32Array, from its bytes and what is known of it. */
 export function decodeColumn(data, column) {
-  const size = MODELS * CONTEXTS * NODES, logits = [0, 0, 0], own = [0, 0, 0];
-  const share = new Int32Array(size).fill(32768), count = new Int32Array(size).fill(2);
+  const size = CONTEXTS * NODES;
+  // Of each node in each context: the probability of a one times 512, and how many it has learned from.
+  const first = new Int32Array(size).fill(START), second = new Int32Array(size).fill(START);
+  const third = new Int32Array(size).fill(START);
   const weights = new Float64Array(NODES * MODELS).fill(WEIGHT);
-  let low = 0, high = 0xffffffff, code = 0, next = 0;
+  let atFirst = 0, atSecond = 0, atThird = 0; // where the contexts of a number begin
+  const range = Uint32Array.of(0, 0xffffffff, 0); // low, high, code; as an array, or each bit would make new numbers
+  let next = 0;
   const byte = () => (next < data.length ? data[next++] : (next++, 0));
-  for (let k = 0; k < 4; k++) code = ((code << 8) | byte()) >>> 0;
+  for (let k = 0; k < 4; k++) range[2] = (range[2] << 8) | byte();
   const bit = (p) => {
-    const span = high - low, middle = low + (span >>> 16) * p + (((span & 0xffff) * p) >>> 16);
-    const one = code <= middle;
-    if (one) high = middle; else low = middle + 1;
-    while (((low ^ high) & 0xff000000) === 0) {
-      low = (low << 8) >>> 0;
-      high = ((high << 8) | 255) >>> 0;
-      code = ((code << 8) | byte()) >>> 0;
+    const low = range[0], span = range[1] - low;
+    const middle = low + (span >>> 16) * p + (((span & 0xffff) * p) >>> 16), one = range[2] <= middle;
+    if (one) range[1] = middle; else range[0] = middle + 1;
+    while (((range[0] ^ range[1]) & 0xff000000) === 0) {
+      range[0] <<= 8;
+      range[1] = (range[1] << 8) | 255;
+      range[2] = (range[2] << 8) | byte();
     }
     return one;
   };
   const learned = (node) => {
-    let total = 0;
-    for (let m = 0; m < MODELS; m++) {
-      logits[m] = LOGIT[share[(m * CONTEXTS + own[m]) * NODES + node] >> 4];
-      total += logits[m] * weights[node * MODELS + m];
-    }
-    const mixed = clip(LOGISTIC[clip(Math.floor(total / 65536), -2047, 2047) + 2048], MARGIN, 65536 - MARGIN);
-    const one = bit(mixed), error = (one ? 65536 : 0) - mixed;
-    for (let m = 0; m < MODELS; m++) {
-      weights[node * MODELS + m] += Math.floor((logits[m] * error * RATE) / 262144);
-      const at = (m * CONTEXTS + own[m]) * NODES + node, p = share[at], n = count[at];
-      share[at] = one ? p + Math.floor((65536 - p) / n) : p - Math.floor(p / n);
-      if (n < MEMORY) count[at] = n + 1;
-    }
-    return one;
+    const one = atFirst + node, other = atSecond + node, near = atThird + node, weight = MODELS * node;
+    const l0 = LOGIT[first[one] >> 13], l1 = LOGIT[second[other] >> 13], l2 = LOGIT[third[near] >> 13];
+    const total = Math.floor((l0 * weights[weight] + l1 * weights[weight + 1] + l2 * weights[weight + 2]) / 65536);
+    const held = LOGISTIC[(total < -2047 ? -2047 : total > 2047 ? 2047 : total) + 2048];
+    const mixed = held < MARGIN ? MARGIN : held > 65536 - MARGIN ? 65536 - MARGIN : held;
+    const found = bit(mixed), error = RATE * ((found ? 65536 : 0) - mixed);
+    weights[weight] += Math.floor((l0 * error) / 262144);
+    weights[weight + 1] += Math.floor((l1 * error) / 262144);
+    weights[weight + 2] += Math.floor((l2 * error) / 262144);
+    first[one] = after(first[one], found);
+    second[other] = after(second[other], found);
+    third[near] = after(third[near], found);
+    return found;
   };
   const values = new Int32Array(column.num), seen = new Float64Array(column.num);
   const expected = (i) => {
@@ -96,8 +108,8 @@ export function decodeColumn(data, column) {
   };
   for (let i = 0; i < column.num; i++) {
     if (!column.has(i)) continue;
-    [own[0], own[1]] = column.contexts(i);
-    own[2] = expected(i);
+    const [one, other] = column.contexts(i);
+    [atFirst, atSecond, atThird] = [one * NODES, other * NODES, expected(i) * NODES];
     if (!learned(0)) {
       const negative = learned(1);
       let exponent = 0;
@@ -217,13 +229,14 @@ function columnNames(degree, shared) {
 }
 
 /** Numbers q and values v of all columns. */
-function unrolled(header, streamOf) {
+function unrolled(header, streamOf, onColumn) {
   const num = header.num_gaussians, { degree, shared, cells } = header, q = {}, v = {}, features = [];
   const [height, width] = header.size, longer = Math.max(height, width);
   const sides = [width / longer, height / longer, 1], middles = [0, 0, 0.5];
   const half = new Float64Array(num), one = () => 1;
   let inCell, nearest;
-  columnNames(degree, shared).forEach((name, column) => {
+  const names = columnNames(degree, shared);
+  names.forEach((name, column) => {
     const [length, origin, exponent, ...slopes] = header.columns[column];
     const common = shared > 0 && COLORS.includes(name), rows = common ? shared : num;
     const k = /^[xy]\d+$/.test(name) ? Number(name.slice(1)) : -1, axis = ["x0", "y0", "time"].indexOf(name);
@@ -265,6 +278,7 @@ function unrolled(header, streamOf) {
       known = { ...known, has, contexts, scale, near, width: NEIGHBOURS };
     }
     const numbers = decodeColumn(streamOf(length), known);
+    onColumn((column + 1) / names.length);
     if (name === "cell") {
       let here = 0;
       for (let i = 0; i < num; i++) numbers[i] = here = (here + numbers[i]) & (2 ** (cells[0] + cells[1] + cells[2]) - 1);
@@ -286,8 +300,11 @@ function unrolled(header, streamOf) {
   return v;
 }
 
-/** {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times. */
-export function decode(buffer) {
+/**
+ * {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times.
+ * `onColumn` is told the share of columns that are done.
+ */
+export function decode(buffer, onColumn = () => {}) {
   const bytes = new Uint8Array(buffer), fixed = new DataView(buffer);
   if (bytes.length < 20 || MAGIC.some((own, k) => bytes[k] !== own)) throw new Error("not a compact model");
   if (fixed.getUint32(8, true) !== 2) throw new Error("a compact model of another version");
@@ -295,7 +312,7 @@ export function decode(buffer) {
   const header = JSON.parse(new TextDecoder().decode(bytes.subarray(20, start)));
   const num = header.num_gaussians, degree = header.degree;
   const stream = (length) => bytes.subarray(start, (start += length));
-  const v = unrolled(header, stream);
+  const v = unrolled(header, stream, onColumn);
   const intervals = decodeColumn(stream(header.intervals), plain(header.num_frames - 1));
   const leaves = {
     loc: new Float32Array(2 * num), log_scale: new Float32Array(2 * num), angle_logit: new Float32Array(num),

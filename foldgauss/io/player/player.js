@@ -1,0 +1,222 @@
+// The player: what time it is, what is shown of it and how, and when to draw.
+import { Originals } from "./originals.js";
+import { WHAT } from "./renderer.js";
+import { Selection } from "./selection.js";
+import { Timeline } from "./timeline.js";
+import { View, common } from "./view.js";
+
+export const SPEEDS = [1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2];
+const TINT = [1, 0.58, 0.2];
+const MOST_PIXELS = 6e6;
+const SLOW = 1 / 27, FAST = 1 / 50; // seconds a picture: draw fewer pixels, more pixels
+
+/** What is done to those picked. `front` null: copies come to the front. */
+const UNCHANGED = { vanish: false, front: null, scale: 1, copies: 1, offset: 0.2 };
+
+export class Player {
+  constructor(canvas, renderer, model, onChange) {
+    this.canvas = canvas;
+    this.model = model;
+    this.onChange = onChange;
+    this.timeline = new Timeline(model.times, model.header.fps);
+    this.view = new View(model.header.size);
+    this.selection = new Selection(model);
+    this.renderer = renderer;
+    renderer.take(model);
+    this.originals = new Originals(() => this.invalidate());
+    Object.assign(this, { position: 0, time: this.timeline.timeAt(0), playing: false, speed: 1, loop: true });
+    Object.assign(this, { mode: "model", split: 0.5, background: [0, 0, 0], brushing: false, edit: { ...UNCHANGED } });
+    Object.assign(this, { quality: 0.1, alive: 0, drawn: [], waiting: false, before: 0, pace: 0 });
+  }
+
+  // ---------------------------------------------------------------------------------------------- time
+
+  /** Go to a position, in frames; between frames is the model's own in-between time. */
+  seekPosition(position) {
+    this.position = Math.min(Math.max(position, 0), this.timeline.last);
+    this.time = this.timeline.timeAt(this.position);
+    this.changed();
+  }
+
+  /** Go to a time of the model, 0 to 1. */
+  seek(time) {
+    this.position = this.timeline.positionOf(time);
+    this.time = this.timeline.outOfCuts(time);
+    this.changed();
+  }
+
+  step(frames) {
+    this.pause();
+    const next = frames > 0 ? Math.floor(this.position + 1e-6) + frames : Math.ceil(this.position - 1e-6) + frames;
+    this.seekPosition(next);
+  }
+
+  play() {
+    if (this.position >= this.timeline.last) this.seekPosition(0);
+    [this.playing, this.before] = [true, 0];
+    this.changed();
+  }
+
+  pause() {
+    this.playing = false;
+    this.quality = 1;
+    this.changed();
+  }
+
+  toggle() {
+    if (this.playing) this.pause();
+    else this.play();
+  }
+
+  advance(now) {
+    const passed = this.before ? Math.min((now - this.before) / 1000, 0.25) : 0, { last } = this.timeline;
+    this.before = now;
+    this.adapt(passed);
+    const next = this.position + passed * this.timeline.fps * this.speed, rest = this.rest ?? 0;
+    if (next <= last) [this.position, this.rest] = [next, 0];
+    else if (!this.loop) {
+      this.pause();
+      return this.seekPosition(last);
+    } else if (rest + next - last < 1) [this.position, this.rest] = [last, rest + next - last]; // the last frame's own time
+    else [this.position, this.rest] = [0, 0];
+    this.time = this.timeline.timeAt(this.position);
+  }
+
+  /** Fewer pixels where pictures come slowly, down to the model's own; all of them where there is time, or a pause. */
+  adapt(passed) {
+    if (passed <= 0) return;
+    this.pace += 0.15 * (passed - this.pace);
+    if (this.pace > SLOW) this.quality = Math.max(0.95 * this.quality, 0.1);
+    else if (this.pace < FAST) this.quality = Math.min(1.03 * this.quality, 1);
+  }
+
+  // ------------------------------------------------------------------------------------------- drawing
+
+  changed() {
+    this.onChange();
+    this.invalidate();
+  }
+
+  /** Draw soon, once; nothing is drawn where nothing has changed. */
+  invalidate() {
+    if (this.waiting) return;
+    this.waiting = true;
+    requestAnimationFrame((now) => {
+      this.waiting = false;
+      if (this.playing) this.advance(now);
+      this.draw();
+      this.drawn = [...this.drawn.filter((own) => now - own < 1000), now];
+      this.onChange();
+      if (this.playing) this.invalidate();
+    });
+  }
+
+  resize(width, height) {
+    [this.canvas.width, this.canvas.height] = this.view.area = [width, height];
+    this.draw();
+    this.onChange();
+  }
+
+  get hasOriginal() {
+    return this.originals.num > 0;
+  }
+
+  get numPanes() {
+    return this.mode === "side" ? 2 : 1;
+  }
+
+  /** What each pane shows. */
+  get shown() {
+    return { side: ["original", "model"] }[this.mode] ?? [this.mode];
+  }
+
+  draw() {
+    const { renderer, view } = this, [width, height] = view.area;
+    if (renderer.gl.isContextLost() || width < 2 || height < 2) return;
+    if (this.mode !== "model") {
+      const picture = this.originals.at(Math.min(Math.round(this.position), this.originals.num - 1));
+      if (picture) renderer.setOriginal(picture);
+    }
+    const panes = view.panes(this.numPanes);
+    const visible = panes.map((pane) => common(view.frameIn(pane), pane));
+    const place = this.shown.findIndex((what) => what !== "original");
+    const inTarget = place < 0 ? [0, 0, 1, 1] : this.drawModel(view.frameIn(panes[place]), visible[place]);
+    renderer.clear(width, height);
+    panes.forEach((pane, k) => this.show(this.shown[k], view.frameIn(pane), visible[k], inTarget));
+  }
+
+  /** Draw the visible part of the frame; returns which part of the target that is. */
+  drawModel(frame, visible) {
+    const least = 1 / frame.scale; // the model's own pixels: fewer would be coarser than it is
+    const most = Math.sqrt(MOST_PIXELS / Math.max(visible.width * visible.height, 1));
+    const k = Math.min(Math.max(this.quality, least), Math.max(most, Math.min(least, 1)));
+    const size = [visible.width, visible.height].map((own) => Math.max(Math.ceil(own * k), 1));
+    const middle = [frame.x + frame.width / 2 - visible.x, frame.y + frame.height / 2 - visible.y];
+    this.drawTo({
+      width: size[0], height: size[1], unit: k * Math.max(frame.width, frame.height), origin: middle.map((own) => k * own),
+      // The footprint that the model was fitted with, in its pixels, however large these are here.
+      lowPass: this.model.header.options.low_pass * Math.max(k * frame.scale, 1) ** 2,
+    });
+    return [0, 0, (visible.width * k) / size[0], (visible.height * k) / size[1]];
+  }
+
+  drawTo(target) {
+    const { list, alive } = this.selection.instances(this.time, { ...this.edit, front: this.inFront });
+    const { scale, offset } = this.edit, pivot = this.selection.middle(this.time);
+    const highlight = this.brushing ? 0.65 : 0;
+    this.alive = alive;
+    this.renderer.draw(list, this.time, target, { scale, pivot, shift: [offset, 0], highlight, tint: TINT });
+  }
+
+  /** Put one part on the screen. */
+  show(what, frame, visible, inTarget) {
+    if (what !== "slider") return this.put(WHAT[what], frame, visible, visible, inTarget);
+    const middle = frame.x + this.split * frame.width, far = 1e6;
+    const left = { x: -far, y: -far, width: far + middle, height: 2 * far }, right = { ...left, x: middle, width: far };
+    this.put(WHAT.original, frame, visible, common(visible, left), inTarget);
+    this.put(WHAT.model, frame, visible, common(visible, right), inTarget);
+  }
+
+  put(what, frame, visible, part, inTarget) {
+    const [width, height] = this.view.area;
+    if (part.width <= 0 || part.height <= 0) return;
+    const share = (whole) => [
+      (part.x - whole.x) / whole.width, (part.y - whole.y) / whole.height, part.width / whole.width, part.height / whole.height,
+    ];
+    const of = share(visible), target = [of[0] * inTarget[2], of[1] * inTarget[3], of[2] * inTarget[2], of[3] * inTarget[3]];
+    this.renderer.put(what, share({ x: 0, y: 0, width, height }), share(frame), target, this.background);
+  }
+
+  /** The picture of this time as the engines of foldgauss draw it, width x height: red, green, blue, 255. */
+  pixels(width, height) {
+    const [rows, columns] = this.model.header.size, aspect = rows / columns;
+    const unit = Math.max(height / Math.min(1, aspect), width / Math.min(1, 1 / aspect));
+    const lowPass = this.model.header.options.low_pass;
+    this.drawTo({ width, height, unit, origin: [width / 2, height / 2], lowPass });
+    return this.renderer.read(this.background);
+  }
+
+  /** Pictures drawn in the last second. */
+  get rate() {
+    return this.drawn.length;
+  }
+
+  // ------------------------------------------------------------------------------------------ the brush
+
+  /** Pick under the brush: a point of the screen and a radius, device pixels. */
+  paint(x, y, radius, erase) {
+    const pane = this.view.paneAt(x, y, this.numPanes), [atX, atY, unit] = this.view.toModel(x, y, pane);
+    this.selection.paint(this.time, atX, atY, radius / unit, erase, this.edit.vanish);
+    this.changed();
+  }
+
+  get inFront() {
+    return this.edit.front ?? this.edit.copies > 1;
+  }
+
+  resetEdit() {
+    this.selection.clear();
+    this.edit = { ...UNCHANGED };
+    this.changed();
+  }
+}

@@ -1,0 +1,197 @@
+// WebGL2: the Gaussians of one time into a picture of half floats, and that onto the screen.
+import { TEXTURE_WIDTH } from "./gaussians.js";
+import splatVertex from "./splat.vert.glsl";
+import splatFragment from "./splat.frag.glsl";
+import showVertex from "./show.vert.glsl";
+import showFragment from "./show.frag.glsl";
+
+export const WHAT = { model: 0, original: 1, difference: 2 };
+const NO_BOUND = 1e30;
+
+function compiled(gl, kind, source) {
+  const shader = gl.createShader(kind);
+  gl.shaderSource(shader, source);
+  gl.compileShader(shader);
+  return shader;
+}
+
+/** A program and the places of its uniforms by name. */
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  gl.attachShader(made, compiled(gl, gl.VERTEX_SHADER, vertex));
+  gl.attachShader(made, compiled(gl, gl.FRAGMENT_SHADER, fragment));
+  gl.bindAttribLocation(made, 0, "instance");
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(made));
+  const at = {};
+  for (let k = 0; k < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); k++) {
+    const { name } = gl.getActiveUniform(made, k);
+    at[name] = gl.getUniformLocation(made, name);
+  }
+  return { made, at };
+}
+
+function texture(gl, filter) {
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+  for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, filter);
+  return made;
+}
+
+/** A texture that can be drawn into, of any size asked for. */
+class Target {
+  constructor(gl, format) {
+    this.gl = gl;
+    this.format = format;
+    this.texture = texture(gl, gl.LINEAR);
+    this.buffer = gl.createFramebuffer();
+    this.width = this.height = 0;
+  }
+
+  bind(width, height) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
+    gl.viewport(0, 0, width, height);
+    if (width === this.width && height === this.height) return;
+    [this.width, this.height] = [width, height];
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    const kind = this.format === gl.RGBA16F ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE;
+    gl.texImage2D(gl.TEXTURE_2D, 0, this.format, width, height, 0, gl.RGBA, kind, null);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.texture, 0);
+  }
+}
+
+export class Renderer {
+  /** Throws an Error with a text for people where the browser cannot. */
+  constructor(canvas) {
+    const gl = canvas.getContext("webgl2", { antialias: false, depth: false, powerPreference: "high-performance" });
+    if (!gl) throw new Error("This browser has no WebGL 2, or it is switched off.");
+    this.gl = gl;
+    this.restore();
+  }
+
+  /** Make all that lives on the graphics card; again after its context was lost. */
+  restore() {
+    const { gl } = this;
+    const half = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.splat = program(gl, splatVertex, splatFragment);
+    this.show = program(gl, showVertex, showFragment);
+    this.drawn = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
+    this.bytes = new Target(gl, gl.RGBA8);
+    this.original = texture(gl, gl.LINEAR);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    this.originalShown = null;
+    this.instances = gl.createBuffer();
+    this.array = gl.createVertexArray();
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.instances);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.disable(gl.DITHER);
+    if (this.model) this.take(this.model);
+  }
+
+  /** The Gaussians that are to be drawn. */
+  take(model) {
+    const { gl } = this;
+    this.model = model;
+    if (model.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE))
+      throw new Error(`This graphics card has no room for ${model.num.toLocaleString("en")} Gaussians.`);
+    this.gaussians = texture(gl, gl.NEAREST);
+    const size = [TEXTURE_WIDTH, model.rows];
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ...size, 0, gl.RGBA, gl.FLOAT, model.values);
+  }
+
+  /**
+   * Draw the Gaussians listed, front to back, at a time into a picture of width x height pixels. `frame` says where the
+   * model's frame is in it: `unit`, pixels per unit, and `origin`, its centre; `lowPass` in px^2.
+   */
+  draw(instances, time, { width, height, unit, origin, lowPass }, edit) {
+    const { gl, model, splat: { made, at } } = this, { header } = model, { options } = header;
+    this.drawn.bind(width, height);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 1); // the light that is left, in place of alpha
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (instances.length === 0) return;
+    gl.useProgram(made);
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.instances);
+    gl.bufferData(gl.ARRAY_BUFFER, instances, gl.STREAM_DRAW);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.gaussians);
+    gl.uniform1i(at.gaussians, 0);
+    gl.uniform1i(at.texels, model.texels);
+    gl.uniform1i(at.degree, model.degree);
+    gl.uniform1f(at.time, time);
+    gl.uniform1f(at.envelopePower, header.power);
+    gl.uniform1f(at.envelopeFloor, header.floor);
+    gl.uniform1f(at.unit, unit);
+    gl.uniform2fv(at.origin, origin);
+    gl.uniform2f(at.target, width, height);
+    gl.uniform1f(at.lowPass, lowPass);
+    gl.uniform1f(at.cutoff, options.alpha_cutoff);
+    gl.uniform1f(at.ceiling, options.alpha_ceiling);
+    gl.uniform1f(at.support, options.support_radius === null ? NO_BOUND : options.support_radius ** 2);
+    gl.uniform2fv(at.pivot, edit.pivot);
+    gl.uniform2fv(at.shift, edit.shift);
+    gl.uniform1f(at.pickedScale, edit.scale);
+    gl.uniform1f(at.highlight, edit.highlight);
+    gl.uniform3fv(at.tint, edit.tint);
+    gl.enable(gl.BLEND);
+    // Front to back: what comes adds its colour by the light left, and leaves less of it. Sums know no light.
+    if (header.compositing === "sum") gl.blendFuncSeparate(gl.ONE, gl.ONE, gl.ZERO, gl.ONE);
+    else gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, instances.length);
+    gl.disable(gl.BLEND);
+  }
+
+  /** The original's picture, which later calls of `put` show. */
+  setOriginal(picture) {
+    const { gl } = this;
+    if (picture === this.originalShown) return;
+    this.originalShown = picture;
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, this.original);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+  }
+
+  /** Begin a new screen. */
+  clear(width, height) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
+  /** Show a part of what was drawn, or of the original. Rectangles are (left, top, width, height), in shares. */
+  put(what, onScreen, inPicture, inTarget, background, gain = 4) {
+    const { gl, show: { made, at }, model } = this;
+    gl.useProgram(made);
+    gl.bindVertexArray(null);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.drawn.texture);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, this.original);
+    gl.uniform1i(at.drawn, 0);
+    gl.uniform1i(at.original, 1);
+    gl.uniform1i(at.what, what);
+    gl.uniform1f(at.gain, gain);
+    gl.uniform3fv(at.background, model.header.compositing === "sum" ? [0, 0, 0] : background);
+    gl.uniform4fv(at.onScreen, onScreen);
+    gl.uniform4fv(at.inPicture, inPicture);
+    gl.uniform4fv(at.inTarget, inTarget);
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+  }
+
+  /** What was drawn, as bytes: red, green, blue, 255, the top row first. */
+  read(background) {
+    const { gl, drawn: { width, height } } = this, whole = [0, 0, 1, 1], bytes = new Uint8Array(4 * width * height);
+    this.bytes.bind(width, height);
+    this.put(WHAT.model, [0, 1, 1, -1], whole, whole, background);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    return bytes;
+  }
+}

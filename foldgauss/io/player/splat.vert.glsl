@@ -1,0 +1,66 @@
+#version 300 es
+// One folded Gaussian, conditioned on the time, as a rectangle of pixels: FoldedSplats.at and the engine's projection.
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+
+uniform sampler2D gaussians; // `texels` of each, see gaussians.js
+uniform int texels, degree;
+uniform float time, envelopePower, envelopeFloor;
+uniform float unit; // pixels of the target per unit of model space
+uniform vec2 origin, target; // the frame's centre and the target's size, pixels
+uniform float lowPass, cutoff, support; // px^2; alpha; squared deviations
+uniform vec2 pivot, shift; // of those picked: what they are scaled about, and how far copies are apart, model units
+uniform float pickedScale, highlight;
+
+in uint instance; // its number; from bit 28 on which copy it is; the highest bit: it is picked
+
+flat out vec2 centre;
+flat out vec4 axes; // two rows that take an offset in pixels to deviations
+flat out vec4 paint; // colour and opacity
+flat out float tinted;
+
+vec4 texel(int index, int k) {
+  int at = index * texels + k;
+  return texelFetch(gaussians, ivec2(at & 2047, at >> 11), 0);
+}
+
+vec2 path(int index, float u) {
+  vec2 sum = vec2(0.0);
+  for (int pair = (degree - 1) / 2; pair >= 0 && degree > 0; pair--) { // Horner; what is beyond the degree is 0
+    vec4 two = texel(index, 3 + pair);
+    sum = u * (two.zw + sum);
+    sum = u * (two.xy + sum);
+  }
+  return sum;
+}
+
+void main() {
+  int index = int(instance & 0x0fffffffu);
+  float copy = float((instance >> 28) & 7u);
+  bool picked = (instance >> 31) == 1u;
+  vec4 place = texel(index, 0), shape = texel(index, 1);
+  paint = texel(index, 2);
+  tinted = picked ? highlight : 0.0;
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: nothing is drawn
+  if (!(paint.a >= cutoff)) return;
+
+  float u = place.z - time, tau = u / place.w;
+  float shrink = sqrt(envelopeFloor + (1.0 - envelopeFloor) * exp(-0.5 * envelopePower * tau * tau));
+  vec2 mean = place.xy + path(index, u), deviations = shape.xy * shrink;
+  if (picked) {
+    mean = pivot + (mean - pivot) * pickedScale + copy * shift;
+    deviations *= pickedScale;
+  }
+  vec2 variances = deviations * deviations * (unit * unit) + lowPass;
+  if (!(min(variances.x, variances.y) > 1e-12)) return;
+
+  // In the frame of its own axes the covariance is diagonal, and so is the low pass: nothing cancels.
+  vec2 first = shape.zw, second = vec2(-shape.w, shape.z), roots = sqrt(variances);
+  centre = mean * unit + origin;
+  axes = vec4(first / roots.x, second / roots.y);
+  float reach = min(2.0 * log(paint.a / cutoff), support) * 1.001 + 0.001; // a little too far: alpha alone decides
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  vec2 away = corner * sqrt(reach) * roots;
+  gl_Position = vec4(2.0 * (centre + away.x * first + away.y * second) / target - 1.0, 0.0, 1.0);
+}

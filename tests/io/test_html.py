@@ -1,0 +1,572 @@
+"""The player's page: whole in itself, closed to the network, and its pictures those of the CPU engine."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import Opened, chromium
+from soft_models import NUM, OBJECT, SIZE, soft_model
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import OutputError, export, html_page, load_video_model, save_compact, save_video_model, write_html
+from foldgauss.io import html as page_module
+from foldgauss.io.html import _fine, bundled
+from foldgauss.render import RenderOptions
+from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, edit, fit, layers
+from foldgauss.video.playback import Playback
+from foldgauss.video.quantise import dequantise
+from foldgauss.video.shots import time_logits
+
+#: What the brush is made of.
+MODULES = ("gaussians", "selection", "timeline")
+
+
+class _Elements(HTMLParser):
+    """Tags with their attributes, and the text of scripts, styles and the title."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.texts = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+        self.texts.append((tag, dict(attributes), []))
+
+    def handle_endtag(self, tag):
+        self.texts.append(("", {}, []))  # of what comes after
+
+    def handle_data(self, data):
+        if self.texts:
+            self.texts[-1][2].append(data)
+
+    def text(self, tag, **wanted):
+        """What is in the one element with these attributes."""
+        (found,) = [text for own, attributes, text in self.texts if own == tag and attributes | wanted == attributes]
+        return "".join(found)
+
+
+def data_of(page, name="model"):
+    return base64.b64decode(_Elements(page).text("script", id=name))
+
+
+def waves(num_frames=6, height=48, width=80):
+    y, x = np.mgrid[0:height, 0:width]
+    pictures = [128 + 100 * np.sin(0.15 * x + 0.3 * k) * np.cos(0.1 * y + k / 9) for k in range(num_frames)]
+    return np.stack([np.stack([one, one[:, ::-1], 255 - one], -1) for one in pictures]).astype(np.uint8)
+
+
+def many(num, seed=0):
+    """A model of a film's size: small Gaussians all over, of which a third is alive at a time."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape, scale=1.0):
+        return (rng.normal(size=(num, *shape)) * scale).astype(np.float32)
+
+    splats = FoldedSplats(
+        loc=rng.uniform([-0.5, -0.25], [0.5, 0.25], (num, 2)).astype(np.float32),
+        log_scale=normal(2, scale=0.5) - np.float32(5),
+        angle_logit=normal(),
+        time_loc_logit=normal(scale=2),
+        log_time_scale=normal(scale=0.5) - np.float32(2.5),
+        coefficients=normal(3, 2, scale=0.05),
+        opacity_logit=normal(scale=2),
+        color_dc=normal(3),
+        envelope=TimeLikelihood(1.0),
+    )
+    return VideoModel(splats, FrameTimes.uniform(60), (160, 320), 25.0, RenderOptions())
+
+
+# ---------------------------------------------------------------------------------------------------- the page
+
+
+def test_the_page_can_reach_no_network():
+    page = html_page(soft_model(), original=waves(7, *SIZE))
+    elements = _Elements(page)
+    assert not re.search(r"(\bhttps?:|\bwss?:|//[a-z0-9-]+\.[a-z]{2,}/)", page)
+    policy = next(one["content"] for tag, one in elements.tags if one.get("http-equiv") == "Content-Security-Policy")
+    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+    assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == "'none'"
+    assert "connect-src" not in rules  # so that default-src holds
+
+    def digest(text):
+        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+    assert rules["script-src"] == digest(elements.text("script", id="player"))
+    assert rules["style-src"] == digest(elements.text("style"))
+    for tag, attributes in elements.tags:
+        assert not [name for name in attributes if name.startswith("on") or name in ("style", "src")], (tag, attributes)
+        assert attributes.get("href", "#").startswith("#")
+        assert tag not in ("link", "iframe", "object", "embed", "img")
+
+
+def test_the_title_is_text_whatever_is_in_it(tmp_path):
+    evil = '</title></script><script>alert(1)</script><b onclick="x">&{{script}}'
+    plain, page = _Elements(html_page(soft_model(), title="x")), html_page(soft_model(), title=evil)
+    elements = _Elements(page)
+    assert [tag for tag, _ in elements.tags] == [tag for tag, _ in plain.tags]
+    assert evil not in page
+    assert page.count(html.escape(evil)) == 2
+    path = save_video_model(tmp_path / "m.safetensors", soft_model(), metadata={"clip": evil})
+    named = _Elements(html_page(path))
+    assert [tag for tag, _ in named.tags] == [tag for tag, _ in plain.tags]
+
+
+def test_scripts_are_bundled_whole():
+    script = bundled("main.js")
+    assert not re.search(r"^\s*(import|export)\b", script, re.MULTILINE)
+    assert "</" not in re.sub(r"<\\/", "", script)
+    for path in page_module._SOURCES.iterdir():
+        if path.suffix == ".js":
+            first = path.read_text(encoding="utf-8").splitlines()[0]
+            assert script.count(first) == 1, path.name
+
+
+def test_the_model_comes_back_from_the_page(tmp_path):
+    model = soft_model(options=RenderOptions())
+    (tmp_path / "out.fgz").write_bytes(data_of(html_page(model)))
+    again = load_video_model(tmp_path / "out.fgz")
+    assert again.num_gaussians == NUM
+    np.testing.assert_allclose(again.splats.opacity_logit, model.splats.opacity_logit, atol=0.02)  # in their order
+    for t in (0.0, 0.37, 1.0):
+        assert np.abs(np.asarray(again.render(t)) - np.asarray(model.render(t))).mean() < 0.5 / 255
+
+
+def test_a_compact_file_goes_in_as_it_is(tmp_path):
+    path = save_compact(tmp_path / "m.fgz", _fine(soft_model()), metadata={"clip": "my clip"})
+    page = html_page(path)
+    assert data_of(page) == path.read_bytes()
+    assert "<title>my clip</title>" in page
+
+
+def test_gaussians_beyond_proportion_get_even_steps():
+    model = soft_model(options=RenderOptions())
+    thin = np.array(model.splats.log_scale)
+    thin[5] = -40.0, -45.0
+    model = eqx.tree_at(lambda m: m.splats.log_scale, model, thin)
+    again = dequantise(_fine(model))
+    np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=0.02)
+
+
+def test_the_original_goes_in_as_pictures():
+    clip = waves(7, *SIZE)
+    page = html_page(soft_model(), original=clip, quality=95)
+    for k in range(7):
+        data = np.frombuffer(data_of(page, f"frame-{k}"), np.uint8)
+        assert np.abs(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(float) - clip[k]).mean() < 4
+    coarse = html_page(soft_model(), original=clip, quality=5)
+    assert len(coarse) < len(page)
+    alpha = np.concatenate([clip // 2, np.full((7, *SIZE, 1), 128, np.uint8)], -1)
+    assert "frame-6" in html_page(soft_model(), original=alpha)
+
+
+def _late(model):
+    return edit(model).select(OBJECT).move((0.1, 0.0), times=(0.5, 1.0)).video()
+
+
+def _two_envelopes(model):
+    power = jnp.linspace(1.0, 2.0, NUM, dtype=jnp.float32)
+    return eqx.tree_at(lambda m: m.splats.envelope, model, TimeLikelihood(power, jnp.zeros(NUM, jnp.float32)))
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (lambda m: html_page(_late(m)), "edits that no folded model holds.*foldgauss render"),
+        (lambda m: html_page(_two_envelopes(m)), "envelope: expected one for all"),
+        (lambda m: html_page(edit(m)), r"model: expected a VideoModel or an EditedVideo.*\.video\(\)"),
+        (lambda m: html_page(m, quality=0), "quality: expected a whole number from 1 to 100, got 0"),
+        (lambda m: html_page(m, original=waves(7, 41, 64)), "original: expected frames uint8 .7, 40, 64, 3."),
+        (lambda m: html_page(m, original=waves(6, *SIZE)), "original: expected"),
+        (lambda m: html_page(m, original=waves(7, *SIZE) / 255), "original: .*float64"),
+        (lambda m: write_html("page.htm", m), r"path: expected a name ending in \.html"),
+        (lambda m: write_html(m, "page.html"), r"path: expected a path.*\(path, model\)"),
+        (lambda m: export(m, "html", "page.html", times=[0.5]), "times: expected an option of this format"),
+        (lambda m: export(m, "obj", "page", original=waves(7, *SIZE)), "original: expected an option of this format"),
+    ],
+)
+def test_what_no_page_can_hold_is_told(tmp_path, monkeypatch, what, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        what(soft_model())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = export(soft_model(), "html", tmp_path / "clip.html", title="a clip")
+    before = path.read_text(encoding="utf-8")
+    assert before == html_page(soft_model(), title="a clip")
+    with pytest.raises(OutputError, match="exists"):
+        export(soft_model(seed=1), "html", path)
+    assert path.read_text(encoding="utf-8") == before
+    export(soft_model(seed=1), "html", path, overwrite=True)
+    assert path.read_text(encoding="utf-8") != before
+    monkeypatch.setattr(page_module, "LARGE", 1000)
+    with pytest.warns(UserWarning, match="slow to open. Compress"):
+        write_html(path, soft_model())
+    with pytest.warns(UserWarning, match="Leave the original out"):
+        write_html(path, soft_model(), original=waves(7, *SIZE))
+
+
+def test_notebooks_show_the_player(monkeypatch):
+    model = soft_model()
+    (frame,) = [one for tag, one in _Elements(model._repr_html_()).tags if tag == "iframe"]
+    assert frame["srcdoc"] == html_page(model, title="foldgauss")
+    assert 390 <= int(frame["height"]) <= 710
+    assert "allow-same-origin" not in frame["sandbox"]
+    baked = layers(model, model)
+    assert "<iframe" in baked._repr_html_()
+    assert _late(model)._repr_html_() is None
+    monkeypatch.setattr(page_module, "LARGEST_IN_NOTEBOOK", 1000)
+    assert model._repr_html_() is None
+
+
+# ------------------------------------------------------------------------------------------------- in a browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser, tmp_path):
+    """Opens pages, and holds at the end that they said nothing and asked for nothing."""
+    pages = []
+
+    def open_page(model, *, original=None, **options):
+        path = write_html(tmp_path / f"{len(pages)}.html", model, original=original)
+        pages.append(Opened(browser, path, **options))
+        return pages[-1].ready()
+
+    yield open_page
+    for one in pages:
+        one.close()
+        assert not one.said
+        assert all(url.startswith(("file:", "blob:", "data:")) for url in one.asked)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return {
+        how: fit(waves(), FitConfig(num_gaussians=300, steps=60, compositing=how), fps=12).model
+        for how in ("over", "sum")
+    }
+
+
+MODELS = {
+    "fitted": lambda fitted: fitted["over"],
+    "sum": lambda fitted: fitted["sum"],
+    "moved": lambda fitted: (
+        edit(fitted["over"]).move((0.1, 0.05)).scale(0.7, about=(0, 0)).rotate(0.4, about=(0, 0)).video()
+    ),
+    "layers": lambda fitted: layers(edit(fitted["over"]).scale(0.4, about=(0, 0)).video(), fitted["over"]),
+    "power 2, exact": lambda fitted: soft_model(power=2.0),
+    "power 1": lambda fitted: soft_model(power=1.0, options=RenderOptions()),
+    "floor, no path": lambda fitted: soft_model(floor=0.1, degree=0, options=RenderOptions()),
+    "degree 4, round": lambda fitted: soft_model(degree=4, options=RenderOptions(support_radius=1.5)),
+    "scale cutoff": lambda fitted: _with(soft_model(options=RenderOptions()), scale_cutoff=0.03),
+    "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(time_logits(7, (3,)))),
+    "tall": lambda fitted: soft_model(size=(64, 36), options=RenderOptions()),
+    "one frame": lambda fitted: soft_model(num_frames=1, options=RenderOptions()),
+}
+
+
+def _with(model, **fields):
+    own = {"scale_cutoff": model.scale_cutoff, "frame_times": model.frame_times} | fields
+    shared = (model.size, model.fps, model.options, model.compositing)
+    return VideoModel(model.splats, own["frame_times"], *shared, own["scale_cutoff"])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_pictures_are_those_of_the_engine(opened, fitted, name):
+    model = MODELS[name](fitted)
+    page, play = opened(model), Playback(model)
+    times = np.asarray(model.frame_times.times())
+    between = [float(0.6 * times[k] + 0.4 * times[k + 1]) for k in (0, 2)] if len(times) > 1 else [0.3]
+    for t in (0.0, *between, 0.456, 1.0):
+        wanted = play.frame(t)
+        far = np.abs(page.picture(t).astype(float) - wanted).mean()
+        assert far < 0.5, (t, far)
+        assert wanted.std() > 3  # there is something to see
+    height, width = (3 * side // 2 for side in model.size)
+    larger = Playback(model, (height, width + 10)).frame(0.456)
+    assert np.abs(page.picture(0.456, (height, width + 10)).astype(float) - larger).mean() < 0.5
+
+
+def test_positions_are_the_learned_times(opened):
+    """A frame on is the next frame's own time, and half a frame on is half way to it."""
+    logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5, 1.0]).astype(np.float32)
+    model = _with(soft_model(), frame_times=FrameTimes(logits))
+    page, times = opened(model), np.asarray(model.frame_times.times())
+    page.page.keyboard.press(".")
+    assert page.stats["time"] == pytest.approx(float(times[1]), abs=1e-3)  # logits are rounded to 2^-10
+    for _ in range(5):
+        page.page.keyboard.press("Shift+ArrowRight")
+    assert page.stats["position"] == pytest.approx(1.5)
+    assert page.stats["time"] == pytest.approx(float(times[1] + times[2]) / 2, abs=1e-3)
+    page.page.keyboard.press(",")
+    assert page.stats["position"] == 1
+    page.page.keyboard.press("End")
+    assert (page.stats["position"], page.stats["time"]) == (6, 1.0)
+
+
+def test_keys_do_what_the_help_says(opened):
+    page = opened(soft_model(), original=waves(7, *SIZE))
+    keyboard = page.page.keyboard
+    for key, name, value in (
+        ("Space", "playing", True),
+        ("Space", "playing", False),
+        ("l", "loop", False),
+        ("[", "speed", 0.5),
+        ("[", "speed", 0.25),
+        (">", "speed", 0.5),
+        ("b", "brushing", True),
+        ("Escape", "brushing", False),
+        ("3", "mode", "slider"),
+        ("5", "mode", "difference"),
+        ("1", "mode", "model"),
+        ("+", "zoom", 1.25),
+        ("0", "zoom", 1),
+        ("Home", "position", 0),
+    ):
+        keyboard.press(key)
+        assert page.stats[name] == value, key
+    keyboard.press("?")
+    assert page.page.locator("#help").is_visible()
+    keyboard.press("Space")
+    assert not page.stats["playing"]
+    keyboard.press("Escape")
+    assert not page.page.locator("#help").is_visible()
+
+
+def test_it_plays_and_stops_at_the_end(opened):
+    page = opened(soft_model(), reduced_motion="no-preference")
+    assert page.stats["playing"]
+    page.page.keyboard.press("l")
+    while page.stats["playing"]:
+        page.page.wait_for_timeout(50)
+    assert page.stats["position"] == 6
+    still = opened(soft_model(), reduced_motion="reduce")
+    assert not still.stats["playing"]
+
+
+def test_what_is_brushed_can_vanish_and_come_back(opened):
+    model = soft_model(options=RenderOptions())
+    page = opened(model)
+    before = page.picture(0.5)
+    page.page.keyboard.press("b")
+    box = page.page.locator("#canvas").bounding_box()
+    scale = min(box["width"] / SIZE[1], box["height"] / SIZE[0])
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    seen = model.at(jnp.float32(0.5))
+    x, y = map(float, np.median(np.asarray(seen.mean)[OBJECT], axis=0))
+    at = (middle[0] + (x - SIZE[1] / 2) * scale, middle[1] + (y - SIZE[0] / 2) * scale)
+    page.page.mouse.move(*at)
+    page.page.mouse.down()
+    page.page.mouse.move(at[0] + 40, at[1] + 20, steps=4)
+    page.page.mouse.up()
+    picked = page.page.evaluate("foldgauss.player.selection.indices()")
+    assert page.stats["picked"] == len(picked) >= 4
+    assert OBJECT[picked].mean() > 0.7
+    assert np.abs(page.picture().astype(float) - before).mean() > 0.2  # tinted
+    page.page.click("#vanish")
+    gone = page.picture()
+    left = np.ones(NUM, bool)
+    left[picked] = False
+    wanted = Playback(edit(model).select(~left).vanish().video()).frame(0.5)
+    assert np.abs(gone.astype(float) - wanted).mean() < 0.5
+    page.page.click("#vanish")
+    page.page.locator("#scale").fill("0.5")
+    page.page.keyboard.press("b")  # no tint
+    small = page.picture()
+    assert np.abs(small.astype(float) - before).mean() > 0.2
+    assert np.abs(small.astype(float) - gone).mean() > 0.2
+    page.page.keyboard.press("b")
+    page.page.keyboard.press("z")
+    page.page.keyboard.press("b")
+    assert page.stats["picked"] == 0
+    np.testing.assert_array_equal(page.picture(), before)
+
+
+def test_what_is_brushed_is_followed_through_the_clip(opened):
+    """An object of two Gaussians, the second of which takes over from the first, on a background that stays."""
+    splats = FoldedSplats(
+        loc=np.float32([[-0.1, 0.0], [-0.08, 0.0], [0.0, 0.0]]),
+        log_scale=np.float32([[-2.5, -2.5], [-2.5, -2.5], [0.0, 0.0]]),
+        angle_logit=np.zeros(3, np.float32),
+        time_loc_logit=np.float32([-1.5, 1.5, 0.0]),
+        log_time_scale=np.float32([-1.6, -1.6, 3.0]),
+        coefficients=np.zeros((3, 1, 2), np.float32),
+        opacity_logit=np.float32([3.0, 3.0, 4.0]),
+        color_dc=np.float32([[1.5, -1.0, -1.0], [1.4, -1.0, -1.0], [-1.0, -1.0, 1.0]]),
+        envelope=TimeLikelihood(1.0),
+    )
+    page = opened(VideoModel(splats, FrameTimes.uniform(9), SIZE, 25.0, RenderOptions()))
+    page.page.evaluate("foldgauss.seek(0)")
+    page.page.evaluate("foldgauss.player.selection.begin(), foldgauss.player.selection.paint(0, -0.1, 0, 0.03, false)")
+    assert page.page.evaluate("foldgauss.player.selection.indices()") == [0]
+    page.page.keyboard.press("b")
+    page.page.click("#follow")
+    page.page.locator("#toast").wait_for()
+    assert page.page.evaluate("foldgauss.player.selection.indices()") == [0, 1]
+
+
+def test_the_original_is_shown_beside_it(opened):
+    model, clip = soft_model(), np.zeros((7, *SIZE, 3), np.uint8)
+    clip[..., 1] = 200
+    page = opened(model, original=clip)
+
+    def shot():
+        page.settle()
+        return cv2.imdecode(np.frombuffer(page.page.locator("#canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+    def green(picture):
+        return float((np.abs(picture.astype(int) - (0, 200, 0)).max(-1) < 12).mean())
+
+    shares = {}
+    for key, mode in enumerate(("model", "original", "slider", "side"), start=1):
+        page.page.keyboard.press(str(key))
+        for _ in range(40):
+            shares[mode] = green(shot())
+            if mode == "model" or shares[mode] > 0.05:
+                break
+        assert page.stats["mode"] == mode
+    assert shares["model"] < 0.02
+    assert shares["original"] > 0.6
+    assert 0.3 < shares["slider"] / shares["original"] < 0.6
+    assert shares["side"] > 0.1
+    page.page.keyboard.press("3")
+    page.page.locator("#divider").focus()
+    before = green(shot())
+    for _ in range(10):
+        page.page.keyboard.press("ArrowLeft")
+    assert green(shot()) < before - 0.05
+
+
+def test_a_phone_has_room_for_all_of_it(opened):
+    for width, height in ((360, 640), (390, 844), (740, 360)):
+        phone = {"viewport": {"width": width, "height": height}, "device_scale_factor": 2, "has_touch": True}
+        page = opened(soft_model(), original=waves(7, *SIZE), **phone).settle().page
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        small = page.evaluate(
+            """[...document.querySelectorAll("button, select")].filter((own) => own.offsetParent)
+            .map((own) => [own.id || own.textContent, own.getBoundingClientRect()])
+            .filter(([, box]) => box.width < 40 || box.height < 40 || box.left < 0 || box.right > innerWidth)
+            .map(([name, box]) => `${name} ${box.x} ${box.y} ${box.width} ${box.height}`)"""
+        )
+        assert small == []
+        assert page.locator("#canvas").bounding_box()["height"] > 0.4 * height
+
+
+def test_buttons_have_names_and_themes_change(opened):
+    page = opened(soft_model(), color_scheme="light").page
+    nameless = """[...document.querySelectorAll("button, select, input")]
+        .filter((own) => !(own.ariaLabel || own.textContent.trim() || own.labels?.length)).map((own) => own.id)"""
+    assert page.evaluate(nameless) == []
+    assert page.evaluate("document.documentElement.dataset.theme") == "light"
+    page.click("#theme")
+    assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+
+
+def test_nothing_is_drawn_where_nothing_changes(opened):
+    page = opened(soft_model()).settle()
+    page.page.wait_for_timeout(400)  # until the first picture has been sharpened
+    count = """foldgauss.player.renderer.count = 0; foldgauss.player.draw = new Proxy(foldgauss.player.draw, {
+        apply: (draw, own, values) => (own.renderer.count++, Reflect.apply(draw, own, values)) })"""
+    page.page.evaluate(f"() => {{ {count} }}")
+    page.page.wait_for_timeout(300)
+    assert page.page.evaluate("foldgauss.player.renderer.count") == 0
+    page.page.keyboard.press(".")
+    page.settle()
+    assert page.page.evaluate("foldgauss.player.renderer.count") == 1
+
+
+def test_a_lost_context_comes_back(opened):
+    page = opened(soft_model())
+    before = page.picture(0.4)
+    page.page.evaluate("void (lost = foldgauss.player.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
+    page.page.get_by_text("has let go of this page").wait_for()
+    page.page.evaluate("lost.restoreContext()")
+    page.page.locator("#notice").wait_for(state="hidden")
+    np.testing.assert_array_equal(page.picture(), before)
+
+
+def test_without_webgl_the_page_says_so(browser, tmp_path):
+    path = write_html(tmp_path / "page.html", soft_model())
+    context = browser.new_context()
+    context.set_default_timeout(120_000)
+    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page = context.new_page()
+    page.goto(path.as_uri())
+    page.get_by_text("has no WebGL 2").wait_for()
+    context.close()
+
+
+def test_the_player_works_in_a_notebooks_frame(browser, tmp_path):
+    """In a frame of no origin, which may keep nothing."""
+    path = tmp_path / "book.html"
+    path.write_text(f"<!doctype html><body>{soft_model()._repr_html_()}</body>")
+    page = Opened(browser, path)
+    frame = page.page.frames[1]
+    frame.locator("#notice").wait_for(state="hidden")
+    assert frame.evaluate("foldgauss.stats.total") == NUM
+    page.close()
+    assert not page.said
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the brush's own conditioning")
+@pytest.mark.parametrize("how", [{}, {"degree": 0}, {"degree": 4, "power": 1.0, "floor": 0.1}])
+def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
+    """The fold equation stands once in Python; the brush has it again, and is held to that."""
+    path = tmp_path / "m.fgz"
+    path.write_bytes(data_of(html_page(soft_model(options=RenderOptions(), **how))))
+    for source in (page_module._DECODER, *(page_module._SOURCES / f"{name}.js" for name in MODULES)):
+        (tmp_path / source.name).write_bytes(source.read_bytes())
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    (tmp_path / "run.js").write_text(
+        """
+        import { readFileSync } from "node:fs";
+        import { prepared } from "./gaussians.js";
+        import { Selection, conditioned } from "./selection.js";
+        const file = readFileSync("m.fgz");
+        const model = prepared(file.buffer.slice(file.byteOffset, file.byteOffset + file.length), () => {});
+        const alive = Array.from(new Selection(model).alive(0.3));
+        console.log(JSON.stringify(alive.map((i) => conditioned(model, i, 0.3, 0))));
+        """
+    )
+    ran = subprocess.run(["node", "run.js"], cwd=tmp_path, check=True, timeout=60, capture_output=True, text=True)
+    found = json.loads(ran.stdout)
+    splats = load_video_model(path).splats.at(jnp.float32(0.3))
+    which = np.array([one["i"] for one in found])
+    np.testing.assert_array_equal(which, np.flatnonzero(splats.opacity))
+    np.testing.assert_allclose([(one["x"], one["y"]) for one in found], splats.mean[which], atol=1e-5)
+    np.testing.assert_allclose([one["opacity"] for one in found], splats.opacity[which], rtol=1e-5)
+    turned = np.array([[[one["cos"], -one["sin"]], [one["sin"], one["cos"]]] for one in found])
+    covariance = (turned * [[[one["first"], one["second"]]] for one in found]) @ turned.transpose(0, 2, 1)
+    expected = np.asarray(splats.factor @ splats.factor.transpose(0, 2, 1))[which]
+    np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_films_model_is_small_and_soon_there(browser, tmp_path):
+    path = write_html(tmp_path / "film.html", many(40_000))
+    assert path.stat().st_size <= 3e6
+    Opened(browser, path).ready().close()  # once, so that the browser has begun
+    page = Opened(browser, path).ready().settle()
+    seconds = page.page.evaluate("performance.now() / 1000")  # since the page was asked for
+    assert page.stats["total"] == 40_000
+    page.close()
+    assert seconds <= 2.0, seconds
