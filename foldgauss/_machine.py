@@ -13,7 +13,7 @@ PACKAGES = ("jax", "jaxlib", "numba", "numpy", "optax")
 def machine() -> dict[str, object]:
     """Facts a timing depends on; no names of hosts or users. `load_average`: processes that ran in the last minute."""
     return {
-        "cpu": _cpu_model(),
+        "cpu": cpu_model(),
         "cores": available_cores(),
         "threads": num_threads(),
         "load_average": load_average(),
@@ -27,7 +27,7 @@ def load_average() -> float | None:
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
-def _cpu_model() -> str:
+def cpu_model() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:  # not Linux

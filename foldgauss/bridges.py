@@ -99,7 +99,11 @@ def to_scipy(dist: Any) -> "FrozenDistribution":
 class FrozenDistribution:
     """A distribution as scipy would freeze it: `pdf`, `logpdf`, `rvs`, `entropy`, `marginal`, `mean`, `cov`.
 
+    **Shapes:** points (..., d) as NumPy arrays, time last; of one coordinate (...) will do. `rvs(size)` is (size, d).
+
     **Example:** `to_scipy(dist).marginal([0]).pdf(0.3)`
+
+    **Source:** the interface of scipy's frozen multivariate distributions.
     """
 
     def __init__(self, base: Any):

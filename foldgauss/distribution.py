@@ -412,7 +412,7 @@ class FoldedGaussian(eqx.Module):
     def _time_index(self) -> int:
         return self.event_shape[0] - 1
 
-    # --- fits and bridges: imported when asked for -----------------------------------------------------------
+    # --- fits, bridges, pictures: imported when asked for -----------------------------------------------------
 
     @staticmethod
     def fit(x: Float[Array, "n d"], **options):
@@ -435,6 +435,12 @@ class FoldedGaussian(eqx.Module):
         from foldgauss import bridges
 
         return bridges.to_scipy(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows: the density over time and space, or of many coordinates some views of it."""
+        from foldgauss import _display
+
+        return _display.distribution_png(self)
 
 
 def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:

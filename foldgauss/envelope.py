@@ -22,6 +22,8 @@ __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood",
 class AbstractEnvelope(eqx.Module):
     """An envelope with batch dimensions, known by its logarithm.
 
+    **Shapes:** t, time_loc, time_scale (*batch,) -> (*batch,). **Units:** the three share theirs; a has none.
+
     To extend: return `log a <= 0`, let leading dimensions of the leaves broadcast against those of `t`, and
     say in `leaf_ranks` where they begin.
     """
@@ -163,7 +165,13 @@ def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelop
 
 
 def as_envelope(envelope: AbstractEnvelope | Callable) -> AbstractEnvelope:
-    """`envelope` itself if it is one, else the callable, which must give log a, in a `CallableEnvelope`."""
+    """`envelope` itself if it is one, else the callable, which must give log a, in a `CallableEnvelope`.
+
+    **Shapes:** a callable takes three scalars (t, time_loc, time_scale) to a scalar <= 0. **Raises:** ValueError if it
+    is not callable.
+
+    **Example:** `as_envelope(lambda t, m, scale: -jnp.abs((t - m) / scale))`
+    """
     return envelope if isinstance(envelope, AbstractEnvelope) else CallableEnvelope(envelope)
 
 

@@ -34,6 +34,8 @@ __all__ = [
 class AbstractFold(eqx.Module):
     """A fold with batch dimensions: `fold(u)` takes u of shape (*batch,) to shifts (*batch, d-1).
 
+    **Units:** u is time, f(u) is space.
+
     To extend: let further leading dimensions of the leaves broadcast against those of `u`, and say in
     `leaf_ranks` where they begin. A function of one scalar needs no class: `as_fold` wraps it.
     """
@@ -272,7 +274,12 @@ class CallableFold(AbstractFold):
 
 
 def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
-    """`fold` itself if it is one, else the callable wrapped (and so vmapped) by `CallableFold`."""
+    """`fold` itself if it is one, else the callable wrapped (and so vmapped) by `CallableFold`.
+
+    **Shapes:** a callable takes one scalar u to (d-1,). **Raises:** ValueError if it is not callable.
+
+    **Example:** `as_fold(lambda u: jnp.stack([u, u**2]))`
+    """
     return fold if isinstance(fold, AbstractFold) else CallableFold(fold)
 
 

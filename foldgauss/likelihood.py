@@ -96,6 +96,10 @@ class Fit(eqx.Module):
     time: str = eqx.field(static=True)
     covariance: str = eqx.field(static=True)
 
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows: the distribution's picture."""
+        return self.distribution._repr_png_()
+
     @property
     def degree(self) -> int:
         return self.triangle_inverse.shape[-1] - 1

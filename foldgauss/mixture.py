@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
+from foldgauss import _display
 from foldgauss._batch import align, as_value, broadcast, check_event, checked_batch, fill, known, parts_of
 from foldgauss._checks import invalid
 from foldgauss._pairs import chunked, components_first, pair_log_prob
@@ -41,6 +42,9 @@ class AbstractMixture(eqx.Module):
     """Components with weights: `p(x) = sum_k w_k p_k(x)`. What every mixture here can do.
 
     The components' last batch dimension counts them.
+
+    **Shapes:** `components` with batch (*batch, k), `logits` (*batch, k); points are (..., d), time last where there is
+    time.
     """
 
     components: eqx.AbstractVar[eqx.Module]
@@ -192,6 +196,10 @@ class FoldedMixture(AbstractMixture):
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return _ranks_of(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows: the density over time and space, or of many coordinates some views of it."""
+        return _display.mixture_png(self)
 
     def condition_time(self, t: Float[Array, "*#batch"]) -> "GaussianMixture":
         """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalised.

@@ -22,7 +22,15 @@ def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*
 
         E s = loc + E f(u),  Cov s = E[a] Sigma + Cov f(u),  Cov(s, t) = -E[f(u) u],  u ~ N(0, time_scale^2)
 
-    **Source:** the laws of total mean and covariance given t.
+    Exact for polynomial folds; others by a Gauss-Hermite rule of `order` nodes. `FoldedGaussian.moments` calls it.
+
+    **Shapes:** `dist` with batch (*batch,) -> (*batch, d) and (*batch, d, d), time last.
+
+    **Units:** of x, and their products.
+
+    **Example:** `moments(dist, 64)[0]  # as dist.mean`
+
+    **Source:** the laws of total mean and covariance given t. **Raises:** nothing of its own.
     """
     dist = fill(dist, dist.batch_shape)
     mean_f, cov_f, cross = _fold_moments(dist, order)
@@ -35,7 +43,14 @@ def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*
 
 
 def entropy(dist) -> Float[Array, "*batch"]:
-    """H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2: the fold has no part in it."""
+    """H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2: the fold has no part in it.
+
+    **Shapes:** batch (*batch,) -> (*batch,). **Units:** nats.
+
+    **Example:** `entropy(dist)  # as dist.entropy()`
+
+    **Source:** the chain rule, H(t) + H(s | t), with eq:cond_dens.
+    """
     dist = fill(dist, dist.batch_shape)
     dim = dist.loc.shape[-1]
     log_det = jnp.log(jnp.diagonal(dist.scale_tril, axis1=-2, axis2=-1)).sum(-1)
@@ -44,7 +59,10 @@ def entropy(dist) -> Float[Array, "*batch"]:
 
 
 def mean_envelope(dist) -> Float[Array, "*batch"]:
-    """E[a(t)]: 1, or floor + (1 - floor) / sqrt(1 + power), or a quadrature."""
+    """E[a(t)]: 1, or floor + (1 - floor) / sqrt(1 + power), or a quadrature.
+
+    **Shapes:** batch (*batch,) -> (*batch,), in (0, 1]. **Source:** eq:a_func_2d, integrated over t.
+    """
     envelope = dist.envelope
     if isinstance(envelope, Constant):
         return jnp.ones_like(dist.time_loc)
@@ -54,7 +72,10 @@ def mean_envelope(dist) -> Float[Array, "*batch"]:
 
 
 def mean_log_envelope(dist) -> Float[Array, "*batch"]:
-    """E[log a(t)]: 0, or -power / 2 without a floor, or a quadrature."""
+    """E[log a(t)]: 0, or -power / 2 without a floor, or a quadrature.
+
+    **Shapes:** batch (*batch,) -> (*batch,), not above 0. **Source:** as `mean_envelope`.
+    """
     envelope = dist.envelope
     if isinstance(envelope, Constant):
         return jnp.zeros_like(dist.time_loc)
@@ -70,6 +91,11 @@ def mean_log_envelope(dist) -> Float[Array, "*batch"]:
 def mode(dist) -> Float[Array, "*batch d"]:
     """The highest point of the density, (loc + f(0), time_loc) for the built-in envelopes, if it is the only one.
 
+    **Shapes:** batch (*batch,) -> (*batch, d), time last. **Units:** of x.
+
+    **Example:** `mode(dist)  # as dist.mode`
+
+    **Source:** the density along the ridge s = loc + f(u), eq:cond_dens.
     **Raises:** ValueError that says whether the density has a ridge of modes, two modes, or none.
     """
     envelope, batch = dist.envelope, dist.batch_shape

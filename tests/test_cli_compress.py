@@ -129,3 +129,19 @@ def test_edited_models_are_refused(work, tmp_path, capsys):
     assert run("compress", tmp_path / "e.safetensors", "--out", tmp_path / "e.fgz") == 2
     assert "MODEL: expected a plain model, got one with edits" in capsys.readouterr().err
     assert not (tmp_path / "e.fgz").exists()
+
+
+def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):
+    """Fitted anew to it, the model would be lost; one that a decoder changed by a little is taken."""
+    monkeypatch.chdir(tmp_path)
+    model, frames = load_video_model(work / "model.safetensors"), read_video(work / "clip").frames
+    about = {"clip": "clip", "mean_psnr": 33.3, "frames": [0, FRAMES], "frames_digest": "another's"}
+    save_video_model("m.safetensors", model, metadata=about)
+    write_video("grey", np.full_like(frames, 90), 12.0)
+    write_video("short", frames[:3], 12.0)
+    assert run("compress", "m.safetensors", "grey") == 2
+    assert "VIDEO: expected the clip that the model was fitted to" in " ".join(capsys.readouterr().err.split())
+    assert run("compress", "m.safetensors", "short") == 2
+    assert "frames 0:5 of clip, got 'short', which has fewer" in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.glob("*.fgz"))
+    assert run("compress", "m.safetensors", work / "clip", "--passes", 0) == 0

@@ -163,9 +163,3 @@ def test_one_frame_has_no_between(tmp_path, capsys):
     save_video_model(tmp_path / "m.safetensors", single)
     assert run("figure", "interpolation", tmp_path / "m.safetensors", "--out", tmp_path / "a.png") == 2
     assert "expected at least 2 frames, got 1" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("kind", ["interpolation", "reconstruction"])
-def test_help_has_an_example(kind, capsys):
-    assert run("figure", kind, "--help") == 0
-    assert f"Example: foldgauss figure {kind} model.safetensors" in " ".join(capsys.readouterr().out.split())

@@ -13,6 +13,7 @@ import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
+from foldgauss.cli import uncertainty as command
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import edit
 
@@ -38,6 +39,12 @@ def done(work):
     target = work / "results" / "short"
     assert run("uncertainty", work / "model.safetensors", work / "clip", "--out", target, *SHORT) == 0
     return target
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Empty files in place of the pictures, which take seconds: `test_everything_is_there` looks at them."""
+    monkeypatch.setattr(command, "_draw", lambda path, *arguments, **options: path.touch())
 
 
 def arguments(work, target, *options):
@@ -88,7 +95,7 @@ def test_arviz_reads_the_draws(done):
     assert data.posterior.attrs.get("message", data.attrs.get("message"))
 
 
-def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys):
+def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys, no_pictures):
     before = (done / "chains.h5").read_bytes()
     assert run(*arguments(work, done, *SHORT)) == 0
     assert "had finished: nothing was drawn anew" in capsys.readouterr().out
@@ -104,7 +111,7 @@ def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys):
     assert {path.name for path in done.iterdir()} == FILES
 
 
-def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys):
+def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no_pictures):
     """Killed without warning once something is kept; called again, it draws what it would have drawn."""
     target = tmp_path / "killed"
     code = (
@@ -132,7 +139,7 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys):
     assert {path.name for path in target.iterdir()} == FILES
 
 
-def test_without_colours_less_is_known(work, done, tmp_path):
+def test_without_colours_less_is_known(work, done, tmp_path, no_pictures):
     target = tmp_path / "results"
     assert run(*arguments(work, target, *SHORT, "--level", "colors")) == 0
     told = (target / "summary.md").read_text()
@@ -144,7 +151,7 @@ def test_without_colours_less_is_known(work, done, tmp_path):
     assert max(wider) > 1.02
 
 
-def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys):
+def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no_pictures):
     target = tmp_path / "results"
     few = ["--steps", "60", "--ensembles", "2", "--only", "6,7"]
     assert run(*arguments(work, target, *few)) == 0

@@ -1,47 +1,153 @@
-"""The guides' examples run, in order, as one program each."""
+"""README's and the guides' programs run, each page as a reader would do it: see `guides`."""
 
-import re
-from pathlib import Path
-
+import guides
 import numpy as np
 import pytest
 from PIL import Image
 
+from foldgauss.io import load_video_model
 from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.video import EditedVideo
 
-DOCS = Path(__file__).parents[1] / "docs"
+#: Extras that a page says it needs; all come with the extra `test`.
+NEEDS = {
+    "README.md": ("emcee", "matplotlib"),
+    "docs/commands.md": ("matplotlib",),
+    "docs/distribution.md": ("numpyro", "matplotlib"),
+    "docs/estimator.md": ("sklearn",),
+    "docs/fit.md": ("matplotlib",),
+    "docs/mixture.md": ("numpyro",),
+    "docs/tradeoff.md": ("matplotlib",),
+    "docs/uncertainty.md": ("emcee",),
+}
+#: Pages of a few seconds, which run by default; all others, a new one too, are slow ones.
+QUICK = {"CONTRIBUTING.md", "docs/economy.md", "docs/own-loss.md"}
 
 
-def _run(name: str) -> dict:
-    """The names that the guide's program leaves."""
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.S)
-    names = {}
-    exec(compile("\n".join(blocks), name, "exec"), names)
-    return names
+def _has_programs(page: str) -> bool:
+    return any(block.language in guides.RUN for block in guides.blocks(page))
 
 
-@pytest.mark.slow
-def test_distribution():
-    pytest.importorskip("numpyro", reason="numpyro is an optional extra")
-    pytest.importorskip("matplotlib", reason="matplotlib is an optional extra").use("Agg")
-    names = _run("distribution.md")
+PAGES = [
+    pytest.param(page, marks=() if page in QUICK else pytest.mark.slow) for page in guides.PAGES if _has_programs(page)
+]
+
+
+@pytest.mark.parametrize("page", guides.PAGES)
+def test_every_block_says_what_it_is(page):
+    guides.check_languages(page)
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("page", PAGES)
+def test_page_runs(page, tmp_path, monkeypatch):
+    for module in NEEDS.get(page, ()):
+        pytest.importorskip(module, reason=f"{module} is an optional extra")
+    if "matplotlib" in NEEDS.get(page, ()):
+        pytest.importorskip("matplotlib").use("Agg")
+    names = guides.run_page(page, tmp_path, monkeypatch)
+    CHECKS.get(page, lambda names, folder: None)(names, tmp_path)
+
+
+def test_every_check_has_its_page():
+    for known in (NEEDS, QUICK, CHECKS, guides.GIVEN):
+        assert known <= set(guides.PAGES) if isinstance(known, set) else known.keys() <= set(guides.PAGES)
+
+
+# What the programs must come to.
+
+
+def _readme(names, folder):
+    assert names["x"].shape == (1000, 3)
+    assert names["picture"].shape == (*guides.SIZE, 3)
+    assert isinstance(names["more"], EditedVideo)
+    assert len(names["rider"]) > 0
+    made = {"holiday.safetensors", "slow.mp4", "times", "holiday.fgz", "trade", "more.mp4", "foldgauss-demo"}
+    assert made <= {path.name for path in folder.iterdir()}
+    assert names["posterior"].mean().shape == (guides.NUM_FRAMES,)
+
+
+def _commands(names, folder):
+    made = {"slow.mp4", "middle.png", "figures.json", "trip.fgz", "edited.mp4", "trip.ply", "between.png", "frames.png"}
+    assert made <= {path.name for path in folder.iterdir()}
+
+
+def _compress(names, folder):
+    assert names["made"].loss_db <= 0.3
+    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
+    assert sizes["holiday.fgz"] < sizes["rounded.fgz"] < sizes["half.safetensors"] < sizes["holiday.safetensors"]
+
+
+def _concepts(names, folder):
+    np.testing.assert_allclose(names["at"].mean, [0.1 + 3 * 0.0625 - 9 * 0.25**3], rtol=1e-5)
+
+
+def _distribution(names, folder):
     assert names["select_degree"](names["x"], 4, "bic").degree == 2
     assert names["kl_divergence"](names["dist"], names["dist"]) == 0
 
 
-@pytest.mark.slow
-def test_estimator():
-    pytest.importorskip("sklearn", reason="scikit-learn is an optional extra")
-    names = _run("estimator.md")
+def _economy(names, folder):
+    assert names["degrees"][1] == names["degrees"][1:].max()
+    assert names["throughout"] > 0
+
+
+def _editing(names, folder):
+    assert len(names["ball"]) > 5
+    assert names["gone"].num_gaussians == names["model"].num_gaussians - len(names["ball"])
+    assert names["picture"].shape == (48, 80, 3)
+    for video in ("night", "jump", "there_and_back", "still", "stacked", "popped", "orbit", "waving", "grown", "again"):
+        picture = names[video].render(0.4)
+        assert np.isfinite(picture).all()
+        assert np.abs(picture - names["model"].render(0.4)).max() > 0.02
+    # The script, as it stands there.
+    (folder / "masks").mkdir()
+    Image.fromarray(255 * names["masks"][0].astype(np.uint8)).save(folder / "masks" / "ball.png")
+    (script,) = [block.text for block in guides.blocks("docs/editing.md") if block.language == "toml"]
+    edited = parse_edit_script(script, folder=folder).apply(names["model"])
+    assert edited.num_gaussians > names["model"].num_gaussians
+    assert isinstance(edited, EditedVideo)
+
+
+def _estimator(names, folder):
     assert names["mixture"].converged_
     assert names["mixture"].score(names["x"]) > 0.5
 
 
-@pytest.mark.slow
-def test_mixture():
-    pytest.importorskip("numpyro", reason="numpyro is an optional extra")
-    names = _run("mixture.md")
+def _extending(names, folder):
+    assert np.isfinite(names["jump"].log_prob(names["x"])).all()
+    assert names["wide"] > 2 * names["narrow"]
+    np.testing.assert_allclose(names["mine"], names["judge"], atol=1e-5)
+    before = names["model"].render(0.8)
+    for video in ("swirled", "later"):
+        assert np.abs(names[video].render(0.8) - before).max() > 0.02
+    np.testing.assert_allclose(names["later"].render(0.0), names["model"].render(0.0), atol=1e-5)
+
+
+def _fit(names, folder):
+    assert names["picture"].shape == (90, 160, 3)
+    assert names["small"].num_frames == 24
+    assert names["bear"].masks.shape == (4, 480, 480)
+    assert load_video_model(folder / "trip.safetensors").degree == 5
+
+
+def _format(names, folder):
+    assert names["made"].loss_db == pytest.approx(names["lost"], abs=1e-6)
+    assert names["lost"] <= 0.2
+    made = {"waves.fgz", "holiday.fgz"}
+    assert {path.name for path in folder.iterdir()} == made | {"holiday.mp4", "holiday.safetensors"}
+
+
+def _formats(names, folder):
+    np.testing.assert_allclose(names["again"].splats.loc, names["model"].splats.loc, atol=1e-6)
+    np.testing.assert_array_equal(names["loaded"].splats.coefficients, names["model"].splats.coefficients)
+    assert len(names["gaussians"].mean) > 10
+    assert names["vertices"].shape[1:] == (3, 3)
+    made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply", "waves.safetensors"}
+    assert {path.name for path in folder.iterdir()} == made
+
+
+def _mixture(names, folder):
     assert names["x"].shape == (1000, 3)
     assert names["curve"].shape == (50, 2)
     np.testing.assert_allclose(names["same"].weights, names["mixture"].weights, rtol=1e-5)
@@ -49,28 +155,22 @@ def test_mixture():
     np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
 
 
-def test_economy():
-    names = _run("economy.md")
-    assert names["degrees"][1] == names["degrees"][1:].max()
-    assert names["throughout"] > 0
+def _own_fold(names, folder):
+    assert names["away"] < 0.15  # of a circle 0.6 wide
+    assert names["frame"].shape == (48, 80, 3)
+    assert np.abs(names["slope"].fold.sine).max() > 0
 
 
-@pytest.mark.slow
-def test_results():
-    names = _run("results.md")
-    assert names["control"].num_floats <= names["model"].num_floats
-    assert names["gain"] > 0
+def _own_loss(names, folder):
+    assert names["left_psnr"](names["better"]) > names["left_psnr"](names["model"]) + 1
 
 
-def test_tradeoff():
-    names = _run("tradeoff.md")
-    assert names["chosen"] == [0, 1, 2, 3]
-    assert names["bend"] == 1
+def _quickstart(names, folder):
+    assert {"look.png", "slow.mp4", "grey.mp4", "short.safetensors"} <= {path.name for path in folder.iterdir()}
+    assert len(names["corner"]) > 0
 
 
-@pytest.mark.slow
-def test_rendering():
-    names = _run("rendering.md")
+def _rendering(names, folder):
     image, target = names["image"], names["target"]
     assert image.shape == (90, 160, 3)
     assert names["features"].shape == (90, 160, 7)
@@ -87,54 +187,105 @@ def test_rendering():
         assert np.abs(names[other] - image).max() > 0.05
 
 
-@pytest.mark.slow
-def test_editing(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    names = _run("editing.md")
-    assert len(names["ball"]) > 5
-    assert names["gone"].num_gaussians == names["model"].num_gaussians - len(names["ball"])
-    assert names["picture"].shape == (48, 80, 3)
-    for video in ("night", "jump", "there_and_back", "still", "stacked", "popped", "orbit", "waving", "grown", "again"):
-        picture = names[video].render(0.4)
-        assert np.isfinite(picture).all()
-        assert np.abs(picture - names["model"].render(0.4)).max() > 0.02
-    # The script, as it stands there.
-    (tmp_path / "masks").mkdir()
-    Image.fromarray(255 * names["masks"][0].astype(np.uint8)).save(tmp_path / "masks" / "ball.png")
-    script = re.search(r"```toml\n(.*?)```", (DOCS / "editing.md").read_text(), re.S)[1]
-    edited = parse_edit_script(script, folder=tmp_path).apply(names["model"])
-    assert edited.num_gaussians > names["model"].num_gaussians
-    assert isinstance(edited, EditedVideo)
+def _results(names, folder):
+    assert names["control"].num_floats <= names["model"].num_floats
+    assert names["gain"] > 0
 
 
-@pytest.mark.slow
-def test_format(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    names = _run("format.md")
-    assert names["made"].loss_db == pytest.approx(names["lost"], abs=1e-6)
-    assert names["lost"] <= 0.2
-    assert {path.name for path in tmp_path.iterdir()} == {"waves.fgz"}
+def _slow_motion(names, folder):
+    assert len(names["slow"]) == 4 * (guides.NUM_FRAMES - 1) + 1
+    assert len(names["large"]) == 2 * guides.NUM_FRAMES - 1
+    assert names["large"][0].shape == (96, 160, 3)
 
 
-@pytest.mark.slow
-def test_formats(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    names = _run("formats.md")
-    np.testing.assert_allclose(names["again"].splats.loc, names["model"].splats.loc, atol=1e-6)
-    np.testing.assert_array_equal(names["loaded"].splats.coefficients, names["model"].splats.coefficients)
-    assert len(names["gaussians"].mean) > 10
-    assert names["vertices"].shape[1:] == (3, 3)
-    made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply", "waves.safetensors"}
-    assert {path.name for path in tmp_path.iterdir()} == made
+def _player(names, folder):
+    assert "<title>Waves</title>" in names["page"]
+    assert (folder / "waves.html").read_text(encoding="utf-8").count('id="frame-') == len(names["clip"])
 
 
-@pytest.mark.slow
-def test_uncertainty(tmp_path, monkeypatch):
-    pytest.importorskip("emcee", reason="emcee is an optional extra")
-    monkeypatch.chdir(tmp_path)
-    names = _run("uncertainty.md")
-    assert {path.name for path in tmp_path.iterdir()} == {"chains.h5"}
+def _tradeoff(names, folder):
+    assert names["chosen"] == [0, 1, 2, 3]
+    assert names["bend"] == 1
+    assert (folder / "trade" / "tradeoff.png").exists()
+    assert (folder / "few" / "tradeoff.csv").exists()
+
+
+def _uncertainty(names, folder):
+    assert (folder / "chains.h5").exists()
     assert names["posterior"].converged
     assert [(one.frames, one.kind) for one in names["found"]] == [((4, 5), "duplicated"), ((11, 12), "dropped")]
     assert names["some"].free.tolist() == [4, 5, 6]
     assert names["row"].name == "even"
+
+
+CHECKS = {
+    "README.md": _readme,
+    "docs/commands.md": _commands,
+    "docs/compress.md": _compress,
+    "docs/concepts.md": _concepts,
+    "docs/distribution.md": _distribution,
+    "docs/economy.md": _economy,
+    "docs/editing.md": _editing,
+    "docs/estimator.md": _estimator,
+    "docs/extending.md": _extending,
+    "docs/fit.md": _fit,
+    "docs/format.md": _format,
+    "docs/formats.md": _formats,
+    "docs/mixture.md": _mixture,
+    "docs/own-fold.md": _own_fold,
+    "docs/own-loss.md": _own_loss,
+    "docs/quickstart.md": _quickstart,
+    "docs/rendering.md": _rendering,
+    "docs/results.md": _results,
+    "docs/slow-motion.md": _slow_motion,
+    "docs/tradeoff.md": _tradeoff,
+    "docs/uncertainty.md": _uncertainty,
+}
+
+
+# The collector itself: what it must refuse.
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "```\nfoldgauss fit\n```",
+        "```bash\nfoldgauss fit\n```",
+        "    foldgauss fit clip.mp4\n",
+        "- a\n\n      $ pip install x\n",
+    ],
+)
+def test_blocks_that_would_escape_are_refused(text, tmp_path, monkeypatch):
+    (tmp_path / "page.md").write_text(f"Text\n\n{text}")
+    monkeypatch.setattr(guides, "ROOT", tmp_path)
+    with pytest.raises(AssertionError, match=r"page\.md:"):
+        guides.check_languages("page.md")
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("```python\nassert 1 == 2\n```", AssertionError),
+        ("- ```python\n  1 / 0\n  ```", ZeroDivisionError),
+        ("```sh\nfoldgauss info nothing.safetensors\n```", AssertionError),
+        ("```sh\nfoldgauss info --nonsense\n```", AssertionError),
+        ("```sh\nfoldgaus info\n```", AssertionError),
+        ('```sh\npip install ".[nothing]"\n```', AssertionError),
+        ("```sh\npytest -m unheard\n```", AssertionError),
+        ("```sh\npython -m benchmarks.figures --nonsense\n```", pytest.fail.Exception),
+        ("```sh\npython -m benchmarks.nothing\n```", ModuleNotFoundError),
+    ],
+)
+def test_what_is_wrong_fails(text, wrong, tmp_path, monkeypatch):
+    (tmp_path / "page.md").write_text(text)
+    with pytest.raises(wrong):
+        guides.run_page(str(tmp_path / "page.md"), tmp_path, monkeypatch)
+
+
+def test_commands_are_split_as_a_shell_does():
+    text = 'pip install ".[a]" && foldgauss fit a.mp4 \\\n  --out b  # a comment\n\n# nothing\nfoldgauss info b'
+    assert list(guides.commands(text)) == [
+        ["pip", "install", ".[a]"],
+        ["foldgauss", "fit", "a.mp4", "--out", "b"],
+        ["foldgauss", "info", "b"],
+    ]

@@ -1,6 +1,7 @@
 """The paper's experiments as commands: what is kept of them, what they say, and all of them on tiny clips."""
 
 import dataclasses
+import itertools
 import json
 import re
 import statistics
@@ -217,14 +218,14 @@ class TestAblation:
 class TestPresets:
     def test_time_and_numbers_are_those_of_paper(self, clip, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(presets, "seconds_per_step", lambda *given: 0.5)
-        configs = fake_fits(monkeypatch, presets, lambda config: 30.0 if config.growth else 32.5, seconds=90.0)
+        configs = fake_fits(monkeypatch, presets, lambda config: 30.0 if config.growth else 32.5, seconds=100.0)
         command = ["--clip", str(clip), "--size", "24x32", "--minutes", "2", "--json", str(tmp_path / "p.json")]
         presets.main(command)
         paper, standard, equal = configs
         num = round(500_000 * 24 * 32 / (640 * 1280))
         assert paper == FitConfig.preset("paper", num_gaussians=num, steps=240)
-        assert standard == FitConfig(minutes=1.5)
-        assert equal == FitConfig(minutes=1.5, num_gaussians=2 * num)
+        assert standard == FitConfig(minutes=100 / 60)
+        assert equal == FitConfig(minutes=100 / 60, num_gaussians=2 * num)
         presets.main([*command, "--size", "12x16"])
         assert len(configs) == 6
         figures = json.loads((tmp_path / "p.json").read_text())["figures"]
@@ -232,6 +233,17 @@ class TestPresets:
             (f"gain_equal_{what}_{size}" for size in ("24x32", "12x16") for what in ("time", "gaussians")), 2.5
         )
         assert "+2.50" in printed(capsys)
+
+    def test_a_plan_that_ends_early_is_made_anew(self, clip, monkeypatch, capsys):
+        monkeypatch.setattr(presets, "seconds_per_step", lambda *given: 0.5)
+        configs = fake_fits(monkeypatch, presets, lambda config: 30.0, seconds=60.0)
+        presets.main(["--clip", str(clip), "--size", "24x32", "--minutes", "2"])
+        *tries, standard, equal = configs
+        assert len(tries) == presets.TRIES
+        assert [config.steps for config in tries][:1] == [240]
+        assert all(b.steps > a.steps for a, b in itertools.pairwise(tries))
+        assert capsys.readouterr().out.count("planned anew") == presets.TRIES - 1
+        assert standard.minutes == equal.minutes == 1.0
 
     @pytest.mark.slow
     def test_tiny(self, clip, capsys):

@@ -7,7 +7,17 @@ from typing import Annotated
 import typer
 
 from foldgauss import __version__
-from foldgauss.cli import compressing, drawing, editing, figures, fitting, tradeoff, uncertainty  # noqa: F401 - each adds its own
+from foldgauss.cli import (  # noqa: F401 - each adds its own
+    compressing,
+    doctor,
+    drawing,
+    editing,
+    figures,
+    fitting,
+    tradeoff,
+    uncertainty,
+    viewing,
+)
 from foldgauss.cli._shared import Stopped, WrongUse, app, as_option, err, out
 
 WRONG_USE, FAILURE = 2, 1
@@ -26,7 +36,10 @@ def root(
         bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
     ] = False,
 ) -> None:
-    """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit."""
+    """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit.
+
+    `foldgauss COMMAND --help` tells all of a command, with examples.
+    """
     del debug, version  # read by `main`, before typer runs, and by the callback
 
 
@@ -37,11 +50,14 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            app([argument for argument in arguments if argument != "--debug"], standalone_mode=True)
+            app([argument for argument in arguments if argument != "--debug"], prog_name="foldgauss")
     except (Exception, KeyboardInterrupt) as error:
         if debug:
             raise
+        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
+            error = error.__cause__  # Ctrl-C while a compiled kernel returned
         text = " ".join(str(error).split()) or type(error).__name__
+        text = text.replace("allow overwriting", "add --overwrite")  # of folders
         option = as_option(text)
         if _names_an_option(text) and option.partition(":")[0] in arguments:
             text = option

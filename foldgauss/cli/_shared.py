@@ -11,12 +11,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-import typer.core
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from foldgauss._checks import invalid
+from foldgauss.cli._completion import clip_files, model_files
+from foldgauss.cli._help import App
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.video_file import (
     ANIMATION_SUFFIXES,
@@ -36,42 +37,26 @@ from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 
-
-class _InOrderOfUse(typer.core.TyperGroup):
-    """The commands as one comes to need them; typer has them as they were registered."""
-
-    _ORDER = (
-        *(
-            "fit",
-            "render",
-            "evaluate",
-            "info",
-            "figure",
-            "uncertainty",
-            "edit",
-            "compress",
-            "tradeoff",
-            "export",
-            "import",
-        ),
-        "demo",
-    )
-
-    def list_commands(self, ctx: typer.Context) -> list[str]:
-        others = set(self.commands).difference(self._ORDER)
-        return [name for name in (*self._ORDER, *sorted(others)) if name in self.commands]
-
-
-app = typer.Typer(
-    cls=_InOrderOfUse, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None
-)
+app = App(no_args_is_help=True, pretty_exceptions_enable=False)
 # No markup: names of files may hold brackets.
 out = Console(markup=False, highlight=False)
 err = Console(stderr=True, markup=False, highlight=False)
 
+#: Of a bar, after the time that has gone.
+TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
+
 PICTURE_SUFFIX = ".png"
 MAX_SHOWN = 100_000  # above, a clip of seconds plays for days
 
+#: Panels of `--help`, beside that of the plain options.
+PICTURE = "What a picture leaves out"
+
+ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.", autocompletion=model_files)]
+FittedClip = Annotated[Path, typer.Argument(help="The clip it was fitted to.", autocompletion=clip_files)]
+NewClip = Annotated[
+    Path,
+    typer.Argument(help="Video file, folder of images in natural order, or one image.", autocompletion=clip_files),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
 Frames = Annotated[
@@ -80,15 +65,24 @@ Frames = Annotated[
 #: Constants of the picture, `RenderOptions`.
 AlphaCutoff = Annotated[
     float | None,
-    typer.Option(help="Leave a Gaussian out where its alpha is below this [default: 1/255, or what was fitted with]."),
+    typer.Option(
+        help="Leave a Gaussian out where its alpha is below this [default: 1/255, or what was fitted with].",
+        rich_help_panel=PICTURE,
+    ),
 ]
 SupportRadius = Annotated[
     float | None,
-    typer.Option(help="Leave a Gaussian out beyond so many of its deviations [default: none, or as fitted]."),
+    typer.Option(
+        help="Leave a Gaussian out beyond so many of its deviations [default: none, or as fitted].",
+        rich_help_panel=PICTURE,
+    ),
 ]
 TransmittanceStop = Annotated[
     float | None,
-    typer.Option(help="A pixel is finished once so little light is left [default: 1e-4, or as fitted]."),
+    typer.Option(
+        help="A pixel is finished once so little light is left [default: 1e-4, or as fitted].",
+        rich_help_panel=PICTURE,
+    ),
 ]
 
 
@@ -152,6 +146,18 @@ def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
         raise WrongUse(f"{option}: {path} exists. Choose another path, or add --overwrite.")
 
 
+def refuse_input(path: Path, what: str, source: Path, option: str = "--out") -> None:
+    """An output in place of what it is made of would be lost with the first error."""
+    if path.exists() and source.exists() and path.samefile(source):
+        raise WrongUse(f"{option}: expected another file than the {what}, got {path}.")
+
+
+def named_after(source: Path, ending: str) -> Path:
+    """Where an output goes that was given no name: into this folder, by the name of what it is made of."""
+    whole = source if source.name not in ("", "..") else source.resolve()
+    return Path(f"{whole.name if whole.is_dir() else whole.stem}{ending}")
+
+
 @contextmanager
 def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], None]]:
     columns = (
@@ -159,6 +165,7 @@ def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callabl
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        *TIME_LEFT,
     )
     with Progress(*columns, console=err, disable=not (shown and err.is_terminal)) as progress:
         task = progress.add_task(title, total=total)
@@ -177,6 +184,7 @@ def evaluate_with_progress(
     keep: Callable[[np.ndarray], None] = lambda picture: None,
     *,
     shown: bool = True,
+    background: tuple[float, float, float] = BLACK,
 ) -> Evaluation:
     """Scores of every frame; `keep` is handed the pictures they were read off."""
     with progress_bar("Evaluating", model.num_frames, shown) as advance:
@@ -185,7 +193,7 @@ def evaluate_with_progress(
             keep(picture)
             advance()
 
-        return evaluate(model, frames, on_frame)
+        return evaluate(model, frames, on_frame, background=background)
 
 
 def figures_of(model: VideoModel | EditedVideo, scores: Evaluation) -> dict[str, Any]:
@@ -226,7 +234,13 @@ def clip_of_model(
     about = read_metadata(model_path)
     kept = about.get("frames")
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
-    clip = read_video(video, frames=wanted, size=model.size)
+    try:
+        clip = read_video(video, frames=wanted, size=model.size)
+    except ValueError as error:
+        if frames is not None or not str(error).startswith("frames:"):
+            raise
+        asked = f"the clip that the model was fitted to, frames {wanted[0]}:{wanted[1]} of {about.get('clip')}"
+        raise WrongUse(f"VIDEO: expected {asked}, got {str(video)!r}, which has fewer. Give that clip.") from error
     if as_many and clip.num_frames != model.num_frames:
         raise WrongUse(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
@@ -234,6 +248,21 @@ def clip_of_model(
         )
     _say_other_frames(about, clip)
     return clip
+
+
+def is_other_clip(model_path: Path, clip: Clip, got: Callable[[], float]) -> bool:
+    """Whether `clip` is not what the model was fitted to: other frames, which it shows worse by `OTHER` dB.
+
+    `got` gives the mean PSNR, and is asked only where the frames differ in some bit.
+    """
+    about = read_metadata(model_path)
+    digest, had = about.get("frames_digest"), about.get("mean_psnr")
+    differs = digest is not None and digest != fingerprint(clip)["frames_digest"]
+    return differs and had is not None and got() < had - OTHER
+
+
+#: dB: decoders differ by less.
+OTHER = 3.0
 
 
 def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:

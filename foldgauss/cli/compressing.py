@@ -6,17 +6,22 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from foldgauss._checks import invalid, within
+from foldgauss.cli._completion import clip_files
 from foldgauss.cli._shared import (
+    ModelFile,
     Overwrite,
     WrongUse,
     app,
     clip_of_model,
     err,
     evaluate_with_progress,
+    is_other_clip,
     print_figures,
     refuse_existing,
+    refuse_input,
     scores_of,
 )
 from foldgauss.io._atomic import check_writable
@@ -24,7 +29,7 @@ from foldgauss.io.compact import COMPACT_SUFFIX, check_compact_name, save_compac
 from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_video_model, read_metadata, save_video_model
 from foldgauss.video.compress import Compressed, compress
-from foldgauss.video.metrics import Evaluation
+from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
 from foldgauss.video.tradeoff import halved
 
@@ -35,9 +40,13 @@ NEARER = 0.5
 
 @app.command(name="compress")
 def compress_command(
-    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    model_path: ModelFile,
     video: Annotated[
-        Path | None, typer.Argument(help="The clip it was fitted to: for a smaller file, and a loss that is measured.")
+        Path | None,
+        typer.Argument(
+            help="The clip it was fitted to: for a smaller file, and a loss that is measured.",
+            autocompletion=clip_files,
+        ),
     ] = None,
     max_loss_db: Annotated[float, typer.Option(help="How much of the mean PSNR it may cost, in dB.")] = 0.2,
     out_path: Annotated[
@@ -70,8 +79,7 @@ def compress_command(
         raise WrongUse(str(invalid("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)))
     if frames is not None and video is None:
         raise WrongUse(str(invalid("--frames", expected="a VIDEO to take them from", got="none")))
-    if target.exists() and model_path.exists() and target.samefile(model_path):
-        raise WrongUse(f"--out: expected another file than the model, got {target}.")
+    refuse_input(target, "model", model_path)
     refuse_existing(target, overwrite)
     check_writable(target)
     model, about = load_video_model(model_path), read_metadata(model_path)
@@ -79,6 +87,10 @@ def compress_command(
         cure = "Compress the model before it is edited, and edit that."
         raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
     clip = None if video is None else clip_of_model(model, model_path, video, frames)
+    if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
+        cure = "Give that clip, or none: numbers are then rounded only."
+        got = f"{str(video)!r}, which it does not show"
+        raise WrongUse(str(invalid("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)))
     if float16:
         figures = _only_rounded(target, model, about, clip)
     else:
@@ -127,10 +139,13 @@ def _compressed(
 ) -> dict[str, Any]:
     told = about.get("mean_psnr")
     told = told if within(told, "(0, 100]") else None
-    with err.status("Compressing") as status:
+    columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
+    with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
+        task = bar.add_task("Compressing", total=None)  # how often it must try nobody knows
 
         def show(what: str, loss: float) -> None:
-            status.update(f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost"))
+            text = f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost")
+            bar.update(task, description=text)
 
         given = None if clip is None else clip.frames
         made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)

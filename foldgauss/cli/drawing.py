@@ -9,9 +9,13 @@ import typer
 from rich.table import Table
 
 from foldgauss._checks import invalid
+from foldgauss.cli._completion import among
 from foldgauss.cli._shared import (
     MAX_SHOWN,
+    PICTURE_SUFFIX,
     AlphaCutoff,
+    FittedClip,
+    ModelFile,
     Overwrite,
     Size,
     SupportRadius,
@@ -25,6 +29,7 @@ from foldgauss.cli._shared import (
     err,
     evaluate_with_progress,
     figures_of,
+    named_after,
     out,
     parse_color,
     parse_size,
@@ -33,16 +38,16 @@ from foldgauss.cli._shared import (
     print_frames,
     refuse_existing,
     refuse_huge,
+    refuse_input,
     short,
     write_json,
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.compact import is_compact
-from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS
+from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
 from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
-from foldgauss.video.metrics import evaluate
 from foldgauss.video.model import VideoModel
 from foldgauss.video.stored import stored_counts, to_stored
 from foldgauss.video.tradeoff import frames_per_second
@@ -53,10 +58,15 @@ MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
 
 @app.command()
 def render(
-    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    model_path: ModelFile,
     out_path: Annotated[
-        Path, typer.Option("--out", help="FILE.mp4, .webm, .gif or .webp; a folder for images; FILE.png for one time.")
-    ],
+        Path | None,
+        typer.Option(
+            "--out",
+            help="FILE.mp4, .webm, .gif or .webp; a folder for images; FILE.png for one time "
+            "[default: the model's name in this folder, .mp4, or .png for one time].",
+        ),
+    ] = None,
     size: Size = None,
     upsample: Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")] = None,
     fps: Annotated[
@@ -76,7 +86,12 @@ def render(
         str, typer.Option(metavar="RRGGBB", help="Colour behind a model of a clip with alpha, as ffffff.")
     ] = "000000",
     image_format: Annotated[
-        str | None, typer.Option("--format", help="Of the images in a folder: png or webp, both exact [default: png].")
+        str | None,
+        typer.Option(
+            "--format",
+            help="Of the images in a folder: png or webp, both exact [default: png].",
+            autocompletion=among(IMAGE_FORMATS),
+        ),
     ] = None,
     alpha_cutoff: AlphaCutoff = None,
     support_radius: SupportRadius = None,
@@ -86,12 +101,15 @@ def render(
     """Draw a model as a video, in between its frames too."""
     course = _Course(upsample, fps, speed, _parse_remap(remap), parse_times(times))
     picture_size, behind = parse_size(size), parse_color(background)
+    if out_path is None:
+        out_path = _named_after_model(model_path, course, image_format)
     check_picture_path(out_path, single=True)
     if image_format is not None and (out_path.suffix and not out_path.is_dir()):
         raise WrongUse(str(invalid("--format", expected="a folder as --out", got=out_path)))
     if image_format is not None and image_format not in IMAGE_FORMATS:
         raise WrongUse(str(invalid("--format", expected="one of " + ", ".join(IMAGE_FORMATS), got=image_format)))
     if not out_path.is_dir():
+        refuse_input(out_path, "model", model_path)
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
     constants = {"support_radius": support_radius, "transmittance_stop": transmittance_stop}
@@ -101,6 +119,16 @@ def render(
     course.warn_of_end(model.num_frames, model.fps)
     how = {"size": picture_size, "background": behind, "overwrite": overwrite}
     draw(model, out_path, shown, rate, image_format=image_format or "png", **how)
+
+
+def _named_after_model(model_path: Path, course: "_Course", image_format: str | None) -> Path:
+    """A video, a picture or a folder by the model's name: never that of the clip, which may well lie here."""
+    if image_format is not None:
+        return named_after(model_path, "-frames")
+    suffix = PICTURE_SUFFIX if course.chosen is not None and len(course.chosen) == 1 else VIDEO_SUFFIXES[0]
+    path = named_after(model_path, suffix)
+    clip = read_metadata(model_path).get("clip", path.name)  # where it is not known, it may be of that name
+    return named_after(model_path, f".rendered{suffix}") if path.name == clip else path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,9 +192,11 @@ class _Course:
 
 @app.command(name="evaluate")
 def evaluate_command(
-    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
-    video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
-    json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+    model_path: ModelFile,
+    video: FittedClip,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the figures here, too.")
+    ] = None,
     frames: Annotated[
         str | None,
         typer.Option(
@@ -185,6 +215,8 @@ def evaluate_command(
     Tells the size of the file, its bits per pixel and how fast it is drawn, too.
     """
     if json_path is not None:
+        for what, source in (("model", model_path), ("clip", video)):
+            refuse_input(json_path, what, source, "--json")
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
     constants = {"support_radius": support_radius, "transmittance_stop": transmittance_stop}
@@ -194,7 +226,8 @@ def evaluate_command(
     num_bytes = model_path.stat().st_size
     figures = figures_of(model, scores) | {"file_bytes": num_bytes}
     if clip.has_alpha:
-        figures["mean_psnr_on_white"] = round(evaluate(model, clip.frames, background=(1.0, 1.0, 1.0)).mean_psnr, 3)
+        on_white = evaluate_with_progress(model, clip.frames, background=(1.0, 1.0, 1.0))
+        figures["mean_psnr_on_white"] = round(on_white.mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
     figures["frames_per_second"] = round(frames_per_second(model), 1)
     if json_path is not None:
@@ -204,7 +237,7 @@ def evaluate_command(
 
 
 @app.command()
-def info(model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]) -> None:
+def info(model_path: ModelFile) -> None:
     """Say what a model file holds."""
     model = load_video_model(model_path)
     about = read_metadata(model_path)

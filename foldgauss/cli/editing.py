@@ -7,40 +7,69 @@ import numpy as np
 import typer
 
 from foldgauss._checks import invalid
+from foldgauss.cli._completion import among, clip_files, files
 from foldgauss.cli._shared import (
+    ModelFile,
     Overwrite,
     Size,
     WrongUse,
     app,
     check_picture_path,
+    clip_of_model,
     counted,
     draw,
+    named_after,
     out,
     parse_size,
     parse_times,
     progress_bar,
     refuse_existing,
     refuse_huge,
+    refuse_input,
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
 from foldgauss.io.exchange import FORMATS, export, import_model
+from foldgauss.io.html import HTML_SUFFIX, QUALITY, write_html
 from foldgauss.io.mesh import read_pseudomesh
-from foldgauss.io.video_file import write_video
+from foldgauss.io.video_file import VIDEO_SUFFIXES, write_video
 from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, read_metadata, save_video_model
 from foldgauss.video.model import VideoModel
 
-_CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles"}
+_CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles", "html": "player"}
+#: Options of a page, also of `view`.
+Original = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="CLIP",
+        help="The clip it was fitted to, to be shown beside it in the player.",
+        autocompletion=clip_files,
+    ),
+]
+OriginalQuality = Annotated[
+    int, typer.Option(help="Of the clip's pictures in the page, as WebP counts it.", min=1, max=100)
+]
 
 
 @app.command(name="edit")
 def edit_command(
-    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
-    script_path: Annotated[Path, typer.Argument(metavar="SCRIPT.toml", help="What to select, and what to do with it.")],
-    out_path: Annotated[
+    model_path: ModelFile,
+    script_path: Annotated[
         Path,
-        typer.Option("--out", help=f"FILE{MODEL_SUFFIX}: the edited model; a video or a folder: its pictures."),
+        typer.Argument(
+            metavar="SCRIPT.toml",
+            help="What to select, and what to do with it.",
+            autocompletion=files(".toml"),
+        ),
     ],
+    out_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help=f"FILE{MODEL_SUFFIX}: the edited model; a video or a folder: its pictures "
+            f"[default: MODEL.SCRIPT{MODEL_SUFFIX} in this folder].",
+        ),
+    ] = None,
     size: Size = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -48,8 +77,9 @@ def edit_command(
 
     Scripts: docs/editing.md. An edited model is rendered, evaluated and edited again like any other.
     """
-    if out_path.exists() and model_path.exists() and out_path.samefile(model_path):
-        raise WrongUse(f"--out: expected another file than the model, got {out_path}.")
+    if out_path is None:
+        out_path = named_after(model_path, f".{script_path.stem}{MODEL_SUFFIX}")
+    refuse_input(out_path, "model", model_path)
     script = read_edit_script(script_path)
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     picture_size = parse_size(size)
@@ -77,34 +107,71 @@ def edit_command(
 
 @app.command(name="export")
 def export_command(
-    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    model_path: ModelFile,
     file_format: Annotated[
-        str, typer.Option("--format", help="ply: VeGaS video; ply3dgs: 3DGS scenes; obj: triangles of each frame.")
+        str,
+        typer.Option(
+            "--format",
+            help="ply: VeGaS video; ply3dgs: 3DGS scenes; obj: triangles of each frame; html: a player.",
+            autocompletion=among(FORMATS),
+        ),
     ],
     out_path: Annotated[
-        Path, typer.Option("--out", help="FILE.ply for ply, and for ply3dgs of one time; else a folder.")
-    ],
-    times: Annotated[
-        str | None, typer.Option(metavar="T,T,..|A:B:N", help="These times, in [0, 1]; or N from A to B [the frames'].")
+        Path | None,
+        typer.Option(
+            "--out",
+            help="FILE.ply for ply, and for ply3dgs of one time; FILE.html for html; else a folder "
+            "[default: by the model's name].",
+        ),
     ] = None,
+    times: Annotated[
+        str | None,
+        typer.Option(
+            metavar="T,T,..|A:B:N", help="These times, in [0, 1]; or N from A to B [default: those of the frames]."
+        ),
+    ] = None,
+    original: Original = None,
+    original_quality: OriginalQuality = QUALITY,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model for other programs: see docs/formats.md."""
+    """Write a model for other programs, or a page.
+
+    See docs/formats.md; of the page, which plays the model, docs/player.md.
+    """
     if file_format not in FORMATS:
         raise WrongUse(str(invalid("--format", expected="one of " + ", ".join(FORMATS), got=file_format)))
+    chosen = parse_times(times)
+    if out_path is None:
+        single = file_format == "ply3dgs" and chosen is not None and len(chosen) == 1
+        endings = {"ply": ".ply", "ply3dgs": ".3dgs.ply" if single else "-3dgs", "html": ".html"}
+        out_path = named_after(model_path, endings.get(file_format, f"-{file_format}"))
+    refuse_input(out_path, "model", model_path)
     if file_format == "ply" and out_path.suffix.lower() != ".ply":
         raise WrongUse(str(invalid("--out", expected="a name ending in .ply", got=out_path)))
     if file_format == "obj" and out_path.suffix:
         raise WrongUse(str(invalid("--out", expected="a folder without extension", got=out_path)))
+    if file_format == "html" and out_path.suffix.lower() != HTML_SUFFIX:
+        raise WrongUse(str(invalid("--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)))
+    if file_format != "html" and original is not None:
+        raise WrongUse(str(invalid("--original", expected="--format html", got=file_format)))
+    if file_format == "html" and times is not None:
+        raise WrongUse(str(invalid("--times", expected="another format", got="html", cure="A page shows all times.")))
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
     model = load_video_model(model_path)
+    if file_format == "html":
+        check_writable(out_path)
+        frames = None if original is None else clip_of_model(model, model_path, original, None)
+        write_html(out_path, model_path, original=frames, quality=original_quality)
+        size = out_path.stat().st_size / 1e6
+        out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
+        return
     if file_format == "ply" and not isinstance(model, VideoModel):
         cure = "Frames of it go out as ply3dgs or obj."
         raise WrongUse(str(invalid("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)))
-    chosen = parse_times(times)
-    path = export(model, file_format, out_path, times=chosen, overwrite=overwrite)
     num_frames = model.num_frames if chosen is None else len(chosen)
+    with progress_bar("Writing", num_frames, shown=file_format != "ply") as advance:
+        path = export(model, file_format, out_path, times=chosen, overwrite=overwrite, on_frame=advance)
     frames = f"{num_frames:,} frame{'' if num_frames == 1 else 's'}"
     most = "" if file_format == "ply" else "up to "  # of frames, those alive
     told = f"{_CALLED[file_format]} ({file_format}), {frames}, {most}{model.num_gaussians:,} Gaussians"
@@ -113,11 +180,22 @@ def export_command(
 
 @app.command(name="import")
 def import_command(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="A .ply of VeGaS, or a folder of .obj and .ply.")],
-    out_path: Annotated[
+    source: Annotated[
         Path,
-        typer.Option("--out", help=f"FILE{MODEL_SUFFIX}; of a folder of triangles: a video or a folder."),
+        typer.Argument(
+            metavar="FILE",
+            help="A .ply of VeGaS, or a folder of .obj and .ply.",
+            autocompletion=files(".ply"),
+        ),
     ],
+    out_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help=f"FILE{MODEL_SUFFIX}; of a folder of triangles: a video or a folder "
+            f"[default: by FILE's name, {MODEL_SUFFIX} or .mp4].",
+        ),
+    ] = None,
     size: Size = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second [default: as noted in the file, or 25].")] = None,
     overwrite: Overwrite = False,
@@ -127,6 +205,8 @@ def import_command(
     Frames edited as triangles have no fold any more: they become pictures.
     """
     picture_size = parse_size(size)
+    if out_path is None:
+        out_path = named_after(source, VIDEO_SUFFIXES[0] if source.is_dir() else MODEL_SUFFIX)
     if source.is_dir():
         check_picture_path(out_path)
         if not out_path.is_dir():

@@ -8,13 +8,17 @@ import numpy as np
 import typer
 
 from foldgauss._checks import invalid
+from foldgauss.cli._help import App
 from foldgauss.cli._shared import (
     PICTURE_SUFFIX,
+    FittedClip,
+    ModelFile,
     Overwrite,
     WrongUse,
     app,
     clip_of_model,
     err,
+    named_after,
     out,
     refuse_existing,
     refuse_huge,
@@ -34,18 +38,20 @@ PARTS, MAX_PARTS = 4, 32
 #: Frames that a reconstruction shows unasked, rows that a picture may have, and the least width of a picture in it.
 SHOWN, MAX_ROWS, LEAST_WIDTH = 3, 32, 16
 
-figure = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+figure = App(no_args_is_help=True)
 app.add_typer(figure, name="figure", help="Make a labelled picture of pictures from a model: PNG.")
 
-Model = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]
-Out = Annotated[Path, typer.Option("--out", help="FILE.png.")]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FILE.png", help="The picture [default: by the model's name, in this folder]."),
+]
 Width = Annotated[int | None, typer.Option(help="Pixels of each picture across [default: the model's own].")]
 
 
 @figure.command()
 def interpolation(
-    model_path: Model,
-    out_path: Out,
+    model_path: ModelFile,
+    out_path: Out = None,
     at: Annotated[
         str | None,
         typer.Option(metavar="K,K,..", help="Frames that rows begin with, from 0 [default: one near the middle]."),
@@ -54,13 +60,10 @@ def interpolation(
     width: Width = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """What the model shows between two frames: t, t+1/4, t+2/4, t+3/4, t+1.
-
-    Example: foldgauss figure interpolation model.safetensors --at 12,40 --width 320 --out between.png
-    """
+    """What the model shows between two frames: t, t+1/4, t+2/4, t+3/4, t+1."""
     if not 2 <= parts <= MAX_PARTS:
         raise WrongUse(str(invalid("--parts", expected=f"a whole number from 2 to {MAX_PARTS}", got=parts)))
-    _check_out(out_path, overwrite)
+    out_path = _checked_out(out_path, model_path, "interpolation", overwrite)
     model = load_video_model(model_path)
     if model.num_frames < 2:
         cure = "Between the frames of one picture lies nothing."
@@ -81,9 +84,9 @@ def interpolation(
 
 @figure.command()
 def reconstruction(
-    model_path: Model,
-    video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
-    out_path: Out,
+    model_path: ModelFile,
+    video: FittedClip,
+    out_path: Out = None,
     at: Annotated[
         str | None,
         typer.Option(metavar="K,K,..", help=f"Frames of the model, from 0 [default: {SHOWN}, evenly spread]."),
@@ -97,10 +100,8 @@ def reconstruction(
     """Frames as they were, as the model has them, and the difference, magnified.
 
     The PSNR above a row is that of the frame at the model's own size, in 8 bits.
-
-    Example: foldgauss figure reconstruction model.safetensors clip.mp4 --at 0,30,60 --width 480 --out frames.png
     """
-    _check_out(out_path, overwrite)
+    out_path = _checked_out(out_path, model_path, "reconstruction", overwrite)
     model = load_video_model(model_path)
     size, num = _size(model, width), model.num_frames
     if size[1] > model.size[1]:
@@ -119,11 +120,13 @@ def reconstruction(
     _write(out_path, comparison(*small, captions), "; ".join(captions))
 
 
-def _check_out(path: Path, overwrite: bool) -> None:
+def _checked_out(path: Path | None, model_path: Path, kind: str, overwrite: bool) -> Path:
+    path = named_after(model_path, f".{kind}{PICTURE_SUFFIX}") if path is None else path
     if path.suffix.lower() != PICTURE_SUFFIX:
         raise WrongUse(str(invalid("--out", expected="a name ending in .png", got=path)))
     refuse_existing(path, overwrite)
     check_writable(path)
+    return path
 
 
 def _size(model: VideoModel | EditedVideo, width: int | None) -> tuple[int, int]:

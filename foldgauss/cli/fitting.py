@@ -14,9 +14,11 @@ import typer
 from foldgauss._checks import invalid
 from foldgauss._progress import Manner, Observer, previewing, print_json, watching
 from foldgauss._threads import num_threads
+from foldgauss.cli._completion import among
 from foldgauss.cli._shared import (
     AlphaCutoff,
     Frames,
+    NewClip,
     Overwrite,
     Size,
     Stopped,
@@ -29,6 +31,7 @@ from foldgauss.cli._shared import (
     evaluate_with_progress,
     figures_of,
     fingerprint,
+    named_after,
     out,
     parse_frames,
     parse_size,
@@ -36,25 +39,32 @@ from foldgauss.cli._shared import (
     provenance,
     refuse_existing,
     refuse_foreign,
+    refuse_input,
     scores_of,
     with_constants,
     write_json,
 )
 from foldgauss.datasets import sample_clip
 from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io._lock import only_writer
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import Clip, read_video, write_image, write_video
-from foldgauss.io.video_model import check_model_name, load_checkpoint, save_checkpoint, save_video_model
-from foldgauss.video.config import PRESETS, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_checkpoint, save_checkpoint, save_video_model
+from foldgauss.render import COMPOSITINGS
+from foldgauss.video.config import ON_DIVERGENCE, PRESETS, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.economy import Economy
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
+from foldgauss.video.guard import FitDiverged
 
 #: A running fit is kept on disk this often, in seconds.
 CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
+#: Panels of `fit --help`.
+MODEL, BUDGET, COURSE = "What is fitted", "When it ends: the first of these", "How it is fitted"
+WATCHED = "Watching a fit, going on with it"
 
 
 @app.command()
@@ -98,82 +108,156 @@ def demo(
 
 @app.command()
 def fit(
-    video: Annotated[Path, typer.Argument(help="Video file, folder of images in natural order, or one image.")],
+    context: typer.Context,
+    video: NewClip,
     out_path: Annotated[
-        Path | None, typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name].")
+        Path | None,
+        typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name, in this folder]."),
     ] = None,
     preset: Annotated[
-        str, typer.Option(help=f"Recipe that other options change: {', '.join(PRESETS)} (slow: the published one).")
+        str,
+        typer.Option(
+            help=f"Recipe that other options change: {', '.join(PRESETS)} (slow: the published one).",
+            autocompletion=among(PRESETS),
+        ),
     ] = "standard",
     size: Size = None,
     frames: Frames = None,
+    overwrite: Overwrite = False,
     gaussians: Annotated[
         int | None,
-        typer.Option(help="Number of Gaussians at the start [default: by the preset, or the clip's size and length]."),
+        typer.Option(
+            help="Number of Gaussians at the start [default: by the preset, or the clip's size and length].",
+            rich_help_panel=MODEL,
+        ),
     ] = None,
-    max_gaussians: Annotated[int | None, typer.Option(help="Largest number of Gaussians, grown or not.")] = None,
+    max_gaussians: Annotated[
+        int | None, typer.Option(help="Largest number of Gaussians, grown or not.", rich_help_panel=MODEL)
+    ] = None,
     economy: Annotated[
         bool,
-        typer.Option("--economy", help="Keep only what saves more bits than it takes: Gaussians, powers, colours."),
+        typer.Option(
+            "--economy",
+            help="Keep only what saves more bits than it takes: Gaussians, powers, colours.",
+            rich_help_panel=MODEL,
+        ),
     ] = False,
     smallest_at_psnr: Annotated[
         float | None,
-        typer.Option("--smallest-at-psnr", help="The smallest model whose mean PSNR is this, in dB; takes its time."),
+        typer.Option(
+            "--smallest-at-psnr",
+            help="The smallest model whose mean PSNR is this, in dB; takes its time.",
+            rich_help_panel=MODEL,
+        ),
     ] = None,
     max_size_mb: Annotated[
         float | None,
-        typer.Option("--max-size-mb", help="Largest model file, in 10^6 bytes; limits the Gaussians."),
+        typer.Option(
+            "--max-size-mb",
+            help="Largest model file, in 10^6 bytes; limits the Gaussians.",
+            rich_help_panel=MODEL,
+        ),
     ] = None,
     degree: Annotated[
-        int | None, typer.Option(help="Degree of the fold polynomial [default: 3; draft: 2; paper: 7].")
+        int | None,
+        typer.Option(help="Degree of the fold polynomial [default: 3; draft: 2; paper: 7].", rich_help_panel=MODEL),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Optimiser steps [default: 3000, more for long clips; draft: 800; paper: 30000].")
+        int | None,
+        typer.Option(
+            help="Optimiser steps [default: 3000, more for long clips; draft: 800; paper: 30000].",
+            rich_help_panel=BUDGET,
+        ),
     ] = None,
-    minutes: Annotated[float | None, typer.Option(help="Time to fit for.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Time to fit for.", rich_help_panel=BUDGET)] = None,
     target_psnr: Annotated[
-        float | None, typer.Option("--target-psnr", help="Stop once the mean PSNR of the frames is this, in dB.")
+        float | None,
+        typer.Option(
+            "--target-psnr", help="Stop once the mean PSNR of the frames is this, in dB.", rich_help_panel=BUDGET
+        ),
     ] = None,
-    batch_size: Annotated[int | None, typer.Option(help="Frames per step [default: 1; paper: 3].")] = None,
+    batch_size: Annotated[
+        int | None, typer.Option(help="Frames per step [default: 1; paper: 3].", rich_help_panel=COURSE)
+    ] = None,
     power: Annotated[
         float | None,
         typer.Option(
-            help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 1; paper: 2]."
+            help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 1; paper: 2].",
+            rich_help_panel=MODEL,
         ),
     ] = None,
     compositing: Annotated[
-        str | None, typer.Option(help="Blend of the Gaussians: over (front to back) or sum [default: over].")
+        str | None,
+        typer.Option(
+            help="Blend of the Gaussians: over (front to back) or sum [default: over].",
+            rich_help_panel=MODEL,
+            autocompletion=among(COMPOSITINGS),
+        ),
     ] = None,
     between_share: Annotated[
         float | None,
         typer.Option(
-            help="Share of the steps that learn what lies between frames, for slow motion, as 0.5 [default: 0]."
+            help="Share of the steps that learn what lies between frames, for slow motion, as 0.5 [default: 0].",
+            rich_help_panel=COURSE,
         ),
     ] = None,
     ssim_share: Annotated[
-        float | None, typer.Option(help="Share of D-SSIM in the loss, the rest being L1 [default: 0.2].")
+        float | None,
+        typer.Option(help="Share of D-SSIM in the loss, the rest being L1 [default: 0.2].", rich_help_panel=COURSE),
     ] = None,
     quarter_share: Annotated[
-        float | None, typer.Option(help="Share of the steps with frames at a quarter of their size [default: 0.2].")
+        float | None,
+        typer.Option(
+            help="Share of the steps with frames at a quarter of their size [default: 0.2].", rich_help_panel=COURSE
+        ),
     ] = None,
     half_share: Annotated[
-        float | None, typer.Option(help="Share of the steps with frames at half of their size [default: 0.4].")
+        float | None,
+        typer.Option(
+            help="Share of the steps with frames at half of their size [default: 0.4].", rich_help_panel=COURSE
+        ),
     ] = None,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the random starts and of the order of frames.", rich_help_panel=COURSE)
+    ] = 0,
     alpha_cutoff: AlphaCutoff = None,
     support_radius: SupportRadius = None,
     transmittance_stop: TransmittanceStop = None,
-    seed: Annotated[int, typer.Option(help="Seed of the random starts and of the order of frames.")] = 0,
-    overwrite: Overwrite = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from where a stopped fit was kept.")] = False,
+    on_divergence: Annotated[
+        str,
+        typer.Option(
+            help="If the fit comes apart: back-off (to sound numbers, at lower rates) or stop.",
+            rich_help_panel=COURSE,
+            autocompletion=among(ON_DIVERGENCE),
+        ),
+    ] = "back-off",
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=WATCHED),
+    ] = False,
     history: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.jsonl", help="Write every step's figures here as it is done; FILE.png: the curves."),
+        typer.Option(
+            metavar="FILE.jsonl",
+            help="Write every step's figures here as it is done; FILE.png: the curves.",
+            rich_help_panel=WATCHED,
+        ),
     ] = None,
     preview: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Keep a picture of the running fit here, new every 10 s.")
+        Path | None,
+        typer.Option(
+            metavar="FILE.png",
+            help="Keep a picture of the running fit here, new every 10 s.",
+            rich_help_panel=WATCHED,
+        ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings and errors.")] = False,
-    log_json: Annotated[bool, typer.Option("--log-json", help="Tell progress and figures as lines of JSON.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Say nothing but warnings and errors.", rich_help_panel=WATCHED)
+    ] = False,
+    log_json: Annotated[
+        bool,
+        typer.Option("--log-json", help="Tell progress and figures as lines of JSON.", rich_help_panel=WATCHED),
+    ] = False,
 ) -> None:
     """Fit a model to a clip; the first of its budgets ends it.
 
@@ -194,11 +278,11 @@ def fit(
         "ssim_share": ssim_share,
         "quarter_share": quarter_share,
         "half_share": half_share,
+        "on_divergence": on_divergence,
         "seed": seed,
     }
-    target = Path(f"{video.resolve().stem}.safetensors") if out_path is None else out_path
-    if target.exists() and video.exists() and target.samefile(video):
-        raise WrongUse(f"--out: expected another file than the clip, got {target}.")
+    target = named_after(video, MODEL_SUFFIX) if out_path is None else out_path
+    refuse_input(target, "clip", video)
     try:
         check_model_name(target, "out")
         if economy or smallest_at_psnr is not None:
@@ -211,13 +295,13 @@ def fit(
     config = dataclasses.replace(config, options=options)
     kept = target.with_name(f"{target.name}.checkpoint")
     manner = _manner(quiet, log_json)
+    context.with_resource(only_writer(target, own=(kept,)))
     refuse_existing(target, overwrite)
     curves = _check_records(target, video, history, preview, overwrite or resume)
     if kept.exists() and not (resume or overwrite):
         raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
     if resume and not kept.exists():
         raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
-    check_writable(target)
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
     _say_clip(clip, config, manner)
     source = fingerprint(clip)
@@ -318,9 +402,22 @@ def _run_fit(
 
     `begin` is called once there is a first step, and so something in place of what was there before.
     """
+    try:
+        return _watched_steps(fit_steps(frames, config, resumed), observe, keep, begin)
+    except FitDiverged as error:
+        raise _diverged(error, keep) from error
+
+
+def _watched_steps(
+    steps: Iterator[tuple[FitState, FitInfo]],
+    observe: Observer,
+    keep: Callable[[FitState], object] | None,
+    begin: Callable[[], object],
+) -> tuple[FitState, FitInfo]:
+    """The last of the steps; a signal ends them, once what is done is kept."""
     with _signals() as asked:
         kept_at = time.monotonic()
-        for state, info in fit_steps(frames, config, resumed):
+        for state, info in steps:
             if not asked.stepping:
                 asked.stepping = True
                 begin()
@@ -331,6 +428,14 @@ def _run_fit(
             if asked.name and info.progress < 1:
                 raise _stopped(asked.name, state, info, keep)
     return state, info
+
+
+def _diverged(error: FitDiverged, keep: Callable[[FitState], object] | None) -> Stopped:
+    """Keep what was sound, and say so."""
+    if keep is None or error.state is None:
+        return Stopped(str(error))
+    keep(error.state)
+    return Stopped(f"{error} It is kept: --resume goes on from there, with --on-divergence back-off at lower rates.")
 
 
 def _keep_if_possible(keep: Callable[[FitState], object], state: FitState) -> None:

@@ -16,8 +16,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from foldgauss import __version__
 from foldgauss._checks import invalid, one_of, within
 from foldgauss._machine import load_average
+from foldgauss.cli._completion import among, lists_of
 from foldgauss.cli._shared import (
+    TIME_LEFT,
     Frames,
+    NewClip,
     Size,
     Stopped,
     WrongUse,
@@ -25,6 +28,7 @@ from foldgauss.cli._shared import (
     as_option,
     err,
     fingerprint,
+    named_after,
     out,
     parse_frames,
     parse_size,
@@ -69,10 +73,18 @@ Tell = Callable[[str], None]
 
 @app.command(name="tradeoff")
 def tradeoff_command(
-    video: Annotated[Path, typer.Argument(help="Video file, folder of images in natural order, or one image.")],
-    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")],
+    video: NewClip,
+    out_dir: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for the results [default: VIDEO-tradeoff in this folder]."),
+    ] = None,
     axes: Annotated[
-        str | None, typer.Option(metavar="AXIS,AXIS,..", help=f"Which axes, of {', '.join(AXES)} [default: all].")
+        str | None,
+        typer.Option(
+            metavar="AXIS,AXIS,..",
+            help=f"Which axes, of {', '.join(AXES)} [default: all].",
+            autocompletion=lists_of(AXES),
+        ),
     ] = None,
     minutes: Annotated[
         float, typer.Option(help="Time for all of it: the fits are made as short as that asks for.")
@@ -84,7 +96,11 @@ def tradeoff_command(
     frames: Frames = None,
     seed: Annotated[int, typer.Option(help="Seed of all fits.")] = 0,
     clock: Annotated[
-        str, typer.Option(help="Time to fit: wall, or cpu, the work of all cores, where others use them, too.")
+        str,
+        typer.Option(
+            help="Time to fit: wall, or cpu, the work of all cores, where others use them, too.",
+            autocompletion=among(CLOCKS),
+        ),
     ] = "wall",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where results are kept.")] = False,
 ) -> None:
@@ -101,6 +117,7 @@ def tradeoff_command(
         raise WrongUse(as_option(str(error))) from error
     if not within(minutes, "(0, inf)"):
         raise WrongUse(str(invalid("--minutes", expected="a number above 0", got=minutes)))
+    out_dir = named_after(video, "-tradeoff") if out_dir is None else out_dir
     refuse_foreign(out_dir, FILES, "tradeoff")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
@@ -340,7 +357,7 @@ def _passing(folder: Path, point: Point) -> Iterator[Path]:
 @contextmanager
 def _bar(total: int, done: int) -> Iterator[tuple[Tell, Tell]]:
     """Two tellers: of what is being done now, and of what is done. In a log, a line for each point."""
-    columns = (TextColumn("Measuring"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (TextColumn("Measuring"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(), *TIME_LEFT)
     bar = Progress(*columns, TextColumn("{task.description}"), console=err, disable=not err.is_terminal)
     with bar:
         task = bar.add_task("", total=total, completed=done)

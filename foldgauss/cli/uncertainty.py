@@ -16,7 +16,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss import __version__
 from foldgauss._checks import invalid
+from foldgauss.cli._completion import among
 from foldgauss.cli._shared import (
+    TIME_LEFT,
+    FittedClip,
+    ModelFile,
     Overwrite,
     Stopped,
     WrongUse,
@@ -24,6 +28,7 @@ from foldgauss.cli._shared import (
     clip_of_model,
     err,
     fingerprint,
+    named_after,
     out,
 )
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable
@@ -57,9 +62,16 @@ _PROFILES = ("nodes", "values", "slopes", "count")
 
 @app.command(name="uncertainty")
 def uncertainty_command(
-    model_path: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
-    video: Annotated[Path, typer.Argument(help="The clip it was fitted to.")],
-    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for tables, pictures and draws.")],
+    model_path: ModelFile,
+    video: FittedClip,
+    out_dir: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Folder for tables, pictures and draws [default: MODEL-uncertainty in this folder].",
+        ),
+    ] = None,
     frames: Annotated[
         str | None,
         typer.Option(
@@ -74,10 +86,18 @@ def uncertainty_command(
         ),
     ] = None,
     noise: Annotated[
-        str, typer.Option(help=f"What of the residuals counts: {', '.join(NOISES)}; see docs/uncertainty.md.")
+        str,
+        typer.Option(
+            help=f"What of the residuals counts: {', '.join(NOISES)}; see docs/uncertainty.md.",
+            autocompletion=among(NOISES),
+        ),
     ] = "score",
     level: Annotated[
-        str, typer.Option(help="What is given: splats, all of them; colors: all but their colours, which takes longer.")
+        str,
+        typer.Option(
+            help="What is given: splats, all of them; colors: all but their colours, which takes longer.",
+            autocompletion=among(LEVELS),
+        ),
     ] = "splats",
     concentration: Annotated[
         float, typer.Option(help="Of the Dirichlet prior on increments: 1 is uniform, more is towards an even pace.")
@@ -99,6 +119,7 @@ def uncertainty_command(
         raise WrongUse(str(invalid("--noise", expected="one of " + ", ".join(NOISES), got=noise)))
     if level not in LEVELS:
         raise WrongUse(str(invalid("--level", expected="one of " + ", ".join(LEVELS), got=level)))
+    out_dir = named_after(model_path, "-uncertainty") if out_dir is None else out_dir
     _check_folder(out_dir, video, overwrite)
     wanted = _parse_only(only)
     model = load_video_model(model_path)
@@ -234,7 +255,7 @@ def _of_another(path: Path) -> WrongUse:
 def _bars() -> Iterator[Callable[[str, int, int], None]]:
     """A bar for the pictures and one for the steps, where somebody looks."""
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[told]}")
-    with Progress(*columns, TimeElapsedColumn(), console=err, disable=not err.is_terminal) as progress:
+    with Progress(*columns, TimeElapsedColumn(), *TIME_LEFT, console=err, disable=not err.is_terminal) as progress:
         tasks: dict[str, Any] = {}
         titles = {"pictures": "Drawing pictures", "frames": "Without colours", "steps": "Sampling"}
 

@@ -5,6 +5,7 @@ from foldgauss.io._ply import FormatError
 from foldgauss.io.compact import load_compact, save_compact
 from foldgauss.io.exchange import export, import_model
 from foldgauss.io.history import HistoryFile, read_history, write_curves
+from foldgauss.io.html import html_page, write_html
 from foldgauss.io.masks import read_masks
 from foldgauss.io.mesh import Pseudomesh, read_pseudomesh, write_pseudomesh
 from foldgauss.io.model_file import ModelFileError
@@ -31,6 +32,7 @@ __all__ = [
     "VideoError",
     "export",
     "frame_gaussians",
+    "html_page",
     "import_model",
     "load_compact",
     "load_selection",
@@ -49,6 +51,7 @@ __all__ = [
     "write_curves",
     "write_frames",
     "write_gaussians_ply",
+    "write_html",
     "write_image",
     "write_pseudomesh",
     "write_vegas_ply",

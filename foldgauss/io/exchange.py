@@ -1,7 +1,7 @@
 """The roads in and out by the name of a format: what `foldgauss export` and `foldgauss import` do."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from foldgauss._checks import invalid, one_of
 from foldgauss.io._atomic import OutputError, check_writable, checked_path
 from foldgauss.io._ply import format_error
+from foldgauss.io.html import HTML_SUFFIX, QUALITY, Frames, write_html
 from foldgauss.io.mesh import write_pseudomesh
 from foldgauss.io.ply import (
     AXES,
@@ -22,8 +23,9 @@ from foldgauss.video.edit import Edit
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 
-#: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame.
-FORMATS = ("ply", "ply3dgs", "obj")
+#: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame;
+#: a page that plays.
+FORMATS = ("ply", "ply3dgs", "obj", "html")
 
 
 def export(
@@ -35,7 +37,11 @@ def export(
     depth_step: float | None = None,
     axes: str | None = None,
     sh_degree: int | None = None,
+    original: Frames | None = None,
+    quality: int | None = None,
+    title: str | None = None,
     overwrite: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
 ) -> Path:
     """Write a model for other programs; returns the path of the file or the folder.
 
@@ -43,9 +49,11 @@ def export(
     - `ply3dgs`: a folder with a 3DGS scene of each frame (`write_3dgs_frames`); or one file, where `out` ends in .ply
       and `times` is one (`write_3dgs_ply`)
     - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
+    - `html`: one page for browsers, which draws the Gaussians at any time (`write_html`)
 
     `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
-    `axes` and `sh_degree` for `ply3dgs`. What exists is refused unless `overwrite`.
+    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality` and `title` for `html`. What exists
+    is refused unless `overwrite`. `on_frame` is called after each frame of a folder.
 
     **Raises:** ValueError for an unknown format, an option that the format does not know, and as the function;
     `OutputError` where the output cannot be written or exists.
@@ -57,24 +65,30 @@ def export(
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     one_of("format", format, FORMATS)
     out = checked_path(out, "model, format, out")
-    options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
-    given = {name: value for name, value in options.items() if value is not None}
+    of_scenes = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
+    of_pages = {"original": original, "quality": quality, "title": title}
+    given = {name: value for name, value in of_scenes.items() if value is not None}
     unknown = list(given) if format != "ply3dgs" else []
-    unknown += ["times"] if format == "ply" and times is not None else []
+    unknown += [name for name, value in of_pages.items() if format != "html" and value is not None]
+    unknown += ["times"] if format in ("ply", "html") and times is not None else []
     if unknown:
         got = f"it for {format!r}"
         raise invalid(unknown[0], expected="an option of this format", got=got, cure="Leave it out.")
     if format == "ply":
         _check_new(out, overwrite)
         return write_vegas_ply(out, model)
+    if format == "html":
+        if out.suffix.lower() == HTML_SUFFIX:
+            _check_new(out, overwrite)
+        return write_html(out, model, **of_pages | {"quality": QUALITY if quality is None else quality})
     if format == "obj":
         if out.suffix.lower() == ".obj" and not out.is_dir():
             cure = "Each frame becomes a file in it: leave the extension out."
             raise invalid("out", expected="a folder", got=repr(str(out)), cure=cure)
-        return write_pseudomesh(out, model, times, overwrite=overwrite)
+        return write_pseudomesh(out, model, times, overwrite=overwrite, on_frame=on_frame)
     given = {"depth_step": DEPTH_STEP, "axes": AXES[0], "sh_degree": 3} | given
     if out.suffix.lower() != ".ply" or out.is_dir():
-        return write_3dgs_frames(out, model, times, overwrite=overwrite, **given)
+        return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **given)
     if times is None or np.size(times) != 1:
         got = "all frames" if times is None else str(np.size(times))
         cure = "Give one time, or a folder (a name without .ply)."

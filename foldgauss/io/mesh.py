@@ -7,7 +7,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,7 +114,12 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 
 def write_pseudomesh(
-    folder: str | os.PathLike, model: VideoModel, times: Sequence[float] | None = None, *, overwrite: bool = False
+    folder: str | os.PathLike,
+    model: VideoModel,
+    times: Sequence[float] | None = None,
+    *,
+    overwrite: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
 ) -> Path:
     """Write frames as triangles: frame_0000.obj, frame_0000.ply and so on, and pseudomesh.json; returns the folder.
 
@@ -125,7 +130,7 @@ def write_pseudomesh(
     takes the shape from the `.obj`, opacity and colour from the `.ply`.
 
     `times` (default: the model's frame times), in [0, 1]. The folder appears whole or not at all; one that holds files
-    is refused unless `overwrite`, and even then if it holds anything else.
+    is refused unless `overwrite`, and even then if it holds anything else. `on_frame` is called after each frame.
 
     **Raises:** ValueError for times outside [0, 1]; `OutputError` where the folder is refused.
 
@@ -141,6 +146,7 @@ def write_pseudomesh(
             gaussians = frame_gaussians(playback, t, depth_step=0.0)
             write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, sh_degree=0)
             (temporary / f"frame_{number:04d}.obj").write_text(_obj_text(gaussians, t), encoding="ascii")
+            on_frame()
         notes = {
             "times": [float(t) for t in times],
             "size": list(model.size),

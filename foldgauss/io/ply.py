@@ -7,7 +7,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -65,8 +65,10 @@ def read_vegas_ply(
     along -z, with a horizontal field of view of 0.6911112, so its frame is 2 tan(0.6911112 / 2) = 0.72 wide. With
     w = min(1, width / height) the frame's width in model space,
 
-    .. math:: (x, y) = k\,(x, -z), \quad c_j = k\,(w_{j,x}, -w_{j,z}), \quad s = k\,(s_0, s_2),
-              \quad k = \frac{w}{2 \tan(0.6911112 / 2)}
+    $$
+    (x, y) = k\,(x, -z), \quad c_j = k\,(w_{j,x}, -w_{j,z}), \quad s = k\,(s_0, s_2),
+    \quad k = \frac{w}{2 \tan(0.6911112 / 2)}
+    $$
 
     The angle is the file's own: it turns about y there, and its axes (cos, -sin) and (sin, cos) in (x, z) are
     (cos, sin) and (sin, -cos) in the picture, where (-sin, cos) is the same axis. y, scale_1 and the normals are not
@@ -116,7 +118,7 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
 
     The envelope has power 2 there. That of another power p > 0 is the same function of time with
 
-    .. math:: \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2))
+    $$ \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2)) $$
 
     Leaves, sigma_t and the power among them, come back here to float32 rounding. The published code draws it with its
     own constants: a Gaussian up to 3.03 sigma_t' from m_t, where it is a hundredth as wide as at its widest (at p = 1
@@ -402,11 +404,12 @@ def write_3dgs_frames(
     axes: str = "y-down",
     sh_degree: int = 3,
     overwrite: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
 ) -> Path:
     """Write pictures of a video as 3DGS PLY files frame_0000.ply, frame_0001.ply, ...; returns the folder.
 
     `times` (default: the model's frame times), in [0, 1]. The folder appears whole or not at all; one that holds files
-    is refused unless `overwrite`, and even then if it holds anything else.
+    is refused unless `overwrite`, and even then if it holds anything else. `on_frame` is called after each.
 
     **Raises:** as `write_3dgs_ply`; `OutputError` where the folder is refused.
 
@@ -420,6 +423,7 @@ def write_3dgs_frames(
         for number, t in enumerate(times):
             gaussians = frame_gaussians(playback, t, depth_step=depth_step)
             write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, axes=axes, sh_degree=sh_degree)
+            on_frame()
     return folder
 
 

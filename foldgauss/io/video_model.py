@@ -78,6 +78,10 @@ def read_metadata(path: str | os.PathLike) -> dict:
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
+#: The one setting with which a fit may go on otherwise: no step depends on it while all is well.
+FREE = "on_divergence"
+
+
 def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
     """Write a running fit with what it must be continued with: its settings and its frames."""
     return save_model(path, state, metadata={"config": dataclasses.asdict(config), "source": source})
@@ -88,6 +92,7 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
     kept = read_header(path)["metadata"]
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
         before = kept.get(part) or {}
+        now, before = ({name: value for name, value in held.items() if name != FREE} for held in (now, before))
         changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
         cure = f"Continue {str(path)!r} with the options it was started with, or start anew with --overwrite."
         if part == "config" and now.keys() != before.keys():
@@ -231,6 +236,8 @@ def _describe_checkpoint(state: FitState) -> dict:
         "plan": state.plan,
         "seconds": state.seconds,
         "error": state.error,
+        "best_error": state.best_error,
+        "backoffs": state.backoffs,
     }
 
 
@@ -269,6 +276,8 @@ def _checkpoint_skeleton(header: dict) -> FitState:
         plan=int(header["plan"]),
         seconds=float(header["seconds"]),
         error=float(header["error"]),
+        best_error=float(header.get("best_error", 0.0)),
+        backoffs=int(header.get("backoffs", 0)),
     )
 
 

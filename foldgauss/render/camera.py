@@ -33,7 +33,7 @@ ORDERS = ("depth", "array")
 class Gaussians3D(eqx.Module):
     r"""Gaussians in space with opacity and colour.
 
-    .. math:: \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i))
+    $$ \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i)) $$
 
     Shapes: `mean` (num, 3) and `factor` (num, 3, 3) in model space, any F with covariance F F^T (columns R S of a
     rotation and scales, or a Cholesky factor); `opacity` (num,) in [0, 1]; `color` (num, channels).
@@ -196,8 +196,10 @@ def project(
 ) -> Splats2D:
     r"""What a camera sees: splats in pixels of a picture of `size` = (height, width), ready for `render`.
 
-    .. math:: F_{2D} F_{2D}^T = J W F F^T W^T J^T,
-              \quad J = \tfrac{f}{z} \begin{bmatrix} 1 & 0 & -x/z \\ 0 & 1 & -y/z \end{bmatrix}
+    $$
+    F_{2D} F_{2D}^T = J W F F^T W^T J^T,
+    \quad J = \tfrac{f}{z} \begin{bmatrix} 1 & 0 & -x/z \\ 0 & 1 & -y/z \end{bmatrix}
+    $$
 
     with (x, y, z) the mean in the camera's axes W and f the focal length in pixels; x/z and y/z are held within 1.3
     times the half field of view in J alone, where the linearisation would blow up.

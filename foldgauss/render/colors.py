@@ -29,7 +29,7 @@ def solve_colors(
 ) -> Float[Array, "num channels"]:
     r"""The colours that come closest to the images, geometry and opacities held.
 
-    .. math:: \min_c \sum_k \| A_k c + b_k - y_k \|^2 + \lambda \| c - c_0 \|^2
+    $$ \min_c \sum_k \| A_k c + b_k - y_k \|^2 + \lambda \| c - c_0 \|^2 $$
 
     A_k is the renderer's linear map from colours to frame k (the weights alpha_i T_i, the same for every channel), b_k
     what the background adds, c_0 the colours that the splats came with.

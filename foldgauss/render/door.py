@@ -37,7 +37,7 @@ def render(
 ) -> Float[Array, "height width channels"]:
     r"""Picture of two-dimensional splats.
 
-    .. math:: C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j)
+    $$ C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j) $$
 
     - `splats`: in pixels (x right, y down, centres at +0.5), front to back in array order.
     - `size`: (height, width) in pixels.

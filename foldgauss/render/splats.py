@@ -20,7 +20,7 @@ LARGEST_CAPACITY = 2**30 - 2
 class Splats2D(eqx.Module):
     r"""Gaussians of one frame, in array order from front to back.
 
-    .. math:: \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i))
+    $$ \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i)) $$
 
     Shapes: `mean` (num, 2) as (x right, y down); `factor` (num, 2, 2), any F with covariance F F^T (a
     rotation times scales, or a Cholesky factor); `opacity` (num,) in [0, 1]; `color` (num, channels).

@@ -20,7 +20,7 @@ _COLUMNS = (kernels._X, kernels._Y, kernels._P, kernels._Q, kernels._R, kernels.
 def weights(trace: Trace) -> scipy.sparse.csr_array:
     r"""What each splat adds to each pixel, alpha times the light that reaches it: (height * width, num), float32.
 
-    .. math:: A_{pi} = \alpha_i(p) \prod_{j < i} (1 - \alpha_j(p))
+    $$ A_{pi} = \alpha_i(p) \prod_{j < i} (1 - \alpha_j(p)) $$
 
     Rows are pixels in reading order; within a row splats stand in array order, front to back. The product is left out
     where splats are added up. Cutoff, ceiling and stop are those that the picture was drawn with, so that

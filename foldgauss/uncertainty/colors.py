@@ -42,13 +42,15 @@ def evidence_without_colors(
 ) -> Profiles:
     r"""Profiles of `frames` (default: all but the first and the last) with colours integrated out; of others, `base`'s.
 
-    .. math:: \ell_k(t) = -\tfrac12 r^T C^{-1} r - \tfrac12 \log\det C, \quad C = s_k^2 I + A(t) P A(t)^T,
-        \quad r = y_k - A(t) \hat c
+    $$
+    \ell_k(t) = -\tfrac12 r^T C^{-1} r - \tfrac12 \log\det C, \quad C = s_k^2 I + A(t) P A(t)^T,
+    \quad r = y_k - A(t) \hat c
+    $$
 
-    summed over channels, where :math:`N(\hat c, P)` are the colours given all frames but k, at the times where `base`
-    is greatest, and :math:`s_k^2` = scale^2 / share. It is taken as what all frames say together less what the others
+    summed over channels, where $N(\hat c, P)$ are the colours given all frames but k, at the times where `base`
+    is greatest, and $s_k^2$ = scale^2 / share. It is taken as what all frames say together less what the others
     do: with H the precision of the colours given all of them, b their right-hand side and d the residuals of the
-    model's own colours, :math:`-\tfrac12 (d^T d / s_k^2 - b^T H^{-1} b) - \tfrac12 \log\det H` up to a constant.
+    model's own colours, $-\tfrac12 (d^T d / s_k^2 - b^T H^{-1} b) - \tfrac12 \log\det H$ up to a constant.
 
     **What is held:** shapes, folds and opacities, the other frames' times, the noise. **What is left out:** that
     colours are not below 0 (the model clamps them; offsets start from the clamped ones). **Prior:** each channel of

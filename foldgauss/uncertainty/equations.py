@@ -37,9 +37,9 @@ _d = nb.float64
 class ColorEquations:
     r"""H c = b of all colours' offsets c from the model's own, of every frame at its time.
 
-    .. math:: H = \lambda^{-2} I + \sum_j A_j^T A_j / s_j^2, \quad b = \sum_j A_j^T (y_j - A_j c_0) / s_j^2
+    $$ H = \lambda^{-2} I + \sum_j A_j^T A_j / s_j^2, \quad b = \sum_j A_j^T (y_j - A_j c_0) / s_j^2 $$
 
-    with :math:`\lambda` the `prior_scale` and :math:`s_j^2` = scale^2 / share. Pictures are A c: linear, since the
+    with $\lambda$ the `prior_scale` and $s_j^2$ = scale^2 / share. Pictures are A c: linear, since the
     clamp of colours at 0 is left out of it. `matrix`: sparse (num, num), `rhs`: (num, 3).
     """
 

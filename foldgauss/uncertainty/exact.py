@@ -1,12 +1,12 @@
 r"""The posterior of frame times without sampling: a Markov chain on grids, and Laplace's approximation.
 
 Given the splats, likelihoods factorise over frames and a Dirichlet prior over increments: the times are a Markov chain
-with transitions :math:`(t_{k+1} - t_k)^{\alpha - 1}`. Forward and backward passes over grids give all marginals.
+with transitions $(t_{k+1} - t_k)^{\alpha - 1}$. Forward and backward passes over grids give all marginals.
 
-What a pass carries is a logarithm, less that of the prior: :math:`\phi_k(t)` is the mean of the likelihoods of the
+What a pass carries is a logarithm, less that of the prior: $\phi_k(t)$ is the mean of the likelihoods of the
 frames up to k, over the prior given that frame k is at t. It is constant where frames tell nothing, and
 
-.. math:: \phi_{k+1}(t) = L_{k+1}(t) \, \mathbb{E}\, \phi_k(t B), \qquad B \sim \mathrm{Beta}(\alpha k, \alpha)
+$$ \phi_{k+1}(t) = L_{k+1}(t) \, \mathbb{E}\, \phi_k(t B), \qquad B \sim \mathrm{Beta}(\alpha k, \alpha) $$
 
 with times from the start of the run. Between grid points, logarithms are linear.
 """

@@ -16,7 +16,7 @@ class Increments:
     r"""Times of n frames, some of them free, as log-ratios of the increments between them.
 
     A *run* is a stretch of m free frames between two whose times are held; with its m + 1 increments p, as shares of
-    the time between those two, its coordinates are :math:`z_i = \log p_i / p_m`. All times free but the first and the
+    the time between those two, its coordinates are $z_i = \log p_i / p_m$. All times free but the first and the
     last: one run, whose coordinates are the model's softmax weights less the last of them.
 
     **Shapes:** `held` (num_frames,) times of which those at `free` do not count; coordinates (*batch, num_free).

@@ -23,7 +23,7 @@ DEFAULT_NOISE = "score"
 class FrameTimeLogProb:
     r"""Log-posterior density of the free frames' log-ratios, up to the evidence; batched, by compiled look-ups.
 
-    .. math:: \log p(z \mid y) = \sum_k \ell_k(t_k(z)) + \log \mathrm{Dirichlet}(p(z)) + \log |dp/dz| + \text{const}
+    $$ \log p(z \mid y) = \sum_k \ell_k(t_k(z)) + \log \mathrm{Dirichlet}(p(z)) + \log |dp/dz| + \text{const} $$
 
     Conditioned on: the splats (their places, folds and colours), the times of frames that are held, and the noise.
 

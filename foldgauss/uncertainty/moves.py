@@ -36,10 +36,12 @@ class BlockSweep(Move):
     proposed and accepted by itself, since given the frames between them blocks are independent. The cuts are drawn anew
     for every half sweep. In a block of m frames, in its log-ratios z, and with partners c, d of the other half:
 
-    .. math:: z' = z_c + \zeta (z - z_c), \quad g(\zeta) \propto \zeta^{-1/2} \text{ on } [1/2, 2]
-       \qquad\text{or}\qquad z' = z + \gamma (z_c - z_d) + \epsilon
+    $$
+    z' = z_c + \zeta (z - z_c), \quad g(\zeta) \propto \zeta^{-1/2} \text{ on } [1/2, 2]
+    \qquad\text{or}\qquad z' = z + \gamma (z_c - z_d) + \epsilon
+    $$
 
-    accepted by the density of z, times :math:`\zeta^{m-1}` for the first.
+    accepted by the density of z, times $\zeta^{m-1}$ for the first.
 
     Half of the sweeps go frame by frame instead, first the even ones, then the odd ones: each time is proposed from its
     own likelihood between its neighbours' times, on a grid, and accepted by what the grid misses. So a frame goes

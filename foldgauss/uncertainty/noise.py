@@ -25,7 +25,7 @@ LOCAL = 1.0
 class FrameNoise:
     r"""Noise of every frame: residuals of standard deviation `scale`, of which a `share` counts.
 
-    .. math:: \ell_k(t) = -\frac{\text{share}_k}{2\, \text{scale}_k^2} \sum_p (y_{kp} - R_p(t))^2
+    $$ \ell_k(t) = -\frac{\text{share}_k}{2\, \text{scale}_k^2} \sum_p (y_{kp} - R_p(t))^2 $$
 
     **Shapes:** `scale` (num_frames,) in units of the pixels' range [0, 1], `share` (num_frames,) in (0, 1]; or numbers
     for all frames. A share of 1 says that all pixels and channels are independent.
@@ -162,8 +162,10 @@ def score_share(
     The score is the sum over pixels of r g, with the residual r and the slope g = dR/dt. The plain likelihood takes its
     variance for J = scale^2 sum g^2. Here it is V, the greater of two estimates, and the share is J / V:
 
-    .. math:: V_1 = \sum_{p, h} \rho(h)\, s_p g_p\, s_{p + h} g_{p + h}, \qquad
-       V_2 = \sum_{p, h} r_p g_p\, r_{p + h} g_{p + h}
+    $$
+    V_1 = \sum_{p, h} \rho(h)\, s_p g_p\, s_{p + h} g_{p + h},
+    \qquad V_2 = \sum_{p, h} r_p g_p\, r_{p + h} g_{p + h}
+    $$
 
     summed over channels, too, over lags h up to twice the `correlated_reach` (in full up to half of it, then less and
     less). The first, with the residual's size s around p and the correlations rho of `covariance`, best those of many

@@ -15,7 +15,7 @@ _d = nb.float64
 
 @dataclasses.dataclass(frozen=True)
 class Profiles:
-    r"""Functions :math:`\ell_k(t)`, piecewise cubic between nodes; -inf outside of a frame's first and last node.
+    r"""Functions $\ell_k(t)$, piecewise cubic between nodes; -inf outside of a frame's first and last node.
 
     Given the splats, frame k's likelihood depends on t_k only: the log-likelihood of all times is the sum of these.
 

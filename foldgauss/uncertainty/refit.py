@@ -5,7 +5,7 @@ that might as well have been seen (of="pixels"), to all frames but some (of="fra
 
 What is still conditioned on. Time and folds trade against each other: with any rising g, times g(t_k) and splats whose
 m_t, sigma_t and folds follow g show the same frames, as far as folds of the model's degree can follow. Only
-:math:`t_0 = 0` and :math:`t_{n-1} = 1` are fixed by definition; all else that holds a smooth warp is where the fit
+$t_0 = 0$ and $t_{n-1} = 1$ are fixed by definition; all else that holds a smooth warp is where the fit
 starts and how far it goes. So absolute times spread the more the longer the fit, without end in principle, and
 `RefitTimes.local` gives what hardly any smooth warp changes, each frame's time between its neighbours'. Few steps hold
 times back where they start, so that they spread less than they might. Also given are the number of Gaussians and, with
@@ -110,7 +110,7 @@ class RefitTimes:
 
     @property
     def local(self) -> Float64[np.ndarray, "num_frames"]:
-        r"""Standard deviation of :math:`t_k - (t_{k-1} + t_{k+1}) / 2`, which hardly a smooth warp changes.
+        r"""Standard deviation of $t_k - (t_{k-1} + t_{k+1}) / 2$, which hardly a smooth warp changes.
 
         Times that are independent with the same deviation sigma have sqrt(3/2) sigma here. 0 for the first and last.
         """

@@ -9,6 +9,7 @@ from foldgauss.video.edited import EditedVideo, Layer, layers
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.growth import Growth
+from foldgauss.video.guard import DivergenceWarning, FitDiverged
 from foldgauss.video.independent import IndependentFrames, independent_frames
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
@@ -31,11 +32,13 @@ from foldgauss.video.timing import Clock, Span
 __all__ = [
     "Clock",
     "Compressed",
+    "DivergenceWarning",
     "Economy",
     "Edit",
     "EditedVideo",
     "Evaluation",
     "FitConfig",
+    "FitDiverged",
     "FitInfo",
     "FitResult",
     "FitState",

@@ -1,6 +1,6 @@
 """Frames with alpha: where light comes through, what lies behind is seen. The colour is premultiplied by alpha.
 
-.. math:: C = c\\,\\alpha + (1 - \\alpha)\\, b
+$$ C = c\\,\\alpha + (1 - \\alpha)\\, b $$
 
 Fitted over another random background b in every step, splats learn alpha too: only where they let as much light
 through as the frame does is the picture right over all of them.

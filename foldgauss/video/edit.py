@@ -51,7 +51,10 @@ class When(TypedDict, total=False):
 
 
 def edit(model: VideoModel | EditedVideo) -> "Edit":
-    """The start of a chain of edits, everything selected. Raises ValueError for what is no video."""
+    """The start of a chain of edits, everything selected. Raises ValueError for what is no video.
+
+    Example: `edit(model).select(ball).move((0.1, 0)).video()`; the methods are those of `Edit`.
+    """
     video = as_edited(model)
     counts = tuple(layer.num_gaussians for layer in video.layers)
     return Edit(video, Selection(np.ones(sum(counts), bool)), counts, tuple(map(np.arange, counts)))

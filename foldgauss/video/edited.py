@@ -148,6 +148,12 @@ class EditedVideo(eqx.Module):
         """Pictures at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
         yield from Playback(self, size, background=background).frames(times)
 
+    def _repr_html_(self) -> str | None:
+        """The player, in a notebook, as of a `VideoModel`; None where no folded model holds the edits."""
+        from foldgauss.io.html import notebook_frame  # passed on: files are another floor's
+
+        return notebook_frame(self)
+
 
 def layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
     """Videos one over another, the front one first: drawn in one pass, what is in front covers what is behind.

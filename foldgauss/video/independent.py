@@ -74,7 +74,7 @@ def independent_frames(
 ) -> IndependentFrames:
     r"""Fit each frame alone, with as many Gaussians in all as `num_floats` numbers have room for.
 
-    .. math:: \mathcal G^{t_1}_{\mathrm{MiraGe}} \cup \dots \cup \mathcal G^{t_n}_{\mathrm{MiraGe}}
+    $$ \mathcal G^{t_1}_{\mathrm{MiraGe}} \cup \dots \cup \mathcal G^{t_n}_{\mathrm{MiraGe}} $$
 
     **Shapes:** `frames` uint8 (num_frames, height, width, 3), or with alpha (..., 4), as `fit` takes them. Frames get
     `num_floats` // 9 Gaussians in equal parts, the first ones what is left over.

@@ -256,6 +256,9 @@ class VideoModel(eqx.Module):
     `size` is (height, width) of the frames it was fitted to, `fps` their rate, `options` the constants and
     `compositing` the blend ("over" or "sum") it was fitted with and must be drawn with. `scale_cutoff`: a Gaussian is
     drawn only where its standard deviations exceed it, in model units; 0 but for imported VeGaS videos.
+
+    Units: time is [0, 1], frame k at `frame_times.times()[k]`; lengths are in model space, see `FoldedSplats`.
+    Example: `fit(frames).model.render(0.5)`. Source: VeGaS, section 4.
     """
 
     splats: FoldedSplats
@@ -326,6 +329,12 @@ class VideoModel(eqx.Module):
         from foldgauss.video.playback import Playback  # which knows this class
 
         yield from Playback(self, size, background=background).frames(times)
+
+    def _repr_html_(self) -> str | None:
+        """The player, in a notebook: see docs/player.md. None where its page would be too large."""
+        from foldgauss.io.html import notebook_frame  # passed on: files are another floor's
+
+        return notebook_frame(self)
 
 
 @eqx.filter_jit

@@ -107,7 +107,7 @@ class AbstractOverlay(eqx.Module):
 class Affine(AbstractOverlay):
     r"""An affine map of the plane about a point, or about the selection's own centre at each time.
 
-    .. math:: m' = c + A (m - c) + b, \quad F' = A F, \quad A = R(\theta) S
+    $$ m' = c + A (m - c) + b, \quad F' = A F, \quad A = R(\theta) S $$
 
     On the way, at progress s, the angle is s theta, S is I + s (S - I) and the offset s b: turns keep their sense, and
     nothing shrinks that does not in the end, unless it is mirrored. What is placed in space keeps its depth.

@@ -189,8 +189,10 @@ def contribution(
 ) -> tuple[Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"]]:
     r"""What each Gaussian adds to the picture inside a mask, and everywhere.
 
-    .. math:: \sum_k \sum_p m_k(p)\, w_{ik}(p), \qquad \sum_k \sum_p w_{ik}(p),
-              \qquad w_{ik}(p) = \alpha_{ik}(p) \prod_{j < i} (1 - \alpha_{jk}(p))
+    $$
+    \sum_k \sum_p m_k(p)\, w_{ik}(p), \qquad \sum_k \sum_p w_{ik}(p),
+    \qquad w_{ik}(p) = \alpha_{ik}(p) \prod_{j < i} (1 - \alpha_{jk}(p))
+    $$
 
     with alpha alone for compositing "sum". `mask`, `frame` and `frames` are `by_mask`'s; k runs over its frames.
 
@@ -361,7 +363,8 @@ def matte(model: VideoModel, selection: Selection, t: float) -> Float32[np.ndarr
 def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndarray, "height width"]:
     """The pixels that the selection reaches at time t, seen or hidden: without it all others are the same.
 
-    Reached is where a Gaussian's alpha is not cut off (`RenderOptions.alpha_cutoff`). Else as `matte`.
+    Reached is where a Gaussian's alpha is not cut off (`RenderOptions.alpha_cutoff`). Shapes, units and errors as
+    `matte`'s. Example: `influence(model, ball, 0.5).sum()`  pixels.
     """
     lit, mask = _known(model, selection)
     check_time(t)

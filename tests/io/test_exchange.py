@@ -148,3 +148,11 @@ def test_swapped_arguments(tmp_path, name):
 def test_one_time_needs_no_list(tmp_path):
     export(soft_model(), "ply3dgs", tmp_path / "frames", times=0.5)
     assert len(list((tmp_path / "frames").iterdir())) == 1
+
+
+@pytest.mark.parametrize("format", ["ply3dgs", "obj"])
+def test_each_frame_is_told(tmp_path, model, format):
+    told = []
+    path = export(model, format, tmp_path / "frames", times=[0.1, 0.5, 0.6], on_frame=lambda: told.append(1))
+    assert len(told) == 3
+    assert files(path) == files(export(model, format, tmp_path / "again", times=[0.1, 0.5, 0.6]))

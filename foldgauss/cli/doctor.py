@@ -1,0 +1,186 @@
+"""The command that looks whether all works here: `doctor`."""
+
+import json
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from foldgauss.cli._checkup import NAME, Trial, facts, trials
+from foldgauss.cli._shared import app, err, out
+
+GREEN, RED, YELLOW = "green", "red", "yellow"
+_FOR = {
+    "samples": "clips to try things on",
+    "plot": "pictures of densities and fits",
+    "uncertainty": "how sure frame times are",
+    "sklearn": "the estimator",
+    "numpyro": "to_numpyro",
+}
+
+
+@app.command()
+def doctor(
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print all of it as JSON to standard output, and nothing else there.")
+    ] = False,
+) -> None:
+    """Look at what is installed and try it: some seconds, more where kernels are compiled for the first time.
+
+    Exit code 0: all is well. 1: something is not; what to do stands beside it.
+    """
+    found = facts()
+    if not as_json:
+        _print_facts(found)
+        out.print("\nTrials", style="bold")
+    done = []
+    with err.status("Trying", spinner="dots") as status:
+        for trial in trials():
+            done.append(trial)
+            if not as_json:
+                _print_trial(trial)
+            status.update(f"Trying: {len(done)} done")
+    problems = _problems(found, done)
+    if as_json:
+        told = {"well": not problems, "problems": problems, **found, "trials": [one._asdict() for one in done]}
+        print(json.dumps(told, indent=2))
+    else:
+        _print_end(done, problems)
+    if problems:
+        raise typer.Exit(1)
+
+
+def _problems(found: dict[str, Any], done: list[Trial]) -> list[str]:
+    """What keeps this installation from working, each with what to do. A missing extra does not."""
+    problems = [f"{one.name}: {one.told}. {one.cure}" for one in done if not one.ok]
+    missing = [name for name, version in found["versions"].items() if version is None]
+    if missing:
+        problems.append(f"missing: {', '.join(missing)}. pip install --upgrade {NAME}")
+    for name, state in found["folders"].items():
+        if state != "writable":
+            problems.append(f"folder ({name}) cannot be written: {state}. {_CURES.get(name, '')}".rstrip())
+    return problems
+
+
+_CURES = {"here": "Change to another folder.", "temporary": "Set TMPDIR to a folder that can be."}
+
+
+def _print_facts(found: dict[str, Any]) -> None:
+    for title, rows in (
+        ("Versions", _version_rows(found["versions"])),
+        ("Extras", _extra_rows(found["extras"])),
+        ("Machine", _machine_rows(found["machine"])),
+        ("Drawing", _engine_rows(found["engines"]) + _kernel_rows(found["kernels"])),
+        ("Files", _folder_rows(found["folders"]) + _codec_rows(found["codecs"])),
+    ):
+        out.print(f"\n{title}", style="bold")
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+        table.add_column(no_wrap=True, width=2)
+        table.add_column(no_wrap=True)
+        table.add_column(overflow="fold")
+        for color, name, told in rows:
+            table.add_row(_mark(color), name, told)
+        out.print(table)
+
+
+Row = tuple[str, str, str]
+
+
+def _mark(color: str) -> Text:
+    return Text({GREEN: "ok", RED: "no", YELLOW: "--"}[color], style=color)
+
+
+def _version_rows(found: dict[str, str | None]) -> list[Row]:
+    if "unknown" in found:  # as where the sources run without being installed
+        return [(YELLOW, "versions", str(found["unknown"]))]
+    return [(GREEN if told else RED, name, told or "missing") for name, told in found.items()]
+
+
+def _extra_rows(found: dict[str, Any]) -> list[Row]:
+    rows = []
+    for name, packages in found.items():
+        if not isinstance(packages, dict):
+            return [(YELLOW, name, str(packages))]
+        there = ", ".join(f"{one} {version}" for one, version in packages.items() if version)
+        missing = [one for one, version in packages.items() if version is None]
+        cure = f"no {', '.join(missing)}: pip install '{NAME}[{name}]'" if missing else ""
+        told = "; ".join(text for text in (there, cure) if text)
+        rows.append((YELLOW if missing else GREEN, name, f"{_FOR.get(name, '')}: {told}".removeprefix(": ")))
+    return rows
+
+
+def _machine_rows(found: dict[str, Any]) -> list[Row]:
+    if "unknown" in found:
+        return [(RED, "machine", found["unknown"])]
+    free = "" if found["memory_free_gib"] is None else f", {found['memory_free_gib']:g} free"
+    clip = f"clips of up to {found['largest_clip_gib']:g} GiB are read"
+    return [
+        (GREEN, "system", found["system"]),
+        (GREEN, "processor", f"{found['processor']} ({found['instructions']})"),
+        (GREEN, "cores", f"{found['cores_usable']} usable of {found['cores_present']}"),
+        (GREEN, "threads", f"{found['threads']}: {found['threads_because']}"),
+        (GREEN, "memory", f"{found['memory_gib'] or '?'} GiB{free}; {clip}"),
+    ]
+
+
+def _engine_rows(found: dict[str, Any]) -> list[Row]:
+    if "unknown" in found:
+        return [(RED, "engines", found["unknown"])]
+    seen = ", ".join(found["jax_devices"])
+    accelerator = (
+        f"JAX sees {seen}: engine xla draws there; fits are made for the processor"
+        if found["gpu"]
+        else f"none that JAX sees ({seen})"
+    )
+    return [
+        (GREEN, "engines", f"{', '.join(found['engines'])}; auto is {found['auto']}"),
+        (GREEN if found["gpu"] else YELLOW, "GPU", accelerator),
+    ]
+
+
+def _kernel_rows(found: dict[str, Any]) -> list[Row]:
+    if "unknown" in found:
+        return [(YELLOW, "kernels", found["unknown"])]
+    if not found["folders"]:
+        return [(YELLOW, "kernels", "compiled anew by every run: NUMBA_CACHE_DIR names a folder to keep them in")]
+    refused = [state for state in found["folders"].values() if state not in ("writable", "not there yet")]
+    if refused:
+        return [(YELLOW, "kernels", f"cannot be kept in {refused[0]}; set NUMBA_CACHE_DIR")]
+    told = f"{found['kept']} kept from earlier runs, {found['bytes'] / 1e6:.1f} MB"
+    return [(GREEN, "kernels", told if found["kept"] else "none kept yet: the first run compiles them")]
+
+
+def _folder_rows(found: dict[str, str]) -> list[Row]:
+    titles = {"here": "this folder", "temporary": "temporary"}
+    return [(GREEN if told == "writable" else RED, titles.get(name, name), told) for name, told in found.items()]
+
+
+def _codec_rows(found: dict[str, Any]) -> list[Row]:
+    if "unknown" in found:
+        return [(YELLOW, "codecs", found["unknown"])]
+    words = {True: "yes", False: "no", None: "not known, no clip to try it on"}
+    return [
+        (GREEN if each["reads"] else YELLOW, name, f"written: {words[each['writes']]}; read: {words[each['reads']]}")
+        for name, each in found.items()
+    ]
+
+
+def _print_trial(trial: Trial) -> None:
+    compiled = f", {trial.first_seconds:.1f} s more the first time" if trial.first_seconds > 0.5 else ""
+    line = Text.assemble(
+        ("ok  " if trial.ok else "no  ", GREEN if trial.ok else RED),
+        f"{trial.name:<34}{trial.told} ({trial.seconds:.2f} s{compiled})",
+    )
+    out.print(line, soft_wrap=True)
+
+
+def _print_end(done: list[Trial], problems: list[str]) -> None:
+    seconds, first = (sum(times) for times in zip(*((one.seconds, one.first_seconds) for one in done), strict=True))
+    told = f"the trials took {seconds:.1f} s, and {first:.1f} s more to compile what is new"
+    if not problems:
+        out.print(f"\nAll is well; {told}.", style=GREEN, soft_wrap=True)
+        return
+    out.print(f"\nNot all is well; {told}.", style=RED, soft_wrap=True)
+    for problem in problems:
+        out.print(f"  {problem}", soft_wrap=True)

@@ -1,0 +1,351 @@
+"""The programs that README and the guides hold: found in the text, and run as a reader would.
+
+Every fenced block says what it is, and what it is says what becomes of it:
+
+| language | is |
+|---|---|
+| `python` | run, all blocks of a page in order as one program |
+| `sh` | run, between the page's Python blocks, in the order of the page |
+| `toml` | read as an edit script by the test of its page |
+| `text`, `math` | output, or a formula: nothing to run |
+
+A block without one of these languages is refused, as are commands that stand in an indented block, so that none
+escapes. All of a page runs in one folder, which holds the clip and whatever else the page takes for granted (`GIVEN`).
+
+Commands run in this process, where kernels are compiled once. What they are given is what the page says, with five
+exceptions, which are all there are:
+
+- `CHEAPER` adds options to what would take minutes: fewer steps, no other work. Only to a command that does not say
+  itself how many.
+- `foldgauss.video.fit` takes as many steps as the page says, and where it gives more than `SHORT` minutes or
+  nothing, `STEPS`.
+- `foldgauss demo` takes all its steps on one page, README, and `STEPS` on others.
+- `foldgauss view` makes its page and its server, opens no browser, and is ended as by Ctrl-C.
+- `pip`, `pytest`, `ruff` and so on change the machine or run this very suite: what they name (extras, files, markers,
+  tools) is looked up. `python -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no
+  further.
+"""
+
+import argparse
+import dataclasses
+import importlib
+import re
+import shlex
+import tomllib
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import jax
+import numpy as np
+import pytest
+from commands import run
+from markdown_it import MarkdownIt
+from PIL import Image
+
+from foldgauss import datasets, video
+from foldgauss.cli import fitting, viewing
+from foldgauss.io import export, save_video_model, write_image, write_video
+from foldgauss.video import FitConfig, fit
+
+ROOT = Path(__file__).parents[1]
+#: All that a visitor reads.
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
+RUN, READ = ("python", "sh"), ("toml", "text", "math")
+#: First words of commands, for those that hide in an indented block.
+_COMMAND = re.compile(r"\s*(?:\$ )?(?:foldgauss|pip|python|pytest|mkdocs|ruff|git|bash|lint-imports)\b")
+
+#: Steps of a fit that says nothing of steps.
+STEPS = 100
+#: Minutes that a fit may take as the page says.
+SHORT = 0.2
+#: What each command is given beside its own arguments, unless one of these options is there.
+CHEAPER = {
+    "fit": ["--steps", STEPS],
+    "tradeoff": ["--steps", STEPS],
+    "uncertainty": ["--steps", 100],
+    "compress": ["--passes", 1],
+}
+#: The page whose `foldgauss demo` takes all its steps; on others it takes `STEPS`.
+WHOLE_DEMO = "README.md"
+#: Of `tradeoff` without axes: one, instead of all eleven, each of which has tests of its own.
+ONE_AXIS = ["--axes", "power"]
+SIZE, NUM_FRAMES = (48, 80), 12
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, its text, and the line it begins at."""
+
+    language: str
+    text: str
+    line: int
+
+
+def blocks(page: str) -> Iterator[Block]:
+    """All fenced blocks of a page, those within lists and quotes too, in order."""
+    for token in MarkdownIt().enable("table").parse((ROOT / page).read_text()):
+        if token.type == "fence":
+            yield Block(token.info.strip(), token.content, token.map[0] + 1)
+        if token.type == "code_block":
+            yield Block("indented", token.content, token.map[0] + 1)
+
+
+def check_languages(page: str) -> None:
+    """Every block says what it is, and no command stands in an indented one."""
+    for block in blocks(page):
+        where = f"{page}:{block.line}"
+        if block.language == "indented":
+            assert not any(map(_COMMAND.match, block.text.splitlines())), f"{where}: a command; fence it as sh"
+        else:
+            assert block.language in RUN + READ, f"{where}: expected one of {RUN + READ}, got {block.language!r}"
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """The words of each command of a shell block."""
+    for line in text.replace("\\\n", " ").splitlines():
+        for command in line.removeprefix("$ ").split("&&"):
+            words = shlex.split(command, comments=True)
+            if words:
+                yield words
+
+
+def run_page(page: str, folder: Path, monkeypatch) -> dict:
+    """Run all of a page in `folder`; the names that its Python leaves."""
+    give(page, folder)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(video, "fit", _fit)
+    if page != WHOLE_DEMO:
+        monkeypatch.setattr(fitting, "DEMO_CONFIG", dataclasses.replace(fitting.DEMO_CONFIG, steps=STEPS))
+    names = {"__name__": "guide"}
+    # As a reader has JAX: the suite's own rules are stricter.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        _run_blocks(page, names)
+    return names
+
+
+def _run_blocks(page: str, names: dict) -> None:
+    for block in blocks(page):
+        if block.language == "python":
+            # Lines before it, so that a traceback tells the page's own.
+            source = "\n" * block.line + block.text
+            exec(compile(source, str(ROOT / page), "exec"), names)
+        elif block.language == "sh":
+            for words in commands(block.text):
+                _run_command(words, f"{page}:{block.line}")
+
+
+def _fit(frames, config: FitConfig | None = None, **options):
+    """`foldgauss.video.fit`, in `STEPS` steps where it would take minutes."""
+    config = FitConfig() if config is None else config
+    if config.steps is None and (config.minutes is None or config.minutes > SHORT):
+        config = dataclasses.replace(config, steps=STEPS, minutes=None, num_gaussians=config.num_gaussians or 600)
+    return fit(frames, config, **options)
+
+
+def _run_command(words: list[str], where: str) -> None:
+    tool = "benchmarks" if words[:2] == ["python", "-m"] and words[2].startswith("benchmarks") else words[0]
+    assert tool in _TOOLS, f"{where}: no way to run {tool!r} is known, see tests/guides.py"
+    _TOOLS[tool](words[1:], where)
+
+
+def _foldgauss(words: list[str], where: str) -> None:
+    more = CHEAPER.get(words[0], [])
+    given = {word.partition("=")[0] for word in words}
+    if not given & {"--steps", "--minutes", "--only"} and not (words[0] == "compress" and "--passes" in given):
+        words = [*words, *more]
+    if "--minutes" in given and words[0] in ("fit", "tradeoff"):
+        at = words.index("--minutes")
+        words = [*words[:at], *words[at + 2 :], *more]
+    if words[0] == "fit" and "--gaussians" not in given and "--preset" not in given:
+        words = [*words, "--gaussians", 600]
+    if words[0] == "tradeoff" and "--axes" not in given:
+        words = [*words, *ONE_AXIS]
+    with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(viewing.webbrowser, "open", lambda url: True)
+        patch.setattr(viewing._Server, "serve_forever", _ended)
+        # What a reader would see as a line; the suite makes errors of warnings, and few steps give some.
+        warnings.simplefilter("default")
+        code = run(*words)
+    assert code == 0, f"{where}: foldgauss {' '.join(map(str, words))}"
+
+
+def _ended(server) -> None:
+    raise KeyboardInterrupt
+
+
+def _pip(words: list[str], where: str) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [word for word in words[1:] if not word.startswith("-")]
+    if "-c" in words:
+        constraints = words[words.index("-c") + 1]
+        assert (ROOT / constraints).exists(), f"{where}: {constraints}"
+        asked.remove(constraints)
+    assert words[0] == "install"
+    assert asked, where
+    for requirement in asked:
+        name, extras = re.fullmatch(r"([\w.-]+?)(?:\[([\w,]+)\])?", requirement).groups()
+        assert name in (".", project["name"]), f"{where}: {requirement}"
+        for extra in (extras or "").split(","):
+            assert not extra or extra in project["optional-dependencies"], f"{where}: no extra {extra!r}"
+
+
+def _pytest(words: list[str], where: str) -> None:
+    markers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["markers"]
+    known = {marker.partition(":")[0] for marker in markers}
+    for option, value in zip(words[::2], words[1::2], strict=False):
+        if option == "-m":
+            assert value in known, f"{where}: no marker {value!r}"
+    for word in words:
+        if word.startswith("tests"):
+            assert (ROOT / word.partition("::")[0]).exists(), f"{where}: {word}"
+
+
+def _benchmark(words: list[str], where: str) -> None:
+    """Its parser takes the arguments; it measures nothing here."""
+    module = importlib.import_module(words[1])
+
+    class Parsed(Exception):
+        """Stops a benchmark once its arguments are parsed."""
+
+    def parse_args(self, args=None, namespace=None):
+        parse(self, args, namespace)
+        raise Parsed
+
+    parse = argparse.ArgumentParser.parse_args
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(argparse.ArgumentParser, "parse_args", parse_args)
+        try:
+            module.main(words[2:])
+        except Parsed:
+            return
+        except SystemExit as stopped:
+            pytest.fail(f"{where}: python -m {' '.join(words[1:])} is refused ({stopped.code})")
+    pytest.fail(f"{where}: {words[1]} parses no arguments")
+
+
+def _developer_tool(name: str):
+    """A tool that an extra installs."""
+
+    def check(words: list[str], where: str) -> None:
+        del words
+        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        named = {re.split(r"[\[<>=]", requirement)[0] for extra in extras.values() for requirement in extra}
+        assert name in named, f"{where}: no extra installs {name}"
+
+    return check
+
+
+def _bash(words: list[str], where: str) -> None:
+    assert (ROOT / words[0]).exists(), f"{where}: {words[0]}"
+
+
+_TOOLS = {
+    "foldgauss": _foldgauss,
+    "pip": _pip,
+    "pytest": _pytest,
+    "benchmarks": _benchmark,
+    "ruff": _developer_tool("ruff"),
+    "lint-imports": _developer_tool("import-linter"),
+    "mkdocs": _developer_tool("mkdocs"),
+    "jupyter": _developer_tool("jupyterlab"),
+    "bash": _bash,
+}
+
+
+# What pages take for granted.
+
+
+def _clip() -> np.ndarray:
+    return datasets.bikes(frames=(30, 30 + NUM_FRAMES), size=SIZE).frames  # something moves
+
+
+def _video(name: str):
+    def make(folder: Path) -> None:
+        write_video(folder / name, _clip(), 25.0)
+
+    return make
+
+
+def _model(name: str):
+    def make(folder: Path) -> None:
+        model = fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
+        save_video_model(folder / name, model)
+
+    return make
+
+
+def _images(name: str):
+    def make(folder: Path) -> None:
+        (folder / name).mkdir(parents=True)
+        for k, frame in enumerate(_clip()):
+            write_image(folder / name / f"{k:05}.png", frame)
+
+    return make
+
+
+def ball_masks() -> np.ndarray:
+    """Of something that rolls to the right, one for each frame."""
+    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
+    return np.stack([(x - 20 - 3 * k) ** 2 + (y - 24) ** 2 < 90 for k in range(NUM_FRAMES)])
+
+
+def _masks(folder: Path) -> None:
+    (folder / "masks").mkdir()
+    for k, mask in enumerate(ball_masks()):
+        Image.fromarray(255 * mask.astype(np.uint8)).save(folder / "masks" / f"{k:05}.png")
+
+
+def _davis(folder: Path) -> None:
+    """A tree of DAVIS' layout with the sequence bear."""
+    for part in ("JPEGImages", "Annotations"):
+        (folder / "DAVIS" / part / "480p" / "bear").mkdir(parents=True)
+    for k in range(4):
+        picture = np.full((480, 480, 3), 20 * k, np.uint8)
+        cv2.imwrite(str(folder / "DAVIS" / "JPEGImages" / "480p" / "bear" / f"{k:05}.jpg"), picture)
+        mask = Image.fromarray(np.zeros((480, 480), np.uint8)).convert("P")
+        mask.save(folder / "DAVIS" / "Annotations" / "480p" / "bear" / f"{k:05}.png")
+
+
+def _edit_script(folder: Path) -> None:
+    (folder / "edits.toml").write_text('[[edits]]\ndo = "rotate"\ndegrees = 5\nabout = [0, 0]\n')
+
+
+def _ply(folder: Path) -> None:
+    """A video as the published code writes it."""
+    model = fit(_clip(), FitConfig(num_gaussians=100, steps=5), fps=24.0).model
+    export(model, "ply", folder / "point_cloud.ply")
+
+
+#: By name as pages write it.
+THINGS = {
+    **{name: _video(name) for name in ("holiday.mp4", "clip.mp4", "bunny.mp4")},
+    **{f"{name}.safetensors": _model(f"{name}.safetensors") for name in ("holiday", "model", "bunny")},
+    "folder/of/images": _images("folder/of/images"),
+    "masks": _masks,
+    "point_cloud.ply": _ply,
+    "DAVIS": _davis,
+    "edits.toml": _edit_script,
+}
+#: What each page takes for granted.
+GIVEN = {
+    "README.md": ("holiday.mp4", "masks"),
+    "docs/commands.md": ("holiday.mp4", "edits.toml"),
+    "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/editing.md": ("holiday.safetensors", "edits.toml", "point_cloud.ply"),
+    "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
+    "docs/economy.md": ("clip.mp4",),
+    "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/player.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/quickstart.md": ("holiday.mp4",),
+    "docs/results.md": ("bunny.mp4", "bunny.safetensors"),
+    "docs/slow-motion.md": ("holiday.mp4",),
+    "docs/tradeoff.md": ("holiday.mp4",),
+    "docs/uncertainty.md": ("clip.mp4", "model.safetensors"),
+}
+
+
+def give(page: str, folder: Path) -> None:
+    for name in GIVEN.get(page, ()):
+        THINGS[name](folder)

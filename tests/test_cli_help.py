@@ -1,0 +1,221 @@
+"""Help, examples, what the Tab key offers, and the names of outputs that were given none."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from commands import run
+from soft_models import soft_model
+
+from foldgauss import cli
+from foldgauss.cli._help import EXAMPLES
+from foldgauss.cli._shared import TIME_LEFT, app
+from foldgauss.io import save_video_model, write_video
+
+#: Of a terminal; Typer's help and ours go by it.
+WIDTHS = (80, 160)
+
+
+def commands() -> dict[str, object]:
+    """Every command by its name as it is typed, groups too."""
+    root = typer.main.get_command(app)
+    found = {"": root}
+    for name, command in root.commands.items():
+        found[name] = command
+        found |= {f"{name} {inner}": one for inner, one in getattr(command, "commands", {}).items()}
+    return found
+
+
+NAMES = sorted(commands())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_command_has_examples_that_parse(name):
+    assert EXAMPLES.get(name), f"foldgauss {name} --help shows no example"
+    for example in EXAMPLES[name]:
+        words = shlex.split(example.line.partition(" > ")[0])
+        assert words[0] == "foldgauss"
+        assert " ".join(words[1:]).startswith(name)
+        assert len(example.line) < 90, "longer than most terminals are wide"
+        command, rest = commands()[""], words[1:]
+        while rest and hasattr(command, "commands") and not rest[0].startswith("-"):
+            command, rest = command.commands[rest[0]], rest[1:]
+        if rest != ["--install-completion"]:
+            command.make_context("foldgauss", rest)  # raises for an option that there is not
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", NAMES)
+def test_help_shows_options_defaults_and_examples(name, width, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert run(*name.split(), "--help") == 0
+    told = capsys.readouterr().out
+    for example in EXAMPLES[name]:
+        assert f"     {example.line}\n" in told  # whole, to be copied
+    panels = told.partition(" Examples\n")[0]
+    assert all(len(line) <= width for line in panels.splitlines())
+    text = " ".join(re.sub("[│╭╮╰╯─]", " ", panels).split())
+    for parameter in commands()[name].params:
+        if parameter.param_type_name == "option":
+            assert parameter.opts[0] in text
+    assert "\\[" not in text  # brackets are told as they are
+
+
+def test_defaults_are_told_in_brackets(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run("fit", "--help") == 0
+    told = capsys.readouterr().out
+    for text in ("[default: standard]", "[default: 1/255, or what was fitted with]", "in this folder]"):
+        assert text in told
+
+
+def test_alone_it_shows_the_first_command(capsys):
+    run()
+    told = capsys.readouterr()
+    assert "foldgauss demo" in told.out + told.err
+
+
+def completions(words: str, folder: Path, monkeypatch, capsys) -> list[str]:
+    """What bash is told for the last of these words."""
+    typed = f"foldgauss {words}"
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("_FOLDGAUSS_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", typed)
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split(" ")) - 1))
+    run()
+    return [line for line in capsys.readouterr().out.split("\n") if line]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("re", ["render"]),
+        ("figure ", ["interpolation", "reconstruction"]),
+        ("fit --preset ", ["standard", "draft", "paper"]),
+        ("fit --preset dr", ["draft"]),
+        ("fit --compositing ", ["over", "sum"]),
+        ("fit --between", ["--between-share"]),
+        ("export m.safetensors --format ply", ["ply", "ply3dgs"]),
+        ("render m.safetensors --format ", ["png", "webp"]),
+        ("uncertainty m c --noise s", ["score"]),
+        ("tradeoff clip.mp4 --axes ti", ["time"]),
+        ("tradeoff clip.mp4 --axes time,deg", ["time,degree"]),
+        ("render ", ["clips/", "one model.safetensors", "small.fgz"]),
+        ("render sm", ["small.fgz"]),
+        ("fit ", ["clips/", "holiday.mp4"]),
+        ("fit cl", ["clips/a.webm", "clips/b.MOV"]),  # into the only folder
+        ("edit small.fgz ", ["clips/", "night.toml"]),
+        ("fit clips/nothing", []),
+        ("fit missing/", []),
+    ],
+)
+def test_completion(words, expected, tmp_path, monkeypatch, capsys):
+    for name in ("one model.safetensors", "small.fgz", "holiday.mp4", "night.toml", "notes.txt", ".hidden.mp4"):
+        (tmp_path / name).touch()
+    (tmp_path / "clips").mkdir()
+    for name in ("a.webm", "b.MOV", "c.txt"):
+        (tmp_path / "clips" / name).touch()
+    assert completions(words, tmp_path, monkeypatch, capsys) == expected
+
+
+def test_completion_is_offered_to_the_shell():
+    """By another process, with Typer's own switch for tests: else it looks for the shell that it runs in."""
+    words = [sys.executable, "-m", "foldgauss", "--show-completion", "bash"]
+    env = os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    told = subprocess.run(words, env=env, capture_output=True, text=True, timeout=120)
+    assert "_FOLDGAUSS_COMPLETE=complete_bash" in told.stdout
+    assert told.stdout.rstrip().endswith("foldgauss")
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A clip and a model, as `foldgauss fit holiday.mp4` leaves them."""
+    folder = tmp_path_factory.mktemp("work")
+    model = soft_model()
+    write_video(folder / "holiday.mp4", model.frames(), 12.0)
+    save_video_model(folder / "holiday.safetensors", model, metadata={"clip": "holiday.mp4"})
+    save_video_model(folder / "beach.safetensors", model, metadata={"clip": "holiday.mp4"})
+    (folder / "night.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    return folder
+
+
+@pytest.fixture
+def here(work, tmp_path, monkeypatch):
+    for path in work.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [
+        ("render beach.safetensors", "beach.mp4"),
+        ("render holiday.safetensors", "holiday.rendered.mp4"),  # not the clip
+        ("render beach.safetensors --times 0.5", "beach.png"),
+        ("render beach.safetensors --format webp", "beach-frames"),
+        ("edit holiday.safetensors night.toml", "holiday.night.safetensors"),
+        ("compress holiday.safetensors --float16", "holiday.float16.safetensors"),
+        ("export holiday.safetensors --format ply", "holiday.ply"),
+        ("export holiday.safetensors --format ply3dgs", "holiday-3dgs"),
+        ("export holiday.safetensors --format ply3dgs --times 0.5", "holiday.3dgs.ply"),
+        ("export holiday.safetensors --format obj", "holiday-obj"),
+        ("export holiday.safetensors --format html", "holiday.html"),
+        ("figure interpolation holiday.safetensors", "holiday.interpolation.png"),
+        ("figure reconstruction holiday.safetensors holiday.mp4", "holiday.reconstruction.png"),
+    ],
+)
+def test_outputs_are_named_after_inputs(words, made, here, capsys):
+    before = {path.name: path.read_bytes() for path in here.iterdir()}
+    assert run(*words.split()) == 0, capsys.readouterr().err
+    assert {path.name for path in here.iterdir()} - before.keys() == {made}
+    assert made in capsys.readouterr().out  # its name is told
+    assert run(*words.split()) != 0  # and not replaced
+    told = " ".join(capsys.readouterr().err.split())
+    assert made in told
+    assert "overwrite" in told
+    assert run(*words.split(), "--overwrite") == 0, capsys.readouterr().err
+    assert {name: (here / name).read_bytes() for name in before} == before
+
+
+def test_imports_are_named_after_inputs(here, capsys):
+    assert run("export", "holiday.safetensors", "--format", "ply", "--out", "video.ply") == 0
+    assert run("export", "holiday.safetensors", "--format", "obj", "--out", "mesh") == 0
+    assert run("import", "video.ply") == 0
+    assert run("import", "mesh") == 0
+    assert (here / "video.safetensors").exists()
+    assert (here / "mesh.mp4").exists()
+    assert "mesh.mp4" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "render holiday.safetensors --out holiday.safetensors",
+        "edit holiday.safetensors night.toml --out holiday.safetensors",
+        "compress holiday.safetensors --float16 --out holiday.safetensors",
+        "export holiday.safetensors --format ply --out holiday.safetensors",
+        "evaluate holiday.safetensors holiday.mp4 --json holiday.safetensors",
+        "evaluate holiday.safetensors holiday.mp4 --json holiday.mp4",
+    ],
+)
+def test_no_input_is_overwritten(words, here, capsys):
+    before = {path.name: path.read_bytes() for path in here.iterdir()}
+    assert run(*words.split(), "--overwrite") == 2
+    assert "expected" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in here.iterdir()} == before
+
+
+def test_bars_tell_the_time_left():
+    from rich.progress import TimeRemainingColumn
+
+    assert any(isinstance(column, TimeRemainingColumn) for column in TIME_LEFT)
+    sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.glob("*.py")}
+    bars = [name for name, text in sources.items() if "BarColumn(" in text]
+    assert bars
+    assert all("TIME_LEFT" in sources[name] for name in bars)
