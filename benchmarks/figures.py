@@ -1,0 +1,276 @@
+"""The pictures of README and of docs/concepts.md.
+
+    python -m benchmarks.figures [--out FOLDER] [--only NAME ...] [--models FOLDER]
+
+*density*, *shapes* and *marginals* are drawn from distributions of two coordinates. *sheet*, *pipeline* and *cameras*
+show 25 frames of *bikes* at 160x384, the rider of `benchmarks.editing`, fitted with 20,000 Gaussians in 3,000 steps,
+half of which learn what lies between frames; `--models` keeps that model, and takes the one that is there.
+"""
+
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.collections import EllipseCollection
+from matplotlib.transforms import Affine2D
+
+from benchmarks import _common
+from benchmarks.editing import Scene, fitted, rider
+from foldgauss import Constant, FoldedGaussian, PolynomialFold, TimeLikelihood, ZeroFold
+from foldgauss.io._atomic import atomic_path
+from foldgauss.plot import plot_density
+from foldgauss.render import Camera, Gaussians3D, project, render
+from foldgauss.video import FitConfig, VideoModel, by_mask
+
+BLUE, RED, GREY = "#2b5c8a", "#c2452d", "#5a5f66"
+DPI = 140
+#: The clip is dark: it is shown so many times as bright.
+BRIGHTNESS = 1.6
+#: Frames that the sheet shows, one a column.
+SHOWN = (2, 5, 8)
+CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, between_share=0.5)
+#: One in so many Gaussians has its outline drawn.
+EVERY = 4
+
+
+def bent() -> FoldedGaussian:
+    """The example of all pictures: a cubic that narrows away from its time."""
+    return FoldedGaussian(
+        loc=jnp.zeros(1),
+        scale_tril=jnp.array([[0.16]]),
+        time_loc=0.5,
+        time_scale=0.18,
+        fold=PolynomialFold(jnp.array([[-0.4], [3.0], [9.0]])),
+        envelope=TimeLikelihood(power=1),
+    )
+
+
+def density() -> plt.Figure:
+    """The density with its curve, and what it is at three times."""
+    fig, ax = plt.subplots(figsize=(7.4, 4.2))
+    plot_density(bent(), ax, slices=[0.25, 0.5, 0.75])
+    ax.set(xlabel="time t", ylabel="space s")
+    note = {"arrowprops": {"arrowstyle": "->", "color": GREY, "lw": 0.8}, "color": GREY, "fontsize": 9}
+    low, high = ax.get_ylim()
+    ax.annotate("centre $m_s + f(m_t - t)$", (0.36, float(_centre(0.36))), (0.3, high - 0.1 * (high - low)), **note)
+    ax.annotate("$s\\,|\\,t$ is a Gaussian with\nvariance $a(t)\\,\\Sigma$", (0.77, float(_centre(0.75))),
+                (0.72, low + 0.75 * (high - low)), **note)  # fmt: skip
+    return fig
+
+
+def _centre(t: float) -> np.ndarray:
+    return np.asarray(bent().condition_time(t).loc)[0]
+
+
+def marginals() -> plt.Figure:
+    """The same density with its two marginals: of time, normal; of space, not."""
+    dist = bent()
+    fig, axes = plt.subplots(2, 2, figsize=(7.4, 4.6), width_ratios=(4, 1.2), height_ratios=(1.2, 4))
+    plot_density(dist, axes[1, 0], slices=())
+    t, s = np.linspace(*axes[1, 0].get_xlim(), 300), np.linspace(*axes[1, 0].get_ylim(), 300)
+    of_time = np.exp(np.asarray(dist.time_marginal.log_prob(jnp.asarray(t))))
+    of_space = np.exp(np.asarray(dist.marginal([0]).log_prob(jnp.asarray(s)[:, None])))
+    axes[0, 0].fill_between(t, of_time, color=BLUE, alpha=0.3, lw=0)
+    axes[0, 0].plot(t, of_time, color=BLUE)
+    axes[0, 0].set_title(r"$t \sim N(m_t, \sigma_t^2)$", fontsize=10, color=GREY)
+    axes[1, 1].fill_betweenx(s, of_space, color=RED, alpha=0.3, lw=0)
+    axes[1, 1].plot(of_space, s, color=RED)
+    axes[1, 1].set_title("$s$: an integral\nover $t$", fontsize=10, color=GREY)
+    axes[0, 1].axis("off")
+    for ax in (axes[0, 0], axes[1, 1]):
+        ax.set(xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+    axes[0, 0].set_xlim(axes[1, 0].get_xlim())
+    axes[1, 1].set_ylim(axes[1, 0].get_ylim())
+    axes[1, 0].set(xlabel="time t", ylabel="space s")
+    return fig
+
+
+def shapes() -> plt.Figure:
+    """What f and a do: columns are folds, rows envelopes."""
+    folds = {
+        "f = 0": ZeroFold(1),
+        "f(u) = u: straight": PolynomialFold([[1.6]]),
+        "u²: a turn": PolynomialFold([[0.0], [6.0]]),
+        "u³: out and on": PolynomialFold([[-0.8], [0.0], [14.0]]),
+    }
+    envelopes = {"a = 1": Constant(), "power 1": TimeLikelihood(power=1), "power 2": TimeLikelihood(power=2)}
+    fig, axes = plt.subplots(3, 4, figsize=(9.6, 5.6), sharex=True, sharey=True)
+    for row, (a_name, envelope) in zip(axes, envelopes.items(), strict=True):
+        for ax, (f_name, fold) in zip(row, folds.items(), strict=True):
+            dist = FoldedGaussian(
+                jnp.zeros(1),
+                scale_tril=jnp.array([[0.14]]),
+                time_loc=0.5,
+                time_scale=0.16,
+                fold=fold,
+                envelope=envelope,
+            )
+            plot_density(dist, ax, t_limits=(0, 1), s_limits=(-0.75, 0.75))
+            ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
+            if row is axes[0]:
+                ax.set_title(f_name, fontsize=10)
+        row[0].set_ylabel(a_name)
+    return fig
+
+
+def sheet(scene: Scene, model: VideoModel) -> np.ndarray:
+    """Rows: the frames, the model's, those half way to the next ones, and with the rider three times."""
+    times = np.asarray(model.frame_times.times())
+    shown = np.array(SHOWN)
+    between = (times[shown] + times[shown + 1]) / 2
+    it = by_mask(model, scene.masks)
+    edited = scene.edits["multiply"](model, it)
+    rows = {
+        "the clip": scene.frames[shown],
+        "the model": np.stack(list(model.frames(times[shown]))),
+        "half a frame later": np.stack(list(model.frames(between))),
+        "edited": np.stack(list(edited.frames(times[shown]))),
+    }
+    lines = []
+    for name, pictures in rows.items():
+        bright = (BRIGHTNESS * pictures.astype(np.float64)).round().clip(0, 255).astype(np.uint8)
+        line = np.concatenate([np.pad(one, ((2, 2), (2, 2), (0, 0)), constant_values=255) for one in bright], axis=1)
+        for color, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+            cv2.putText(line, name, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, color, thickness, cv2.LINE_AA)
+        lines.append(line)
+    return np.concatenate(lines)
+
+
+def pipeline(scene: Scene, model: VideoModel) -> plt.Figure:
+    """From frames to pictures: optical flow, Gaussians, a picture between two frames."""
+    k = SHOWN[1]
+    t = float(np.asarray(model.frame_times.times())[k])
+    fig, axes = plt.subplots(2, 2, figsize=(9.6, 4.7))
+    panels = {
+        "1  frames, and what moves in them": _bright(scene.frames[k]),
+        "2  Gaussians start along the flow (colour: direction)": _flow(scene.frames[k], scene.frames[k + 1]),
+        f"3  fitted, conditioned on t (one in {EVERY} drawn)": np.full_like(scene.frames[k], 255),
+        "4  blended front to back: a picture, at any t": _bright(next(model.frames(np.array([t])))),
+    }
+    for ax, (title, picture) in zip(axes.flat, panels.items(), strict=True):
+        ax.imshow(picture)
+        ax.set_title(title, fontsize=10, loc="left")
+        ax.axis("off")
+    _outlines(axes[1, 0], model, t)
+    return fig
+
+
+def _bright(picture: np.ndarray) -> np.ndarray:
+    return (BRIGHTNESS * picture.astype(np.float64)).round().clip(0, 255).astype(np.uint8)
+
+
+def _flow(frame: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Optical flow as colour: hue is direction, paleness is rest."""
+    grey = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in (frame, after)]
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*grey, None)
+    length, angle = cv2.cartToPolar(flow[..., 0], flow[..., 1])
+    saturation = np.clip(length / np.quantile(length, 0.98), 0, 1)
+    hsv = np.stack([angle * 90 / np.pi, 255 * saturation, np.full_like(length, 255)], -1)
+    return cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB)
+
+
+def _outlines(ax: plt.Axes, model: VideoModel, t: float) -> None:
+    """Two-sigma ellipses of some of the Gaussians alive at t, in their colours."""
+    splats = model.at(t)
+    alive = np.flatnonzero(np.asarray(splats.opacity) > 0.05)[::EVERY][::-1]  # the front ones are drawn last
+    factor = np.asarray(splats.factor)[alive]
+    axes, scale, _ = np.linalg.svd(factor)
+    angle = np.degrees(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
+    color = np.clip(BRIGHTNESS * np.asarray(splats.color)[alive], 0, 1)
+    ellipses = EllipseCollection(
+        *(4 * scale.T), angle, units="xy", offsets=np.asarray(splats.mean)[alive], offset_transform=ax.transData,
+        facecolors=np.concatenate([color, np.full((len(color), 1), 0.35)], 1), edgecolors=color, linewidths=0.6,
+    )  # fmt: skip
+    ax.add_collection(ellipses)
+    ax.set(xlim=(0, model.size[1]), ylim=(model.size[0], 0))
+
+
+def cameras(scene: Scene, model: VideoModel) -> plt.Figure:
+    """Flat Gaussians between two cameras, and what each sees, and a third from the side."""
+    height, width = model.size
+    aspect, k = height / width, SHOWN[1]
+    t = float(np.asarray(model.frame_times.times())[k])
+    flat = Gaussians3D.from_flat(model.splats.at(jnp.asarray(t, jnp.float32)))
+    front = Camera.front(aspect=aspect)
+    views = {
+        "the front camera's picture": (front, "depth"),
+        "the opposing camera's: mirrored": (Camera.opposing(aspect=aspect), "depth"),
+        "from the side": (front.orbit(0.6, 0.15), "array"),
+    }
+    fig = plt.figure(figsize=(9.6, 5.2))
+    _stage(fig.add_subplot(2, 2, 1), _bright(scene.frames[k]), front, aspect)
+    for place, (title, (camera, order)) in zip((2, 3, 4), views.items(), strict=True):
+        picture = np.asarray(render(project(flat, camera, model.size, order=order), model.size))
+        ax = fig.add_subplot(2, 2, place)
+        ax.imshow(np.clip(BRIGHTNESS * picture, 0, 1))
+        ax.set_title(title, fontsize=10)
+        ax.axis("off")
+    return fig
+
+
+def _stage(ax: plt.Axes, picture: np.ndarray, front: Camera, aspect: float) -> None:
+    """The plane with its picture between both cameras, in oblique projection: depth runs to the right."""
+    away = abs(float(np.asarray(front.position)[2]))
+    drawn = np.array([[0.45, 0.0, 1.0], [0.25, -1.0, 0.0]])  # of (x, y down, z): to the right, and up
+    across, down = drawn[:, 0], drawn[:, 1] * aspect
+    corner = -0.5 * (across + down)
+    plane = Affine2D.from_values(*across, *down, *corner) + ax.transData
+    ax.imshow(picture, extent=(0, 1, 1, 0), transform=plane, interpolation="bilinear")
+    for side, color, name in ((-1, BLUE, "front"), (1, RED, "opposing")):
+        camera = drawn @ [0, 0, side * away]
+        for x in (-0.5, 0.5):
+            for y in (-0.5, 0.5):
+                ax.plot(*np.stack([camera, x * across + y * down], 1), color=color, lw=0.9)
+        ax.plot(*camera, "o", color=color, ms=7)
+        ax.annotate(name, camera, (0, 10), textcoords="offset points", ha="center", color=color, fontsize=10)
+    ax.set(xlim=(-1.15 * away, 1.15 * away), ylim=(-0.55, 0.55), aspect="equal")
+    ax.axis("off")
+
+
+DRAWN = {"density": density, "marginals": marginals, "shapes": shapes}
+FROM_CLIP = {"sheet": sheet, "pipeline": pipeline, "cameras": cameras}
+#: Files carry what they are of.
+PREFIX = dict.fromkeys((*DRAWN, *FROM_CLIP), "concept-") | {"sheet": ""}
+
+
+def write(path: Path, made: plt.Figure | np.ndarray) -> None:
+    with atomic_path(path) as temporary:
+        if isinstance(made, np.ndarray):
+            picture = cv2.cvtColor(made, cv2.COLOR_RGB2BGR)
+            temporary.write_bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+        else:
+            made.tight_layout()
+            made.savefig(temporary, dpi=DPI, format="png", facecolor="white")
+            plt.close(made)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = _common.parser(__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs"), metavar="FOLDER", help="[docs]")
+    parser.add_argument("--only", choices=(*DRAWN, *FROM_CLIP), action="append", metavar="NAME", help="[all]")
+    parser.add_argument("--models", type=Path, metavar="FOLDER", help="keep the model there, or take it from there")
+    options = _common.parse(parser, arguments)
+    matplotlib.use("Agg")
+    wanted = options.only or (*DRAWN, *FROM_CLIP)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in wanted:
+        if name in DRAWN:
+            write(options.out / f"{PREFIX[name]}{name}.png", DRAWN[name]())
+    if set(wanted) & FROM_CLIP.keys():
+        if options.models is not None:
+            options.models.mkdir(parents=True, exist_ok=True)
+        scene = rider()
+        model = fitted(scene._replace(name="figures"), CONFIG, options.models)
+        for name in wanted:
+            if name in FROM_CLIP:
+                made = FROM_CLIP[name](scene, model)
+                suffix = "jpg" if isinstance(made, np.ndarray) else "png"
+                write(options.out / f"{PREFIX[name]}{name}.{suffix}", made)
+
+
+if __name__ == "__main__":
+    main()
