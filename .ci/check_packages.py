@@ -24,18 +24,19 @@ ADDED = {"PKG-INFO", ".gitignore"}
 
 def name_of(requirement: str) -> str:
     """The name of `name==version`, as the index normalises it."""
-    return re.sub(r"[-_.]+", "-", re.split(r"==| @ ", requirement.strip())[0]).lower()
+    return re.sub(r"[-_.]+", "-", requirement.partition("==")[0]).lower()
 
 
 def pins(constraints: str, python: str) -> None:
     """Every distribution installed beside `python` has a line in `constraints`."""
     lines = Path(constraints).read_text().splitlines()
     pinned = {name_of(line) for line in lines if line and not line.startswith("#")}
-    frozen = subprocess.run([python, "-m", "pip", "freeze", "--all"], check=True, capture_output=True, text=True).stdout
-    unpinned = {name_of(line) for line in frozen.splitlines() if not line.startswith("#")} - pinned - ITS_OWN
+    words = [python, "-m", "pip", "list", "--format", "freeze"]
+    listed = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    unpinned = {name_of(line) for line in listed.splitlines()} - pinned - ITS_OWN
     if unpinned:
         raise SystemExit(f"{constraints}: expected every distribution that is installed, lacks {sorted(unpinned)}")
-    print(f"pinned: all {len(frozen.splitlines())} distributions")
+    print(f"pinned: all {len(listed.splitlines())} distributions")
 
 
 def imports(checkout: str) -> None:
