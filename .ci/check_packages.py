@@ -62,9 +62,13 @@ def imports(checkout: str) -> None:
 
 
 def contents(checkout: str, *packages: str) -> None:
-    """The wheel holds all of foldgauss/ and nothing else, the sdist all that git knows."""
-    listed = subprocess.run(["git", "ls-files"], cwd=checkout, check=True, capture_output=True, text=True).stdout
-    known = {name for name in listed.splitlines() if (Path(checkout) / name).exists()} - LEFT_OUT
+    """The wheel holds all of foldgauss/ and nothing else, the sdist all that git knows, or would after `git add`."""
+    words = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    told = subprocess.run(words, cwd=checkout, capture_output=True, text=True)
+    if told.returncode:
+        print(f"contents NOT COMPARED: {checkout} is no checkout of git")
+        return
+    known = {name for name in told.stdout.splitlines() if (Path(checkout) / name).exists()} - LEFT_OUT
     for package in packages:
         if package.endswith(".whl"):
             with zipfile.ZipFile(package) as archive:
