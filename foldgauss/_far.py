@@ -21,9 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Primitive, unmapped_aval
+from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
+
+try:
+    from jax.extend.core import unmapped_aval
+except ImportError:  # of older JAX
+    from jax.core import unmapped_aval
 
 __all__ = ["far_reaching"]
 

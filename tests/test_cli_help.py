@@ -13,8 +13,10 @@ from commands import run
 from soft_models import soft_model
 
 from foldgauss import cli
+from foldgauss.cli._app import app, loaded
+from foldgauss.cli._commands import COMMANDS
 from foldgauss.cli._help import EXAMPLES
-from foldgauss.cli._shared import TIME_LEFT, app
+from foldgauss.cli._shared import TIME_LEFT
 from foldgauss.io import save_video_model, write_video
 
 #: Of a terminal; Typer's help and ours go by it.
@@ -23,9 +25,9 @@ WIDTHS = (80, 160)
 
 def commands() -> dict[str, object]:
     """Every command by its name as it is typed, groups too."""
-    root = typer.main.get_command(app)
-    found = {"": root}
-    for name, command in root.commands.items():
+    every = loaded()
+    found = {"": typer.main.get_command(app)}
+    for name, command in every.items():
         found[name] = command
         found |= {f"{name} {inner}": one for inner, one in getattr(command, "commands", {}).items()}
     return found
@@ -64,6 +66,12 @@ def test_help_shows_options_defaults_and_examples(name, width, capsys, monkeypat
         if parameter.param_type_name == "option":
             assert parameter.opts[0] in text
     assert "\\[" not in text  # brackets are told as they are
+
+
+def test_the_list_of_commands_says_what_each_says_of_itself():
+    assert sorted(loaded()) == sorted(COMMANDS)
+    for name, command in loaded().items():
+        assert command.help.partition("\n\n")[0] == COMMANDS[name].what
 
 
 def test_defaults_are_told_in_brackets(capsys, monkeypatch):

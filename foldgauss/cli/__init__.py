@@ -7,18 +7,7 @@ from typing import Annotated
 import typer
 
 from foldgauss import __version__
-from foldgauss.cli import (  # noqa: F401 - each adds its own
-    compressing,
-    doctor,
-    drawing,
-    editing,
-    figures,
-    fitting,
-    tradeoff,
-    uncertainty,
-    viewing,
-)
-from foldgauss.cli._shared import Stopped, WrongUse, app, as_option, err, out
+from foldgauss.cli._app import Stopped, WrongUse, app, as_option, err, loaded, out
 
 WRONG_USE, FAILURE = 2, 1
 
@@ -81,8 +70,10 @@ def _exit_code(error: BaseException) -> int:
 
 def _names_an_option(text: str) -> bool:
     """Whether an error of the floors below is about what the user gave by an option of the same name."""
-    commands = list(typer.main.get_command(app).commands.values())
+    if ":" not in text:
+        return False
+    commands = list(loaded().values())
     for command in commands:  # of groups, those within too
         commands.extend(getattr(command, "commands", {}).values())
     options = {option for command in commands for part in command.params for option in part.opts}
-    return ":" in text and as_option(text).partition(":")[0] in options
+    return as_option(text).partition(":")[0] in options

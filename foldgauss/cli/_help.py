@@ -143,22 +143,8 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
 )
 
 
-class _Command(typer.core.TyperCommand):
-    def __init__(self, *arguments: Any, **options: Any):
-        super().__init__(*arguments, **options)
-        _as_plain_text(self)
-
-    def format_help(self, ctx, formatter) -> None:
-        _show_help(self, ctx)
-
-
-class _Group(typer.core.TyperGroup):
-    """The commands as one comes to need them; typer has them as they were registered."""
-
-    _ORDER = (
-        *("fit", "view", "render", "evaluate", "info", "figure", "uncertainty", "edit", "compress", "tradeoff"),
-        *("export", "import", "doctor", "demo"),
-    )
+class Command(typer.core.TyperCommand):
+    """A command whose help has examples."""
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
@@ -167,9 +153,16 @@ class _Group(typer.core.TyperGroup):
     def format_help(self, ctx, formatter) -> None:
         _show_help(self, ctx)
 
-    def list_commands(self, ctx) -> list[str]:
-        others = set(self.commands).difference(self._ORDER)
-        return [name for name in (*self._ORDER, *sorted(others)) if name in self.commands]
+
+class Group(typer.core.TyperGroup):
+    """A group whose help has examples."""
+
+    def __init__(self, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
+        _as_plain_text(self)
+
+    def format_help(self, ctx, formatter) -> None:
+        _show_help(self, ctx)
 
 
 class App(typer.Typer):
@@ -177,13 +170,13 @@ class App(typer.Typer):
 
     def __init__(self, **options: Any):
         # Without markup errors stay on one line; help has its own way, below.
-        super().__init__(cls=_Group, rich_markup_mode=None, **options)
+        super().__init__(**({"cls": Group} | options), rich_markup_mode=None)
 
     def command(self, name: str | None = None, **options: Any) -> Callable:
-        return super().command(name, **({"cls": _Command} | options))
+        return super().command(name, **({"cls": Command} | options))
 
 
-def _as_plain_text(command: "_Command | _Group") -> None:
+def _as_plain_text(command: "Command | Group") -> None:
     """Brackets are no markup in our texts, and the ends of source lines no ends of lines."""
     paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
     command.help = escape("\n\n".join(" ".join(one.split()) for one in paragraphs))
@@ -192,7 +185,7 @@ def _as_plain_text(command: "_Command | _Group") -> None:
             parameter.help = escape(parameter.help)
 
 
-def _show_help(command: "_Command | _Group", ctx) -> None:
+def _show_help(command: "Command | Group", ctx) -> None:
     from typer import rich_utils  # for help alone: it brings a reader of Markdown
 
     rich_utils.rich_format_help(obj=command, ctx=ctx, markup_mode="rich")

@@ -11,13 +11,14 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from foldgauss._checks import invalid
+from foldgauss.cli._app import Stopped as Stopped
+from foldgauss.cli._app import WrongUse, as_option, err, out
+from foldgauss.cli._app import app as app
 from foldgauss.cli._completion import clip_files, model_files
-from foldgauss.cli._help import App
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.video_file import (
     ANIMATION_SUFFIXES,
@@ -36,11 +37,6 @@ from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
-
-app = App(no_args_is_help=True, pretty_exceptions_enable=False)
-# No markup: names of files may hold brackets.
-out = Console(markup=False, highlight=False)
-err = Console(stderr=True, markup=False, highlight=False)
 
 #: Of a bar, after the time that has gone.
 TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
@@ -84,14 +80,6 @@ TransmittanceStop = Annotated[
         rich_help_panel=PICTURE,
     ),
 ]
-
-
-class WrongUse(ValueError):
-    """The command was called with arguments that cannot be right."""
-
-
-class Stopped(Exception):
-    """The user asked a fit, or a sampler, to stop; the message says how to go on."""
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
@@ -322,13 +310,6 @@ def short(value: Any) -> str:
 def write_json(path: Path, figures: dict[str, Any]) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(figures, indent=2) + "\n")
-
-
-def as_option(text: str) -> str:
-    """An error about a setting, as one about its option: num_gaussians is --gaussians."""
-    name, colon, rest = text.partition(":")
-    name = name.replace("num_gaussians", "gaussians").replace("economy.psnr", "smallest_at_psnr")
-    return f"--{name.replace('_', '-')}{colon}{rest}"
 
 
 def refuse_foreign(folder: Path, own: Collection[str], command: str) -> None:

@@ -39,7 +39,7 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
     tile = np.full((height + _BAND, width + _MARGIN, 3), _PAPER, np.uint8)
     tile[_BAND:, _MARGIN:] = picture
     scale = 0.45
-    while scale > 0.1 and cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width - 2:
+    while scale > 0.1 and cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width - 3:  # its rim
         scale *= 0.95  # step by step: the width of small letters is not in proportion to their scale
     cv2.putText(tile, title, (_MARGIN, _BAND - 9), cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
     return tile

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from foldgauss._checks import invalid, one_of, short_repr, within
@@ -469,7 +469,11 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     if (lengths < _SMALLEST).any():
         got = f"0 in vertex {np.argmax(lengths < _SMALLEST)}"
         raise format_error(ply.path, expected="quaternions of some length", got=got, cure="Drop that row.")
-    rotation = Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix() if len(turn) else np.empty((0, 3, 3))
+    rotation = (
+        scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
+        if len(turn)
+        else np.empty((0, 3, 3))
+    )
     with np.errstate(over="ignore", invalid="ignore"):
         factor = _float32(ply, "scale", rotation * np.exp(spatial[:, None, 3:]))
     rgb = np.maximum(0.5 + SH_C0 * np.stack(color, axis=1), 0)
@@ -499,4 +503,4 @@ def _scales_and_quaternion(
     axes[..., 2] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, no reflection: an axis has no direction
     if len(axes) == 0:
         return scale, np.empty((0, 4))
-    return scale, np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
+    return scale, np.roll(scipy.spatial.transform.Rotation.from_matrix(axes).as_quat(), 1, axis=1)

@@ -708,12 +708,16 @@ def _bytes_text(path: Path) -> str:
     return "an empty file" if size == 0 else f"{size} bytes"
 
 
+#: OpenCV's LOG_LEVEL_SILENT, which it has no name for up to OpenCV 4.
+_LOG_LEVEL_SILENT = 0
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence OpenCV's own log (FFmpeg's is set above); the level is the whole process's, so restore it."""
-    logging = cv2.utils.logging
+    logging = getattr(cv2.utils, "logging", cv2)  # cv2 itself: up to OpenCV 4
     level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    logging.setLogLevel(_LOG_LEVEL_SILENT)
     try:
         yield
     finally:

@@ -4,11 +4,9 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+import scipy
+import skimage
 from jaxtyping import Bool, Float, Float32, Int, Int8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
-from skimage.color import deltaE_ciede2000, rgb2lab
 
 from foldgauss.video.light import Light, LitModel, weighted_mean
 from foldgauss.video.shots import is_cut
@@ -79,12 +77,12 @@ def _motion(lit: LitModel, k: int, light: Light) -> Float32[np.ndarray, "num_ali
 
 def lab(color: Float[np.ndarray, "num 3"]) -> Float32[np.ndarray, "num 3"]:
     """CIELAB of RGB as shown: held to [0, 1], as pictures are."""
-    return rgb2lab(np.clip(color, 0, 1)[None]).astype(np.float32)[0]
+    return skimage.color.rgb2lab(np.clip(color, 0, 1)[None]).astype(np.float32)[0]
 
 
 def difference(one: Float[np.ndarray, "num 3"], other: Float[np.ndarray, "3"]) -> Float[np.ndarray, "num"]:
     """Delta E of CIELAB colours. Source: CIEDE2000."""
-    return deltaE_ciede2000(one, np.broadcast_to(other, one.shape))
+    return skimage.color.deltaE_ciede2000(one, np.broadcast_to(other, one.shape))
 
 
 # ------------------------------------------------------------------------------------------------ following
@@ -138,7 +136,7 @@ def settled(
 def _voted(known: np.ndarray, label: np.ndarray, asked: np.ndarray) -> Int8[np.ndarray, "num_asked"]:
     """The label of most of the nearest of those known, the nearer the more."""
     num = min(VOTERS, len(known))
-    distance, who = cKDTree(known).query(asked, list(range(1, num + 1)))
+    distance, who = scipy.spatial.cKDTree(known).query(asked, list(range(1, num + 1)))
     weight = 1 / (distance + 1e-6)
     return np.where((weight * label[who]).sum(1) > 0.5 * weight.sum(1), IN, OUT).astype(np.int8)
 
@@ -210,10 +208,12 @@ def _connected(num: int, pairs: _Pairs, seed: int) -> Bool[np.ndarray, "num_gaus
     Chains do not go through those at borders: there the motion seen changes little by little, from one to the other.
     """
     one, other = pairs.one[pairs.firm], pairs.other[pairs.firm]
-    votes = coo_array((np.where(pairs.alike[pairs.firm], 1.0, -1.0), (one, other)), shape=(num, num)).tocsr()
+    votes = scipy.sparse.coo_array(
+        (np.where(pairs.alike[pairs.firm], 1.0, -1.0), (one, other)), shape=(num, num)
+    ).tocsr()
     votes.data[votes.data < 0] = 0
     votes.eliminate_zeros()
-    _, part = connected_components(votes, directed=False)
+    _, part = scipy.sparse.csgraph.connected_components(votes, directed=False)
     return part == part[seed]
 
 
@@ -244,7 +244,7 @@ def _touching(seen: Traits, motion: float) -> _Pairs:
     """The pairs of one frame."""
     num = min(NEIGHBOURS + 1, len(seen.index))  # with oneself
     radius = np.abs(np.linalg.det(seen.light.splats.factor[seen.which])) ** 0.5
-    distance, other = cKDTree(seen.position).query(seen.position, list(range(1, num + 1)))
+    distance, other = scipy.spatial.cKDTree(seen.position).query(seen.position, list(range(1, num + 1)))
     one = np.broadcast_to(np.arange(len(other))[:, None], other.shape)
     near = (distance <= REACH * (radius[one] + radius[other]) + 1) & (one != other)
     one, other = one[near], other[near]

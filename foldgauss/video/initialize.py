@@ -6,7 +6,7 @@ from collections.abc import Callable
 import cv2
 import jax
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.growth import PUBLISHED_UNIT
@@ -108,7 +108,7 @@ def initialize_uniform(
     loc = rng.uniform(-0.5, 0.5, (num_gaussians, 2)) * UNIFORM_BOX * frame
     near = min(NEIGHBOURS, num_gaussians - 1)
     # The nearest is the point itself; one that is alone is as wide as the frame.
-    scale = cKDTree(loc).query(loc, near + 1)[0][:, 1:].mean(axis=1) if near else np.ones(1)
+    scale = scipy.spatial.cKDTree(loc).query(loc, near + 1)[0][:, 1:].mean(axis=1) if near else np.ones(1)
     limit = UNIFORM_FOLD * PUBLISHED_UNIT
     share = lambda: rng.uniform(1e-6, 1 - 1e-6, num_gaussians)  # noqa: E731
     leaves = {

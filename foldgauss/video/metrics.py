@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+import skimage
 
 from foldgauss._checks import invalid
 from foldgauss.video.alpha import BLACK, checked_background, composited
@@ -19,7 +19,7 @@ def psnr(target: np.ndarray, picture: np.ndarray) -> float:
     """
     if np.array_equal(target, picture):
         return 100.0
-    return float(peak_signal_noise_ratio(target, picture, data_range=255))
+    return float(skimage.metrics.peak_signal_noise_ratio(target, picture, data_range=255))
 
 
 #: Pixels along a side of the window of SSIM, and from its middle to its edge.
@@ -37,7 +37,7 @@ def ssim(target: np.ndarray, picture: np.ndarray) -> float:
     short = [(SSIM_REACH, SSIM_REACH) if length < SSIM_WINDOW else (0, 0) for length in target.shape[:2]]
     pair = (np.pad(one, [*short, (0, 0)], mode="symmetric") for one in (target, picture))
     return float(
-        structural_similarity(
+        skimage.metrics.structural_similarity(
             *pair,
             data_range=255,
             gaussian_weights=True,

@@ -13,8 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from foldgauss._checks import invalid, one_of
 from foldgauss.render import Gaussians3D, Triangles
@@ -255,7 +255,7 @@ class Place(AbstractOverlay):
         mean, factor, move = gaussians.mean, gaussians.factor, np.array([0, 0, progress * self.depth])
         if any(self.rotation):
             centre = gaussians.centre if self.about is None else np.array([*self.about, 0.0])
-            turn = Rotation.from_rotvec(progress * np.array(self.rotation)).as_matrix()
+            turn = scipy.spatial.transform.Rotation.from_rotvec(progress * np.array(self.rotation)).as_matrix()
             mean, factor, move = mean @ turn.T.astype(np.float32), _mapped(turn, factor), move + centre - turn @ centre
         return dataclasses.replace(gaussians, mean=mean + move.astype(np.float32), factor=factor)
 

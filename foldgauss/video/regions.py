@@ -8,8 +8,8 @@ from numbers import Integral
 
 import cv2
 import numpy as np
+import skimage
 from jaxtyping import ArrayLike, Bool, Float, Float32
-from skimage.draw import polygon2mask
 
 from foldgauss._checks import invalid, whole, within
 from foldgauss.video.model import VideoModel, check_model
@@ -81,7 +81,7 @@ def polygon_region(
     if bad or not np.isfinite(corners).all():
         raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=_shown(polygon))
     # There a pixel's centre is a whole number, and rows come first.
-    return _still("polygon", model, polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames)
+    return _still("polygon", model, skimage.draw.polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames)
 
 
 def _as_numbers(given: object) -> np.ndarray:

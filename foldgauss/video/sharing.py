@@ -6,8 +6,8 @@ import math
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float, Float32, Int, Int32
-from scipy.spatial import cKDTree
 
 from foldgauss.video.sparse_adam import BETA1, BETA2, EPSILON
 
@@ -116,8 +116,8 @@ def _clustered(values: np.ndarray, weight: np.ndarray, size: int, seed: int) -> 
     chance = np.maximum(weight, 1e-9 * weight.max() + 1e-300)
     centre = values[rng.choice(len(values), size, replace=False, p=chance / chance.sum())]
     for _ in range(_LLOYD):
-        index = cKDTree(centre).query(values)[1]
+        index = scipy.spatial.cKDTree(centre).query(values)[1]
         total = np.bincount(index, chance, size)
         sums = np.stack([np.bincount(index, chance * column, size) for column in values.T], 1)
         centre = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], centre)
-    return cKDTree(centre).query(values)[1]
+    return scipy.spatial.cKDTree(centre).query(values)[1]

@@ -1,0 +1,58 @@
+"""The application: its list of commands, each imported when it is called, and what it says things with."""
+
+import importlib
+from typing import Any
+
+import typer
+from rich.console import Console
+
+from foldgauss.cli._commands import COMMANDS
+from foldgauss.cli._help import App, Command, Group
+
+
+class WrongUse(ValueError):
+    """The command was called with arguments that cannot be right."""
+
+
+class Stopped(Exception):
+    """The user asked a fit, or a sampler, to stop; the message says how to go on."""
+
+
+class _Root(Group):
+    """All commands by name and first sentence, which is what lists and the Tab key show; one that is called, whole.
+
+    Whole they need JAX, Numba and OpenCV: a second or two, for a word that is completed.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
+        listed = {name: Command(name=name, help=known.what) for name, known in COMMANDS.items()}
+        self.commands = listed | dict(self.commands)
+
+    def list_commands(self, ctx) -> list[str]:
+        return list(self.commands)
+
+    def resolve_command(self, ctx, args: list[str]) -> Any:
+        self.commands |= loaded(args[0])
+        return super().resolve_command(ctx, args)
+
+
+app = App(cls=_Root, no_args_is_help=True, pretty_exceptions_enable=False)
+# No markup: names of files may hold brackets.
+out = Console(markup=False, highlight=False)
+err = Console(stderr=True, markup=False, highlight=False)
+
+
+def loaded(*names: str) -> dict[str, Any]:
+    """The commands by name, these imported, or all where none is named; there may be none of such a name."""
+    for name in names or COMMANDS:
+        if name in COMMANDS:
+            importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
+    return typer.main.get_command(app).commands
+
+
+def as_option(text: str) -> str:
+    """An error about a setting, as one about its option: num_gaussians is --gaussians."""
+    name, colon, rest = text.partition(":")
+    name = name.replace("num_gaussians", "gaussians").replace("economy.psnr", "smallest_at_psnr")
+    return f"--{name.replace('_', '-')}{colon}{rest}"

@@ -1,0 +1,36 @@
+"""The commands: in which module each stands, and what the list of them says of it. Imported when one is called."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+
+class Command(NamedTuple):
+    """The module of `foldgauss.cli` that adds a command, and the first sentence of its help."""
+
+    module: str
+    what: str
+
+
+#: As one comes to need them.
+COMMANDS: Mapping[str, Command] = MappingProxyType(
+    {
+        "fit": Command("fitting", "Fit a model to a clip; the first of its budgets ends it."),
+        "view": Command("viewing", "Play a model in the browser; Ctrl-C ends it."),
+        "render": Command("drawing", "Draw a model as a video, in between its frames too."),
+        "evaluate": Command("drawing", "Compare a model with its clip: PSNR and SSIM of every frame."),
+        "info": Command("drawing", "Say what a model file holds."),
+        "figure": Command("figures", "Make a labelled picture of pictures from a model: PNG."),
+        "uncertainty": Command("uncertainty", "Say how sure the frame times are, given the splats."),
+        "edit": Command("editing", "Edit objects or single frames of a model by a script."),
+        "compress": Command("compressing", "Write a model as a compact file: a fraction of its size."),
+        "tradeoff": Command("tradeoff", "Measure what speed and size cost, one setting at a time."),
+        "export": Command("editing", "Write a model for other programs, or a page."),
+        "import": Command("editing", "Read what another program made: see docs/formats.md."),
+        "doctor": Command(
+            "doctor",
+            "Look at what is installed and try it: some seconds, more where kernels are compiled for the first time.",
+        ),
+        "demo": Command("fitting", "Fit 24 frames of the clip Bunny and show what comes out."),
+    }
+)
