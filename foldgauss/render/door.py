@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from foldgauss._checks import invalid, one_of
 from foldgauss._threads import run_tasks
-from foldgauss.render import cpu
+from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
 from foldgauss.render.xla import render_xla
@@ -22,7 +22,7 @@ try:
 except ImportError:  # it is experimental: where JAX has it no more, its slower sister does
     buffer_callback = None
 
-ENGINES = ("auto", "cpu", "xla", "reference")
+ENGINES = ("auto", "cpu", "xla", "pallas", "reference")
 COMPOSITINGS = ("over", "sum")
 
 
@@ -45,8 +45,9 @@ def render(
     - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all
       T_i are 1 and the background is added whole.
     - `engine`: "cpu" (Numba, float32 inside); "xla" (tiles in plain JAX, on CPU, GPU and TPU, float32 or float64);
-      "reference" (dense, slow); or "auto": "cpu" where JAX's default device is a CPU and the options are those that
-      "cpu" takes, else "xla".
+      "pallas" (a program of a GPU per tile, float32 inside; on a CPU interpreted, for tests only; never timed on a
+      GPU so far); "reference" (dense, slow); or "auto": "cpu" where JAX's default device is a CPU and the options are
+      those that "cpu" takes, else "xla".
     - `options`: what may be left out, `RenderOptions`.
 
     Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
@@ -83,6 +84,8 @@ def render(
         engine = "cpu" if jax.default_backend() == "cpu" and _cpu_takes(options) else "xla"
     if engine == "cpu":
         cpu.check_options(options)
+    if engine == "pallas":
+        pallas.check_options(options)
     # Engine "xla" looks at the numbers themselves where it can, to size its lists.
     rendered = _compiled if engine == "cpu" else _rendered
     return rendered(splats, background, tuple(map(int, size)), compositing, engine, options)
@@ -97,11 +100,13 @@ def _rendered(splats, background, size, compositing, engine, options):
         leaves = (*_finite_splats(splats), background)
     if engine == "reference":
         return render_reference(Splats2D(*leaves[:4]), size, background, compositing=compositing, options=options)
-    # Below single precision a sum of hundreds of splats has no digits left; float64 stays what it is, but in "cpu".
-    inner = jnp.float32 if engine == "cpu" or dtype.itemsize < 4 else dtype
+    # Below single precision a sum of hundreds of splats has no digits left; float64 stays so in "xla".
+    inner = jnp.float32 if engine in ("cpu", "pallas") or dtype.itemsize < 4 else dtype
     leaves = tuple(leaf.astype(inner) for leaf in leaves)
     if engine == "xla":
         image = render_xla(leaves, size, compositing=compositing, options=options)
+    elif engine == "pallas":
+        image = pallas.render_pallas(leaves, size, compositing=compositing, options=options)
     else:
         image = _render_cpu(size, compositing, options, *leaves)
     return image.astype(dtype)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import check_slope, scene
 
-from foldgauss.render import RenderOptions, Splats2D, render, xla
+from foldgauss.render import RenderOptions, Splats2D, render, tiles, xla
 
 BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
 draw = functools.partial(render, engine="xla", background=BACKGROUND)
@@ -69,7 +69,7 @@ def test_more_pairs_than_room_is_no_loss(monkeypatch):
     """Eager, too: the room is counted, and bounded."""
     splats, size = scene("huge")
     truth = draw(splats, size)
-    monkeypatch.setattr(xla, "MOST_SLOTS", 64)
+    monkeypatch.setattr(tiles, "MOST_SLOTS", 64)
     np.testing.assert_allclose(draw(splats, size), truth, atol=1e-6)
 
 

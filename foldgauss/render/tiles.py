@@ -1,0 +1,310 @@
+"""Pictures cut into square tiles: which splats each tile lists, and what the engines in JAX, `xla` and `pallas`, share.
+
+Every splat is listed in the tiles that its cutoff ellipse reaches: prefix sums give each (splat, tile) of a bounding
+box a slot, an exact test drops what the ellipse misses, and one sort by tile * num + splat brings the slots of a tile
+together, front to back. The room for slots is static, as XLA wants it, yet nothing is ever cut: splats that do not fit
+at once are drawn in *rounds*, from front to back, while the light left travels along.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from foldgauss._checks import invalid
+from foldgauss.render.footprint import covariance, squared_reach, whitening
+from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
+
+#: Slots per splat, or if there are few per tile, where the splats' sizes are not known (inside `jit`), and the most
+#: slots of one round.
+SLOTS_PER_SPLAT, SLOTS_PER_TILE, MOST_SLOTS = 16, 16, 1 << 22
+#: Rounds whose start the backward pass keeps, a plane of light each; of more, every n-th.
+KEPT_ROUNDS = 8
+#: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
+SLACK = 1e-3
+#: Sums of slots stop here, above any capacity.
+_MANY = LARGEST_CAPACITY + 1
+# Rows of a splat's fields, colours after them.
+X, Y, P, Q, R, OPACITY, COLOR = range(7)
+# Rows of a splat's gradient sums, colours after them: of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where
+# v = p dx + q dy and w = r dy.
+MOMENTS = 6
+
+
+class Plan(NamedTuple):
+    """How the work is cut; static."""
+
+    size: tuple[int, int]
+    over: bool
+    options: RenderOptions
+    tile: int
+    capacity: int
+    batch: int  # tiles
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of tiles."""
+        return -(-self.size[0] // self.tile), -(-self.size[1] // self.tile)
+
+    @property
+    def num_tiles(self) -> int:
+        return self.grid[0] * self.grid[1]
+
+    @property
+    def num_batches(self) -> int:
+        return -(-self.num_tiles // self.batch)
+
+    @property
+    def finished(self) -> float:
+        """Light up to which a pixel is finished; with compositing "sum" it never is."""
+        return self.options.transmittance_stop if self.over else -1.0
+
+
+def make_plan(leaves, size, compositing, options, *, tile: int, batch_pixels: int) -> Plan:
+    """Cut the work: counted where the splats are at hand, from their number where they are traced.
+
+    `tile`: side of a tile in px; `batch_pixels`: about as many are drawn at a time, in whole tiles.
+    """
+    num_tiles = -(-size[0] // tile) * -(-size[1] // tile)
+    num_batches = -(-num_tiles * tile * tile // max(batch_pixels, tile * tile))
+    batch = -(-num_tiles // num_batches)
+    plan = Plan(size, compositing == "over", options, tile, 1, batch)
+    capacity = options.list_capacity
+    if capacity is not None and capacity < num_tiles:
+        raise invalid(
+            "options.list_capacity",
+            expected=f"at least the number of tiles, {num_tiles}",
+            got=capacity,
+            cure="Or None, to have it chosen.",
+        )
+    if capacity is None:
+        geometry = jax.lax.stop_gradient(leaves[:3])  # concrete even under an eager `grad`
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in geometry)
+        num = len(leaves[2])
+        # Of a few wide splats some for every tile: fewer would make rounds of little work, more would be sorted in
+        # vain where splats are small (a million slots double the time of 20k splats on 160x320).
+        guess = min(num * num_tiles, max(SLOTS_PER_SPLAT * num, SLOTS_PER_TILE * num_tiles))
+        slots = guess if traced else int(_count_slots(plan, *geometry))
+        # A power of two, so that a scene that moves does not compile anew for each frame.
+        capacity = max(_power_of_two(min(slots, MOST_SLOTS)), _power_of_two(num_tiles))
+    return plan._replace(capacity=capacity)
+
+
+def _power_of_two(number: int) -> int:
+    return 1 << max(number - 1, 0).bit_length()
+
+
+# ------------------------------------------------------------------------------------------------ splats
+
+
+class Projected(NamedTuple):
+    """What the tiles need to know of every splat."""
+
+    white: Float[Array, "3 num"]
+    reach: Float[Array, "num"]  # squared Mahalanobis distance, with slack; not positive: not seen
+    radius_x: Float[Array, "num"]
+    first: Int[Array, "2 num"]  # (row, column) of tiles of the bounding box
+    shape: Int[Array, "2 num"]  # its rows and columns; 0 where it is not seen
+
+    @property
+    def slots(self) -> Int[Array, "num"]:
+        return self.shape[0] * self.shape[1]
+
+
+def project(plan: Plan, mean, factor, opacity) -> Projected:
+    options = plan.options
+    white, drawn = jax.vmap(lambda one: whitening(one, options.low_pass), out_axes=(-1, 0))(factor)
+    xx, _, yy, _ = jax.vmap(lambda one: covariance(one, options.low_pass))(factor)
+    reach = squared_reach(opacity, options)
+    seen = drawn & (reach >= 0) & jnp.all(jnp.isfinite(mean), axis=1)
+    reach = jnp.where(seen, reach * (1 + SLACK) + SLACK, jnp.zeros_like(reach))
+    radius_x, radius_y = jnp.sqrt(reach * jnp.where(seen, xx, 1)), jnp.sqrt(reach * jnp.where(seen, yy, 1))
+    firsts, shapes = [], []
+    for axis, radius, length in ((1, radius_y, plan.size[0]), (0, radius_x, plan.size[1])):
+        first, last = _tiles_between(mean[:, axis] - radius, mean[:, axis] + radius, length, plan.tile)
+        firsts.append(first)
+        shapes.append(jnp.where(seen, last - first, 0))
+    return Projected(white, reach, radius_x, jnp.stack(firsts), jnp.stack(shapes))
+
+
+def _tiles_between(low, high, length: int, tile: int):
+    """Tiles first <= k < last whose pixel centres lie within [low, high]; clipped before the cast to an integer."""
+    first = jnp.clip(jnp.ceil(low - 0.5), 0, length)
+    last = jnp.clip(jnp.floor(high - 0.5), -1, length - 1)
+    first_tile, last_tile = first.astype(jnp.int32) // tile, last.astype(jnp.int32) // tile
+    return first_tile, jnp.where(last >= first, last_tile + 1, first_tile)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _count_slots(plan: Plan, mean, factor, opacity) -> Int[Array, ""]:
+    return _running_sum(project(plan, mean, factor, opacity).slots)[-1]
+
+
+def numbers(count: int) -> Int[Array, "count"]:
+    """0, 1, ...: 32 bits also where JAX's default is 64."""
+    return jnp.arange(count, dtype=jnp.int32)
+
+
+def _running_sum(counts: Int[Array, "num"]) -> Int[Array, "num"]:
+    """Inclusive prefix sum that stays at `_MANY`: the pairs of a million large splats would overflow."""
+    return jax.lax.associative_scan(lambda a, b: jnp.minimum(a + b, _MANY), jnp.minimum(counts, _MANY))
+
+
+def fields_of(projected: Projected, mean, opacity, color) -> Float[Array, "num+1 fields"]:
+    """A row for every splat, and one of zeros, which is never seen, for the empty slots."""
+    table = jnp.concatenate([mean, projected.white.T, opacity[:, None], color], axis=1)
+    return jnp.concatenate([table, jnp.zeros((1, table.shape[1]), table.dtype)])
+
+
+# ------------------------------------------------------------------------------------------------- lists
+
+
+class Lists(NamedTuple):
+    """Splats of every tile, front to back, at `splat[start[k] : start[k] + length[k]]`; tiles fill whole batches."""
+
+    splat: Int[Array, "capacity"]
+    start: Int[Array, "tiles"]
+    length: Int[Array, "tiles"]
+    order: Int[Array, "batches batch"]  # tiles, longest lists first
+
+
+def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, Int[Array, ""]]:
+    """Lists of the splats from number `begin` on, as many as have room, and the number of the first that has not."""
+    num = len(mean)
+    slots = jnp.where(numbers(num) >= begin, projected.slots, 0)
+    total = _running_sum(slots)
+    end = jnp.sum(total <= plan.capacity, dtype=jnp.int32)
+    slots = jnp.where(numbers(num) < end, slots, 0)
+    first = total - slots  # of no meaning for splats from `end` on, which have no slots
+    number = numbers(plan.capacity)
+    # A mark at each splat's first slot; splats without slots share a place, of whom the last counts.
+    marks = jnp.zeros(plan.capacity, jnp.int32).at[jnp.where(numbers(num) < end, first, plan.capacity)]
+    owner = jnp.cumsum(marks.add(1, mode="drop")) - 1
+    used = number < jnp.max(jnp.where(numbers(num) < end, total, 0))
+    owner = jnp.where(used, owner, 0)
+    rows, columns = _place(projected, owner, number - first[owner])
+    used &= _meets(plan, projected, mean, owner, rows, columns)
+    tile = jnp.where(used, rows * plan.grid[1] + columns, plan.num_tiles)
+    tile, splat = _sort_by_tile(tile, owner, plan.num_tiles, num)
+    padded = plan.num_batches * plan.batch
+    bounds = jnp.searchsorted(tile, numbers(padded + 1), side="left").astype(jnp.int32)
+    bounds = jnp.where(numbers(padded + 1) <= plan.num_tiles, bounds, bounds[plan.num_tiles])
+    length = bounds[1:] - bounds[:-1]
+    order = jnp.argsort(-length).astype(jnp.int32).reshape(plan.num_batches, plan.batch)
+    return Lists(splat, bounds[:-1], length, order), end
+
+
+def _place(projected: Projected, owner, local):
+    """Row and column of tiles of slot number `local` of its splat."""
+    columns = jnp.maximum(projected.shape[1][owner], 1)
+    down = local // columns
+    return projected.first[0][owner] + down, projected.first[1][owner] + local - down * columns
+
+
+def _meets(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, "slots"]:
+    """Whether the splat's ellipse meets the pixel centres of a tile: within the tile's rows it is widest at its own
+    turning point, or at the nearest of the rows.
+    """
+    p, q, r = projected.white[:, owner]
+    x, y, reach = mean[owner, 0], mean[owner, 1], projected.reach[owner]
+    top = (rows * plan.tile).astype(mean.dtype) + 0.5
+    bottom = jnp.minimum(top + (plan.tile - 1), plan.size[0] - 0.5)
+    left = (columns * plan.tile).astype(mean.dtype) + 0.5
+    turn = -p * q * projected.radius_x[owner] / (q * q + r * r)
+
+    def edge(q, dy):
+        return (jnp.sqrt(jnp.maximum(reach - (r * dy) ** 2, 0)) - q * dy) / p
+
+    right_end = x + edge(q, jnp.clip(turn, top - y, bottom - y))
+    left_end = x - edge(-q, jnp.clip(-turn, top - y, bottom - y))
+    return (right_end >= left) & (left_end <= left + (plan.tile - 1))
+
+
+def _sort_by_tile(tile, splat, num_tiles: int, num: int):
+    """Sort by tile, then splat. As one number if it fits into 32 bits: on the CPU five times faster than pairs."""
+    if (num_tiles + 1) * num >= 2**32:
+        return jax.lax.sort((tile, splat), num_keys=2, is_stable=False)
+    key = jnp.sort(tile.astype(jnp.uint32) * np.uint32(num) + splat.astype(jnp.uint32))
+    tile = key // np.uint32(num)
+    return tile.astype(jnp.int32), (key - tile * np.uint32(num)).astype(jnp.int32)
+
+
+# ------------------------------------------------------------------------------------------------ canvas
+
+
+class Canvas(NamedTuple):
+    """Pixels by tile, filled up to whole batches."""
+
+    light: Float[Array, "pixels tiles"]
+    color: tuple[Float[Array, "pixels tiles"], ...]  # a plane per channel
+
+
+def blank(plan: Plan, channels: int, dtype) -> Canvas:
+    """Where a tile reaches beyond the picture there is no light from the start: nothing waits for it to be taken."""
+    pixel, tile = numbers(plan.tile**2)[:, None], numbers(plan.num_batches * plan.batch)[None, :]
+    y = tile // plan.grid[1] * plan.tile + pixel // plan.tile
+    x = tile % plan.grid[1] * plan.tile + pixel % plan.tile
+    light = ((y < plan.size[0]) & (x < plan.size[1])).astype(dtype)
+    return Canvas(light, tuple(jnp.zeros_like(light) for _ in range(channels)))
+
+
+def picture_of(plan: Plan, planes: Float[Array, "channels pixels tiles"]) -> Float[Array, "height width channels"]:
+    (rows, columns), tile = plan.grid, plan.tile
+    planes = planes[..., : plan.num_tiles].reshape(len(planes), tile, tile, rows, columns)
+    image = planes.transpose(3, 1, 4, 2, 0).reshape(rows * tile, columns * tile, len(planes))
+    return image[: plan.size[0], : plan.size[1]]
+
+
+def planes_of(plan: Plan, image: Float[Array, "height width channels"]) -> Float[Array, "channels pixels tiles"]:
+    """The reverse of `picture_of`; zeros where there is no pixel."""
+    (rows, columns), tile, channels = plan.grid, plan.tile, image.shape[-1]
+    image = jnp.pad(image, ((0, rows * tile - image.shape[0]), (0, columns * tile - image.shape[1]), (0, 0)))
+    planes = image.reshape(rows, tile, columns, tile, channels).transpose(4, 1, 3, 0, 2)
+    planes = planes.reshape(channels, tile * tile, plan.num_tiles)
+    return jnp.pad(planes, ((0, 0), (0, 0), (0, plan.num_batches * plan.batch - plan.num_tiles)))
+
+
+def keep_rounds(plan: Plan, light, num, draw: Callable):
+    """Draw `num` rounds once more but for colours, keeping starts; returns the function that gives, for the number of
+    a round, its first splat and the light there, by drawing on from the start kept before it.
+
+    `light`: at the first round. `draw(begin, light)`: one round, gives the first splat that did not fit, and the light.
+    """
+    stride = jnp.maximum(-(-num // KEPT_ROUNDS), 1)
+    last = (num - 1) // stride
+
+    def advance(count, begin, light):
+        return jax.lax.fori_loop(0, count, lambda _, state: draw(*state), (begin, light))
+
+    def keep(k, carry):
+        begins, lights, begin, light = carry
+        begins, lights = begins.at[k].set(begin), lights.at[k].set(light)
+        return begins, lights, *advance(jnp.where(k < last, stride, 0), begin, light)
+
+    room = jnp.zeros(KEPT_ROUNDS, jnp.int32), jnp.zeros((KEPT_ROUNDS, *light.shape), light.dtype)
+    begins, lights, *_ = jax.lax.fori_loop(0, last + 1, keep, (*room, jnp.int32(0), light))
+    return lambda number: advance(number % stride, begins[number // stride], lights[number // stride])
+
+
+def carry_back(projected: Projected, sums, factor, opacity):
+    """Carry a splat's sums back to its mean, factor, opacity and colour.
+
+    With W = [[p, q], [0, r]]: Sigma^-1 = W^T W, dL/dmean = W^T (v, w), dL/dF = W^T M W F, M the second moments of
+    (v, w). In whitened coordinates the moments of thin splats do not cancel.
+    """
+    p, q, r = projected.white
+    total, v, w, vv, vw, ww = (sums[:, k] for k in range(MOMENTS))
+    mean = jnp.stack([p * v, q * v + r * w], axis=-1)
+    seen = projected.reach > 0
+    white_x = p[:, None] * factor[:, 0] + q[:, None] * factor[:, 1]
+    white_y = r[:, None] * factor[:, 1]
+    by_v = vv[:, None] * white_x + vw[:, None] * white_y
+    by_w = vw[:, None] * white_x + ww[:, None] * white_y
+    d_factor = jnp.stack([p[:, None] * by_v, q[:, None] * by_v + r[:, None] * by_w], axis=1)
+    d_factor = jnp.where(seen[:, None, None], d_factor, jnp.zeros_like(d_factor))
+    d_opacity = jnp.where(seen, total / jnp.where(seen, opacity, jnp.ones_like(opacity)), jnp.zeros_like(total))
+    return mean, d_factor, d_opacity, sums[:, MOMENTS:]

@@ -1,0 +1,128 @@
+"""The Pallas engine, interpreted on the CPU: against the judge, in rounds, in batches; and lowered for a GPU."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import KINDS, scene
+from test_engines import BACKGROUND, grads_and_picture, judged, weights_for
+
+from foldgauss.render import RenderOptions, Splats2D, pallas, render, tiles
+
+OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, transmittance_stop=0.0)}
+QUICK = [("plain", "over", "default"), ("plain", "sum", "sharp")]
+CASES = [
+    pytest.param(kind, *how, marks=[] if (kind, *how) in QUICK else [pytest.mark.slow])  # each compiles for seconds
+    for how in (("over", "default"), ("over", "sharp"), ("sum", "default"), ("sum", "sharp"))
+    for kind in KINDS
+]
+
+
+def check(grads, picture, judgement, tolerance=2e-5):
+    avoid, true_grads, truth = judgement
+    difference = np.abs(picture - truth)
+    assert difference[~avoid].max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
+    for one, other in zip(jax.tree.leaves(grads), jax.tree.leaves(true_grads), strict=True):
+        size_of = max(1.0, np.abs(other).max(initial=0))
+        np.testing.assert_allclose(one / size_of, other / size_of, atol=tolerance)
+
+
+@pytest.mark.parametrize(("kind", "compositing", "options"), CASES)
+def test_agrees_with_reference(kind, compositing, options):
+    splats, size = scene(kind)
+    judgement = judged(kind, compositing, options)
+    leaves = splats, BACKGROUND, weights_for(size, judgement[0])
+    grads, picture = grads_and_picture("pallas", size, compositing, OPTIONS[options], *leaves)
+    check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
+
+
+@pytest.mark.parametrize(
+    "tile", [16, pytest.param(8, marks=pytest.mark.slow), pytest.param(32, marks=pytest.mark.slow)]
+)
+def test_several_rounds_are_one(tile):
+    """What does not fit into the lists at once is drawn later; of many rounds not every start is kept."""
+    splats, size = scene("huge")
+    judgement = judged("huge", "over", "default")
+    num_tiles = -(-size[0] // tile) * -(-size[1] // tile)
+    rounds = len(splats.mean) if tile == 16 else 4
+    options = RenderOptions(list_capacity=max(num_tiles * len(splats.mean) // rounds, num_tiles), tile_size=tile)
+    leaves = splats.mean, splats.factor, splats.opacity, splats.color, BACKGROUND
+    plan = pallas._plan(leaves, size, "over", options)
+    if tile == 16:
+        number, *_ = jax.jit(functools.partial(pallas._forward, plan))(leaves)
+        assert int(number) > tiles.KEPT_ROUNDS
+    grads, picture = grads_and_picture("pallas", size, "over", options, *leaves_for(splats, judgement, size))
+    check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
+
+
+def leaves_for(splats, judgement, size):
+    return splats, BACKGROUND, weights_for(size, judgement[0])
+
+
+@pytest.mark.slow
+def test_batches_of_scenes():
+    """Each with lists of its own, forward and backward."""
+    splats, size = scene("plain")
+    others = Splats2D(splats.mean[::-1] * 0.5, splats.factor * 2, splats.opacity, splats.color)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), splats, others)
+
+    def loss(splats, engine):
+        return jnp.sum(render(splats, size, engine=engine) ** 2)
+
+    own, true = (
+        jax.jit(jax.vmap(jax.grad(functools.partial(loss, engine=engine))))(both) for engine in ("pallas", "xla")
+    )
+    for one, other in zip(jax.tree.leaves(own), jax.tree.leaves(true), strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_it_lowers_for_a_gpu(compositing):
+    """Forward and backward become programs of a GPU, whole batches too, with no call of the host in between."""
+    splats, size = scene("plain")
+
+    def loss(splats):
+        return jnp.sum(render(splats, size, engine="pallas", compositing=compositing) ** 2)
+
+    step = jax.jit(jax.value_and_grad(loss)).trace(splats).lower(lowering_platforms=("cuda",)).as_text()
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), splats)
+    frames = jax.jit(jax.vmap(loss)).trace(batch).lower(lowering_platforms=("cuda",)).as_text()
+    assert step.count("xla.gpu.triton") >= 2
+    assert frames.count("xla.gpu.triton") == 1  # one launch for all frames
+    assert "callback" not in step + frames
+
+
+@pytest.mark.parametrize(
+    ("options", "name"), [({"alpha_ceiling": 1.0}, "alpha_ceiling"), ({"tile_size": 12}, "tile_size")]
+)
+def test_what_it_does_not_take(options, name):
+    splats, size = scene("one")
+    with pytest.raises(ValueError, match=name):
+        render(splats, size, engine="pallas", options=RenderOptions(**options))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float64])
+def test_dtypes(dtype):
+    """Inside it is float32."""
+    with jax.enable_x64(True):
+        splats, size = scene("one", dtype=dtype)
+        picture = render(splats, size, engine="pallas")
+        assert picture.dtype == dtype
+        wide = jax.tree.map(lambda leaf: leaf.astype(np.float64), splats)
+        np.testing.assert_allclose(picture, render(wide, size, engine="reference"), atol=2e-3)
+
+
+@pytest.mark.slow
+def test_what_is_not_finite_is_left_out():
+    splats, size = scene("one")
+    broken = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.full_like(leaf, jnp.nan)]), splats)
+    one, other = (
+        jax.value_and_grad(lambda own: jnp.sum(render(own, size, engine="pallas") ** 2))(own)
+        for own in (splats, broken)
+    )
+    assert float(one[0]) == pytest.approx(float(other[0]))
+    for true, leaf in zip(jax.tree.leaves(one[1]), jax.tree.leaves(other[1]), strict=True):
+        np.testing.assert_allclose(leaf[:1], true, rtol=1e-5)
+        assert not np.asarray(leaf[1]).any()
