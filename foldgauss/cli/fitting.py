@@ -501,6 +501,8 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
             f"warning: only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; those are used.",
             soft_wrap=True,
         )
+    for note in clip.notes:
+        err.print(f"warning: {clip.source}: {note}", soft_wrap=True)
     num = chosen_num_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.batch_size < clip.num_frames:
