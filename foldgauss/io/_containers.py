@@ -68,6 +68,11 @@ def has_alpha_beside(head: bytes) -> bool:
     return head.startswith(_MATROSKA) and _ALPHA_MODE in head.split(_CLUSTER)[0]
 
 
+def tells_duration(head: bytes) -> bool:
+    """Whether what the container says of its duration is what its frames take; Flash videos say up to 2 frames more."""
+    return not head.startswith(b"FLV")
+
+
 def counts_frames(head: bytes) -> bool:
     """Whether the container counts its frames (MP4, MOV, AVI); in others a count is the duration times a rate."""
     is_mov = head[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
@@ -89,6 +94,15 @@ def claimed_size(head: bytes) -> tuple[int, int] | None:
         return _size_of_jpeg(head) if head.startswith(b"\xff\xd8") else None
     except struct.error:  # cut off
         return None
+
+
+def fewest_bytes(head: bytes, size: tuple[int, int]) -> int:
+    """Bytes that an image of such a (height, width) cannot do without; 0 where that is not known.
+
+    Of a PNG the best that deflate can do, 1032 to 1, with a bit a pixel; of a JPEG a bit for each 8x8 block.
+    """
+    pixels_a_byte = 8 * 1032 if head.startswith(_PNG) else 8 * 64 if head.startswith(b"\xff\xd8") else 0
+    return size[0] * size[1] // pixels_a_byte if pixels_a_byte else 0
 
 
 def _size_of_jpeg(head: bytes) -> tuple[int, int] | None:

@@ -39,10 +39,9 @@ def risen(milliseconds: list[float], fps: float) -> Float[np.ndarray, "num_frame
     return np.array(seconds)
 
 
-def promised(seconds: Float[np.ndarray, "num_frames"], declared: int, fps: float) -> int:
-    """Frames that a container promises which knows its duration alone: `declared` is that times the rate `fps`."""
-    num_frames = len(seconds)
-    left = declared / fps - seconds[-1]
-    interval = 1 / fps if num_frames < 2 else np.diff(seconds).mean()
-    longest = max(1 / fps, np.diff(seconds).max(initial=0.0))
-    return num_frames if left <= LAST * longest else num_frames - 1 + round(left / interval)
+def promised(seconds: Float[np.ndarray, "num_frames"], duration: float, fps: float, reached: int) -> int:
+    """Frames in all where a container tells its duration alone, and `reached` frames of it end at seconds[-1]."""
+    left, intervals = duration - seconds[-1], np.diff(seconds)
+    if left <= LAST * max(1 / fps, intervals.max(initial=0.0)):
+        return reached
+    return reached - 1 + round(left / (intervals.mean() if len(intervals) else 1 / fps))

@@ -10,8 +10,9 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,10 +24,12 @@ from foldgauss.io._containers import (
     LIST,
     claimed_size,
     counts_frames,
+    fewest_bytes,
     has_alpha_beside,
     is_image,
     kind_of,
     may_move,
+    tells_duration,
 )
 from foldgauss.io._rates import Pace, pace_of, promised, risen
 
@@ -46,6 +49,8 @@ WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
 MAX_FPS = 1000.0  # a container's time stamps are milliseconds
 MAX_PIXELS = 1 << 28  # of one picture, 16384x16384: a header may claim any size
+MISSES = 1000  # after so many times without a frame a video is over: damage is passed by, at its end it is instant
+MOST_LOST = 1e6  # frames; what a damaged time stamp says beyond that is not believed
 GIF_DELAY = 100.0  # milliseconds that browsers show a frame for that says nothing of its own
 
 Range = tuple[int | None, int | None]
@@ -177,20 +182,19 @@ def _head(path: Path) -> bytes:
 
 def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
     """The frames of a video file."""
-    milliseconds: list[float] = []
+    seen: list[_Seen] = []
     with _capture(path) as capture:
         _refuse_alpha(capture, path)
         _refuse_huge(path, (capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
         declared, rate = _declared_frames(capture), capture.get(cv2.CAP_PROP_FPS)
         notes = _shape_notes(capture)
-        # Frames before the range are decoded and dropped: seeking lands on key frames in some containers.
-        num_skipped = sum(1 for _ in islice(_grabbed(capture, milliseconds), start))
-        stays = _Stays(num_skipped)
-        decoded = stays.watched(_decoded(capture, start, stop, milliseconds))
+        fps = rate if 0 < rate <= MAX_FPS else DEFAULT_FPS
+        stays = _Stays(seen)
+        decoded = stays.watched(_decoded(capture, fps, start, stop, seen))
         kept = _in_blocks(prepare(frame) for frame in _same_size(decoded, path))
         if len(kept) == 1:  # nothing to compare it with yet
-            list(stays.watched(islice(_decoded(capture, 0, 1, []), 1)))
-    num_decoded = len(milliseconds)
+            list(stays.watched(islice(_decoded(capture, fps, 0, None, []), 1)))
+    num_decoded = len(seen)
     if num_decoded == 0:
         raise _error(
             "path",
@@ -208,11 +212,10 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
             got=f"one of interlaced fields, {str(path)!r}, which OpenCV does not convert",
             cure="Make whole pictures of them: ffmpeg -i VIDEO -vf yadif NEW.mp4.",
         )
-    fps = rate if 0 < rate <= MAX_FPS else DEFAULT_FPS
-    seconds = risen(milliseconds, fps)
-    if declared and rate > 0 and not counts_frames(_head(path)):
-        declared = promised(seconds, declared, rate)
-    num_total, pace = max(declared, num_decoded), _usable(pace_of(seconds[start:], fps))
+    seconds, head, reached = risen([one.milliseconds for one in seen], fps), _head(path), seen[-1].position + 1
+    if declared and rate > 0 and not counts_frames(head):
+        declared = promised(seconds, declared / rate, fps, reached) if tells_duration(head) else reached
+    num_total = max(declared, reached)
     # A container's count may be an estimate, so the range is judged against what decoded as well.
     _check_within(start, stop, num_total, path)
     if not kept:
@@ -223,11 +226,25 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
             cure="Ask for earlier frames.",
         )
     num_declared = (num_total if stop is None else stop) - start
-    return kept, num_declared, pace, notes + _pace_notes(pace)
+    pace = _usable(pace_of(seconds[len(seen) - len(kept) :], fps))
+    gaps = _gap_notes([start - 1, *(one.position for one in seen[len(seen) - len(kept) :])])
+    return kept, num_declared, pace, notes + gaps + _pace_notes(pace)
 
 
 def _usable(pace: Pace) -> Pace:
     return pace if pace.fps <= MAX_FPS else Pace(DEFAULT_FPS)
+
+
+def _gap_notes(positions: list[int]) -> tuple[str, ...]:
+    """What is to be said of frames that damage left out before others."""
+    gaps = [(before + 1, after) for before, after in pairwise(positions) if after - before > 1]
+    if not gaps:
+        return ()
+    first, after = gaps[0]
+    which = f"frame {first}" if after == first + 1 else f"frames {first} to {after - 1}"
+    num = sum(after - first for first, after in gaps)
+    which = which if len(gaps) == 1 else f"{num} frames, the first of them {first},"
+    return (f"{which} cannot be decoded and are left out; those that follow may be blemished.",)
 
 
 def _pace_notes(pace: Pace) -> tuple[str, ...]:
@@ -277,7 +294,7 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
 
     One that does not move is left to the decoder of images, which keeps its 16 bits.
     """
-    _refuse_huge(path, claimed_size(_head(path)))
+    _refuse_huge_image(path, _head(path))
     kept, delays, fault = [], [], False
     try:
         with Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
@@ -370,7 +387,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def _read_image(path: Path) -> np.ndarray:
     """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
     head = _head(path)
-    _refuse_huge(path, claimed_size(head))
+    _refuse_huge_image(path, head)
     # UNCHANGED shows a fourth channel; JPEG has none, and COLOR also applies its orientation.
     flags = cv2.IMREAD_COLOR if head.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
     with _quiet():
@@ -397,6 +414,14 @@ def _read_image(path: Path) -> np.ndarray:
 def _undecoded(path: Path) -> VideoError:
     got = f"{str(path)!r} ({_bytes_text(path)}), which does not"
     return _error("path", expected="images that decode", got=got, cure="Replace or remove it.")
+
+
+def _refuse_huge_image(path: Path, head: bytes) -> None:
+    """Raise for an image whose header claims more pixels than are taken, or than its bytes can hold."""
+    size = claimed_size(head)
+    _refuse_huge(path, size)
+    if size is not None and path.stat().st_size < fewest_bytes(head, size):
+        raise _undecoded(path)
 
 
 def _refuse_huge(path: Path, size: tuple[float, float] | None) -> None:
@@ -500,23 +525,46 @@ def _shape_notes(capture: cv2.VideoCapture) -> tuple[str, ...]:
     return (f"pixels are {across / down:.3g} times as wide as high; frames are kept as stored, not stretched.",)
 
 
-def _grabbed(capture: cv2.VideoCapture, milliseconds: list[float]) -> Iterator[None]:
-    """The next frames, one by one, until the first that does not decode; the time of each is added to the list."""
-    while capture.grab():
-        milliseconds.append(capture.get(cv2.CAP_PROP_POS_MSEC))
-        yield
+class _Seen(NamedTuple):
+    """A frame that decodes: which one of the file it is, and its time."""
+
+    position: int
+    milliseconds: float
+
+
+def _grabbed(capture: cv2.VideoCapture, fps: float) -> Iterator[_Seen]:
+    """The frames that decode, one by one. Those lost before one, in damage, are counted by its time."""
+    position, before, misses = -1, -1000 / fps, 0
+    while misses < MISSES:
+        if not capture.grab():
+            misses += 1
+            continue
+        now = capture.get(cv2.CAP_PROP_POS_MSEC)
+        lost = (now - before) * fps / 1000 - 1 if misses else 0.0
+        position += 1 + (round(lost) if 0 < lost < MOST_LOST else 0)
+        before, misses = now, 0
+        yield _Seen(position, now)
 
 
 def _decoded(
-    capture: cv2.VideoCapture, start: int, stop: int | None, milliseconds: list[float]
+    capture: cv2.VideoCapture, fps: float, start: int, stop: int | None, seen: list[_Seen]
 ) -> Iterator[np.ndarray]:
-    """The next frames, BGR, at most `stop - start`, and their times as `_grabbed`."""
-    for _ in islice(_grabbed(capture, milliseconds), None if stop is None else stop - start):
-        found, frame = capture.retrieve()
-        if not found:
-            milliseconds.pop()
+    """The frames from `start` up to `stop`, BGR, that decode; all that are passed are added to `seen`.
+
+    Those before `start` are decoded and dropped: seeking lands on key frames in some containers.
+    """
+    for one in _grabbed(capture, fps):
+        if stop is not None and one.position >= stop:
             return
-        yield frame
+        if one.position >= start:
+            found, frame = capture.retrieve()
+            if not found:
+                continue
+        seen.append(one)
+        if one.position >= start:
+            yield frame
+        if stop is not None and one.position == stop - 1:
+            return
 
 
 class _Stays:
@@ -526,14 +574,13 @@ class _Stays:
     it equals the one before; so do frames of clips in which nothing moves.
     """
 
-    def __init__(self, number: int):
-        self.last, self._number, self._before = 0, number, None
+    def __init__(self, seen: list[_Seen]):
+        self.last, self._seen, self._before = 0, seen, None
 
     def watched(self, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         for frame in frames:
-            self._number += 1
             if self._before is not None and np.array_equal(frame, self._before):
-                self.last = self._number
+                self.last = len(self._seen)
             self._before = frame
             yield frame
 
@@ -541,9 +588,9 @@ class _Stays:
 #: Read so many frames, and let FFmpeg tell its errors.
 _TRIAL = """
 import sys, cv2
-capture = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG)
-for _ in range(int(sys.argv[2])):
-    capture.read()
+capture, left, misses = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG), int(sys.argv[2]), int(sys.argv[3])
+while left > 0 and misses > 0:
+    left, misses = (left - 1, misses) if capture.read()[0] else (left, misses - 1)
 """
 
 
@@ -559,7 +606,7 @@ def _converts(path: Path, num_frames: int) -> bool:
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         _OPTIONS: _restricting(os.environ.get(_OPTIONS)),
     }
-    command = [sys.executable, "-c", _TRIAL, str(path.resolve()), str(num_frames)]
+    command = [sys.executable, "-c", _TRIAL, str(path.resolve()), str(num_frames), str(MISSES)]
     try:
         ran = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, env=environment, check=False)
     except OSError:  # no more processes: then nothing can be said
