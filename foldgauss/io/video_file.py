@@ -243,8 +243,9 @@ def _gap_notes(positions: list[int]) -> tuple[str, ...]:
     first, after = gaps[0]
     which = f"frame {first}" if after == first + 1 else f"frames {first} to {after - 1}"
     num = sum(after - first for first, after in gaps)
+    sound = f"frames {positions[0] + 1}:{first} are sound" if first > positions[0] + 1 else "all of it"
     which = which if len(gaps) == 1 else f"{num} frames, the first of them {first},"
-    return (f"{which} cannot be decoded and are left out; those that follow may be blemished.",)
+    return (f"{which} cannot be decoded, and are left out; what follows may be blemished, {sound}.",)
 
 
 def _pace_notes(pace: Pace) -> tuple[str, ...]:

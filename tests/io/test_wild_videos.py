@@ -443,7 +443,7 @@ def test_broken_frames_are_left_out(tmp_path, broken):
     sound = [k for k in range(8) if k not in broken and k - 1 not in broken]
     np.testing.assert_array_equal(clip.frames, _noise()[sound])
     assert clip.num_declared == 8
-    assert "cannot be decoded and are left out" in clip.notes[0]
+    assert "cannot be decoded, and are left out" in clip.notes[0]
     shown = np.array(sound) / 10
     if np.ptp(np.diff(sound)):  # there is a gap in the middle
         np.testing.assert_allclose(clip.times, shown - shown[0], atol=1e-3)
