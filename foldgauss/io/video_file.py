@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no us
 MAX_FPS = 1000.0  # a container's time stamps are milliseconds
 MAX_PIXELS = 1 << 28  # of one picture, 16384x16384: a header may claim any size
 MISSES = 1000  # after so many times without a frame a video is over: damage is passed by, at its end it is instant
-MOST_LOST = 1e6  # frames; what a damaged time stamp says beyond that is not believed
+MOST_LOST = 1_000_000  # frames; what a damaged time stamp says beyond that is not believed
 GIF_DELAY = 100.0  # milliseconds that browsers show a frame for that says nothing of its own
 
 Range = tuple[int | None, int | None]
@@ -117,7 +117,7 @@ def read_video(
     by cubic interpolation where it grows: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides
     the rate of the container (25 for images). `center_crop = (height, width)` first cuts that window around
     the centre as it is (an odd rest goes below and to the right). Decoding is frame by frame: the memory
-    taken is the output's plus one source frame, and a clip that would take over a third of the machine's
+    taken is the output's plus two source frames, and a clip that would take over a third of the machine's
     memory is refused.
 
     Images of 16 bits are scaled to 8, grey ones get three equal channels. Where any image of a folder, or any frame of
@@ -278,7 +278,9 @@ def _is_image(path: Path) -> bool:
         return False
     with _quiet():
         num_images = cv2.imcount(str(path))
-    if num_images > 1 and path.suffix.lower() in (".tif", ".tiff"):  # of which that decoder sees the first alone
+    if num_images > 1 and _head(path).startswith(
+        (b"II*\0", b"MM\0*")
+    ):  # a TIFF, of which that decoder sees the first alone
         got = f"{num_images} in {str(path)!r}"
         raise _error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
     return num_images == 1
@@ -288,6 +290,19 @@ def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable
     """As `_read_folder`, of a file with one image."""
     _check_within(start, stop, 1, path)
     return _read_images([path], prepare)
+
+
+#: What Pillow raises of damaged files.
+_BROKEN = (
+    EOFError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    IndexError,
+    OverflowError,
+    struct.error,
+    Image.DecompressionBombError,
+)
 
 
 def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
@@ -302,22 +317,20 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
             if animation.format != "GIF" and not getattr(animation, "is_animated", False):
                 return _read_image_file(path, start, stop, prepare)
             num_promised = _promised_pictures(animation)
-            for number in range(num_promised if stop is None else min(stop, num_promised)):
+            for number in islice(count(), min(num_promised or MOST_LOST, stop or MOST_LOST)):
                 animation.seek(number)
                 animation.load()
                 delays.append(animation.info.get("duration") or GIF_DELAY)
                 if number >= start:
                     rgba = np.asarray(animation.convert("RGBA"))
                     kept.append(prepare(_premultiplied(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))))
-    except (EOFError, SyntaxError, struct.error, OSError, IndexError, Image.DecompressionBombError):
-        fault = True  # whatever its decoders raise of damaged files
     except VideoError:
         raise
-    except ValueError:
+    except _BROKEN:
         fault = True
     if not delays:
         raise _undecoded(path)
-    num_total = max(num_promised, len(delays)) if not fault else max(num_promised, len(delays) + 1)
+    num_total = max(num_promised, len(delays) + fault)
     _check_within(start, stop, num_total, path)
     if not kept:
         raise _error(
@@ -335,11 +348,11 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
 
 
 def _promised_pictures(animation: Image.Image) -> int:
-    """Their number as the file gives it; a damaged GIF, which is counted by reading it, ends where it ends."""
+    """Their number as the file gives it; 0 of a damaged GIF, which is counted by reading it."""
     try:
         return animation.n_frames
-    except (EOFError, SyntaxError, OSError, ValueError):
-        return 1
+    except _BROKEN:
+        return 0
 
 
 def _read_images(chosen: list[Path], prepare: Callable) -> _Read:

@@ -468,6 +468,22 @@ def test_a_broken_animation(tmp_path, name):
         np.testing.assert_array_equal(clip.frames, whole.frames[: clip.num_frames])
 
 
+def test_a_gif_whose_frames_cannot_be_counted(tmp_path, monkeypatch):
+    first, *rest = (Image.fromarray(frame) for frame in _waves())
+    first.save(tmp_path / "a.gif", save_all=True, append_images=rest, duration=100)
+    whole = read_video(tmp_path / "a.gif")
+    monkeypatch.setattr(video_file, "_promised_pictures", lambda animation: 0)
+    clip = read_video(tmp_path / "a.gif")
+    np.testing.assert_array_equal(clip.frames, whole.frames)
+    np.testing.assert_array_equal(read_video(tmp_path / "a.gif", frames=(2, 4)).frames, whole.frames[2:4])
+
+
+def test_pages_of_a_tiff_are_refused_whatever_it_is_called(tmp_path):
+    first, *rest = (Image.fromarray(frame) for frame in _waves(3))
+    first.save(tmp_path / "clip.mp4", "TIFF", save_all=True, append_images=rest)
+    _refused(tmp_path / "clip.mp4", "one image in a TIFF, got 3")
+
+
 # ------------------------------------------------------------------------------------------- other things
 
 
