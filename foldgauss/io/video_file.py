@@ -1028,10 +1028,10 @@ def _bytes_text(path: Path) -> str:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence OpenCV's own log (FFmpeg's is set above); the level is the whole process's, so restore it."""
-    logging = cv2.utils.logging
-    level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    home = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging  # of OpenCV 4, and of 5
+    level = home.getLogLevel()
+    home.setLogLevel(0)  # LOG_LEVEL_SILENT
     try:
         yield
     finally:
-        logging.setLogLevel(level)
+        home.setLogLevel(level)
