@@ -176,6 +176,12 @@ def _reader(path: Path) -> Callable[..., _Read]:
 
 
 def _head(path: Path) -> bytes:
+    """The first bytes of a file; raises for a name that OpenCV would crash of."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        got, cure = f"{str(path)!a}, which is no Unicode", "Rename the file or its folder."
+        raise _error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
     with open(path, "rb") as file:
         return file.read(HEAD_BYTES)
 
@@ -494,11 +500,7 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         # FFmpeg only, and an absolute path: other backends take 'img01.png' for the first of a sequence,
         # and FFmpeg takes 'name:rest' for a protocol.
         with _restricted():
-            try:
-                capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
-            except UnicodeEncodeError as error:
-                got, cure = f"{str(path)!r}, whose name is no Unicode", "Rename the file."
-                raise _error("path", expected="a name that OpenCV can open", got=ascii(got), cure=cure) from error
+            capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         try:
             if not capture.isOpened():
                 raise _error(

@@ -586,6 +586,22 @@ def test_names_are_taken_as_they_are(tmp_path, monkeypatch, mp4, name):
     assert read_video(name).num_frames == 8
 
 
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX has names that are no Unicode")
+@pytest.mark.parametrize("made", ["video", "image", "folder"])
+def test_names_that_are_no_unicode_are_refused(tmp_path, mp4, made):
+    """OpenCV ends the process over them."""
+    name = os.fsdecode(os.fsencode(tmp_path) + b"/\xff")
+    try:
+        if made == "folder":
+            os.mkdir(name)
+        path = f"{name}/0.png" if made == "folder" else name
+        with open(path, "wb") as file:
+            file.write(mp4 if made == "video" else _png(_noise(1)[0]))
+    except OSError as error:
+        pytest.skip(f"this file system has no such names: {error}")
+    _refused(name, "no Unicode")
+
+
 def test_a_pattern_is_no_file(tmp_path):
     for number in range(3):
         (tmp_path / f"img{number:03d}.png").write_bytes(_png(_noise(3)[number]))
