@@ -201,6 +201,17 @@ def scores_of(scores: Evaluation) -> dict[str, Any]:
     return {"mean_psnr": round(scores.mean_psnr, 3), "mean_ssim": round(scores.mean_ssim, 4)}
 
 
+def tell_of(clip: Clip) -> None:
+    """Say what of a clip is not as one would think: frames that are missing, uneven times."""
+    if clip.num_declared > clip.num_frames:
+        err.print(
+            f"warning: only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; those are used.",
+            soft_wrap=True,
+        )
+    for note in clip.notes:
+        err.print(f"warning: {clip.source}: {note}", soft_wrap=True)
+
+
 def fingerprint(clip: Clip) -> dict[str, Any]:
     """What a resumed fit must find again: the frames themselves, whatever they are called now."""
     digest = hashlib.blake2b(clip.frames, digest_size=16).hexdigest()

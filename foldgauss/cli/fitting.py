@@ -41,6 +41,7 @@ from foldgauss.cli._shared import (
     refuse_foreign,
     refuse_input,
     scores_of,
+    tell_of,
     with_constants,
     write_json,
 )
@@ -496,11 +497,7 @@ def _draw_curves(path: Path, history: Path) -> None:
 
 def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
     height, width = clip.size
-    if clip.num_declared > clip.num_frames:
-        err.print(
-            f"warning: only {clip.num_frames} of {clip.num_declared} frames of {clip.source} decode; those are used.",
-            soft_wrap=True,
-        )
+    tell_of(clip)
     num = chosen_num_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.batch_size < clip.num_frames:

@@ -34,6 +34,7 @@ from foldgauss.cli._shared import (
     parse_size,
     refuse_foreign,
     scores_of,
+    tell_of,
 )
 from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Record, Words, report, settings_of
 from foldgauss.cli.compressing import save_compressed, save_halved
@@ -121,6 +122,7 @@ def tradeoff_command(
     refuse_foreign(out_dir, FILES, "tradeoff")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
+    tell_of(clip)
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
     make_folder(out_dir)
     run = _Run(clip, record, Words(video, size, frames, out_dir), noted(clip, seed, frames))

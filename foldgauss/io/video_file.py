@@ -3,16 +3,35 @@
 import math
 import os
 import re
+import struct
+import subprocess
+import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from foldgauss._checks import invalid, one_of, within
 from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_replaceable, checked_path, not_writable
+from foldgauss.io._containers import (
+    FORMATS,
+    HEAD_BYTES,
+    LIST,
+    claimed_size,
+    counts_frames,
+    fewest_bytes,
+    has_alpha_beside,
+    is_image,
+    kind_of,
+    may_move,
+    tells_duration,
+)
+from foldgauss.io._rates import Pace, pace_of, promised, risen
 
 # FFmpeg writes to stderr about every damaged packet; our errors say it in one line. OpenCV reads this
 # variable when it first opens a video, so it stands before the import. -8 is AV_LOG_QUIET.
@@ -29,6 +48,10 @@ MAX_GIF_FPS = 50.0  # frames of less than 2 hundredths of a second are shown for
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container that gives no usable rate
 MAX_FPS = 1000.0  # a container's time stamps are milliseconds
+MAX_PIXELS = 1 << 28  # of one picture, 16384x16384: a header may claim any size
+MISSES = 1000  # after so many times without a frame a video is over: damage is passed by, at its end it is instant
+MOST_LOST = 1_000_000  # frames; what a damaged time stamp says beyond that is not believed
+GIF_DELAY = 100.0  # milliseconds that browsers show a frame for that says nothing of its own
 
 Range = tuple[int | None, int | None]
 PathLike = str | os.PathLike
@@ -45,13 +68,17 @@ class Clip:
     `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous; of images with alpha RGBA, shape
     (num_frames, height, width, 4), the colour premultiplied by alpha: what is seen over black. `fps`: frames per
     second. `source`: the path as given. `num_declared`: frames that the container promised within the range asked
-    for; larger than `num_frames` where a damaged file breaks off ("N of M frames decode").
+    for; larger than `num_frames` where a damaged file breaks off ("N of M frames decode"). `times`: when each
+    frame is shown, float64 (num_frames,), in seconds from the first; None where that is evenly, at `fps`. Else `fps` is
+    their mean rate. `notes`: what else there is to know of how the file was read, a line each.
     """
 
     frames: np.ndarray
     fps: float
     source: str
     num_declared: int
+    times: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def has_alpha(self) -> bool:
@@ -90,41 +117,90 @@ def read_video(
     by cubic interpolation where it grows: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides
     the rate of the container (25 for images). `center_crop = (height, width)` first cuts that window around
     the centre as it is (an odd rest goes below and to the right). Decoding is frame by frame: the memory
-    taken is the output's plus one source frame, and a clip that would take over a third of the machine's
+    taken is the output's plus two source frames, and a clip that would take over a third of the machine's
     memory is refused.
 
-    Images of 16 bits are scaled to 8, grey ones get three equal channels. Where any image of a folder is
-    transparent anywhere, the clip has alpha (see `Clip`), and images without are opaque. Videos with alpha are
-    refused, since decoding drops it. A damaged video yields the frames that decode; see `Clip.num_declared`.
+    Images of 16 bits are scaled to 8, grey ones get three equal channels. Where any image of a folder, or any frame of
+    an animated GIF, PNG or WebP, is transparent anywhere, the clip has alpha (see `Clip`), and the others are opaque.
+    Other videos with alpha are refused, since decoding drops it, and interlaced ones where OpenCV does not convert
+    them. Videos are turned upright. A damaged one yields the frames that decode; see `Clip.num_declared`. Frames of
+    uneven times are all kept; see `Clip.times`.
+
+    What a file is, its bytes tell, not its name. Nothing but `path` is opened: no address, and no file that another
+    one names, as a playlist does. A picture of more than 16384x16384 pixels is refused by its header.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
-    path = checked_path(path)
+    address, path = str(path), checked_path(path)
     if not os.path.exists(path):
-        raise FileNotFoundError(
-            f"path: expected a video file or a folder of images, got {str(path)!r}, which is missing. "
-            "Check the spelling and the current folder."
+        raise FileNotFoundError(_missing(address))
+    if not (path.is_dir() or path.is_file()):
+        raise _error(
+            "path",
+            expected="a video file or a folder of images",
+            got=f"{str(path)!r}, a pipe or a device",
+            cure="Save what comes out of it to a file.",
         )
     start, stop = _checked_range(frames)
     prepare = _fit_to(_checked_size(size), _checked_size(center_crop, "center_crop"))
     if fps is not None:
         _check_fps(fps)
-    read = _read_folder if path.is_dir() else _read_image_file if _is_image(path) else _read_file
-    kept, num_declared, found_fps = read(path, start, stop, prepare)
-    return Clip(_stacked(kept), float(found_fps if fps is None else fps), str(path), num_declared)
+    try:
+        kept, num_declared, pace, notes = _reader(path)(path, start, stop, prepare)
+    except OSError as error:
+        got = f"{str(path)!r} ({error.strerror or error})"
+        raise _error("path", expected="a file that can be read", got=got) from error
+    clip_fps, times = (pace.fps, pace.times) if fps is None else (fps, None)
+    return Clip(_stacked(kept), float(clip_fps), str(path), num_declared, times, notes)
 
 
-def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
-    """(prepared frames, frames declared within the range, fps) of a video file."""
+#: (prepared frames, frames declared within the range, how they follow one another, notes)
+_Read = tuple[list[np.ndarray], int, Pace, tuple[str, ...]]
+
+
+def _missing(address: str) -> str:
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", address):
+        return f"path: expected a file or a folder, got the address {address!r}. Nothing is fetched: download it first."
+    return (
+        f"path: expected a video file or a folder of images, got {address!r}, which is missing. "
+        "Check the spelling and the current folder."
+    )
+
+
+def _reader(path: Path) -> Callable[..., _Read]:
+    if path.is_dir():
+        return _read_folder
+    if may_move(_head(path)):
+        return _read_animation
+    return _read_image_file if _is_image(path) else _read_file
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file; raises for a name that OpenCV would crash of."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        got, cure = f"{str(path)!a}, which is no Unicode", "Rename the file or its folder."
+        raise _error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
+    with open(path, "rb") as file:
+        return file.read(HEAD_BYTES)
+
+
+def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
+    """The frames of a video file."""
+    seen: list[_Seen] = []
     with _capture(path) as capture:
         _refuse_alpha(capture, path)
-        declared = _declared_frames(capture)
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        # Frames before the range are decoded and dropped: seeking lands on key frames in some containers.
-        num_skipped = sum(1 for _ in islice(iter(capture.grab, False), start))
-        kept = _in_blocks(prepare(frame) for frame in _same_size(_decoded(capture, start, stop), path))
-    num_decoded = num_skipped + len(kept)
-    num_total = max(declared, num_decoded)
+        _refuse_huge(path, (capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        declared, rate = _declared_frames(capture), capture.get(cv2.CAP_PROP_FPS)
+        notes = _shape_notes(capture)
+        fps = rate if 0 < rate <= MAX_FPS else DEFAULT_FPS
+        stays = _Stays(seen)
+        decoded = stays.watched(_decoded(capture, fps, start, stop, seen))
+        kept = _in_blocks(prepare(frame) for frame in _same_size(decoded, path))
+        if len(kept) == 1:  # nothing to compare it with yet
+            list(stays.watched(islice(_decoded(capture, fps, 0, None, []), 1)))
+    num_decoded = len(seen)
     if num_decoded == 0:
         raise _error(
             "path",
@@ -132,6 +208,20 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> t
             got=f"none in {str(path)!r}",
             cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
         )
+    if num_decoded == 1 and rate > MAX_FPS:  # the rate of one picture among sound
+        got = f"sound with a picture of its cover, {str(path)!r}"
+        raise _error("path", expected="a video", got=got, cure="Give a file with moving pictures.")
+    if stays.last and not _converts(path, stays.last):
+        raise _error(
+            "path",
+            expected="a video of whole pictures",
+            got=f"one of interlaced fields, {str(path)!r}, which OpenCV does not convert",
+            cure="Make whole pictures of them: ffmpeg -i VIDEO -vf yadif NEW.mp4.",
+        )
+    seconds, head, reached = risen([one.milliseconds for one in seen], fps), _head(path), seen[-1].position + 1
+    if declared and rate > 0 and not counts_frames(head):
+        declared = promised(seconds, declared / rate, fps, reached) if tells_duration(head) else reached
+    num_total = max(declared, reached)
     # A container's count may be an estimate, so the range is judged against what decoded as well.
     _check_within(start, stop, num_total, path)
     if not kept:
@@ -142,11 +232,40 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> t
             cure="Ask for earlier frames.",
         )
     num_declared = (num_total if stop is None else stop) - start
-    return kept, num_declared, fps if 0 < fps <= MAX_FPS else DEFAULT_FPS
+    pace = _usable(pace_of(seconds[len(seen) - len(kept) :], fps))
+    gaps = _gap_notes([start - 1, *(one.position for one in seen[len(seen) - len(kept) :])])
+    return kept, num_declared, pace, notes + gaps + _pace_notes(pace)
 
 
-def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
-    """(prepared frames, images within the range, fps) of a folder of images."""
+def _usable(pace: Pace) -> Pace:
+    return pace if pace.fps <= MAX_FPS else Pace(DEFAULT_FPS)
+
+
+def _gap_notes(positions: list[int]) -> tuple[str, ...]:
+    """What is to be said of frames that damage left out before others."""
+    gaps = [(before + 1, after) for before, after in pairwise(positions) if after - before > 1]
+    if not gaps:
+        return ()
+    first, after = gaps[0]
+    which = f"frame {first}" if after == first + 1 else f"frames {first} to {after - 1}"
+    num = sum(after - first for first, after in gaps)
+    sound = f"frames {positions[0] + 1}:{first} are sound" if first > positions[0] + 1 else "all of it"
+    which = which if len(gaps) == 1 else f"{num} frames, the first of them {first},"
+    return (f"{which} cannot be decoded, and are left out; what follows may be blemished, {sound}.",)
+
+
+def _pace_notes(pace: Pace) -> tuple[str, ...]:
+    if pace.times is None:
+        return ()
+    apart = np.diff(pace.times)
+    return (
+        f"frames are {apart.min():.3g} to {apart.max():.3g} s apart; all are kept, and taken as evenly spaced "
+        f"at their mean rate, {pace.fps:.4g} a second.",
+    )
+
+
+def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
+    """The images of a folder."""
     images = image_paths(folder)
     if not images:
         raise _error(
@@ -160,25 +279,90 @@ def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) 
 
 
 def _is_image(path: Path) -> bool:
-    """Whether a file is one image; what moves, as an animated PNG, is left to the decoder of videos."""
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
+    """Whether a file is one image, whatever it is called."""
+    if path.suffix.lower() not in IMAGE_SUFFIXES and not is_image(_head(path)):
         return False
     with _quiet():
         num_images = cv2.imcount(str(path))
-    if num_images > 1 and path.suffix.lower() in (".tif", ".tiff"):  # of which that decoder sees the first alone
+    if num_images > 1 and _head(path).startswith(
+        (b"II*\0", b"MM\0*")
+    ):  # a TIFF, of which that decoder sees the first alone
         got = f"{num_images} in {str(path)!r}"
         raise _error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
     return num_images == 1
 
 
-def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> tuple[list, int, float]:
+def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
     """As `_read_folder`, of a file with one image."""
     _check_within(start, stop, 1, path)
     return _read_images([path], prepare)
 
 
-def _read_images(chosen: list[Path], prepare: Callable) -> tuple[list, int, float]:
-    """(prepared frames, their number, fps) of images of one size."""
+#: What Pillow raises of damaged files.
+_BROKEN = (
+    EOFError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    IndexError,
+    OverflowError,
+    struct.error,
+    Image.DecompressionBombError,
+)
+
+
+def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
+    """The frames of a GIF, PNG or WebP, which have alpha, times of their own, and no decoder in FFmpeg that keeps both.
+
+    One that does not move is left to the decoder of images, which keeps its 16 bits.
+    """
+    _refuse_huge_image(path, _head(path))
+    kept, delays, fault = [], [], False
+    try:
+        with Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
+            if animation.format != "GIF" and not getattr(animation, "is_animated", False):
+                return _read_image_file(path, start, stop, prepare)
+            num_promised = _promised_pictures(animation)
+            for number in islice(count(), min(num_promised or MOST_LOST, stop or MOST_LOST)):
+                animation.seek(number)
+                animation.load()
+                delays.append(animation.info.get("duration") or GIF_DELAY)
+                if number >= start:
+                    rgba = np.asarray(animation.convert("RGBA"))
+                    kept.append(prepare(_premultiplied(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))))
+    except VideoError:
+        raise
+    except _BROKEN:
+        fault = True
+    if not delays:
+        raise _undecoded(path)
+    num_total = max(num_promised, len(delays) + fault)
+    _check_within(start, stop, num_total, path)
+    if not kept:
+        raise _error(
+            "frames",
+            expected="a range with frames that decode",
+            got=f"{_text(start, stop)}, while {len(delays)} of {num_total} frames decode in {str(path)!r}",
+            cure="Ask for earlier frames.",
+        )
+    shown = np.array(delays[start:])
+    pace = pace_of(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
+    if pace.times is not None:
+        pace = Pace(pace.fps, pace.times[:-1])
+    pace = _usable(pace)
+    return _alike(kept), (num_total if stop is None else stop) - start, pace, _pace_notes(pace)
+
+
+def _promised_pictures(animation: Image.Image) -> int:
+    """Their number as the file gives it; 0 of a damaged GIF, which is counted by reading it."""
+    try:
+        return animation.n_frames
+    except _BROKEN:
+        return 0
+
+
+def _read_images(chosen: list[Path], prepare: Callable) -> _Read:
+    """Images of one size."""
     first_shape, kept = None, []
     for entry in chosen:
         image = _read_image(entry)
@@ -191,7 +375,7 @@ def _read_images(chosen: list[Path], prepare: Callable) -> tuple[list, int, floa
                 cure="Resize the images, or choose others with frames=(A, B).",
             )
         kept.append(prepare(image))
-    return _alike(kept), len(chosen), DEFAULT_FPS
+    return _alike(kept), len(chosen), Pace(DEFAULT_FPS), ()
 
 
 def _alike(frames: list[np.ndarray]) -> list[np.ndarray]:
@@ -222,20 +406,17 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def _read_image(path: Path) -> np.ndarray:
     """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
+    head = _head(path)
+    _refuse_huge_image(path, head)
     # UNCHANGED shows a fourth channel; JPEG has none, and COLOR also applies its orientation.
-    flags = cv2.IMREAD_COLOR if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
+    flags = cv2.IMREAD_COLOR if head.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
     with _quiet():
         try:
             image = cv2.imread(str(path), flags)
         except cv2.error:  # an absurd size in the header
             image = None
     if image is None:
-        raise _error(
-            "path",
-            expected="images that decode",
-            got=f"{str(path)!r} ({_bytes_text(path)}), which does not",
-            cure="Replace or remove it.",
-        )
+        raise _undecoded(path)
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
     if image.dtype != np.uint8:
@@ -250,25 +431,83 @@ def _read_image(path: Path) -> np.ndarray:
     return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
 
 
+def _undecoded(path: Path) -> VideoError:
+    got = f"{str(path)!r} ({_bytes_text(path)}), which does not"
+    return _error("path", expected="images that decode", got=got, cure="Replace or remove it.")
+
+
+def _refuse_huge_image(path: Path, head: bytes) -> None:
+    """Raise for an image whose header claims more pixels than are taken, or than its bytes can hold."""
+    size = claimed_size(head)
+    _refuse_huge(path, size)
+    if size is not None and path.stat().st_size < fewest_bytes(head, size):
+        raise _undecoded(path)
+
+
+def _refuse_huge(path: Path, size: tuple[float, float] | None) -> None:
+    """Raise for a picture that a header says is larger than any, before memory is taken for it."""
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise _error(
+            "path",
+            expected=f"pictures of at most {MAX_PIXELS:,} pixels",
+            got=f"{size[0]:.0f}x{size[1]:.0f} (height x width) in the header of {str(path)!r}",
+            cure="The file is damaged, or must be scaled down first.",
+        )
+
+
 def _premultiplied(image: np.ndarray) -> np.ndarray:
     """Colours times alpha, to nearest: what the hidden pixels of a transparent image are does not matter then."""
     alpha = image[..., 3:].astype(np.uint16)
     return np.concatenate([((image[..., :3] * alpha + 127) // 255).astype(np.uint8), image[..., 3:]], axis=-1)
 
 
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"  # where OpenCV takes FFmpeg's options from, at each opening
+_opening = threading.Lock()
+
+
+def _restricting(others: str | None) -> str:
+    ours = f"protocol_whitelist;file|format_whitelist;{FORMATS}"
+    return f"{others}|{ours}" if others else ours
+
+
+@contextmanager
+def _restricted() -> Iterator[None]:
+    """Let FFmpeg open this one file and nothing that it names: no address, no playlist, no sequence of images."""
+    with _opening:
+        before = os.environ.get(_OPTIONS)
+        os.environ[_OPTIONS] = _restricting(before)
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[_OPTIONS]
+            else:
+                os.environ[_OPTIONS] = before
+
+
 @contextmanager
 def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     """An opened decoder, silent and released at the end."""
+    kind = kind_of(_head(path))
+    if kind == LIST:
+        raise _error(
+            "path",
+            expected="a video file or a folder of images",
+            got=f"{kind}, {str(path)!r}",
+            cure="What it names is never opened: give the video itself.",
+        )
     with _quiet():
         # FFmpeg only, and an absolute path: other backends take 'img01.png' for the first of a sequence,
         # and FFmpeg takes 'name:rest' for a protocol.
-        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+        with _restricted():
+            capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         try:
             if not capture.isOpened():
                 raise _error(
                     "path",
                     expected="a video file or a folder of images",
-                    got=f"{str(path)!r} ({_bytes_text(path)}), which does not open as a video",
+                    got=f"{str(path)!r} ({_bytes_text(path)}{f', {kind}' if kind else ''}), "
+                    "which does not open as a video",
                     cure="Check that it is a video and that its copy or download is complete.",
                 )
             yield capture
@@ -279,19 +518,13 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
 #: Pixel formats as FFmpeg names them to OpenCV, where there is alpha in every one: of packed pixels, and the first two
 #: letters of planar ones, whose third says how colours are sampled (a small number; "Y42B" is another).
 _PACKED_ALPHA, _PLANAR_ALPHA = (b"RGBA", b"BGRA", b"ARGB", b"ABGR"), (b"Y4", b"G4")
-#: AlphaMode = 1 in Matroska's and WebM's description of a track, which stands before the first cluster.
-_MATROSKA, _ALPHA_MODE, _CLUSTER, _HEAD_BYTES = b"\x1a\x45\xdf\xa3", b"\x53\xc0\x81\x01", b"\x1f\x43\xb6\x75", 1 << 16
 
 
 def _refuse_alpha(capture: cv2.VideoCapture, path: Path) -> None:
     """Raise for a video with alpha: decoding would drop it without a word."""
     kind = (int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) & 0xFFFFFFFF).to_bytes(4, "little")
     packed = kind in _PACKED_ALPHA and int(capture.get(cv2.CAP_PROP_FOURCC)) != 0  # raw video's fourth byte is idle
-    with open(path, "rb") as file:
-        head = file.read(_HEAD_BYTES)
-    packed &= not head.startswith(b"GIF8")  # whose decoder always says so; most have none
-    beside = head.startswith(_MATROSKA) and _ALPHA_MODE in head.split(_CLUSTER)[0]
-    if packed or (kind[:2] in _PLANAR_ALPHA and kind[2] < ord(" ")) or beside:
+    if packed or (kind[:2] in _PLANAR_ALPHA and kind[2] < ord(" ")) or has_alpha_beside(_head(path)):
         raise _error(
             "path",
             expected="a video without alpha",
@@ -300,15 +533,101 @@ def _refuse_alpha(capture: cv2.VideoCapture, path: Path) -> None:
         )
 
 
-def _decoded(capture: cv2.VideoCapture, start: int, stop: int | None) -> Iterator[np.ndarray]:
-    """The next frames, BGR, at most `stop - start`, until the first that does not decode."""
-    left = math.inf if stop is None else stop - start
-    while left > 0:
-        found, frame = capture.read()
-        if not found:
+def _shape_notes(capture: cv2.VideoCapture) -> tuple[str, ...]:
+    """What is to be said of pixels that are not square."""
+    across, down = (capture.get(name) for name in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
+    if not (across > 0 and down > 0 and abs(across / down - 1) > 0.01):
+        return ()
+    return (f"pixels are {across / down:.3g} times as wide as high; frames are kept as stored, not stretched.",)
+
+
+class _Seen(NamedTuple):
+    """A frame that decodes: which one of the file it is, and its time."""
+
+    position: int
+    milliseconds: float
+
+
+def _grabbed(capture: cv2.VideoCapture, fps: float) -> Iterator[_Seen]:
+    """The frames that decode, one by one. Those lost before one, in damage, are counted by its time."""
+    position, before, misses = -1, -1000 / fps, 0
+    while misses < MISSES:
+        if not capture.grab():
+            misses += 1
+            continue
+        now = capture.get(cv2.CAP_PROP_POS_MSEC)
+        lost = (now - before) * fps / 1000 - 1 if misses else 0.0
+        position += 1 + (round(lost) if 0 < lost < MOST_LOST else 0)
+        before, misses = now, 0
+        yield _Seen(position, now)
+
+
+def _decoded(
+    capture: cv2.VideoCapture, fps: float, start: int, stop: int | None, seen: list[_Seen]
+) -> Iterator[np.ndarray]:
+    """The frames from `start` up to `stop`, BGR, that decode; all that are passed are added to `seen`.
+
+    Those before `start` are decoded and dropped: seeking lands on key frames in some containers.
+    """
+    for one in _grabbed(capture, fps):
+        if stop is not None and one.position >= stop:
             return
-        yield frame
-        left -= 1
+        if one.position >= start:
+            found, frame = capture.retrieve()
+            if not found:
+                continue
+        seen.append(one)
+        if one.position >= start:
+            yield frame
+        if stop is not None and one.position == stop - 1:
+            return
+
+
+class _Stays:
+    """Which frame was the last to equal the one before it.
+
+    Where FFmpeg refuses to convert a frame, OpenCV (from 4.13 on) says nothing and hands out what its memory held, so
+    it equals the one before; so do frames of clips in which nothing moves.
+    """
+
+    def __init__(self, seen: list[_Seen]):
+        self.last, self._seen, self._before = 0, seen, None
+
+    def watched(self, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+        for frame in frames:
+            if self._before is not None and np.array_equal(frame, self._before):
+                self.last = len(self._seen)
+            self._before = frame
+            yield frame
+
+
+#: Read so many frames, and let FFmpeg tell its errors.
+_TRIAL = """
+import sys, cv2
+capture, left, misses = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG), int(sys.argv[2]), int(sys.argv[3])
+while left > 0 and misses > 0:
+    left, misses = (left - 1, misses) if capture.read()[0] else (left, misses - 1)
+"""
+
+
+def _converts(path: Path, num_frames: int) -> bool:
+    """Whether the first frames of a video become pictures: those of interlaced fields may not.
+
+    Only FFmpeg's log says so, whose level is fixed when the process first opens a video; so another one asks.
+    """
+    if getattr(sys, "frozen", False) or not sys.executable:
+        return True
+    environment = os.environ | {
+        "OPENCV_FFMPEG_LOGLEVEL": "16",  # AV_LOG_ERROR
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        _OPTIONS: _restricting(os.environ.get(_OPTIONS)),
+    }
+    command = [sys.executable, "-c", _TRIAL, str(path.resolve()), str(num_frames), str(MISSES)]
+    try:
+        ran = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, env=environment, check=False)
+    except OSError:  # no more processes: then nothing can be said
+        return True
+    return b"Cannot convert interlaced" not in ran.stdout + ran.stderr
 
 
 def _same_size(frames: Iterable[np.ndarray], path: Path) -> Iterator[np.ndarray]:
@@ -721,4 +1040,4 @@ def _quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        logging.setLogLevel(level)
+        home.setLogLevel(level)

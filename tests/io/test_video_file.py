@@ -160,8 +160,14 @@ def test_damaged_video_tells_what_was_promised(tmp_path):
     clip = read_video(path, size=(16, 32))
     assert 2 <= clip.num_frames < clip.num_declared == 132
     with pytest.raises(VideoError) as caught:
-        read_video(path, size=(16, 32), frames=(120, 130))
-    _one_line(caught, "120:130", "of 132 frames decode")
+        read_video(path, size=(16, 32), frames=(18, 20))
+    _one_line(caught, "18:20", "of 132 frames decode")
+    # What decodes past the damage is blemished, but in its place.
+    assert "frames 17 to 23 cannot be decoded" in clip.notes[0]
+    assert "frames 0:17 are sound" in clip.notes[0]
+    late = read_video(path, size=(16, 32), frames=(120, 130))
+    assert late.num_frames == late.num_declared == 10
+    np.testing.assert_array_equal(late.frames, clip.frames[120 - 7 : 130 - 7])
 
 
 def test_range_of_bad_video_counts_within_the_range(tmp_path, clip_file):

@@ -1,0 +1,761 @@
+"""Videos as they come: each kind is read right, or refused in a line that says why.
+
+Most are made here byte by byte: AVIs whose packets are PNGs or JPEGs, MP4s and WebMs whose boxes are changed. What only
+an encoder makes is made with ffmpeg, and skipped where there is none.
+"""
+
+import os
+import shutil
+import struct
+import subprocess
+import wave
+import zipfile
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+from PIL import Image
+
+from foldgauss.io import load_video_model, video_file
+from foldgauss.io.video_file import VideoError, read_video, write_video
+
+OLD = int(cv2.__version__.split(".")[0]) < 5
+FLAT = np.array(
+    [
+        [200, 30, 30],
+        [30, 200, 30],
+        [30, 30, 200],
+        [128, 128, 128],
+        [250, 250, 250],
+        [5, 5, 5],
+        [220, 180, 40],
+        [90, 20, 140],
+    ],
+    np.uint8,
+)
+
+
+def _noise(num_frames=8, height=48, width=64, channels=3):
+    return np.random.default_rng(0).integers(0, 256, (num_frames, height, width, channels)).astype(np.uint8)
+
+
+def _waves(num_frames=8, height=48, width=64):
+    """What a lossy encoder keeps; no two frames are alike."""
+    y, x = np.mgrid[:height, :width]
+    frames = [128 + 100 * np.sin(0.05 * x + 0.5 * k) * np.cos(0.06 * y) for k in range(num_frames)]
+    return np.repeat(np.rint(frames).astype(np.uint8)[..., None], 3, -1)
+
+
+def _png(frame):
+    order = [2, 1, 0, 3][: frame.shape[-1]] if frame.ndim == 3 else ...
+    return cv2.imencode(".png", frame[..., order])[1].tobytes()
+
+
+def _avi(packets, height, width, *, num=None, fourcc=b"MPNG"):
+    """An AVI of such packets, 10 a second; `num`: the frames that its header counts."""
+
+    def chunk(name, *parts):
+        data = b"".join(parts)
+        return name + struct.pack("<I", len(data)) + data + b"\0" * (len(data) % 2)
+
+    num = len(packets) if num is None else num
+    main = struct.pack("<14I", 100_000, 0, 0, 0, num, 0, 1, 0, width, height, 0, 0, 0, 0)
+    stream = b"vids" + fourcc
+    stream += struct.pack("<IHHIIIIIIIIHHHH", 0, 0, 0, 0, 1, 10, 0, num, 0, 0, 0, 0, 0, width, height)
+    kind = struct.pack("<IiiHH4sIiiII", 40, width, height, 1, 24, fourcc, 0, 0, 0, 0, 0)
+    described = chunk(b"LIST", b"strl", chunk(b"strh", stream), chunk(b"strf", kind))
+    head = chunk(b"LIST", b"hdrl", chunk(b"avih", main), described)
+    return chunk(b"RIFF", b"AVI ", head, chunk(b"LIST", b"movi", *[chunk(b"00dc", packet) for packet in packets]))
+
+
+def _exact_avi(path, frames, **options):
+    path.write_bytes(_avi([_png(frame) for frame in frames], *frames[0].shape[:2], **options))
+    return path
+
+
+_HOLDERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+
+
+def _with_box(data, name, change):
+    """An MP4 whose index stands last, with `change` made to the content of its boxes `name`."""
+    made = b""
+    while data:
+        size, kind = int.from_bytes(data[:4], "big"), data[4:8]
+        content, data = data[8:size], data[size:]
+        if kind in _HOLDERS:
+            content = _with_box(content, name, change)
+        elif kind == name:
+            content = change(content)
+        made += struct.pack(">I", 8 + len(content)) + kind + content
+    return made
+
+
+@pytest.fixture(scope="module")
+def mp4(tmp_path_factory):
+    """8 frames of 48x64, 10 a second."""
+    data = write_video(tmp_path_factory.mktemp("clip") / "clip.mp4", _waves(), 10).read_bytes()
+    assert data.rindex(b"moov") > data.rindex(b"mdat")
+    return data
+
+
+@pytest.fixture(scope="module")
+def webm(tmp_path_factory):
+    return write_video(tmp_path_factory.mktemp("clip") / "clip.webm", _waves(), 10).read_bytes()
+
+
+def _ffmpeg(*arguments, frames=None, rate=10):
+    """What ffmpeg writes to its output, given `frames` if any; skip where there is none, or none with that encoder."""
+    if shutil.which("ffmpeg") is None:
+        pytest.skip("ffmpeg is not installed, and nothing else here encodes this")
+    given = []
+    if frames is not None:
+        height, width = frames.shape[1:3]
+        kind = {3: "rgb24", 4: "rgba"}[frames.shape[3]]
+        given = ["-f", "rawvideo", "-pix_fmt", kind, "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
+    command = ["ffmpeg", "-v", "error", *([] if given else ["-nostdin"]), "-y", *given, *map(str, arguments)]
+    sent = None if frames is None else frames.tobytes()
+    ran = subprocess.run(command, input=sent, capture_output=True, check=False, timeout=120)
+    if b"Unknown encoder" in ran.stderr:
+        pytest.skip(f"this ffmpeg lacks an encoder: {ran.stderr.decode().splitlines()[0]}")
+    assert ran.returncode == 0, ran.stderr.decode()
+    return ran.stdout
+
+
+def _refused(path, *words):
+    with pytest.raises(VideoError) as caught:
+        read_video(path)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert "expected" in text
+    for word in words:
+        assert word in text
+    return text
+
+
+# ------------------------------------------------------------------------------------------------ times
+
+TICKS = [1, 1, 1, 1, 4, 4, 4, 4]  # of 0.1 s, which each frame lasts
+SHOWN = np.array([0, 0.1, 0.2, 0.3, 0.4, 0.8, 1.2, 1.6])
+
+
+def _uneven(content):
+    """A table of sample times (stts) with every frame's own."""
+    tick = int.from_bytes(content[12:16], "big")
+    entries = b"".join(struct.pack(">II", 1, tick * ticks) for ticks in TICKS)
+    return content[:4] + struct.pack(">I", len(TICKS)) + entries
+
+
+@pytest.fixture(scope="module")
+def uneven_mp4(mp4):
+    return _with_box(mp4, b"stts", _uneven).replace(b"edts", b"free")  # an edit list, which would cut it short
+
+
+def test_uneven_times_are_told_and_no_frame_is_lost(tmp_path, mp4, uneven_mp4):
+    (tmp_path / "even.mp4").write_bytes(mp4)
+    (tmp_path / "uneven.mp4").write_bytes(uneven_mp4)
+    even, uneven = read_video(tmp_path / "even.mp4"), read_video(tmp_path / "uneven.mp4")
+    np.testing.assert_array_equal(uneven.frames, even.frames)
+    assert (even.times, even.notes, even.fps) == (None, (), 10)
+    np.testing.assert_allclose(uneven.times, SHOWN, atol=1e-3)
+    assert uneven.fps == pytest.approx(7 / 1.6)
+    assert uneven.num_declared == 8
+    assert len(uneven.notes) == 1
+    assert "0.1 to 0.4 s apart" in uneven.notes[0]
+    assert "4.375" in uneven.notes[0]
+    late = read_video(tmp_path / "uneven.mp4", frames=(3, 6))
+    np.testing.assert_allclose(late.times, [0, 0.1, 0.5], atol=1e-3)
+    assert late.fps == pytest.approx(4)
+    steady = read_video(tmp_path / "uneven.mp4", frames=(4, 8))
+    assert (steady.times, steady.fps) == (None, pytest.approx(2.5))
+    given = read_video(tmp_path / "uneven.mp4", fps=12)
+    assert (given.times, given.fps) == (None, 12)
+
+
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.nut", "clip.mov"])
+def test_uneven_times_in_other_containers(tmp_path, name):
+    """Matroska does not count its frames: 22 were once promised of these 8."""
+    shown = "+".join(rf"gte(N\,{k})*{ticks}" for k, ticks in enumerate(TICKS[:-1], 1))
+    _ffmpeg(
+        "-vf", f"settb=1/1000,setpts=100*({shown})", "-vsync", "vfr", "-c:v", "png", tmp_path / name, frames=_noise()
+    )
+    clip = read_video(tmp_path / name)
+    np.testing.assert_array_equal(clip.frames, _noise())
+    np.testing.assert_allclose(clip.times, SHOWN, atol=2e-3)
+    assert (clip.num_declared, clip.fps) == (8, pytest.approx(7 / 1.6, rel=1e-3))
+
+
+@pytest.mark.parametrize(("fps", "name"), [(29.97, "a.webm"), (23.976, "a.mp4"), (60, "a.webm"), (29.97, "a.gif")])
+def test_rounded_time_stamps_are_even(tmp_path, fps, name):
+    clip = read_video(write_video(tmp_path / name, _waves(31), fps))
+    assert clip.times is None
+    assert clip.notes == ()
+    assert clip.fps == pytest.approx(fps, rel=5e-3)  # half a hundredth of a second in 31 frames
+
+
+def test_animations_have_times_of_their_own(tmp_path):
+    pictures = [Image.fromarray(frame) for frame in _waves(4)]
+    shared = {"save_all": True, "append_images": pictures[1:], "duration": [100, 100, 400, 200]}
+    for name in ("a.gif", "a.png", "a.webp"):
+        pictures[0].save(tmp_path / name, **shared)
+        clip = read_video(tmp_path / name)
+        np.testing.assert_allclose(clip.times, [0, 0.1, 0.2, 0.6])
+        assert clip.fps == pytest.approx(4 / 0.8)
+        assert "apart" in clip.notes[0]
+
+
+# ---------------------------------------------------------------------------------------- sizes and turns
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (35, 51), (3, 4097)])
+def test_odd_sizes(tmp_path, size):
+    frames = _noise(3, *size)
+    np.testing.assert_array_equal(read_video(_exact_avi(tmp_path / "a.avi", frames)).frames, frames)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_videos_are_turned_upright(tmp_path, mp4, turns):
+    """The matrix of a track (tkhd) turns it clockwise, by quarters; phones write that."""
+    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
+    matrix = struct.pack(">9i", cos << 16, sin << 16, 0, -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
+    turned = _with_box(mp4, b"tkhd", lambda content: content[:40] + matrix + content[76:])
+    (tmp_path / "a.mp4").write_bytes(mp4)
+    (tmp_path / "turned.mp4").write_bytes(turned)
+    stored = read_video(tmp_path / "a.mp4").frames
+    np.testing.assert_array_equal(read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2)))
+
+
+def test_pixels_that_are_not_square_are_told(tmp_path):
+    _ffmpeg("-vf", "setsar=16/15", "-c:v", "ffv1", tmp_path / "a.mkv", frames=_waves())
+    clip = read_video(tmp_path / "a.mkv")
+    assert clip.size == (48, 64)
+    assert "1.07 times as wide" in clip.notes[0]
+
+
+# --------------------------------------------------------------------------------------- grey, alpha, depth
+
+
+@pytest.mark.parametrize(("suffix", "fourcc"), [(".png", b"MPNG"), (".jpg", b"MJPG")])
+def test_grey(tmp_path, suffix, fourcc):
+    grey = _waves(4)[..., 0]
+    packets = [cv2.imencode(suffix, frame, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes() for frame in grey]
+    (tmp_path / "grey.avi").write_bytes(_avi(packets, 48, 64, fourcc=fourcc))
+    frames = read_video(tmp_path / "grey.avi").frames
+    assert np.abs(frames.astype(int) - grey[..., None]).max() <= (0 if suffix == ".png" else 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "near"),
+    [
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv444p"), 2),
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le"), 3),
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p16le"), 3),
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "gbrp10le"), 1),
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "rgb48le"), 1),
+        ("a.mov", ("-c:v", "prores_ks", "-pix_fmt", "yuv422p10le"), 3),
+        ("a.mp4", ("-c:v", "libx264", "-crf", "1", "-pix_fmt", "yuv420p10le"), 3),
+        ("a.mp4", ("-c:v", "libx265", "-crf", "1", "-pix_fmt", "yuv420p10le", "-x265-params", "log-level=none"), 3),
+        ("a.webm", ("-c:v", "libvpx-vp9", "-crf", "1", "-pix_fmt", "yuv420p10le"), 3),
+        ("full.mkv", ("-vf", "scale=out_range=full", "-color_range", "pc", "-c:v", "ffv1", "-pix_fmt", "yuv420p"), 3),
+        ("hd.mkv", ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709", "-c:v", "ffv1"), None),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else str(value),
+)
+def test_levels_of_depths_and_ranges(tmp_path, name, options, near):
+    """Ten bits are not clipped, a full range not stretched; colours are those of their matrix where OpenCV knows it."""
+    if OLD and near is None:
+        pytest.skip(f"OpenCV {cv2.__version__} knows no matrix but that of BT.601")
+    frames = np.repeat(np.repeat(np.repeat(FLAT[None, None], 48, 1), 16, 2), 2, 0)
+    _ffmpeg(*options, tmp_path / name, frames=frames)
+    found = read_video(tmp_path / name).frames[1]
+    for number, color in enumerate(FLAT):
+        patch = found[5:43, 16 * number + 5 : 16 * number + 11].astype(int)
+        assert np.abs(patch - color).max() <= (3 if near is None else near)
+
+
+def test_ten_bits_of_grey(tmp_path):
+    grey = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, None, :, None], 3, -1).repeat(48, 1).repeat(2, 0)
+    _ffmpeg("-c:v", "ffv1", "-pix_fmt", "gray10le", tmp_path / "a.mkv", frames=grey)
+    assert np.abs(read_video(tmp_path / "a.mkv").frames.astype(int) - grey).max() <= 2
+
+
+def test_high_dynamic_range_is_read(tmp_path):
+    tags = ("-color_primaries", "bt2020", "-color_trc", "smpte2084", "-colorspace", "bt2020nc")
+    _ffmpeg("-c:v", "ffv1", "-pix_fmt", "yuv420p10le", *tags, tmp_path / "a.mkv", frames=_waves())
+    assert read_video(tmp_path / "a.mkv").frames.shape == (8, 48, 64, 3)
+
+
+def _rgba():
+    alpha = np.zeros((4, 48, 64, 1), np.uint8)
+    alpha[:, :24], alpha[:, 24:36] = 255, 51
+    return np.concatenate([_waves(4), alpha], -1)
+
+
+def test_alpha_of_animations_is_kept(tmp_path):
+    rgba = _rgba()
+    first, *rest = (Image.fromarray(frame) for frame in rgba)
+    first.save(tmp_path / "a.png", save_all=True, append_images=rest, duration=50)
+    first.save(tmp_path / "a.webp", save_all=True, append_images=rest, duration=50, lossless=True)
+    for name in ("a.png", "a.webp"):
+        clip = read_video(tmp_path / name)
+        assert (clip.has_alpha, clip.fps, clip.num_declared) == (True, 20, 4)
+        np.testing.assert_array_equal(clip.frames[..., 3], rgba[..., 3])
+        expected = np.rint(rgba[..., :3] * (rgba[..., 3:] / 255))
+        assert np.abs(clip.over_black - expected).max() <= 1
+        np.testing.assert_array_equal(read_video(tmp_path / name, frames=(1, 3)).frames, clip.frames[1:3])
+
+
+def test_alpha_of_a_gif_is_kept(tmp_path):
+    pictures = []
+    for k in range(3):
+        picture = Image.new("P", (64, 48), 0)
+        picture.putpalette([0, 0, 0, 200, 30, 30])
+        picture.paste(1, (8 * k, 8, 8 * k + 16, 24))
+        pictures.append(picture)
+    shared = {"save_all": True, "append_images": pictures[1:], "duration": 100, "transparency": 0, "disposal": 2}
+    pictures[0].save(tmp_path / "a.gif", **shared)
+    clip = read_video(tmp_path / "a.gif")
+    assert clip.has_alpha
+    for k, frame in enumerate(clip.frames):
+        expected = np.zeros((48, 64, 4), np.uint8)
+        expected[8:24, 8 * k : 8 * k + 16] = (200, 30, 30, 255)
+        np.testing.assert_array_equal(frame, expected)
+
+
+def test_what_is_written_as_webp_is_read(tmp_path):
+    clip = read_video(write_video(tmp_path / "a.webp", _waves(), 20))
+    assert (clip.num_frames, clip.fps, clip.has_alpha) == (8, 20, False)
+    assert np.abs(clip.frames.astype(int) - _waves()).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.webm", ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p")),
+        ("a.mov", ("-c:v", "qtrle", "-pix_fmt", "argb")),
+        ("a.mov", ("-c:v", "png", "-pix_fmt", "rgba")),
+        ("a.mov", ("-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le")),
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "bgra")),
+        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuva420p")),
+        ("a.avi", ("-c:v", "utvideo", "-pix_fmt", "gbrap")),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else value,
+)
+def test_alpha_that_decoding_drops_is_refused(tmp_path, name, options):
+    _ffmpeg(*options, tmp_path / name, frames=_rgba())
+    _refused(tmp_path / name, "without alpha", "PNGs")
+
+
+# --------------------------------------------------------------------------------------------- interlaced
+
+
+@pytest.mark.parametrize("codec", ["mpeg2video", "libx264"])
+def test_interlaced_is_right_or_refused(tmp_path, codec):
+    """OpenCV 4.13 to 5.0 hand out whatever their memory held before."""
+    frames = _waves(8, 64, 96)
+    quality = ("-q:v", "1") if codec == "mpeg2video" else ("-crf", "5")
+    _ffmpeg("-c:v", codec, *quality, "-flags", "+ilme+ildct", tmp_path / "a.mkv", frames=frames, rate=25)
+    for chosen in (None, (2, 3)):
+        try:
+            found = read_video(tmp_path / "a.mkv", frames=chosen).frames
+        except VideoError:
+            _refused(tmp_path / "a.mkv", "interlaced", "yadif")
+        else:
+            assert np.abs(found - frames[slice(*chosen) if chosen else ...].astype(int)).mean() < 8
+
+
+def test_a_clip_in_which_nothing_moves_is_read(tmp_path):
+    frames = _noise(1).repeat(4, 0)
+    np.testing.assert_array_equal(read_video(_exact_avi(tmp_path / "a.avi", frames)).frames, frames)
+
+
+def test_what_does_not_convert_is_asked_of_the_frames_that_stay(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(video_file, "_converts", lambda path, num_frames: asked.append(num_frames) or False)
+    moving = _noise(6)
+    read_video(_exact_avi(tmp_path / "a.avi", moving))
+    assert asked == []
+    moving[4] = moving[3]
+    _refused(_exact_avi(tmp_path / "b.avi", moving), "interlaced", "b.avi")
+    assert asked == [5]
+    with pytest.raises(VideoError, match="interlaced"):
+        read_video(tmp_path / "b.avi", frames=(3, 4))
+
+
+# ------------------------------------------------------------------------------------- counts and damage
+
+
+@pytest.mark.parametrize("num", [0, 3, 1000, 2**31 - 2, 2**32 - 1])
+def test_a_count_that_lies(tmp_path, num):
+    if OLD and num == 3:
+        pytest.skip(f"OpenCV {cv2.__version__} itself stops at the count of the header")
+    clip = read_video(_exact_avi(tmp_path / "a.avi", _noise(), num=num))
+    np.testing.assert_array_equal(clip.frames, _noise())
+    assert clip.num_declared == (num if 8 < num < 2**31 else 8)
+
+
+def _duration(webm, seconds):
+    """The WebM with another duration, told in milliseconds."""
+    at = webm.index(b"\x44\x89\x88") + 3
+    return webm[:at] + struct.pack(">d", 1000 * seconds) + webm[at + 8 :]
+
+
+@pytest.mark.parametrize(("seconds", "declared"), [(0.8, 8), (0.1, 8), (0.0, 8), (float("nan"), 8), (2.0, 20)])
+def test_a_duration_that_lies(tmp_path, webm, seconds, declared):
+    (tmp_path / "a.webm").write_bytes(_duration(webm, seconds))
+    clip = read_video(tmp_path / "a.webm")
+    assert (clip.num_frames, clip.num_declared, clip.fps) == (8, declared, 10)
+
+
+def test_no_count_at_all(tmp_path, webm):
+    """As a stream has it that is written while it is sent: the element of the duration made void."""
+    assert webm.count(b"\x44\x89\x88") == 1
+    (tmp_path / "a.webm").write_bytes(webm.replace(b"\x44\x89\x88", b"\xec\x40\x08"))
+    clip = read_video(tmp_path / "a.webm")
+    assert (clip.num_frames, clip.num_declared) == (8, 8)
+
+
+@pytest.mark.parametrize("kind", ["matroska", "webm", "mpegts", "flv"])
+def test_streams_from_a_pipe(tmp_path, kind):
+    codec = {"matroska": "ffv1", "webm": "libvpx-vp9", "mpegts": "mpeg2video", "flv": "flv"}[kind]
+    live = ("-live", "1") if kind == "webm" else ()
+    path = tmp_path / f"clip.{kind}"
+    path.write_bytes(_ffmpeg("-c:v", codec, "-q:v", "1", *live, "-f", kind, "-", frames=_waves(), rate=25))
+    clip = read_video(path)
+    assert (clip.num_frames, clip.num_declared, clip.times) == (8, 8, None)
+    assert np.abs(clip.frames.astype(int) - _waves()).mean() < 10
+
+
+@pytest.mark.parametrize("kept", [1, 4, 7])
+def test_a_tail_cut_off(tmp_path, kept):
+    packets = [_png(frame) for frame in _noise()]
+    data = _avi(packets, 48, 64)
+    end = data.index(packets[kept])
+    (tmp_path / "a.avi").write_bytes(data[: end + len(packets[kept]) // 3])
+    clip = read_video(tmp_path / "a.avi")
+    assert clip.num_declared == 8
+    np.testing.assert_array_equal(clip.frames[:kept], _noise()[:kept])
+    assert clip.num_frames <= kept + 1
+
+
+@pytest.mark.parametrize("broken", [(0, 1), (3, 4), (0, 3)], ids=str)
+def test_broken_frames_are_left_out(tmp_path, broken):
+    packets = [bytes(100) if k in broken else _png(frame) for k, frame in enumerate(_noise())]
+    (tmp_path / "a.avi").write_bytes(_avi(packets, 48, 64))
+    clip = read_video(tmp_path / "a.avi")
+    # OpenCV passes by the frame after a broken one as well.
+    sound = [k for k in range(8) if k not in broken and k - 1 not in broken]
+    np.testing.assert_array_equal(clip.frames, _noise()[sound])
+    assert clip.num_declared == 8
+    assert "cannot be decoded, and are left out" in clip.notes[0]
+    shown = np.array(sound) / 10
+    if np.ptp(np.diff(sound)):  # there is a gap in the middle
+        np.testing.assert_allclose(clip.times, shown - shown[0], atol=1e-3)
+    late = read_video(tmp_path / "a.avi", frames=(6, 7))  # frames keep their numbers
+    assert late.notes == ()
+    np.testing.assert_array_equal(late.frames, _noise()[6:7])
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.png", "a.webp"])
+def test_a_broken_animation(tmp_path, name):
+    first, *rest = (Image.fromarray(frame) for frame in _noise())
+    first.save(tmp_path / name, save_all=True, append_images=rest, duration=100)
+    data, whole = (tmp_path / name).read_bytes(), read_video(tmp_path / name)
+    assert whole.num_frames == 8
+    for eighth in range(8):
+        (tmp_path / name).write_bytes(data[: len(data) * eighth // 8])
+        try:
+            clip = read_video(tmp_path / name)
+        except VideoError:
+            continue
+        assert clip.num_frames < clip.num_declared <= 8
+        np.testing.assert_array_equal(clip.frames, whole.frames[: clip.num_frames])
+
+
+def test_a_gif_whose_frames_cannot_be_counted(tmp_path, monkeypatch):
+    first, *rest = (Image.fromarray(frame) for frame in _waves())
+    first.save(tmp_path / "a.gif", save_all=True, append_images=rest, duration=100)
+    whole = read_video(tmp_path / "a.gif")
+    monkeypatch.setattr(video_file, "_promised_pictures", lambda animation: 0)
+    clip = read_video(tmp_path / "a.gif")
+    np.testing.assert_array_equal(clip.frames, whole.frames)
+    np.testing.assert_array_equal(read_video(tmp_path / "a.gif", frames=(2, 4)).frames, whole.frames[2:4])
+
+
+def test_pages_of_a_tiff_are_refused_whatever_it_is_called(tmp_path):
+    first, *rest = (Image.fromarray(frame) for frame in _waves(3))
+    first.save(tmp_path / "clip.mp4", "TIFF", save_all=True, append_images=rest)
+    _refused(tmp_path / "clip.mp4", "one image in a TIFF, got 3")
+
+
+# ------------------------------------------------------------------------------------------- other things
+
+
+def _wav(path):
+    with wave.open(str(path), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", ""))
+        sound.writeframes(bytes(800))
+
+
+def _zip(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "text")
+
+
+OTHERS = {
+    "nothing": (lambda path: path.write_bytes(b""), "an empty file"),
+    "zeros": (lambda path: path.write_bytes(bytes(5000)), "5000 bytes"),
+    "text": (lambda path: path.write_text("Dear diary,\n" * 40), "a text"),
+    "sound": (_wav, "sound"),
+    "zip": (_zip, "a zip archive"),
+    "model": (lambda path: path.write_bytes(struct.pack("<Q", 2) + b"{}"), "a model"),
+    "list": (lambda path: path.write_text("#EXTM3U\nother.ts\n"), "a list of other files"),
+}
+
+
+@pytest.mark.parametrize("make", OTHERS.values(), ids=OTHERS)
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.avi", "clip"])
+def test_what_is_no_video_is_named(tmp_path, make, name):
+    make[0](tmp_path / name)
+    _refused(tmp_path / name, make[1], name)
+
+
+@pytest.mark.parametrize("length", [8, 40, 300])
+def test_a_head_alone(tmp_path, mp4, webm, length):
+    for name, data in (("a.mp4", mp4), ("a.webm", webm), ("a.avi", _avi([_png(_noise(1)[0])], 48, 64))):
+        (tmp_path / name).write_bytes(data[:length])
+        _refused(tmp_path / name, name)
+
+
+def test_sound_with_a_cover_is_no_video(tmp_path):
+    cover = tmp_path / "cover.png"
+    cover.write_bytes(_png(_noise(1)[0]))
+    given = ("-f", "lavfi", "-i", "sine=d=0.2", "-i", cover, "-map", "0", "-map", "1")
+    _ffmpeg(*given, "-c:a", "aac", "-c:v", "copy", "-disposition:v", "attached_pic", tmp_path / "a.m4a")
+    _refused(tmp_path / "a.m4a", "cover")
+    _ffmpeg("-f", "lavfi", "-i", "sine=d=0.2", "-c:a", "aac", tmp_path / "b.mp4")
+    _refused(tmp_path / "b.mp4", "sound")
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.safetensors", "clip.txt", "clip"])
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "GIF", "WEBP", "TIFF"])
+def test_a_picture_called_otherwise(tmp_path, name, kind):
+    Image.fromarray(_waves(1)[0]).save(tmp_path / name, kind)
+    clip = read_video(tmp_path / name)
+    assert (clip.num_frames, clip.size, clip.fps) == (1, (48, 64), 10 if kind == "GIF" else 25)
+    assert np.abs(clip.frames[0].astype(int) - _waves(1)[0]).mean() < 4
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.gif", "a.safetensors", "a.txt", "a"])
+def test_a_video_called_otherwise(tmp_path, mp4, name):
+    (tmp_path / name).write_bytes(mp4)
+    assert read_video(tmp_path / name).num_frames == 8
+
+
+def test_a_folder_called_as_a_video(tmp_path):
+    folder = tmp_path / "clip.mp4"
+    folder.mkdir()
+    _refused(folder, "without any")
+    (folder / "0.png").write_bytes(_png(_noise(1)[0]))
+    assert read_video(folder).num_frames == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+@pytest.mark.timeout(120)
+def test_pipes_and_devices_are_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "clip.mp4")
+    _refused(tmp_path / "clip.mp4", "a pipe or a device")
+    if os.path.exists("/dev/zero"):
+        _refused("/dev/zero", "a pipe or a device")
+
+
+NAMES = ["with spaces.mp4", "Größe 日本.mp4", "clip%03d.mp4", "-lead.mp4", "a" * 250 + ".mp4", "x:y.mp4"]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=lambda name: name[:20])
+def test_names_are_taken_as_they_are(tmp_path, monkeypatch, mp4, name):
+    """A pattern names one file, not a sequence; what looks like an option or a protocol is a name."""
+    for number in range(3):
+        (tmp_path / f"img{number:03d}.png").write_bytes(_png(_noise(3)[number]))
+    (tmp_path / name).write_bytes(mp4)
+    (tmp_path / "img%03d.png").write_bytes(_png(_noise(1)[0, :20]))
+    assert read_video(tmp_path / "img%03d.png").frames.shape == (1, 20, 64, 3)
+    assert read_video(tmp_path / name).num_frames == 8
+    monkeypatch.chdir(tmp_path)
+    assert read_video(name).num_frames == 8
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX has names that are no Unicode")
+@pytest.mark.parametrize("made", ["video", "image", "folder"])
+def test_names_that_are_no_unicode_are_refused(tmp_path, mp4, made):
+    """OpenCV ends the process over them."""
+    name = os.fsdecode(os.fsencode(tmp_path) + b"/\xff")
+    try:
+        if made == "folder":
+            os.mkdir(name)
+        path = f"{name}/0.png" if made == "folder" else name
+        with open(path, "wb") as file:
+            file.write(mp4 if made == "video" else _png(_noise(1)[0]))
+    except OSError as error:
+        pytest.skip(f"this file system has no such names: {error}")
+    _refused(name, "no Unicode")
+
+
+def test_a_pattern_is_no_file(tmp_path):
+    for number in range(3):
+        (tmp_path / f"img{number:03d}.png").write_bytes(_png(_noise(3)[number]))
+    for name in ("img%03d.png", "*.png", "a" * 5000):
+        with pytest.raises(FileNotFoundError, match="missing"):
+            read_video(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "address", ["http://127.0.0.1:9/a.mp4", "rtsp://127.0.0.1/a", "file:///a.mp4", "concat:/a.mp4"]
+)
+def test_addresses_are_not_fetched(address):
+    with pytest.raises(FileNotFoundError, match=r"address.*Nothing is fetched: download it first"):
+        read_video(address)
+
+
+LISTS = {
+    "ffconcat": "ffconcat version 1.0\nfile clip.avi\n",
+    "m3u8": "#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:1,\nclip.ts\n#EXT-X-ENDLIST\n",
+    "sdp": "v=0\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+    "mpd": '<?xml version="1.0"?><MPD profiles="urn:mpeg:dash:profile:isoff-live:2011"></MPD>',
+    "asx": "<ASX><entry><ref href='clip.avi'/></entry></ASX>",
+    "url": "http://127.0.0.1:9/clip.mp4\n",
+}
+
+
+@pytest.mark.parametrize("hidden", [False, True], ids=["by its first bytes", "by the decoder"])
+@pytest.mark.parametrize("kind", LISTS)
+@pytest.mark.parametrize("name", ["list.{}", "list.mp4"])
+def test_lists_let_nothing_in(tmp_path, monkeypatch, kind, name, hidden):
+    """Two doors: what such a file begins with; and the formats that FFmpeg may open, should the first fail."""
+    path = tmp_path / name.format(kind)
+    path.write_text(LISTS[kind])
+    _exact_avi(tmp_path / "clip.avi", _noise())
+    if hidden:
+        monkeypatch.setattr(video_file, "kind_of", lambda head: None)
+    _refused(path, "does not open as a video" if hidden else "never opened")
+
+
+def test_the_second_door_is_needed(tmp_path):
+    """Without it FFmpeg reads the file that a list names."""
+    (tmp_path / "list.txt").write_text(LISTS["ffconcat"])
+    _exact_avi(tmp_path / "clip.avi", _noise())
+    with video_file._quiet():
+        capture = cv2.VideoCapture(str(tmp_path / "list.txt"), cv2.CAP_FFMPEG)
+        assert capture.read()[0]
+        capture.release()
+
+
+def test_the_environment_is_left_as_it_was(tmp_path, monkeypatch):
+    path, name = _exact_avi(tmp_path / "a.avi", _noise()), "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+    for value in (None, "threads;1"):
+        monkeypatch.delenv(name, raising=False)
+        if value:
+            monkeypatch.setenv(name, value)
+        read_video(path)
+        assert os.environ.get(name) == value
+
+
+# -------------------------------------------------------------------------------------------- huge claims
+
+
+def _png_of(height, width):
+    data = _png(_noise(1)[0])
+    head = data[12:16] + struct.pack(">II", width, height) + data[24:29]
+    return data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:]
+
+
+def _jpeg_of(height, width, progressive=0):
+    data = cv2.imencode(".jpg", _noise(1)[0], [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
+    at = data.index(b"\xff\xc2" if progressive else b"\xff\xc0") + 5
+    return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
+
+
+def _gif_of(height, width):
+    return b"GIF89a" + struct.pack("<HH", width, height) + bytes(100)
+
+
+def _webp_of(height, width):
+    sides = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+    return b"RIFF" + struct.pack("<I", 100) + b"WEBPVP8X" + struct.pack("<II", 10, 0) + sides + bytes(80)
+
+
+def _bmp_of(height, width):
+    data = cv2.imencode(".bmp", _noise(1)[0])[1].tobytes()
+    return data[:18] + struct.pack("<ii", width, -height) + data[26:]
+
+
+@pytest.mark.parametrize("made", [_png_of, _jpeg_of, _gif_of, _webp_of, _bmp_of])
+@pytest.mark.parametrize("in_folder", [False, True])
+def test_huge_images_are_refused_by_their_header(tmp_path, monkeypatch, made, in_folder):
+    monkeypatch.setattr(cv2, "imread", None)  # as memory is taken there
+    suffix = made.__name__[1:-3]
+    path = tmp_path / f"0.{suffix}"
+    path.write_bytes(made(60_000, 65_000))
+    if in_folder and suffix != "gif":  # whose frames are none of a folder
+        _refused(tmp_path, "at most 268,435,456 pixels", "60000x65000", path.name)
+    elif suffix != "bmp":
+        _refused(path, "at most 268,435,456 pixels", "60000x65000", path.name)
+
+
+@pytest.mark.parametrize("made", [_png_of, _jpeg_of, lambda *size: _jpeg_of(*size, progressive=1)])
+def test_images_with_more_pixels_than_their_bytes_can_hold(tmp_path, monkeypatch, made):
+    monkeypatch.setattr(cv2, "imread", None)
+    (tmp_path / "0.img").write_bytes(made(16_000, 16_000))
+    _refused(tmp_path / "0.img", "decode")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_images_of_one_colour_are_not_taken_for_them(tmp_path, suffix):
+    assert cv2.imwrite(str(tmp_path / f"a{suffix}"), np.zeros((3000, 3000, 3), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 1])
+    assert read_video(tmp_path / f"a{suffix}", size=(10, 10)).num_frames == 1
+
+
+def test_huge_videos_are_refused_before_a_frame_is_decoded(tmp_path, mp4, monkeypatch):
+    (tmp_path / "a.mp4").write_bytes(mp4)
+    monkeypatch.setattr(video_file, "MAX_PIXELS", 48 * 64 - 1)
+    monkeypatch.setattr(video_file, "_grabbed", None)
+    _refused(tmp_path / "a.mp4", "at most 3,071 pixels", "48x64", "a.mp4")
+
+
+# ------------------------------------------------------------------------------------------- the commands
+
+FEW = ("--steps", 2, "--gaussians", 20, "--size", "16x16")
+
+
+def test_fit_tells_of_uneven_times_and_keeps_the_duration(tmp_path, capsys, uneven_mp4):
+    (tmp_path / "clip.mp4").write_bytes(uneven_mp4)
+    assert run("fit", tmp_path / "clip.mp4", "--out", tmp_path / "a.safetensors", *FEW) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "apart" in line]
+    assert len(told) == 1
+    assert told[0].startswith("warning: ")
+    model = load_video_model(tmp_path / "a.safetensors")
+    assert (model.num_frames, model.fps) == (8, pytest.approx(4.375))
+    assert run("evaluate", tmp_path / "a.safetensors", tmp_path / "clip.mp4") == 0
+
+
+def test_fit_tells_of_frames_that_are_missing(tmp_path, capsys):
+    packets = [_png(frame) for frame in _noise()]
+    data = _avi(packets, 48, 64)
+    (tmp_path / "clip.avi").write_bytes(data[: data.index(packets[5])])
+    assert run("fit", tmp_path / "clip.avi", "--out", tmp_path / "a.safetensors", *FEW) == 0
+    assert "only 5 of 8 frames" in capsys.readouterr().err
+    assert load_video_model(tmp_path / "a.safetensors").num_frames == 5
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_commands_refuse_in_one_line(tmp_path, capfd, kind):
+    """And nothing of OpenCV, FFmpeg or libjpeg stands beside it."""
+    path, model = tmp_path / "clip.mp4", tmp_path / "a.safetensors"
+    OTHERS[kind][0](path)
+    assert run("fit", path, "--out", model, *FEW) == 1
+    told = capfd.readouterr().err
+    assert told.count("\n") == 1
+    assert told.startswith("error: path: expected")
+    assert OTHERS[kind][1] in told
+    assert not model.exists()
