@@ -6,6 +6,7 @@ depend on the number of threads, every result is the same to the bit for any num
 """
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -15,6 +16,7 @@ from foldgauss._checks import invalid
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _num_threads: int | None = None
+_forked = False  # from a process in which JAX had started
 
 
 def available_cores() -> int:
@@ -46,14 +48,37 @@ def set_num_threads(count: int | None) -> None:
         _num_threads, _pool = count, None
 
 
-def _forget_pool() -> None:
+def check_process() -> None:
+    """Raise RuntimeError in a process that was forked from one in which JAX had started.
+
+    JAX's threads do not exist there, and what waits for them waits for ever. Our own kernels alone do work.
+    """
+    if _forked:
+        raise RuntimeError(
+            f"process {os.getpid()}: expected one with JAX's threads, got one that was forked after JAX had started, "
+            "where it would hang. Start processes by spawn: multiprocessing.get_context('spawn'), or "
+            "ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')); or fork before anything is computed."
+        )
+
+
+def _jax_has_started() -> bool:
+    """Whether JAX has threads. It has none while it is but imported, and no public way to tell."""
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    if bridge is None:
+        return False
+    started = getattr(bridge, "backends_are_initialized", None)
+    return started is None or started()
+
+
+def _begin_child() -> None:
     """In a forked child the pool's threads do not exist: start afresh, with a lock nobody holds."""
-    global _pool, _lock
+    global _pool, _lock, _forked
     _pool, _lock = None, threading.Lock()
+    _forked = _forked or _jax_has_started()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pool)
+    os.register_at_fork(after_in_child=_begin_child)
 
 
 def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:

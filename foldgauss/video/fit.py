@@ -12,6 +12,7 @@ import numpy as np
 
 from foldgauss import _display
 from foldgauss._checks import invalid, whole, within
+from foldgauss._threads import check_process
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
@@ -115,6 +116,7 @@ def fit_steps(
 
     `motion`: the frames' own, where it is known from before; finding it takes some hundredths of a second a frame.
     """
+    check_process()
     check_frames(frames)
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
