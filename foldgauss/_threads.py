@@ -8,8 +8,9 @@ depend on the number of threads, every result is the same to the bit for any num
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from foldgauss._checks import invalid
 
@@ -84,7 +85,8 @@ if hasattr(os, "register_at_fork"):
 def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:
     """Call `task(item)` for every item on the pool, or all on this thread, and wait; the first error is raised here.
 
-    Tasks must not call `run_tasks` themselves.
+    Tasks must not call `run_tasks` themselves. Where no more threads can be started, since the main thread has ended or
+    the system allows no more, fewer work.
     """
     global _pool
     items = list(items)
@@ -100,18 +102,32 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
     # One queue entry per thread, not per item: a Python future costs about as much as a small tile.
     pending = iter(items)
     guard = threading.Lock()
-    interrupt: KeyboardInterrupt | None = None
+    errors: list[BaseException] = []
+    futures: list[Future] = []
+    in_work: list[None] = []  # one for each item
 
     def drain() -> None:
         while True:
             with guard:
                 item = next(pending, None)
-            if item is None:
-                return
-            task(item)
+                if item is None:
+                    return
+                in_work.append(None)
+            try:
+                task(item)
+            except BaseException as error:
+                errors.append(error)
+                raise
+            finally:
+                in_work.pop()
 
-    futures = [pool.submit(drain) for _ in range(min(threads, len(items)) - 1)]
+    all_known = True
     try:
+        try:
+            for _ in range(min(threads, len(items)) - 1):
+                futures.append(pool.submit(drain))
+        except RuntimeError:  # what was to start the thread may be in the queue all the same, with no future
+            all_known = False
         drain()  # the calling thread works too
     finally:
         # Not before all are done: what they read and write may be freed once this returns.
@@ -122,7 +138,8 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
                 try:
                     wait([future])
                 except KeyboardInterrupt as error:
-                    interrupt = error
-    for error in (interrupt, *(future.exception() for future in futures)):
-        if error is not None:
-            raise error
+                    errors.insert(0, error)
+        while in_work and not all_known:
+            time.sleep(1e-3)
+    if errors:
+        raise errors[0]
