@@ -82,6 +82,19 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_begin_child)
 
 
+def _call(task: Callable[[int], object], item: int) -> None:
+    """`task(item)`; an interrupt that Numba met within its own Python code, and made a SystemError of, is one again."""
+    try:
+        task(item)
+    except SystemError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        raise KeyboardInterrupt from error
+
+
 def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:
     """Call `task(item)` for every item on the pool, or all on this thread, and wait; the first error is raised here.
 
@@ -92,7 +105,7 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
     items = list(items)
     if serial or len(items) <= 1 or num_threads() == 1:
         for item in items:
-            task(item)
+            _call(task, item)
         return
     threads = num_threads()
     with _lock:
@@ -114,7 +127,7 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
                     return
                 in_work.append(None)
             try:
-                task(item)
+                _call(task, item)
             except BaseException as error:
                 errors.append(error)
                 raise

@@ -448,6 +448,26 @@ def test_where_no_thread_can_be_started_the_others_do_the_work(monkeypatch, star
         _threads.set_num_threads(None)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_interrupt_inside_numba_is_one_again(count):
+    """Where it meets Numba's own Python code the dispatcher says SystemError, and nobody's `except` would know it."""
+
+    def task(item):
+        if item == 3:
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        if item == 90:
+            raise SystemError("of another kind")
+
+    _threads.set_num_threads(count)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _threads.run_tasks(task, range(5))
+        with pytest.raises(SystemError, match="another"):
+            _threads.run_tasks(task, range(88, 95))
+    finally:
+        _threads.set_num_threads(None)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process alone; CI runs it on Linux")
 def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
     script = """
@@ -475,6 +495,6 @@ def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
         threading.Thread(target=interrupt, daemon=True).start()
         while True:  # and now nobody catches it
             started.set()
-            np.asarray(soft_model().render(0.5, size))
+            shown.frame(0.5)
     """
     assert run_script(script, expected=-signal.SIGINT, FOLDGAUSS_NUM_THREADS="3") == "True\n"

@@ -167,6 +167,8 @@ def fit_steps(
         stopped_by = _stopped_by(state, config, frames)
         if stopped_by == "smallest_at_psnr":
             step.stock.trim(state)
+        if stopped_by:
+            guard.finish(state)
         state.seconds += time.perf_counter() - begun
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
