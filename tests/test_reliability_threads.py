@@ -26,7 +26,7 @@ from foldgauss.video import FitConfig, fit
 from foldgauss.video.playback import Playback
 
 #: Seconds after which a process tells its stacks and is given up; what it does takes a few.
-LIMIT = 240
+LIMIT = 280
 TESTS = Path(__file__).parent
 
 
@@ -498,3 +498,91 @@ def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
             shown.frame(0.5)
     """
     assert run_script(script, expected=-signal.SIGINT, FOLDGAUSS_NUM_THREADS="3") == "True\n"
+
+
+# --------------------------------------------------------------------------------------------- the same bits
+
+MADE = """
+    import dataclasses, hashlib, sys, warnings
+    from pathlib import Path
+    import jax, numpy as np
+    from foldgauss.estimator import FoldedGaussianMixture
+    from foldgauss.io import save_compact, save_video_model, write_image
+    from foldgauss.video import Economy, FitConfig, compress, fit
+    folder, long = Path(sys.argv[1]), sys.argv[2] == "long"
+    y, x = np.mgrid[:96, :128]
+    discs = np.stack([np.exp(-((x - at) ** 2 + (y - 48) ** 2) / 200) for at in (30, 45, 60, 75, 90)])[..., None]
+    frames = np.rint(255 * (0.6 * discs * [1, 0.5, 0.1] + 0.3 * (x / 128)[..., None])).astype(np.uint8)
+    clear = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], -1)
+    clear[:, :, :40] = 0
+    usual = FitConfig(num_gaussians=5000, steps=60 if long else 12)
+    change = dataclasses.replace
+    configs = {
+        "default": usual,
+        "paper": FitConfig.preset("paper", initialization="clip", num_gaussians=3000, max_gaussians=6000, steps=60),
+        "economy": change(usual, economy=Economy()),
+    }
+    if long:
+        configs |= {
+            "smallest": change(usual, economy=Economy(psnr=25.0)),
+            "batches": change(usual, batch_size=3, two_cameras=True, between_share=0.3),
+            "sum": change(usual, compositing="sum"),
+            "target": change(usual, target_psnr=30.0),
+            "fixed times": change(usual, learn_frame_times=False, degree=7, own_time=False, only_alive=False),
+            "uniform": change(usual, initialization="uniform", follow_motion=False),
+        }
+
+    def say(name, made):
+        print(name, hashlib.sha256(made).hexdigest(), flush=True)
+
+    for name, config in configs.items():
+        model = fit(frames, config).model
+        say(name, save_video_model(folder / "model.safetensors", model).read_bytes())
+        if name == "default":
+            shown = model
+    say("alpha", save_video_model(folder / "model.safetensors", fit(clear, usual).model).read_bytes())
+    for k, picture in enumerate(shown.frames(size=(200, 300))):
+        write_image(folder / f"{k}.png", picture)
+        say(f"{k}.png", (folder / f"{k}.png").read_bytes())
+    if long:
+        for engine in ("cpu", "xla", "reference"):
+            say(engine, np.asarray(shown.render(0.4, (200, 300), engine=engine)).tobytes())
+        made = compress(shown, frames, max_loss_db=0.5, passes=1)
+        say("fgz", save_compact(folder / "model.fgz", made.quantised).read_bytes())
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 1, (6000 if long else 600, 3)).astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # EM need not converge here
+        em = FoldedGaussianMixture(3, random_state=0, max_iter=5).fit(points)
+    say("EM", b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(em.to_mixture())))
+    say("draws", em.sample(1000)[0].tobytes())
+    if long:
+        from foldgauss.uncertainty import frame_time_posterior
+        seen = fit(frames, change(usual, num_gaussians=800, steps=200)).model
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # nor this
+            drawn = frame_time_posterior(seen, frames, steps=200, seed=1, progress=False)
+        say("posterior", np.ascontiguousarray(drawn.times).tobytes())
+"""
+
+
+def made_with(folder, threads, length="short") -> list[str]:
+    """Names and digests of what is made with so many threads: our kernels', Numba's own and XLA's (NPROC)."""
+    folder.mkdir()
+    names = ("FOLDGAUSS_NUM_THREADS", "NUMBA_NUM_THREADS", "NPROC")
+    return run_script(MADE, folder, length, **dict.fromkeys(names, str(threads))).splitlines()
+
+
+def test_the_same_bits_for_any_number_of_threads(tmp_path):
+    """Model files, with growth, economy, alpha and learned frame times; PNG files; mixtures and their draws."""
+    alone = made_with(tmp_path / "1", 1)
+    assert len(alone) >= 11
+    assert made_with(tmp_path / "3", 3) == alone
+
+
+@pytest.mark.slow
+def test_the_same_bits_for_any_number_of_threads_whatever_is_made(tmp_path):
+    """Every kind of fit, file and engine, and the posterior of frame times, with 1, 2, 3 and 5 threads."""
+    alone = made_with(tmp_path / "1", 1, "long")
+    for threads in (2, 3, 5):
+        assert made_with(tmp_path / str(threads), threads, "long") == alone
