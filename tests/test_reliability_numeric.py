@@ -1,4 +1,4 @@
-"""Numbers that are none, rates far too high, models at the ends of float32: named, taken back, or drawn all the same."""
+"""Numbers that are none, rates far too high, models at the ends of float32: named, taken back, drawn all the same."""
 
 import dataclasses
 import math
