@@ -51,9 +51,10 @@ def too_high(leaf, factor):
 
 
 #: What is said of a leaf's rate a thousand and a million times too high. Where nothing is, the leaf comes to an end of
-#: what it can do: angles turn round, opacities are 0 or 1. With log_time_scale go the rates that are in its units.
+#: what it can do: angles turn round, opacities are 0 or 1, and the
+#: falling rates find a poorer end. With log_time_scale go the rates that are in its units.
 NAMED = {
-    "loc": ["loc having moved most", "loc having moved most"],
+    "loc": [None, "loc having moved most"],
     "coefficients": [None, "coefficients having moved most"],
     "log_scale": ["no finite log_scale", "no finite log_scale"],
     "angle_logit": [None, None],

@@ -25,8 +25,9 @@ from foldgauss.render import ENGINES, render
 from foldgauss.video import FitConfig, fit
 from foldgauss.video.playback import Playback
 
-#: Seconds after which a process tells its stacks and is given up; what it does takes a few.
-LIMIT = 280
+#: Seconds after which a process tells its stacks and is given up; what it does takes some ten, on a core of its own.
+LIMIT = 600
+pytestmark = pytest.mark.timeout(3 * LIMIT)  # some start several
 TESTS = Path(__file__).parent
 
 
