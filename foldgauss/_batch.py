@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from foldgauss._checks import invalid
+from foldgauss._threads import check_process
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
 
@@ -31,6 +32,7 @@ def broadcast(parts: list[tuple[Array, int]], batch: tuple[int, ...]) -> list[Ar
 
 def parts_of(module: eqx.Module) -> list[tuple[Array, int]]:
     """(leaf, event rank) of every leaf."""
+    check_process()
     return list(zip(jax.tree.leaves(module), module.leaf_ranks, strict=True))
 
 
@@ -57,6 +59,7 @@ def batch_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
 
 def common_dtype(*inputs: ArrayLike):
     """The float type of the arrays among the inputs; Python numbers and lists follow, they do not lead."""
+    check_process()
     dtypes = [x.dtype for x in inputs if hasattr(x, "dtype") and not isinstance(x, float)]
     floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
     if not floats:
@@ -66,6 +69,7 @@ def common_dtype(*inputs: ArrayLike):
 
 def as_value(x: ArrayLike, dtype) -> Array:
     """A value as an array: float arrays keep their type, all else takes that of the distribution."""
+    check_process()
     own = getattr(x, "dtype", None)
     keeps = own is not None and jnp.issubdtype(own, jnp.floating) and not isinstance(x, float)
     return jnp.asarray(x) if keeps else jnp.asarray(x, dtype)

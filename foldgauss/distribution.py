@@ -28,6 +28,7 @@ from foldgauss._checks import invalid
 from foldgauss._factor import check_loc, given_factor
 from foldgauss._far import far_reaching
 from foldgauss._restrict import checked_indices, restricted_fold, restricted_tril
+from foldgauss._threads import check_process
 from foldgauss._triangular import columns_of, lower_times, solve_lower, stacked
 from foldgauss.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
@@ -205,6 +206,7 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:foldgauss, read as a recipe. **Raises:** nothing.
         """
+        check_process()
         time_key, space_key = jax.random.split(key)
         # Every batch element draws its own t, also where only loc or the fold carries the batch.
         shape = (*sample_shape, *self.batch_shape)
@@ -350,6 +352,7 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:integral_proof. **Raises:** ValueError on indices that are none.
         """
+        check_process()
         indices = checked_indices(indices, self.event_shape[0])
         space = tuple(i for i in indices if i != self._time_index)
         if len(space) == len(indices):

@@ -28,6 +28,7 @@ from foldgauss._em.scaling import Scaling, scaling_of, to_mixture, variances_of
 from foldgauss._em.starts import STARTS, from_joint, start
 from foldgauss._em.statistics import Points, points_of, scores
 from foldgauss._em.updates import Model
+from foldgauss._threads import check_process
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.mixture import FoldedMixture
 
@@ -180,6 +181,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def _checked(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, both of the dtype that is fitted in."""
+        check_process()
         X = validate_data(self, X, dtype=[np.float64, np.float32], ensure_min_samples=2 if reset else 1, reset=reset)
         if X.shape[1] < 2:
             cure = "One column is time; give at least one of space."
@@ -464,6 +466,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
+        check_process()
         with _precision(self._params.curve.dtype):
             x, component = self.to_mixture().sample(jax.random.key(seed), (n_samples,), return_component=True)
             x, component = np.asarray(x), np.asarray(component)
@@ -488,6 +491,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), made)
 
     def _scaled(self, X) -> np.ndarray:
+        check_process()
         check_is_fitted(self)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
         return self._scaling.apply(_time_last(X, self._column(X.shape[1])))

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from foldgauss._checks import invalid
 from foldgauss._pointwise import call_each, split
+from foldgauss._threads import check_process
 from foldgauss._triangular import columns_of, stacked
 
 __all__ = [
@@ -324,6 +325,7 @@ def _with_rank(x: Array, rank: int) -> Array:
 
 def _aligned(u: Array, rows: Array) -> tuple[Array, Array]:
     """u (*batch, 1) and rows (*batch, n, d-1), of equal batch rank."""
+    check_process()
     rank = max(u.ndim, rows.ndim - 2)
     return _with_rank(u, rank)[..., None], _with_rank(rows, rank + 2)
 

@@ -28,6 +28,7 @@ from foldgauss._checks import invalid
 from foldgauss._factor import check_space, check_tril
 from foldgauss._far import far_reaching
 from foldgauss._restrict import checked_indices, restricted_tril
+from foldgauss._threads import check_process
 from foldgauss._triangular import UNROLLED_SIZE, Columns, columns_of, lower_times, solve_lower, solve_upper, stacked
 
 __all__ = ["Gaussian", "Normal"]
@@ -221,6 +222,7 @@ def given_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussi
 
 
 def _as_gaussian(normal: Normal) -> Gaussian:
+    check_process()
     return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from foldgauss._checks import invalid, whole
 from foldgauss._em.loop import EMStatus
+from foldgauss._threads import check_process
 from foldgauss.envelope import CallableEnvelope
 from foldgauss.mixture import FoldedMixture
 
@@ -72,6 +73,7 @@ def fit_gradient(
         raise invalid("mixture", expected="one FoldedMixture", got=type(mixture).__name__, cure="No batch of mixtures.")
     if not whole(steps, 1):
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
+    check_process()
     dtype = mixture.logits.dtype
     x = jnp.asarray(x, dtype)
     if x.ndim != 2 or x.shape[1:] != mixture.event_shape:

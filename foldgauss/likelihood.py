@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 from foldgauss._checks import invalid, one_of
 from foldgauss._profile import Profile, Space, maximise
 from foldgauss._regression import hermite, hermite_to_powers
+from foldgauss._threads import check_process
 from foldgauss._triangular import solve_upper_matrix
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
@@ -529,6 +530,7 @@ def _held_out(plan: _Plan, parts) -> Float[Array, "degrees"]:
 
 
 def _points(x) -> Float[Array, "n d"]:
+    check_process()
     x = jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
     if x.ndim != 2 or x.shape[1] < 2:

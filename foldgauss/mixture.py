@@ -26,6 +26,7 @@ from foldgauss._batch import align, as_value, broadcast, check_event, checked_ba
 from foldgauss._checks import invalid
 from foldgauss._pairs import chunked, components_first, pair_log_prob
 from foldgauss._restrict import checked_indices
+from foldgauss._threads import check_process
 from foldgauss.bridges import to_numpyro, to_scipy
 from foldgauss.conditional import TimeDensity, TimeMixture
 from foldgauss.distribution import FoldedGaussian
@@ -66,6 +67,7 @@ class AbstractMixture(eqx.Module):
     @property
     def log_weights(self) -> Float[Array, "*batch k"]:
         """Normalised log w_k; -inf where a component has no weight."""
+        check_process()
         return jax.nn.log_softmax(self.logits, axis=-1)
 
     @property

@@ -14,6 +14,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from foldgauss._checks import invalid
+from foldgauss._threads import check_process
 from foldgauss.io._atomic import atomic_path
 
 FORMAT = "foldgauss-model"
@@ -260,6 +261,7 @@ def load_model(path: str | os.PathLike) -> Any:
         ) from error
     described = _specs(_array_leaves(skeleton))
     _check_tensors(_widened(about["tensors"], described), described, str(path))
+    check_process()
     filled = _filled(skeleton, path)
     try:
         return kind.from_stored(filled)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._checks import invalid, one_of
-from foldgauss._threads import run_tasks
+from foldgauss._threads import check_process, run_tasks
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
@@ -52,12 +52,14 @@ def render(
 
     Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
     `background`. A splat with a number that is not finite among its parameters is not drawn and gets no gradient.
-    Raises ValueError for an unknown option, a size below 1, shapes that do not fit or colours without a channel.
+    Raises ValueError for an unknown option, a size below 1, shapes that do not fit or colours without a channel, and
+    RuntimeError in a process that was forked after JAX had started.
 
     Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
 
     Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 3; VeGaS, section 4.
     """
+    check_process()
     one_of("engine", engine, ENGINES)
     one_of("compositing", compositing, COMPOSITINGS)
     check_size(size)

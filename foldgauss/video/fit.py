@@ -12,6 +12,7 @@ import numpy as np
 
 from foldgauss import _display
 from foldgauss._checks import invalid, whole, within
+from foldgauss._threads import check_process
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.alpha import random_background
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
@@ -115,6 +116,7 @@ def fit_steps(
 
     `motion`: the frames' own, where it is known from before; finding it takes some hundredths of a second a frame.
     """
+    check_process()
     check_frames(frames)
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
@@ -165,6 +167,8 @@ def fit_steps(
         stopped_by = _stopped_by(state, config, frames)
         if stopped_by == "smallest_at_psnr":
             step.stock.trim(state)
+        if stopped_by:
+            guard.finish(state)
         state.seconds += time.perf_counter() - begun
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
@@ -401,16 +405,20 @@ def check_frames(frames: np.ndarray) -> None:
     if shape is None or len(shape) != 4 or shape[3] not in (3, 4) or dtype != np.uint8 or 0 in shape:
         got = type(frames).__name__ if shape is None else f"{dtype} {shape}"
         expected = "a uint8 array (num_frames, height, width, 3 or 4)"
-        raise invalid("frames", expected=expected, got=got, cure=_cure_of_frames(shape, dtype))
+        raise invalid("frames", expected=expected, got=got, cure=_cure_of_frames(frames, shape, dtype))
 
 
-def _cure_of_frames(shape: tuple[int, ...] | None, dtype: np.dtype | None) -> str:
+def _cure_of_frames(frames: object, shape: tuple[int, ...] | None, dtype: np.dtype | None) -> str:
     """What makes frames of an array that is none; pixels are never scaled unasked, since no array says of what."""
     if shape is None:
         return "Stack them: np.stack(frames). Of a file: read_video(path).frames."
     if dtype == np.uint16:
         return "From 16 bits: np.rint(frames / 257).astype(np.uint8)."
     if dtype is not None and dtype.kind == "f":
+        bad = np.argwhere(~np.isfinite(np.asarray(frames)))
+        if len(bad):
+            where = ", ".join(map(str, bad[0]))
+            return f"{len(bad):,} of its numbers are NaN or infinite, the first at frames[{where}]: replace them."
         return "From floats in [0, 1]: np.rint(255 * np.clip(frames, 0, 1)).astype(np.uint8)."
     if len(shape) == 3:
         return "One picture: frames[None]. Grey ones: np.repeat(frames[..., None], 3, axis=-1)."

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._checks import invalid
+from foldgauss._threads import check_process
 from foldgauss.video.shots import is_cut
 
 
@@ -38,6 +39,7 @@ class FrameTimes(eqx.Module):
 
         Neighbours are equal only where a weight is too small for the dtype to show.
         """
+        check_process()
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 

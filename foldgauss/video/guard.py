@@ -26,6 +26,11 @@ FINE = 3e-4
 NO_BETTER, LOST_PASSES = 1.25, 6
 #: Each time a fit is taken back its rates are divided by this, as often as `MOST_BACKOFFS`: down to 1/4096.
 LOWERED, MOST_BACKOFFS = 4.0, 6
+#: How far a frame time's logit may come from its last sound value, one of some `REMEMBERED` steps ago: by then its
+#: interval is e^15 times as long or short by the others, and float32 tells neighbours no longer apart.
+FARTHEST_TIME = 15.0
+#: The least unit that a leaf's moves are judged in: where all start alike, as opacities do, their own spread is none.
+LEAST_UNIT = {"loc": 0.3}  # of the frame; 1 for logits, logarithms, colours and folds
 #: All frames must have been seen at a size before their errors are compared.
 PASSES, LEAST_STEPS = 2, 20
 
@@ -94,8 +99,12 @@ class Guard:
         """What is wrong after a step, in words; empty if nothing is."""
         if not (math.isfinite(loss) and _finite(state.rows) and _finite(state.time_logits)):
             return _broken(state, self.config) or f"a loss of {loss}"
-        if not self.comparable or state.step < self.settled or state.backoffs >= MOST_BACKOFFS:
+        if state.backoffs >= MOST_BACKOFFS:
             return ""  # where no tries are left, bad pictures are better than none
+        if self._times_moved(state) > FARTHEST_TIME:
+            return f"frame times moved by e^{self._times_moved(state):.0f} since step {self.sound.step}"
+        if not self.comparable or state.step < self.settled:
+            return ""
         worse = self._times_worse(state)
         if worse > MUCH_WORSE:
             decibels, moved = 10 * math.log10(worse), self._most_moved(state)
@@ -127,9 +136,25 @@ class Guard:
         """Now and then, of a state in which nothing is wrong. One whose moments overflow is not sound, nor one whose
         pictures look bad, be it by too few of them to say so."""
         due = state.step - self.sound.step >= REMEMBERED
+        if state.backoffs and state.step < self.settled:
+            return  # what the errors were, and are now, is not known of all frames
         bad = self.comparable and (self._times_worse(state) > MUCH_WORSE or self._times_start(state) > NO_BETTER)
         if due and not bad and _finite(state.second):
             self.sound = _Remembered.of(state)
+
+    def finish(self, state: FitState) -> None:
+        """At the end: where no tries were left and pictures came out worse than they were, they are those of before."""
+        if not self.comparable or state.backoffs < MOST_BACKOFFS:
+            return
+        worse = max(self._times_worse(state), self._times_start(state))
+        if worse > MUCH_WORSE or self._times_start(state) > NO_BETTER:
+            decibels = 10 * math.log10(worse)
+            told = f"the fit ended at step {state.step} with pictures {decibels:.0f} dB worse than they were"
+            moved, start = self._most_moved(state), self.sound.step
+            self.sound.put_back(state)
+            state.error = self.sound.error or float(np.mean(list(self.start_errors.values()) or [0.0]))
+            cure = f"What is kept is of step {start}: lower these rates."
+            warnings.warn(f"{told}, {moved} having moved most. {cure}", DivergenceWarning, stacklevel=3)
 
     def back_off(self, state: FitState, fault: str, error_before: float) -> None:
         """Take the arrays of `state` back, and lower its rates. Steps go on counting: so a fit ends when it should.
@@ -161,11 +186,17 @@ class Guard:
             return "some leaves"
         with np.errstate(over="ignore", invalid="ignore"):
             moved = {
-                name: float(np.median(np.abs(state.rows[:, at] - before[:, at])) / (before[:, at].std() + 1e-6))
+                name: float(np.median(np.abs(state.rows[:, at] - before[:, at])))
+                / max(float(before[:, at].std()), LEAST_UNIT.get(name, 1.0))
                 for name, at in columns(self.config.degree).items()
                 if at.stop > at.start
             }
+        moved["frame times"] = self._times_moved(state)
         return max(moved, key=moved.get)
+
+    def _times_moved(self, state: FitState) -> float:
+        """The farthest that a frame time's logit is from where it was when all was sound."""
+        return float(np.abs(np.asarray(state.time_logits) - self.sound.arrays["time_logits"]).max(initial=0.0))
 
 
 def _finite(array: np.ndarray) -> bool:

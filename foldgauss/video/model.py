@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from foldgauss._batch import known
 from foldgauss._checks import invalid, short_repr
+from foldgauss._threads import check_process
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
@@ -230,6 +231,7 @@ def _checked_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
 
 def check_time(t: float) -> None:
     """Raise unless t is a time of a video, where that is known."""
+    check_process()
     try:
         value = known(jnp.asarray(t))
     except (TypeError, ValueError):

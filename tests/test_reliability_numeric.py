@@ -1,0 +1,214 @@
+"""Numbers that are none, rates far too high, models at the ends of float32: named, taken back, drawn all the same."""
+
+import dataclasses
+import math
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from soft_models import soft_model
+
+from foldgauss.render import ENGINES
+from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit
+from foldgauss.video import fit_steps as steps_of
+from foldgauss.video.fit import start, start_from, to_model
+
+
+def moving_disc(num_frames=6, size=(48, 64)):
+    """uint8 (num_frames, *size, 3): a disc over a slope."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    centres = np.linspace(0.2, 0.8, num_frames) * size[1]
+    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 40) for at in centres])[..., None]
+    slope = np.stack([x / size[1], y / size[0], 0 * x + 0.3], -1) * 0.6
+    return np.rint(255 * (slope * (1 - light) + light * np.array([1, 0.2, 0.1]))).astype(np.uint8)
+
+
+CLIP = moving_disc()
+CONFIG = FitConfig(num_gaussians=200, steps=240)
+
+
+def fitted_with(config):
+    """dB of a fit, and what it warned of; that its model is finite is checked."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        model = fit(CLIP, config).model
+    assert all(np.isfinite(leaf).all() for leaf in map(np.asarray, jax.tree.leaves(model)))
+    assert all(issubclass(one.category, DivergenceWarning) for one in told)
+    return evaluate(model, CLIP).mean_psnr, [str(one.message) for one in told]
+
+
+@pytest.fixture(scope="module")
+def at_start() -> float:
+    """dB before the first step."""
+    return evaluate(to_model(start(CLIP, CONFIG), CONFIG, CLIP.shape[1:3], 25.0), CLIP).mean_psnr
+
+
+def too_high(leaf, factor):
+    rates = dataclasses.replace(LearningRates(), **{leaf: factor * getattr(LearningRates(), leaf)})
+    return dataclasses.replace(CONFIG, rates=rates)
+
+
+#: What is said of a leaf's rate a thousand and a million times too high. Where nothing is, the leaf comes to an end of
+#: what it can do: angles turn round, opacities are 0 or 1, and the
+#: falling rates find a poorer end. With log_time_scale go the rates that are in its units.
+NAMED = {
+    "loc": [None, "loc having moved most"],
+    "coefficients": [None, "coefficients having moved most"],
+    "log_scale": ["no finite log_scale", "no finite log_scale"],
+    "angle_logit": [None, None],
+    "opacity_logit": [None, None],
+    "color_dc": ["color_dc having moved most", "color_dc having moved most"],
+    "time_loc_logit": [None, None],
+    "log_time_scale": ["no finite time_loc_logit", None],
+    "frame_times": ["frame times moved", "frame times moved"],
+}
+
+
+@pytest.mark.parametrize("power", [3, 6])
+@pytest.mark.parametrize("leaf", NAMED)
+def test_a_rate_far_too_high_is_named_and_no_model_is_worse_than_its_start(at_start, leaf, power):
+    config, named = too_high(leaf, 10.0**power), NAMED[leaf][power // 6]
+    if (leaf, power) == ("log_time_scale", 6):
+        with pytest.warns(DivergenceWarning), pytest.raises(FitDiverged, match=r"step \d+: no finite time_loc_logit"):
+            fit(CLIP, config)
+        return
+    psnr, told = fitted_with(config)
+    assert psnr > at_start - 0.3
+    assert bool(told) == (named is not None)
+    if told:
+        assert named in told[0]
+        assert "came apart at step " in told[0]
+
+
+def test_frame_times_that_fly_apart_are_brought_back(at_start):
+    """Pictures alone do not tell: they come to a poor end, and never get worse than before."""
+    psnr, told = fitted_with(too_high("frame_times", 1e3))
+    assert len(told) == 1
+    assert "frame times moved by e^" in told[0]
+    assert psnr > at_start + 8
+
+
+def test_a_fit_that_cannot_be_saved_gives_back_what_was_sound(at_start):
+    psnr, told = fitted_with(too_high("color_dc", 1e8))
+    assert "the fit ended at step 240" in told[-1]
+    assert "lower these rates" in told[-1]
+    assert psnr == pytest.approx(at_start, abs=0.3)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
+@pytest.mark.parametrize("leaf", NAMED)
+def test_rates_that_are_none_are_refused(leaf, value):
+    with pytest.raises(ValueError, match=f"rates.{leaf}"):
+        LearningRates(**{leaf: value})
+
+
+# ---------------------------------------------------------------------------------------------------- frames
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_frames_that_hold_none_say_where(value):
+    frames = CLIP.astype(np.float32) / 255
+    frames[2, 3, 5, 1] = frames[4, 0, 0, 0] = value
+    with pytest.raises(
+        ValueError, match=r"float32.* 2 of its numbers are NaN or infinite, the first at frames\[2, 3, 5, 1\]"
+    ):
+        fit(frames, CONFIG)
+
+
+@pytest.mark.parametrize(
+    "dtype", [bool, np.int8, np.int16, np.uint16, np.int64, np.float16, np.float64, np.complex64, object]
+)
+def test_frames_of_other_kinds_are_refused(dtype):
+    """Never scaled or cut unasked: no array says of what its numbers are."""
+    with pytest.raises(ValueError, match="frames: expected a uint8 array"):
+        fit(CLIP.astype(dtype), CONFIG)
+
+
+# ---------------------------------------------------------------------------------------------------- states
+
+
+def with_leaf(model, name, value):
+    leaf = np.array(getattr(model.splats, name))
+    leaf.reshape(-1)[5] = value
+    return dataclasses.replace(model, splats=dataclasses.replace(model.splats, **{name: leaf}))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["loc", "coefficients", "opacity_logit"])
+def test_models_that_hold_none_are_not_gone_on_with(name, value):
+    model = with_leaf(soft_model(size=CLIP.shape[1:3], num_frames=len(CLIP)), name, value)
+    config = FitConfig(power=2.0, options=model.options)
+    with pytest.raises(FitDiverged, match=f"state: expected finite numbers, got no finite {name} in 1 Gaussians"):
+        next(steps_of(CLIP, config, start_from(model, config, 10)))
+
+
+@pytest.mark.parametrize("huge", [1e6, 1e18, 1e38])
+def test_folds_of_degree_7_that_explode_stay_finite(huge):
+    """Gaussians are thrown out of the picture; those that are left learn on."""
+    model = soft_model(size=CLIP.shape[1:3], num_frames=len(CLIP), degree=7)
+    coefficients = np.array(model.splats.coefficients)
+    coefficients[::2] *= huge
+    model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, coefficients=coefficients))
+    config = FitConfig(power=2.0, options=model.options, degree=7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DivergenceWarning)
+        for state, info in steps_of(CLIP, config, start_from(model, config, 30)):
+            assert np.isfinite(state.rows).all()
+            assert math.isfinite(info.loss)
+
+
+# --------------------------------------------------------------------------------------------- far from usual
+
+
+def _extreme():
+    """Leaves of some Gaussians at the ends of what is finite; the others are as they were."""
+    far = np.float32(3e38)
+    return {
+        "centres far away": {"loc": [1e30, -1e30]},
+        "centres at the largest number": {"loc": [far, -far]},
+        "scales of 1e-30": {"log_scale": [math.log(1e-30)] * 2},
+        "scales of 1e-45 and 1e30": {"log_scale": [-103.0, 69.0]},
+        "scales that overflow": {"log_scale": [1e30, 1e30]},
+        "opacities of 1": {"opacity_logit": 1e30},
+        "opacities of 0": {"opacity_logit": -far},
+        "angles far round": {"angle_logit": 1e30},
+        "no time": {"log_time_scale": -100.0},
+        "all time": {"log_time_scale": 80.0},
+        "times at the end": {"time_loc_logit": 1e30},
+        "folds of 1e6": {"coefficients": 1e6},
+        "folds of the largest number": {"coefficients": far},
+        "colours below black": {"color_dc": -far},
+    }
+
+
+@pytest.mark.parametrize("name", _extreme())
+def test_models_far_from_usual_are_drawn_alike_by_all(name):
+    """Degree 7; a Gaussian in three is far from usual. Colours of the others stay below white."""
+    model = soft_model(degree=7)
+    changed = {}
+    for leaf, value in _extreme()[name].items():
+        changed[leaf] = np.array(getattr(model.splats, leaf))
+        changed[leaf][::3] = value
+    model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **changed))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pictures = {engine: np.asarray(model.render(0.37, engine=engine)) for engine in ENGINES if engine != "auto"}
+        (played,) = model.frames(np.array([0.37]))
+    top = max(1.0, float(np.max(0.5 + 0.2821 * np.asarray(model.splats.color_dc))))
+    for engine, picture in pictures.items():
+        assert np.isfinite(picture).all(), engine
+        assert picture.min() >= 0
+        assert picture.max() <= top + 1e-4
+        np.testing.assert_allclose(picture, pictures["reference"], atol=2e-4, err_msg=engine)
+    np.testing.assert_allclose(played / 255, np.clip(pictures["reference"], 0, 1), atol=0.5 / 255 + 1e-3)
+
+
+@pytest.mark.parametrize("logits", [[1e30, 0, 0, 0, 0, 0], [-1e30] * 6, [3e38, -3e38, 0, 0, 0, 0]])
+def test_frame_times_far_from_usual_stay_in_order(logits):
+    times = np.asarray(FrameTimes(jnp.asarray(logits, jnp.float32)).times())
+    assert np.isfinite(times).all()
+    assert (np.diff(times) >= 0).all()
+    assert times[0] == 0
+    assert times[-1] == 1
