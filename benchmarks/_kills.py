@@ -99,7 +99,7 @@ def killed(
     options = FITS[name]
     whole = uninterrupted(clip, options, folder)
     tell(f"{name}: {whole.seconds:.0f} s and {whole.num_checkpoints} checkpoints left in peace")
-    rng, rows, ended = np.random.default_rng(seed), [], 0
+    rng, rows, ended, before = np.random.default_rng(seed), [], 0, None  # before: the step that is kept
     place = folder / name
     place.mkdir()
     target = place / "m.safetensors"
@@ -115,10 +115,12 @@ def killed(
         if code == 0 and aim == "none":
             break
         if code != 0:
-            rows.append({"fit": name, "aim": aim, "seconds": round(passed, 2), **_seen(target, rows)})
+            rows.append({"fit": name, "aim": aim, "seconds": round(passed, 2), **_seen(target, rows, before)})
+            before = rows[-1]["step"]
             rows[-1] |= {key: plan[key] for key in ("moment", "number", "count") if aim != "time" and key in plan}
             tell(f"{name} {len(rows)}: {rows[-1]}")
         if code == 0 or not _unfinished(target):
+            before = None
             for left in place.iterdir():
                 left.unlink()
     return rows, ended
@@ -159,7 +161,7 @@ def _unfinished(target: Path) -> bool:
     return _kept(target).exists() or not target.exists()
 
 
-def _seen(target: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _seen(target: Path, rows: list[dict[str, Any]], before: int | None) -> dict[str, Any]:
     """What lies there after a kill. Raises `Wrong` for a damaged file, or a checkpoint that went back."""
     hidden = [path for path in target.parent.iterdir() if HIDDEN.fullmatch(path.name)]
     hit = [f"{path.suffix[1:]}, {_state_of(path)}" for path in hidden if path.stat().st_mtime > _last(rows)]
@@ -172,7 +174,6 @@ def _seen(target: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:
                 raise Wrong(f"{path.name} after a kill: {error}") from error
     if kept.exists():
         step = read_header(kept)["header"]["step"]
-    before = rows[-1]["step"] if rows and rows[-1]["goes_on_from"] == "its checkpoint" else None
     if before is not None and kept.exists() and step < before:
         raise Wrong(f"the checkpoint went back from step {before} to {step}")
     if before is not None and not kept.exists() and not target.exists():

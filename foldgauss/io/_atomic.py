@@ -57,24 +57,25 @@ def temporary_name(path: Path, suffix: str) -> Path:
 def not_writable(path: Path, error: OSError) -> OutputError:
     """The one-line form of a refusal by the operating system."""
     reason = error.strerror or str(error)
+    if error.errno in _NO_ROOM:
+        return OutputError(
+            f"path: expected room for {str(path)!r}, got none ({reason}). Make room, or choose another output path."
+        )
     return OutputError(f"path: expected a writable place, got {str(path)!r} ({reason}). Choose another output path.")
 
 
 @contextmanager
 def _told_where(path: Path, temporary: Path) -> Iterator[None]:
-    """A disk that is full in the midst of a write: the system's own error names no file, and no cure."""
+    """A disk that is full in the midst of a write: the system's error names no file, or a hidden one, and no cure."""
     try:
         yield
-    except OutputError:
-        raise
+    except OutputError as error:  # of a file in a folder, or of what a file is made from
+        raise OutputError(str(error).replace(str(temporary), str(path))) from error
     except OSError as error:
         own = error.filename is None or str(error.filename).startswith(str(temporary))
-        if error.errno not in _NO_ROOM or not own:
-            raise
-        raise OutputError(
-            f"path: expected room for {str(path)!r}, got none ({error.strerror}). Make room, or choose another output "
-            "path."
-        ) from error
+        if error.errno in _NO_ROOM and own:
+            raise not_writable(path, error) from error
+        raise
 
 
 def _new_file(path: Path, suffix: str) -> Path:
