@@ -55,8 +55,11 @@ class Plan:
         os.fsync, os.replace = self.fsync, self.replace
 
     def _is_hidden(self, path) -> bool:
-        name = os.path.basename(os.fspath(path)) if isinstance(path, str | os.PathLike) else ""
-        return HIDDEN.fullmatch(name) is not None and name.endswith(self.ending)
+        if not isinstance(path, str | os.PathLike):
+            return False
+        folder, name = os.path.split(os.fspath(path))
+        hidden = HIDDEN.fullmatch(name) or HIDDEN.fullmatch(os.path.basename(folder))  # a file, or one of a folder
+        return hidden is not None and name.endswith(self.ending)
 
     def _due(self) -> bool:
         return self.begun == self.number

@@ -96,12 +96,12 @@ def killed(
 
     Raises `Wrong` where a file is damaged, the fit goes back, or a model differs from that of the fit left in peace.
     """
-    options = FITS[name]
-    whole = uninterrupted(clip, options, folder)
+    options, place, alone = FITS[name], folder / name, folder / f"{name}-alone"
+    place.mkdir()
+    alone.mkdir()
+    whole = uninterrupted(clip, options, alone)
     tell(f"{name}: {whole.seconds:.0f} s and {whole.num_checkpoints} checkpoints left in peace")
     rng, rows, ended, before = np.random.default_rng(seed), [], 0, None  # before: the step that is kept
-    place = folder / name
-    place.mkdir()
     target = place / "m.safetensors"
     while len(rows) < num or rows[-1]["goes_on_from"] != "the end":
         aim = AIMS[len(rows) % len(AIMS)] if len(rows) < num else "none"

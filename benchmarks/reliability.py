@@ -1,6 +1,7 @@
 """What a long fit has to bear: kills, long clips, and half an hour without growing.
 
     python -m benchmarks.reliability kills [--kills N] [--fits NAME ...] [--seed N] [--json FILE]
+    python -m benchmarks.reliability outputs [--seed N] [--json FILE]
     python -m benchmarks.reliability long [--frames N] [--size HxW] [--gaussians N] [--steps N] [--json FILE]
     python -m benchmarks.reliability soak [--minutes N] [--json FILE]
 
@@ -8,6 +9,9 @@
   half of the kills comes at random times of the life of a fit, start-up included, a third at a random byte or another
   moment of the writing of a checkpoint, a sixth in that of the model. After each one what lies there must be whole, and
   each model that a fit ends with must be that of a fit left in peace, bit for bit, with no other file beside it.
+* outputs: `render`, `evaluate`, `compress`, `edit`, `export` killed while they write, with an older output in the place:
+  there must be that or the whole new one; `tradeoff` and `uncertainty` killed in a file of their folder: called again
+  they must come to their end.
 * long: 2,000 frames of 320x640 through `fit`, `evaluate` and `render`: the largest resident set of each beside a bound,
   which is a share of the frames' bytes and a constant (`_long.bound`); and whether the progress that the fit told was
   true.
@@ -19,7 +23,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from benchmarks import _common, _kills, _long, _soak
+from benchmarks import _common, _kills, _long, _outputs, _soak
 from benchmarks._common import console
 from benchmarks.memory import write_clip
 
@@ -64,6 +68,17 @@ def kills(options) -> None:
 PLACES = ("the start", "its checkpoint", "the end")
 
 
+def outputs(options) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        rows = _outputs.run(options.seed, lambda text: console.print(text, style="dim", soft_wrap=True), Path(folder))
+    table = _common.table("killed while it was written", "output", "moment", "found after it", "unfinished files left")
+    for row in rows:
+        table.add_row(row["output"], f"{row['moment']} {row['ending']}", row["found"], str(len(row["left"])))
+    console.print(table)
+    figures = {"kills": len(rows), "damaged_files": 0}  # or `Wrong` would have been raised
+    _common.finish(options.json, figures, _common.machine(), kills=rows)
+
+
 def long(options) -> None:
     frame_bytes = options.frames * 3 * options.size[0] * options.size[1]
     with tempfile.TemporaryDirectory() as folder:
@@ -99,7 +114,7 @@ def soak(options) -> None:
     _common.finish(options.json, figures, _common.machine(), series=[sample._asdict() for sample in samples])
 
 
-KINDS = {"kills": kills, "long": long, "soak": soak}
+KINDS = {"kills": kills, "outputs": outputs, "long": long, "soak": soak}
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from foldgauss.cli._shared import (
     named_after,
     out,
 )
-from foldgauss.io._atomic import OutputError, atomic_path, check_writable
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
 from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.uncertainty import (
@@ -294,6 +294,11 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
             existed, posterior = False, sample()
     except KeyboardInterrupt as error:
         raise Stopped(f"stopped by Ctrl-C; what {path} holds goes on when called again.") from error
+    except OSError as error:
+        if error.filename is None or Path(error.filename) != path:
+            raise
+        again = f" What {path} holds goes on when called again." if path.exists() else ""
+        raise OutputError(f"{not_writable(path, error)}{again}") from error
     if existed:
         text = "had finished: nothing was drawn anew" if not course else "went on from where it was stopped"
         out.print(f"{path}: {text}", soft_wrap=True)
@@ -351,6 +356,8 @@ def _write_netcdf(path: Path, posterior: FrameTimePosterior) -> None:
     data = thinned.to_arviz()
     data.attrs["kept_one_step_in"] = stride
     with atomic_path(path) as temporary:
+        # As much as it will be, and more: HDF5 may crash on a disk that is full, Python says so.
+        temporary.write_bytes(bytes(2 * thinned.times.nbytes + (1 << 20)))
         data.to_netcdf(str(temporary), engine="h5netcdf")
 
 
