@@ -9,7 +9,7 @@
   half of the kills comes at random times of the life of a fit, start-up included, a third at a random byte or another
   moment of the writing of a checkpoint, a sixth in that of the model. After each one what lies there must be whole, and
   each model that a fit ends with must be that of a fit left in peace, bit for bit, with no other file beside it.
-* outputs: `render`, `evaluate`, `compress`, `edit`, `export` killed while they write, with an older output in the place:
+* outputs: `render`, `evaluate`, `compress`, `edit`, `export` killed while they write, an older output in the place:
   there must be that or the whole new one; `tradeoff` and `uncertainty` killed in a file of their folder: called again
   they must come to their end.
 * long: 2,000 frames of 320x640 through `fit`, `evaluate` and `render`: the largest resident set of each beside a bound,

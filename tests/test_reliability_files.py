@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from commands import run
 
+from benchmarks import _kills, _long, _outputs, _soak
+from benchmarks.memory import write_clip
 from foldgauss import _kernels
 from foldgauss.cli import _shared, fitting
 from foldgauss.io import load_video_model, write_video
@@ -30,8 +32,10 @@ OLDER = b"older"
 def work(tmp_path_factory):
     """A clip, a model fitted to it and a script of edits."""
     folder = tmp_path_factory.mktemp("work")
-    frames = np.random.default_rng(0).integers(0, 255, (6, 48, 64, 3), np.uint8)
-    write_video(folder / "clip.mp4", frames, 12.0)
+    y, x = np.mgrid[0:48, 0:64]
+    blob = np.exp(-((x - 64 * np.linspace(0.2, 0.7, 6)[:, None, None]) ** 2 + (y - 24) ** 2) / 40)[..., None]
+    noise = np.random.default_rng(0).integers(0, 50, (6, 48, 64, 3))  # without it, files are too small to be cut off
+    write_video(folder / "clip.mp4", (blob * [200, 100, 50] + noise).astype(np.uint8), 12.0)
     (folder / "move.toml").write_text(SCRIPT)
     assert run("fit", folder / "clip.mp4", "--out", folder / "model.safetensors", *SMALL) == 0
     return folder
@@ -234,6 +238,25 @@ def test_compiled_code_without_room_is_not_kept_and_that_is_all(tmp_path):
     assert ".nbc" in kept()
 
 
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of a size; skips where none can be mounted."""
+    with contextlib.ExitStack() as stack:
+        yield lambda size: Small(stack.enter_context(mounted(tmp_path / size, f"size={size}")))
+
+
+@pytest.mark.parametrize(("size", "what"), [("8k", "evidence.npz"), ("512k", "chains.h5")])
+def test_draws_without_room(size, what, work, small_disk, capsys):
+    """HDF5 crashes where a disk is full in the midst of its writing, so the room is looked at before."""
+    pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
+    folder = small_disk(size).folder
+    out = folder / "draws"
+    assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith(f"error: path: expected room for {str(out / what)!r}, got none")
+    assert os.listdir(out) == ([] if what == "evidence.npz" else ["evidence.npz"])
+
+
 # ------------------------------------------------------------------------- places that cannot be written
 
 
@@ -374,3 +397,78 @@ def test_a_fit_writes_its_model_in_a_name_known_for_its_own(work, tmp_path, monk
     assert run("fit", work / "clip.mp4", "--out", tmp_path / "m.safetensors", *SMALL) == 0
     assert len(seen) == 2
     assert all(name.startswith(str(tmp_path / ".m.own-")) for name in seen)
+
+
+# --------------------------------------------------------------------------------------------- the long runs
+
+
+def test_a_trend_is_seen_and_none_is_not():
+    """Of the soak's line: noise of 20 MiB whose neighbours are alike, an hour of it; 60 MiB an hour are seen, 0 not."""
+    found = {0.0: 0, 60.0: 0}
+    for slope in found:
+        for seed in range(20):
+            rng, noise = np.random.default_rng(seed), [0.0]
+            for _ in range(179):
+                noise.append(0.5 * noise[-1] + rng.normal(0, 17))
+            points = [(k / 180, 700 + slope * k / 180 + noise[k]) for k in range(180)]
+            found[slope] += not _soak.trend(points).low <= 0 <= _soak.trend(points).high
+    assert found[0.0] <= 3  # of 20, of which one is expected; more than 3 once in 60 times, and never with these seeds
+    assert found[60.0] == 20
+
+
+def test_true_and_untrue_progress_are_told_apart():
+    """Of the long clip's table."""
+
+    def lines(done, left):
+        return [
+            (k, {"event": "progress", "progress": done(k / 20), "seconds": k, "seconds_left": left(k)})
+            for k in range(21)
+        ]
+
+    true = _long.progress(lines(lambda share: share, lambda k: 20 - k))
+    assert true == {"progress_lines": 21, "progress_backwards": 0, "progress_last": 1.0, **dict.fromkeys(OFF, 0.0)}
+    untrue = _long.progress(lines(lambda share: 0.3 if share > 0.5 else share, lambda k: 30 - k))
+    assert untrue["progress_backwards"] == 1
+    assert untrue["progress_last"] == 0.3
+    assert untrue["progress_off_by"] == pytest.approx(0.7)
+    assert untrue["left_off_by"] == pytest.approx(0.5)
+
+
+OFF = ("progress_off_by", "left_off_by")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="moments of a write are told by Linux's /proc")
+@pytest.mark.parametrize("name", _kills.FITS)
+def test_25_kills(name):
+    """`python -m benchmarks.reliability kills`: it raises where anything is damaged, or a model is another."""
+    found = _kills.run({name: 25}, 1, print)
+    assert len(found["rows"]) == 25
+    assert found["ended"] >= 1
+    assert sum(row["aim"] != "time" for row in found["rows"]) >= 9
+    assert sum("checkpoint, cut off" in row["in_write"] for row in found["rows"]) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="moments of a write are told by Linux's /proc")
+def test_outputs_killed_while_they_are_written(tmp_path):
+    """`python -m benchmarks.reliability outputs` raises where an output is neither the older nor the whole new one."""
+    rows = _outputs.run(1, print, tmp_path)
+    assert {row["found"] for row in rows} == {"the older one", "the new one", "went on to its end"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_long_clip(tmp_path):
+    """`python -m benchmarks.reliability long`: 2,000 frames of 320x640 within their bounds, told truly."""
+    num, size, gaussians = 2000, (320, 640), 80_000
+    write_clip(tmp_path / "clip.avi", num, size)
+    ran = _long.long_clip(tmp_path / "clip.avi", tmp_path, gaussians, 300)
+    for command, own in ran.items():
+        assert own.peak <= _long.bound(command, num * size[0] * size[1] * 3, gaussians), command
+    told = _long.progress(ran["fit"].lines)
+    assert told["progress_backwards"] == 0
+    assert told["progress_last"] == 1.0
+    assert told["progress_lines"] >= 10
