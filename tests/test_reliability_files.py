@@ -16,7 +16,7 @@ from commands import run
 from benchmarks import _kills, _long, _outputs, _soak
 from benchmarks.memory import write_clip
 from foldgauss import _kernels
-from foldgauss.cli import _shared, fitting
+from foldgauss.cli import _shared, fitting, uncertainty
 from foldgauss.io import load_video_model, write_video
 from foldgauss.io._lock import only_writer
 from foldgauss.io.model_file import load_model, read_header
@@ -397,6 +397,14 @@ def test_a_fit_writes_its_model_in_a_name_known_for_its_own(work, tmp_path, monk
     assert run("fit", work / "clip.mp4", "--out", tmp_path / "m.safetensors", *SMALL) == 0
     assert len(seen) == 2
     assert all(name.startswith(str(tmp_path / ".m.own-")) for name in seen)
+
+
+def test_draws_go_on_where_a_kill_left_a_picture(work, tmp_path):
+    (tmp_path / ".times.tmp-01ab23cd.png").write_bytes(OLDER)
+    uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
+    (tmp_path / "frame.png").write_bytes(OLDER)
+    with pytest.raises(_shared.WrongUse, match="without other images"):
+        uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
 
 
 # --------------------------------------------------------------------------------------------- the long runs

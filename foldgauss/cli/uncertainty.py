@@ -173,7 +173,8 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     if video.is_dir() and folder.resolve() == video.resolve():
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder other than the clip's", got=folder, cure=cure)))
-    images = [path for path in folder.glob("*") if path.suffix.lower() in IMAGES and path.name not in PICTURES]
+    shown = [path for path in folder.glob("*") if not path.name.startswith(".")]  # not what a kill left of a picture
+    images = [path for path in shown if path.suffix.lower() in IMAGES and path.name not in PICTURES]
     if images:
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder without other images", got=folder, cure=cure)))
