@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -130,13 +131,14 @@ def refuse_huge(size: tuple[int, int] | None) -> None:
 
 
 def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
-    if path.exists() and not overwrite:
+    if os.path.exists(path) and not overwrite:
         raise WrongUse(f"{option}: {path} exists. Choose another path, or add --overwrite.")
 
 
 def refuse_input(path: Path, what: str, source: Path, option: str = "--out") -> None:
     """An output in place of what it is made of would be lost with the first error."""
-    if path.exists() and source.exists() and path.samefile(source):
+    # os.path: a name that is too long is none, here; making the file says so.
+    if os.path.exists(path) and os.path.exists(source) and path.samefile(source):
         raise WrongUse(f"{option}: expected another file than the {what}, got {path}.")
 
 

@@ -323,12 +323,18 @@ def fit(
         state, info = _run_fit(clip.frames, config, observe, state, keep, begin)
     model = to_model(state, config, clip.size, clip.fps)
     about = noted(clip, seed, frames)
-    save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
+    try:
+        save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
+    except OSError as error:
+        raise _unsaved(error, keep, state, kept) from error
     kept.unlink(missing_ok=True)
     if history is not None:
         _draw_curves(curves, history)
     scores = evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
-    save_video_model(target, model, metadata=about | scores_of(scores))
+    try:
+        save_video_model(target, model, metadata=about | scores_of(scores))
+    except OSError as error:  # of the second write; the model is there
+        err.print(f"warning: {target} is written, but its scores could not be noted in it: {error}", soft_wrap=True)
     if smallest_at_psnr is not None and info.stopped_by != "smallest_at_psnr":
         got = f"{scores.mean_psnr:.2f} dB after {info.step:,} steps"
         err.print(
@@ -445,6 +451,14 @@ def _keep_if_possible(keep: Callable[[FitState], object], state: FitState) -> No
         keep(state)
     except OSError as error:
         err.print(f"warning: the fit could not be kept at step {state.step}: {error}", soft_wrap=True)
+
+
+def _unsaved(error: OSError, keep: Callable[[FitState], object], state: FitState, kept: Path) -> OutputError:
+    """The fit is done, its model cannot be written: keep the fit if that can be, and say how to go on."""
+    _keep_if_possible(keep, state)
+    if not kept.exists():
+        return OutputError(str(error))
+    return OutputError(f"{error} The fit is kept in {kept}: --resume goes on from there, and writes the model.")
 
 
 def _stopped(name: str, state: FitState, info: FitInfo, keep: Callable[[FitState], object] | None) -> Stopped:

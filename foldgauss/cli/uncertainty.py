@@ -31,7 +31,7 @@ from foldgauss.cli._shared import (
     named_after,
     out,
 )
-from foldgauss.io._atomic import OutputError, atomic_path, check_writable
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
 from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.uncertainty import (
@@ -173,7 +173,8 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     if video.is_dir() and folder.resolve() == video.resolve():
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder other than the clip's", got=folder, cure=cure)))
-    images = [path for path in folder.glob("*") if path.suffix.lower() in IMAGES and path.name not in PICTURES]
+    shown = [path for path in folder.glob("*") if not path.name.startswith(".")]  # not what a kill left of a picture
+    images = [path for path in shown if path.suffix.lower() in IMAGES and path.name not in PICTURES]
     if images:
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder without other images", got=folder, cure=cure)))
@@ -294,6 +295,11 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
             existed, posterior = False, sample()
     except KeyboardInterrupt as error:
         raise Stopped(f"stopped by Ctrl-C; what {path} holds goes on when called again.") from error
+    except OSError as error:
+        if error.filename is None or Path(error.filename) != path:
+            raise
+        again = f" What {path} holds goes on when called again." if path.exists() else ""
+        raise OutputError(f"{not_writable(path, error)}{again}") from error
     if existed:
         text = "had finished: nothing was drawn anew" if not course else "went on from where it was stopped"
         out.print(f"{path}: {text}", soft_wrap=True)
@@ -351,6 +357,8 @@ def _write_netcdf(path: Path, posterior: FrameTimePosterior) -> None:
     data = thinned.to_arviz()
     data.attrs["kept_one_step_in"] = stride
     with atomic_path(path) as temporary:
+        # As much as it will be, and more: HDF5 may crash on a disk that is full, Python says so.
+        temporary.write_bytes(bytes(2 * thinned.times.nbytes + (1 << 20)))
         data.to_netcdf(str(temporary), engine="h5netcdf")
 
 

@@ -1,5 +1,6 @@
 """Files that appear whole or not at all."""
 
+import errno
 import os
 import re
 import secrets
@@ -12,6 +13,10 @@ from foldgauss._checks import invalid, short_repr
 
 #: Characters of an output's name that its temporary file bears.
 KEPT = 40
+#: Refusals of the system that more room cures: a full disk, a quota, a limit to the size of files.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+#: Outputs that this process alone may write, see `_lock.only_writer`.
+OWNED: set[Path] = set()
 
 
 class OutputError(OSError):
@@ -40,20 +45,48 @@ def _check_target(path: Path) -> None:
 
 
 def temporary_name(path: Path, suffix: str) -> Path:
-    """A fresh hidden name beside `path`: the rename then stays within one file system."""
+    """A fresh hidden name beside `path`: the rename then stays within one file system.
+
+    "own" instead of "tmp" in it: who holds the lock of `path` knows it for what a killed one left.
+    """
+    kind = "own" if path.absolute() in OWNED else "tmp"
     # The stem is cut: with a long one the random part would pass the file system's limit of 255 bytes.
-    return path.with_name(f".{path.stem[:KEPT]}.tmp-{secrets.token_hex(4)}{suffix}")
+    return path.with_name(f".{path.stem[:KEPT]}.{kind}-{secrets.token_hex(4)}{suffix}")
 
 
 def not_writable(path: Path, error: OSError) -> OutputError:
     """The one-line form of a refusal by the operating system."""
     reason = error.strerror or str(error)
+    if error.errno in _NO_ROOM:
+        return OutputError(
+            f"path: expected room for {str(path)!r}, got none ({reason}). Make room, or choose another output path."
+        )
     return OutputError(f"path: expected a writable place, got {str(path)!r} ({reason}). Choose another output path.")
+
+
+@contextmanager
+def _told_where(path: Path, temporary: Path) -> Iterator[None]:
+    """A disk that is full in the midst of a write: the system's error names no file, or a hidden one, and no cure."""
+    try:
+        yield
+    except OutputError as error:  # of a file in a folder, or of what a file is made from
+        raise OutputError(str(error).replace(str(temporary), str(path))) from error
+    except OSError as error:
+        own = error.filename is None or str(error.filename).startswith(str(temporary))
+        if error.errno in _NO_ROOM and own:
+            raise not_writable(path, error) from error
+        raise
 
 
 def _new_file(path: Path, suffix: str) -> Path:
     """Make the empty temporary file that is to become `path`."""
     _check_target(path)
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        pass
+    except OSError as error:  # a name that is too long for `path`, though not for the temporary file
+        raise not_writable(path, error) from error
     # os.path, not Path: it takes any refusal (a name too long) for "no", and opening then says why.
     if os.path.exists(path) and not os.path.isfile(path):
         raise OutputError(f"path: expected a file's path, got {str(path)!r}, which is not a plain file.")
@@ -69,7 +102,7 @@ def _new_file(path: Path, suffix: str) -> Path:
 def check_writable(path: str | os.PathLike) -> None:
     """Find out before long work, not after it, whether `atomic_path(path)` will work. Raises `OutputError`."""
     path = Path(path)
-    _new_file(path, path.suffix).unlink()
+    _new_file(path, path.suffix).unlink(missing_ok=True)  # who holds the lock may have tidied up
 
 
 @contextmanager
@@ -85,9 +118,10 @@ def atomic_path(path: str | os.PathLike, *, suffix: str | None = None) -> Iterat
     path = Path(path)
     temporary = _new_file(path, path.suffix if suffix is None else suffix)
     try:
-        yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
+        with _told_where(path, temporary):
+            yield temporary
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
         try:
             os.replace(temporary, path)
         except OSError as error:
@@ -113,7 +147,8 @@ def atomic_folder(folder: str | os.PathLike) -> Iterator[Path]:
     except OSError as error:
         raise not_writable(folder, error) from error
     try:
-        yield temporary
+        with _told_where(folder, temporary):
+            yield temporary
         if folder.exists():
             os.replace(folder, aside)
         try:

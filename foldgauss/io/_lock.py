@@ -9,7 +9,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from foldgauss.io._atomic import KEPT, OutputError, check_writable, not_writable
+from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, not_writable
 
 #: Seconds after which an unfinished file beside an output is one that a killed process left.
 LEFT = 3600.0
@@ -20,10 +20,11 @@ def only_writer(path: Path, *, own: tuple[Path, ...] = ()) -> Iterator[None]:
     """Keep others that ask likewise from writing `path`, until the block or the process ends, however it does.
 
     `own`: files that nobody writes but who holds the lock. Unfinished ones of theirs, left by a kill, are removed, and
-    those of `path` once they are an hour old. Raises `OutputError` at once where another holds the lock, or `path`
-    cannot be written.
+    so are those of `path` that a holder left; others of `path` once they are an hour old. Raises `OutputError` at once
+    where another holds the lock, or one of the files cannot be written.
     """
-    check_writable(path)  # the lock would make a folder that is missing
+    for target in (path, *own):
+        check_writable(target)  # the lock would make a folder that is missing
     file = path.with_name(f".{_short(path.name)}.lock")
     lock = FileLock(file, timeout=0)
     try:
@@ -37,17 +38,20 @@ def only_writer(path: Path, *, own: tuple[Path, ...] = ()) -> Iterator[None]:
         raise not_writable(path, error) from error
     try:
         for target in own:
-            _remove_unfinished(target, 0.0 if _is_told_whole(target) else LEFT)
-        _remove_unfinished(path, LEFT)
+            _remove_unfinished(target, "tmp", 0.0 if _is_told_whole(target) else LEFT)
+        _remove_unfinished(path, "own", 0.0 if _is_told_whole(path) else LEFT)
+        _remove_unfinished(path, "tmp", LEFT)
+        OWNED.add(path.absolute())
         yield
     finally:
+        OWNED.discard(path.absolute())
         file.unlink(missing_ok=True)  # while it is held: who opened it before finds that it is another's or none's
         lock.release()
 
 
-def _remove_unfinished(path: Path, age: float) -> None:
-    """What `atomic_path(path)` left in a process that was killed."""
-    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.tmp-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+def _remove_unfinished(path: Path, kind: str, age: float) -> None:
+    """What `atomic_path(path)` left in a process that was killed, see `temporary_name`."""
+    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
     for found in path.parent.iterdir():
         with suppress(FileNotFoundError):  # another was faster
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:

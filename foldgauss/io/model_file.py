@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
@@ -394,7 +393,7 @@ def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
     if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
         raise _error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
-        return jnp.asarray(array)
+        return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
     return np.array(array)
 
 

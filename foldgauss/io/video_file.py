@@ -885,6 +885,7 @@ def _encode(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
                 if writer is None:
                     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, image.shape[1::-1])
                 if not writer.isOpened():
+                    _check_room(path)
                     raise OutputError(
                         "path: expected an OpenCV with FFmpeg's VP9 encoder, got one without. "
                         "Install opencv-contrib-python-headless from PyPI, or write to a folder."
@@ -895,6 +896,13 @@ def _encode(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
             if writer is not None:
                 writer.release()
     return num_frames
+
+
+def _check_room(path: Path) -> None:
+    """Raise the system's OSError where not even a few bytes can be written: OpenCV does not say why it cannot."""
+    path.write_bytes(bytes(4096))
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
 
 
 def _for_encoder(frame: np.ndarray) -> np.ndarray:

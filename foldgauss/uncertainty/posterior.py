@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import errno
 import hashlib
 import importlib
 import importlib.metadata
@@ -390,6 +391,9 @@ class _Run:
                 needed = 1.1 * (TIMES_TAU + BURN_IN) * found.tau.max() / self.thin_by
                 goal = min(max(int(min(needed, 2 * done)), done + max(LOOK, done // 4)), most)
                 del found  # its draws, before there are more
+            if self.file is not None:
+                left = sum(goal - sampler.iteration for sampler in self.samplers)
+                self.file.check_space(8 * left * self.walkers * (self.log_prob.num_free + 1))  # and its log-density
             for n, sampler in enumerate(self.samplers):
                 for _ in self._steps(sampler, goal - sampler.iteration):
                     if show is not None:
@@ -409,6 +413,8 @@ class _Run:
                 sampler.start = state
                 yield
         except (RuntimeError, np.linalg.LinAlgError) as error:
+            if self.file is not None:
+                self.file.check_room(error)
             raise invalid("moves", expected="moves that these walkers can make", got=str(error)) from error
 
     def times(self) -> Float64[np.ndarray, "ensembles steps walkers num_frames"]:
@@ -515,6 +521,10 @@ def _described(value, depth: int = 2) -> Any:
     return kind, [(name, _described(each, depth - 1)) for name, each in sorted(inner.items())]
 
 
+#: Room that an HDF5 file of draws takes beside them: of its pieces, the last ones are not full.
+SPARE, SPARE_BYTES = 1.2, 4 << 20
+
+
 class _Kept:
     """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced."""
 
@@ -528,10 +538,13 @@ class _Kept:
                 raise invalid(
                     "backend", expected="the file of this very run", got=f"{self.path}, of another", cure=cure
                 )
-            shutil.copyfile(self.path, self.live)
-        else:
-            with needed("h5py").File(self.live, "w") as file:
-                file.attrs["fingerprint"] = fingerprint
+        self.check_space(path.stat().st_size if path.exists() else 0)
+        with self.written():
+            if path.exists():
+                shutil.copyfile(self.path, self.live)
+            else:
+                with needed("h5py").File(self.live, "w") as file:
+                    file.attrs["fingerprint"] = fingerprint
 
     def of(self, n: int):
         import emcee
@@ -541,12 +554,43 @@ class _Kept:
     def keep(self) -> None:
         """What is written so far replaces the file."""
         copy = self.path.with_name(f".{self.path.name}.new")
-        shutil.copyfile(self.live, copy)
-        os.replace(copy, self.path)
+        try:
+            with self.written():
+                shutil.copyfile(self.live, copy)
+                with open(copy, "rb") as file:
+                    os.fsync(file.fileno())
+                os.replace(copy, self.path)
+        finally:
+            copy.unlink(missing_ok=True)
 
     def close(self) -> None:
         self.keep()
         self.live.unlink()
+
+    def check_space(self, num_bytes: int) -> None:
+        """Raise OSError where the disk has no room for so much more, and a copy: HDF5 may crash on one that is full."""
+        there = self.live.stat().st_size if self.live.exists() else 0
+        needed = SPARE * (2 * num_bytes + there) + SPARE_BYTES
+        if shutil.disk_usage(self.path.parent).free < needed:
+            self.check_room(OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed"))
+
+    @contextlib.contextmanager
+    def written(self) -> Iterator[None]:
+        """Where writing fails for what the system refuses: an OSError that names the file, and nothing beside it."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            self.check_room(error)
+            raise
+
+    def check_room(self, error: Exception) -> None:
+        """Raise what the system has refused, if it has: HDF5 tells it within a long text, or as a RuntimeError."""
+        told = re.search(r"errno = (\d+)", str(error))
+        number = int(told[1]) if told else getattr(error, "errno", None)
+        if number is None:
+            return
+        self.live.unlink(missing_ok=True)
+        raise OSError(number, os.strerror(number), str(self.path)) from error
 
 
 def _fingerprint_of(path: Path) -> str:

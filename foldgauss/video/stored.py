@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt, UInt8
 
@@ -154,12 +153,13 @@ def _dense(splats: StoredSplats) -> dict[str, Array]:
     kinds, num, rows = np.asarray(splats.kinds), splats.num_gaussians, np.asarray(splats.coefficients)
     coefficients = np.zeros((num, splats.degree, 2), rows.dtype)
     coefficients[_has_power(degrees, splats.degree)] = rows
-    leaves = {"coefficients": jnp.asarray(coefficients)}
+    # device_put: jnp.asarray compiles, and keeps, a program for every shape.
+    leaves = {"coefficients": jax.device_put(coefficients)}
     for name, (bit, value) in _LEFT_OUT.items():
         kept = np.asarray(getattr(splats, name))
         leaf = np.full(num, value, kept.dtype)
         leaf[(kinds & bit) == 0] = kept
-        leaves[name] = jnp.asarray(leaf)
+        leaves[name] = jax.device_put(leaf)
     return leaves
 
 
@@ -197,7 +197,7 @@ def _by_index(splats: FoldedSplats) -> dict[str, np.ndarray]:
 def _own_rows(splats: StoredSplats, name: str, index_name: str) -> Float[Array, "num width"]:
     index, rows = np.asarray(getattr(splats, index_name)), np.asarray(getattr(splats, name))
     _check_count(f"the greatest {index_name}", int(index.max(initial=0)), 0, len(rows) - 1)
-    return jnp.asarray(rows[index])
+    return jax.device_put(rows[index])
 
 
 def _index_type(num: int) -> type:

@@ -228,6 +228,18 @@ def _refused(path, match=None):
         assert str(path) in str(caught.value)
 
 
+def test_no_shape_of_a_leaf_is_compiled_for(tmp_path, caplog):
+    """Programs that are compiled for a shape stay: a process that loads models of many sizes would grow without end."""
+    for rows in (1013, 1019):
+        save_model(tmp_path / "m", _toy(np.ones((rows, 3), np.float32), {"whole": np.arange(rows, dtype=np.int32)}))
+        with jax.log_compiles():
+            load_model(tmp_path / "m")
+            assert "Compiling" not in caplog.text
+            jnp.asarray(np.zeros(rows, np.float32)) * 2  # the test sees what it looks for
+            assert "Compiling" in caplog.text
+        caplog.clear()
+
+
 def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors"):
         load_model(tmp_path / "nowhere.safetensors")

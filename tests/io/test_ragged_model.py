@@ -397,3 +397,15 @@ def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     run("info", save_video_model(tmp_path / "whole.safetensors", ragged_model(np.full(NUM, 3))))
     told = capsys.readouterr().out
     assert not any(name in told for name in ("degrees", "lasting", "colours", "shapes", "solid"))
+
+
+def test_no_shape_of_a_ragged_model_is_compiled_for(tmp_path, caplog):
+    """Compiled programs stay: a process that loads models of many sizes would grow without end."""
+    for num in (67, 71):
+        model = ragged_model(np.arange(num) % 4, np.arange(num) % 2 == 0, num_colors=3, num_shapes=2)
+        save_video_model(tmp_path / "m.safetensors", model)
+        with jax.log_compiles():
+            found = load_video_model(tmp_path / "m.safetensors")
+        assert "Compiling" not in caplog.text
+        assert "tracing" in caplog.text  # of the skeleton: the log is seen
+        same(found, model)

@@ -1,0 +1,142 @@
+"""Half an hour of work in one process, and what its memory does meanwhile."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from foldgauss.datasets import bunny
+from foldgauss.io.video_file import Clip, write_video
+from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
+from foldgauss.video import FitConfig, evaluate
+from foldgauss.video.economy import Economy
+from foldgauss.video.fit import fit_steps, to_model
+
+#: Frames and size of the clip, Gaussians and steps of each short fit.
+FRAMES, SIZE, GAUSSIANS, STEPS = (0, 16), (80, 160), 3000, 240
+#: Seconds of the long fit in each cycle; and between two looks at the memory.
+LONG, LOOK = 12.0, 2.0
+#: Of the soak, its beginning: what is compiled and cached in the first cycles is no growth.
+WARM_UP = 0.25
+MIB = 2**20
+
+
+class Sample(NamedTuple):
+    """Seconds since the start; resident set and, of it, what is in no file, in bytes."""
+
+    seconds: float
+    resident: int
+    anonymous: int
+
+
+class Trend(NamedTuple):
+    """A line through the memory after the warm-up: MiB an hour, the ends of its 95% interval, and the MiB it is at."""
+
+    slope: float
+    low: float
+    high: float
+    level: float
+
+
+def memory() -> tuple[int, int]:
+    """Resident set of this process and its anonymous part, in bytes. Linux alone tells."""
+    fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return tuple(1024 * int(fields[name].split()[0]) for name in ("VmRSS", "RssAnon"))
+
+
+@contextlib.contextmanager
+def sampling(every: float = LOOK) -> Iterator[list[Sample]]:
+    """A list that grows by a sample every so many seconds, as long as the block lasts."""
+    samples, over, begun = [], threading.Event(), time.monotonic()
+
+    def look() -> None:
+        while not over.wait(every):
+            samples.append(Sample(time.monotonic() - begun, *memory()))
+
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        yield samples
+    finally:
+        over.set()
+        thread.join()
+
+
+def soak(minutes: float, folder: Path, tell: Callable[[str], None] = print) -> list[tuple[float, float]]:
+    """Seconds at which each cycle began and ended. A cycle is some steps of a fit that lasts throughout, kept and read
+    back, and a short fit of its own, kept, resumed, saved, loaded, evaluated and rendered.
+    """
+    clip, begun, cycles = bunny(frames=FRAMES, size=SIZE), time.monotonic(), []
+    config = FitConfig(num_gaussians=GAUSSIANS, steps=10**6)
+    lasting = fit_steps(clip.frames, config)
+    while time.monotonic() - begun < 60 * minutes:
+        first = time.monotonic() - begun
+        until = time.monotonic() + LONG
+        for state, info in lasting:
+            if time.monotonic() > until:
+                break
+        save_checkpoint(folder / "long.checkpoint", state, config=config, source={})
+        load_checkpoint(folder / "long.checkpoint", config=config, source={})
+        number = len(cycles)
+        shown = _short(clip, _kind(number), folder)
+        cycles.append((first, time.monotonic() - begun))
+        tell(f"cycle {number}: {cycles[-1][1]:.0f} s, long fit at step {info.step}, {shown}")
+    return cycles
+
+
+def _kind(number: int) -> FitConfig:
+    """Plain, economical and growing fits in turn, each with a seed of its own."""
+    common = {"num_gaussians": GAUSSIANS, "steps": STEPS, "seed": number}
+    kinds = (
+        FitConfig(**common),
+        FitConfig(**common, economy=Economy()),
+        FitConfig.preset("paper", **common | {"num_gaussians": 1000}, degree=3, max_gaussians=GAUSSIANS),
+    )
+    return kinds[number % len(kinds)]
+
+
+def _short(clip: Clip, config: FitConfig, folder: Path) -> str:
+    """A fit that is stopped in its middle and goes on from its checkpoint; what comes out is used."""
+    kept, path, state = folder / "short.checkpoint", folder / "short.safetensors", None
+    for state, info in fit_steps(clip.frames, config):
+        if info.step == STEPS // 2:
+            break
+    save_checkpoint(kept, state, config=config, source={})
+    for state, info in fit_steps(clip.frames, config, load_checkpoint(kept, config=config, source={})):
+        pass
+    save_video_model(path, to_model(state, config, clip.size, clip.fps))
+    model = load_video_model(path)
+    scores = evaluate(model, clip.frames)
+    write_video(folder / "short.mp4", model.frames(), clip.fps)
+    return f"short one {info.num_gaussians:,} Gaussians, {scores.mean_psnr:.2f} dB"
+
+
+def by_cycle(samples: list[Sample], cycles: list[tuple[float, float]], field: str) -> list[tuple[float, float]]:
+    """(hours, MiB), the mean of each cycle: within one the memory goes up and down, by what is being done."""
+    means = []
+    for first, last in cycles:
+        own = [getattr(sample, field) for sample in samples if first <= sample.seconds < last]
+        if own:
+            means.append(((first + last) / 2 / 3600, float(np.mean(own)) / MIB))
+    return means
+
+
+def trend(points: list[tuple[float, float]], warm_up: float = WARM_UP) -> Trend:
+    """A least-squares line through `points` (hours, MiB), but for the first share `warm_up` of the time.
+
+    Neighbours are alike, so they tell less than as many independent ones: the error is that of
+    n (1 - r) / (1 + r) points, r being the correlation of neighbouring residuals where that is above 0.
+    """
+    hours, mib = np.array([point for point in points if point[0] >= warm_up * points[-1][0]]).T
+    line = stats.linregress(hours, mib)
+    rest = mib - line.intercept - line.slope * hours
+    alike = max(float(np.corrcoef(rest[:-1], rest[1:])[0, 1]), 0.0) if np.ptp(rest) > 0 else 0.0
+    num = len(hours) * (1 - alike) / (1 + alike)
+    error = line.stderr * np.sqrt(max(len(hours) - 2, 1) / max(num - 2, 1))
+    reach = stats.t.ppf(0.975, max(num - 2, 1)) * error
+    return Trend(float(line.slope), float(line.slope - reach), float(line.slope + reach), float(mib.mean()))

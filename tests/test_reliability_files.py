@@ -1,0 +1,482 @@
+"""A disk that is full, a folder that cannot be written, a process that is killed: nothing is lost, nothing half there.
+
+Disks are full in two ways: a file system of some kilobytes, where this may be mounted, and a limit to the size of
+files, which needs no rights. The long runs: `python -m benchmarks.reliability`.
+"""
+
+import contextlib
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from commands import run
+
+from benchmarks import _kills, _long, _outputs, _soak
+from benchmarks.memory import write_clip
+from foldgauss import _kernels
+from foldgauss.cli import _shared, fitting, uncertainty
+from foldgauss.io import load_video_model, write_video
+from foldgauss.io._lock import only_writer
+from foldgauss.io.model_file import load_model, read_header
+
+resource = pytest.importorskip("resource", reason="limits to the size of files are POSIX's; CI runs it on Linux")
+
+SMALL = ["--gaussians", "400", "--steps", "30", "--quiet"]
+SCRIPT = '[[edits]]\ndo = "move"\noffset = [0.1, 0.0]\n'
+OLDER = b"older"
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A clip, a model fitted to it and a script of edits."""
+    folder = tmp_path_factory.mktemp("work")
+    y, x = np.mgrid[0:48, 0:64]
+    blob = np.exp(-((x - 64 * np.linspace(0.2, 0.7, 6)[:, None, None]) ** 2 + (y - 24) ** 2) / 40)[..., None]
+    noise = np.random.default_rng(0).integers(0, 50, (6, 48, 64, 3))  # without it, files are too small to be cut off
+    write_video(folder / "clip.mp4", (blob * [200, 100, 50] + noise).astype(np.uint8), 12.0)
+    (folder / "move.toml").write_text(SCRIPT)
+    assert run("fit", folder / "clip.mp4", "--out", folder / "model.safetensors", *SMALL) == 0
+    return folder
+
+
+class Limited:
+    """A folder, and a limit to the size of all files that this process writes."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def fill(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+
+    def empty(self):
+        _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+
+
+class Small:
+    """A file system of its own, which is filled to its last byte."""
+
+    def __init__(self, folder):
+        self.folder, self.ballast = folder, folder / "ballast"
+
+    def fill(self):
+        with open(self.ballast, "ab", buffering=0) as file, contextlib.suppress(OSError):
+            while file.write(bytes(4096)):
+                pass
+
+    def empty(self):
+        self.ballast.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def mounted(folder, options):
+    """A file system in memory; skips the test where that may not be."""
+    folder.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", options, "none", str(folder)]
+    done = subprocess.run(words, capture_output=True, text=True) if shutil.which("mount") else None
+    if done is None or done.returncode:
+        pytest.skip(f"no file system can be mounted here: {done.stderr.strip() if done else 'no mount'}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture(params=["a small file system", "a limit to files"])
+def disk(request, tmp_path):
+    """A folder whose disk can be filled and emptied."""
+    with contextlib.ExitStack() as stack:
+        if request.param == "a limit to files":
+            (tmp_path / "disk").mkdir()
+            found = Limited(tmp_path / "disk")
+        else:
+            found = Small(stack.enter_context(mounted(tmp_path / "disk", "size=512k")))
+        try:
+            yield found
+        finally:
+            found.empty()
+
+
+#: Commands that write a file or a folder of this name; MODEL, CLIP and SCRIPT stand for those of `work`.
+OUTPUTS = {
+    "v.mp4": ["render", "MODEL", "--out"],
+    "v.webm": ["render", "MODEL", "--out"],
+    "v.gif": ["render", "MODEL", "--out"],
+    "v.webp": ["render", "MODEL", "--out"],
+    "p.png": ["render", "MODEL", "--times", "0.5", "--out"],
+    "frames": ["render", "MODEL", "--out"],
+    "e.json": ["evaluate", "MODEL", "CLIP", "--json"],
+    "c.fgz": ["compress", "MODEL", "--passes", "0", "--out"],
+    "h.safetensors": ["compress", "MODEL", "--float16", "--out"],
+    "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
+    "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
+    "scenes": ["export", "MODEL", "--format", "ply3dgs", "--out"],
+    "meshes": ["export", "MODEL", "--format", "obj", "--out"],
+    "page.html": ["export", "MODEL", "--format", "html", "--out"],
+    "m.safetensors": ["fit", "CLIP", *SMALL, "--out"],
+}
+
+
+def words_of(name, work, folder):
+    """The command that writes `name` into `folder`."""
+    places = {"MODEL": work / "model.safetensors", "CLIP": work / "clip.mp4", "SCRIPT": work / "move.toml"}
+    return [places.get(word, word) for word in OUTPUTS[name]] + [folder / name]
+
+
+def older(folder, name):
+    """An output of before, as the command would overwrite it; returns how to see that it is as it was."""
+    path = folder / name
+    if path.suffix:
+        path.write_bytes(OLDER)
+        return lambda: path.read_bytes() == OLDER
+    path.mkdir()
+    old = path / {"frames": "00000.png", "scenes": "frame_0000.ply", "meshes": "frame_0000.obj"}[name]
+    old.write_bytes(OLDER)
+    return lambda: old.read_bytes() == OLDER and os.listdir(path) == [old.name]
+
+
+def test_a_full_disk_costs_no_older_output_and_leaves_nothing(work, disk, capsys):
+    """All commands that write one file or one folder, each with an older one there."""
+    for name in OUTPUTS:
+        as_it_was = older(disk.folder, name)
+        disk.fill()
+        before = sorted(os.listdir(disk.folder))
+        code = run(*words_of(name, work, disk.folder), "--overwrite")
+        disk.empty()
+        told = capsys.readouterr().err.strip().splitlines()[-1]
+        assert code == 1, (name, told)
+        assert told.startswith("error: path: expected "), (name, told)
+        assert str(disk.folder / name) in told, (name, told)
+        assert ".tmp-" not in told, (name, told)
+        assert "Make room" in told or "disk may be full" in told, (name, told)
+        assert as_it_was(), name
+        assert sorted({*os.listdir(disk.folder), "ballast"}) == sorted({*before, "ballast"}), name
+
+
+def filling(monkeypatch, disk, full_at, empty_at=None):
+    """Fill the disk before step `full_at` is told, and empty it before `empty_at` is."""
+    steps = fitting.fit_steps
+
+    def stepping(*arguments):
+        for state, info in steps(*arguments):
+            if info.step == full_at:
+                disk.fill()
+            if info.step == empty_at:
+                disk.empty()
+            yield state, info
+
+    monkeypatch.setattr(fitting, "fit_steps", stepping)
+
+
+def test_a_checkpoint_without_room_is_told_and_the_fit_goes_on(work, disk, monkeypatch, capsys):
+    target, kept = disk.folder / "m.safetensors", disk.folder / "m.safetensors.checkpoint"
+    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    filling(monkeypatch, disk, 6, 9)
+    seen, keep = [], fitting._keep_if_possible
+
+    def keeping(*arguments):
+        keep(*arguments)
+        load_model(kept)
+        seen.append(read_header(kept)["header"]["step"])
+
+    monkeypatch.setattr(fitting, "_keep_if_possible", keeping)
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
+    assert seen == [1, 2, 3, 4, 5, 5, 5, 5, *range(9, 31)]  # whole at any time
+    told = capsys.readouterr().err
+    assert told.count("warning: the fit could not be kept at step ") == 3
+    assert f"expected room for {str(kept)!r}" in told
+    assert load_model(target).num_frames == 6
+    assert set(os.listdir(disk.folder)) <= {"m.safetensors", "ballast"}
+
+
+def test_a_model_without_room_is_written_by_resuming_to_the_bit(work, disk, monkeypatch, capsys):
+    target, kept = disk.folder / "m.safetensors", disk.folder / "m.safetensors.checkpoint"
+    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    filling(monkeypatch, disk, 27)
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith(f"error: path: expected room for {str(target)!r}")
+    assert f"The fit is kept in {kept}: --resume goes on" in told
+    assert read_header(kept)["header"]["step"] == 26
+    assert set(os.listdir(disk.folder)) <= {kept.name, "ballast"}
+    monkeypatch.undo()
+    disk.empty()
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL, "--resume") == 0
+    assert os.listdir(disk.folder) == [target.name]
+    assert target.read_bytes() == (work / "model.safetensors").read_bytes()
+
+
+def test_scores_without_room_are_told_and_the_model_is_there(work, disk, monkeypatch, capsys):
+    target, evaluate = disk.folder / "m.safetensors", _shared.evaluate
+    monkeypatch.setattr(
+        _shared, "evaluate", lambda *arguments, **options: disk.fill() or evaluate(*arguments, **options)
+    )
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
+    assert f"warning: {target} is written, but its scores could not be noted" in capsys.readouterr().err
+    found, whole = load_video_model(target), load_video_model(work / "model.safetensors")
+    assert np.array_equal(found.render(0.3), whole.render(0.3))
+    assert set(os.listdir(disk.folder)) <= {target.name, "ballast"}
+
+
+def test_compiled_code_without_room_is_not_kept_and_that_is_all(tmp_path):
+    """What Numba keeps beside the sources, or in the user's folder, may find a full disk, too."""
+    source = tmp_path / "doubling.py"
+    source.write_text("def doubled(x):\n    return 2 * x\n")
+    made = {}
+    exec(compile(source.read_text(), str(source), "exec"), made)
+    disk = Limited(tmp_path)
+    disk.fill()
+    try:
+        assert _kernels.kernel(made["doubled"])(4.0) == 8.0
+    finally:
+        disk.empty()
+    kept = lambda: [path.suffix for path in (tmp_path / "__pycache__").iterdir()]  # noqa: E731
+    assert ".nbc" not in kept()
+    assert _kernels.kernel(made["doubled"])(4.0) == 8.0
+    assert ".nbc" in kept()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of a size; skips where none can be mounted."""
+    with contextlib.ExitStack() as stack:
+        yield lambda size: Small(stack.enter_context(mounted(tmp_path / size, f"size={size}")))
+
+
+@pytest.mark.parametrize(("size", "what"), [("8k", "evidence.npz"), ("512k", "chains.h5")])
+def test_draws_without_room(size, what, work, small_disk, capsys):
+    """HDF5 crashes where a disk is full in the midst of its writing, so the room is looked at before."""
+    pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
+    folder = small_disk(size).folder
+    out = folder / "draws"
+    assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith(f"error: path: expected room for {str(out / what)!r}, got none")
+    assert os.listdir(out) == ([] if what == "evidence.npz" else ["evidence.npz"])
+
+
+# ------------------------------------------------------------------------- places that cannot be written
+
+
+@pytest.fixture
+def before_any_work(monkeypatch):
+    """A fit that comes as far as reading its clip fails the test."""
+    for name in ("read_video", "fit_steps"):
+        monkeypatch.setattr(fitting, name, lambda *a, name=name, **k: pytest.fail(f"{name} was called"))
+
+
+@pytest.fixture
+def read_only(tmp_path):
+    """A folder that cannot be written: root writes whatever the permissions are, but not to what is mounted so."""
+    if os.geteuid() == 0:
+        with mounted(tmp_path / "shut", "size=64k,ro") as folder:
+            yield folder
+    else:
+        (tmp_path / "shut").mkdir(mode=0o555)
+        yield tmp_path / "shut"
+
+
+def refused(work, target, capsys, *options):
+    """What a fit to `target` says on the one line with which it refuses."""
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL, *options) in (1, 2)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def test_places_that_cannot_be_written_are_found_before_the_fit(work, tmp_path, capsys, before_any_work):
+    (tmp_path / "folder.safetensors").mkdir()
+    (tmp_path / "file").write_bytes(OLDER)
+    (tmp_path / "m.safetensors.checkpoint").mkdir()
+    told = {
+        tmp_path / "none" / "m.safetensors": "expected an existing folder",
+        tmp_path / "file" / "m.safetensors": "expected a folder, got the file",
+        tmp_path / "folder.safetensors": "not a plain file",
+        tmp_path / f"{'m' * 250}.safetensors": "File name too long",
+        tmp_path / f"{'m' * 240}.safetensors": ".checkpoint' (File name too long)",
+        tmp_path / "m.safetensors": "m.safetensors.checkpoint', which is not a plain file",
+    }
+    for target, what in told.items():
+        before = sorted(os.listdir(tmp_path))
+        for options in ([], ["--overwrite"]):
+            found = refused(work, target, capsys, *options)
+            assert what in found
+            assert found.startswith("error: path: expected ")
+        assert sorted(os.listdir(tmp_path)) == before
+    assert (tmp_path / "file").read_bytes() == OLDER
+
+
+def test_a_read_only_folder_is_found_before_the_fit(work, read_only, capsys, before_any_work):
+    found = refused(work, read_only / "m.safetensors", capsys)
+    assert f"expected a writable place, got {str(read_only / 'm.safetensors')!r}" in found
+    assert "Choose another output path" in found
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the folder of processes is Linux's")
+def test_a_folder_of_the_system_is_found_before_the_fit(work, capsys, before_any_work):
+    assert "expected a writable place" in refused(work, "/proc/self/m.safetensors", capsys)
+
+
+def test_read_only_for_every_command(work, read_only, capsys):
+    for name in OUTPUTS:
+        assert run(*words_of(name, work, read_only)) in (1, 2), name
+        told = capsys.readouterr().err.strip().splitlines()[-1]
+        assert told.startswith("error: "), (name, told)
+        assert str(read_only) in told, (name, told)
+    assert os.listdir(read_only) == []
+
+
+def test_the_clip_may_vanish_while_it_is_fitted(work, tmp_path, monkeypatch, capsys):
+    clip, target = tmp_path / "clip.mp4", tmp_path / "m.safetensors"
+    shutil.copy(work / "clip.mp4", clip)
+    steps = fitting.fit_steps
+
+    def stepping(*arguments):
+        for state, info in steps(*arguments):
+            if info.step == 3:
+                clip.unlink()
+            yield state, info
+
+    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    assert run("fit", clip, "--out", target, *SMALL) == 0
+    assert target.read_bytes() == (work / "model.safetensors").read_bytes()
+    monkeypatch.undo()
+    (tmp_path / "m.safetensors.checkpoint").write_bytes(OLDER)
+    assert run("fit", clip, "--out", target, *SMALL, "--resume", "--overwrite") == 2
+    assert f"got {str(clip)!r}, which is missing" in capsys.readouterr().err
+    assert (tmp_path / "m.safetensors.checkpoint").read_bytes() == OLDER
+
+
+# ---------------------------------------------------------------------------------- two fits, one output
+
+
+def test_one_output_by_any_name_has_one_fit(work, tmp_path, monkeypatch, capsys, before_any_work):
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (tmp_path / "link").symlink_to(folder)
+    monkeypatch.chdir(folder)
+    names = [folder / "m.safetensors", "m.safetensors", "../models/m.safetensors", tmp_path / "link" / "m.safetensors"]
+    for held in names:
+        with only_writer(fitting.Path(held)):
+            for other in names:
+                assert "which another fit is" in refused(work, other, capsys)
+    assert os.listdir(folder) == []
+
+
+def test_a_link_is_an_output_of_its_own(work, tmp_path):
+    """A fit puts its file in the link's place; what the link led to stays, so two fits never write one file."""
+    (tmp_path / "other").mkdir()
+    real, link = tmp_path / "other" / "m.safetensors", tmp_path / "m.safetensors"
+    real.write_bytes(OLDER)
+    link.symlink_to(real)
+    with only_writer(real):
+        assert run("fit", work / "clip.mp4", "--out", link, *SMALL, "--overwrite") == 0
+    assert real.read_bytes() == OLDER
+    assert not link.is_symlink()
+    assert link.read_bytes() == (work / "model.safetensors").read_bytes()
+
+
+def test_what_a_killed_fit_left_is_gone_after_the_next(work, tmp_path):
+    """Its lock, and its unfinished files, however young; files of others stay."""
+    target = tmp_path / "m.safetensors"
+    left = [".m.safetensors.lock", ".m.safetensors.tmp-01ab23cd.checkpoint", ".m.own-01ab23cd.safetensors"]
+    others = [".m.tmp-01ab23cd.safetensors", ".m.own-01ab23cd.checkpoint", ".mm.own-01ab23cd.safetensors"]
+    for name in left + others:
+        (tmp_path / name).write_bytes(OLDER)
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
+    assert sorted(os.listdir(tmp_path)) == sorted([target.name, *others])
+
+
+def test_a_fit_writes_its_model_in_a_name_known_for_its_own(work, tmp_path, monkeypatch):
+    """Without it, what a kill leaves of a model could not be told from what another command is just writing."""
+    seen, replace = [], os.replace
+    monkeypatch.setattr(os, "replace", lambda source, target: seen.append(str(source)) or replace(source, target))
+    assert run("fit", work / "clip.mp4", "--out", tmp_path / "m.safetensors", *SMALL) == 0
+    assert len(seen) == 2
+    assert all(name.startswith(str(tmp_path / ".m.own-")) for name in seen)
+
+
+def test_draws_go_on_where_a_kill_left_a_picture(work, tmp_path):
+    (tmp_path / ".times.tmp-01ab23cd.png").write_bytes(OLDER)
+    uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
+    (tmp_path / "frame.png").write_bytes(OLDER)
+    with pytest.raises(_shared.WrongUse, match="without other images"):
+        uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
+
+
+# --------------------------------------------------------------------------------------------- the long runs
+
+
+def test_a_trend_is_seen_and_none_is_not():
+    """Of the soak's line: noise of 20 MiB whose neighbours are alike, an hour of it; 60 MiB an hour are seen, 0 not."""
+    found = {0.0: 0, 60.0: 0}
+    for slope in found:
+        for seed in range(20):
+            rng, noise = np.random.default_rng(seed), [0.0]
+            for _ in range(179):
+                noise.append(0.5 * noise[-1] + rng.normal(0, 17))
+            points = [(k / 180, 700 + slope * k / 180 + noise[k]) for k in range(180)]
+            found[slope] += not _soak.trend(points).low <= 0 <= _soak.trend(points).high
+    assert found[0.0] <= 3  # of 20, of which one is expected; more than 3 once in 60 times, and never with these seeds
+    assert found[60.0] == 20
+
+
+def test_true_and_untrue_progress_are_told_apart():
+    """Of the long clip's table."""
+
+    def lines(done, left):
+        return [
+            (k, {"event": "progress", "progress": done(k / 20), "seconds": k, "seconds_left": left(k)})
+            for k in range(21)
+        ]
+
+    true = _long.progress(lines(lambda share: share, lambda k: 20 - k))
+    assert true == {"progress_lines": 21, "progress_backwards": 0, "progress_last": 1.0, **dict.fromkeys(OFF, 0.0)}
+    untrue = _long.progress(lines(lambda share: 0.3 if share > 0.5 else share, lambda k: 30 - k))
+    assert untrue["progress_backwards"] == 1
+    assert untrue["progress_last"] == 0.3
+    assert untrue["progress_off_by"] == pytest.approx(0.7)
+    assert untrue["left_off_by"] == pytest.approx(0.5)
+
+
+OFF = ("progress_off_by", "left_off_by")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="moments of a write are told by Linux's /proc")
+@pytest.mark.parametrize("name", _kills.FITS)
+def test_25_kills(name):
+    """`python -m benchmarks.reliability kills`: it raises where anything is damaged, or a model is another."""
+    found = _kills.run({name: 25}, 1, print)
+    assert len(found["rows"]) == 25
+    assert found["ended"] >= 1
+    assert sum(row["aim"] != "time" for row in found["rows"]) >= 9
+    assert sum("checkpoint, cut off" in row["in_write"] for row in found["rows"]) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="moments of a write are told by Linux's /proc")
+def test_outputs_killed_while_they_are_written(tmp_path):
+    """`python -m benchmarks.reliability outputs` raises where an output is neither the older nor the whole new one."""
+    rows = _outputs.run(1, print, tmp_path)
+    assert {row["found"] for row in rows} == {"the older one", "the new one", "went on to its end"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_long_clip(tmp_path):
+    """`python -m benchmarks.reliability long`: 2,000 frames of 320x640 within their bounds, told truly."""
+    num, size, gaussians = 2000, (320, 640), 80_000
+    write_clip(tmp_path / "clip.avi", num, size)
+    ran = _long.long_clip(tmp_path / "clip.avi", tmp_path, gaussians, 300)
+    for command, own in ran.items():
+        assert own.peak <= _long.bound(command, num * size[0] * size[1] * 3, gaussians), command
+    told = _long.progress(ran["fit"].lines)
+    assert told["progress_backwards"] == 0
+    assert told["progress_last"] == 1.0
+    assert told["progress_lines"] >= 10
