@@ -347,7 +347,8 @@ class _Run:
         self.exact = exact_times(log_prob.profiles, log_prob.increments)
         self.laplace = laplace_times(log_prob.profiles, log_prob.increments, self.exact.quantile(0.5))
         fingerprint = self._fingerprint(settings.ensembles, moves)
-        self.file = None if settings.backend is None else _Kept(settings.backend, fingerprint)
+        shape = settings.ensembles, self.walkers, log_prob.num_free
+        self.file = None if settings.backend is None else _Kept(settings.backend, fingerprint, shape)
         self.samplers = [self._sampler(n, moves) for n in range(settings.ensembles)]
 
     def _fingerprint(self, ensembles: int, moves: list[tuple[Any, float]]) -> str:
@@ -518,11 +519,12 @@ def _described(value, depth: int = 2) -> Any:
 class _Kept:
     """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced."""
 
-    def __init__(self, path: Path, fingerprint: str):
+    def __init__(self, path: Path, fingerprint: str, shape: tuple[int, int, int]):
+        """`shape`: ensembles, walkers of each, frames that move."""
         self.path = path
         self.live = path.with_name(f".{path.name}.running")
         if path.exists():
-            kept = _fingerprint_of(path)
+            kept = _fingerprint_of(path, fingerprint, shape)
             if kept != fingerprint:
                 cure = "Choose another file, or give the same model, video and settings."
                 raise invalid(
@@ -549,14 +551,53 @@ class _Kept:
         self.live.unlink()
 
 
-def _fingerprint_of(path: Path) -> str:
-    """Of the run that a file keeps."""
+def _fingerprint_of(path: Path, wanted: str | None = None, shape: tuple[int, int, int] = (0, 0, 0)) -> str:
+    """Of the run that a file keeps, which holds all that `wanted` promises. A file may come from a stranger."""
     try:
         with needed("h5py").File(path) as file:
-            return file.attrs.get("fingerprint", "")
-    except OSError as error:
-        cure = "Remove it, or choose another."
-        raise invalid("backend", expected="an HDF5 file, or none yet", got=f"{path}, damaged", cure=cure) from error
+            found = file.attrs.get("fingerprint", "")
+            whole = isinstance(found, str)
+            if whole and found == wanted:
+                num, *each = shape
+                whole = all(_is_whole(file, f"ensemble_{n}", *each, path.stat().st_size) for n in range(num))
+    except Exception as error:  # of what kind depends on where the library finds the damage
+        raise _damaged(path) from error
+    if not whole:
+        raise _damaged(path)
+    return found
+
+
+def _damaged(path: Path) -> ValueError:
+    cure = "Remove it, or choose another."
+    return invalid("backend", expected="an HDF5 file, or none yet", got=f"{path}, damaged", cure=cure)
+
+
+def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
+    """Whether an ensemble is as emcee wrote it, in this file, of so many bytes: it reads no more than those."""
+    h5py = needed("h5py")
+    links = [name, *(f"{name}/{part}" for part in ("chain", "log_prob", "accepted"))]
+    if not all(isinstance(file.get(link, getlink=True), h5py.HardLink) for link in links):
+        return False
+    group, *parts = (file[link] for link in links)
+    done, rows = int(group.attrs["iteration"]), parts[0].shape[0]
+    shapes = (rows, walkers, free), (rows, walkers), (walkers,)
+    for part, want in zip(parts, shapes, strict=True):
+        plain = part.dtype == np.float64 and part.external is None and not part.is_virtual and part.compression is None
+        if not (plain and part.shape == want and part.id.get_storage_size() <= size):
+            return False
+    told = [int(group.attrs[fact]) for fact in ("nwalkers", "ndim", "has_blobs")]
+    if not 0 <= done <= rows or told != [walkers, free, 0]:
+        return False
+    needs = 8 * done * walkers * free, 8 * done * walkers
+    if any(part.id.get_storage_size() < need for part, need in zip(parts[:2], needs, strict=True)):
+        return False
+    return done == 0 or (bool(np.isfinite(parts[0][done - 1]).all()) and _is_random_state(group.attrs))
+
+
+def _is_random_state(attributes) -> bool:
+    """Whether NumPy may be handed it: it trusts the place within its numbers."""
+    kind, keys, place, _, _ = (attributes[f"random_state_{k}"] for k in range(5))
+    return kind == "MT19937" and keys.shape == (624,) and keys.dtype == np.uint32 and 0 <= int(place) <= 624
 
 
 def needed(name: str):

@@ -1,0 +1,246 @@
+"""Targets: pictures, videos, HDF5 and arrays of NumPy, which libraries decode."""
+
+import functools
+import io
+import tempfile
+import warnings
+import zlib
+from pathlib import Path
+from random import Random
+
+import cv2
+import h5py
+import numpy as np
+from PIL import Image
+
+from foldgauss.cli._evidence import keep_evidence, kept_evidence
+from foldgauss.io import VideoError, read_masks, read_video, write_video
+from foldgauss.io.labels import MOST_PER_BYTE, MOST_PIXELS
+from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
+
+from .models import written
+from .mutate import png_resealed, png_sized, zip_resealed
+from .target import CONSTANT, Target
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    posterior.needed("arviz")
+
+_NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
+
+
+def _image(mode: str, format: str, **options) -> bytes:
+    file = io.BytesIO()
+    image = Image.fromarray(_NUMBERS)
+    if mode == "P":
+        image = Image.fromarray(_NUMBERS, "L").convert("P")
+        image.putpalette(bytes(range(256)) * 3)
+    elif mode == "1":
+        image = Image.fromarray(np.where(_NUMBERS > 0, 255, 0).astype(np.uint8)).convert("1")
+    elif mode != "L":
+        image = image.convert(mode)
+    image.save(file, format, **options)
+    return file.getvalue()
+
+
+def _images() -> list[bytes]:
+    made = [_image(mode, "PNG") for mode in ("P", "L", "1", "RGB", "RGBA")]
+    made += [_image("L", "BMP"), _image("L", "TIFF"), _image("L", "TIFF", compression="tiff_lzw")]
+    return [*made, _image("RGB", "WEBP", lossless=True)]
+
+
+def _picture_memory(size: int) -> int:
+    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.labels`."""
+    return 2 * CONSTANT + 12 * max(MOST_PIXELS, MOST_PER_BYTE * size)
+
+
+def _read_mask(path: Path) -> None:
+    given = {"label": 1} if zlib.crc32(path.read_bytes()) % 4 == 0 else {}
+    masks = read_masks(path, **given)
+    assert masks.dtype == bool and masks.ndim == 2
+
+
+MASKS = Target(
+    "masks",
+    ".png",
+    _images,
+    _read_mask,
+    (ValueError,),
+    {"foldgauss.io.labels": (), "foldgauss.io.masks": ()},
+    lambda data: 8 if data.startswith(b"\x89PNG") else 2,
+    _picture_memory,
+    (png_resealed, png_sized),
+    past_header=2,
+    share=1.5,
+)
+
+
+# ---------------------------------------------------------------------------------------------- pictures, videos
+
+
+def _read_picture(path: Path) -> None:
+    clip = read_video(path)
+    assert clip.frames.dtype == np.uint8 and clip.frames.ndim == 4
+
+
+#: What `foldgauss.io.video_file` has beside reading.
+_NOT_READ = (
+    "write_video", "write_frames", "write_image", "memory_limit", "_write_folder", "_write_animation", "_write_file",
+    "image_size", "_resized", "centre_window", "aspect_window",
+)  # fmt: skip
+
+PICTURES = Target(
+    "pictures",
+    ".png",
+    lambda: [data for data in _images() if not data.startswith(b"RIFF")][:5],
+    _read_picture,
+    (VideoError,),
+    {"foldgauss.io.video_file": _NOT_READ},
+    lambda data: 8,
+    lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
+    (png_resealed, png_sized),
+    past_header=2,
+    share=0.6,
+)
+
+
+@functools.cache
+def _clips() -> tuple[bytes, ...]:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 255, (3, 16, 24, 3), np.uint8)
+    found = []
+    for suffix in (".mp4", ".webm", ".gif"):
+        found.append(written(lambda path: write_video(path, frames, 10), suffix))
+    with tempfile.TemporaryDirectory() as folder:
+        for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v"), ("c.avi", "FFV1")):
+            path = str(Path(folder) / name)
+            writer = cv2.VideoWriter(path, cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 10, (24, 16))
+            for frame in frames:
+                writer.write(frame)
+            writer.release()
+            found.append(Path(path).read_bytes())
+    return tuple(found)
+
+
+def _clip_body(data: bytes) -> int:
+    """Past what tells the kind: the first box of an MP4, Matroska's own header, a GIF's screen, an AVI's list."""
+    if data[4:8] == b"ftyp":
+        return min(int.from_bytes(data[:4], "big"), len(data))
+    return min({b"\x1aE\xdf\xa3": 40, b"GIF8": 13, b"RIFF": 12}.get(data[:4], 0), len(data))
+
+
+VIDEO = Target(
+    "video",
+    ".mp4",
+    lambda: list(_clips()),
+    lambda path: read_video(path, **({} if zlib.crc32(path.read_bytes()) % 3 else {"size": (8, 12), "frames": (0, 2)})),
+    (VideoError,),
+    {"foldgauss.io.video_file": _NOT_READ},
+    _clip_body,
+    lambda size: 1 << 32,
+    share=0.6,
+)
+
+
+# ---------------------------------------------------------------------------------------------- HDF5, arrays
+
+_FINGERPRINT, _SHAPE = "0" * 64, (2, 4, 2)
+
+
+def _chains(steps: int, version: str, done: bool = True) -> bytes:
+    """A file of an interrupted run, as emcee writes it."""
+
+    def write(path: Path) -> None:
+        rng = np.random.default_rng(0)
+        with h5py.File(path, "w", libver=version) as file:
+            file.attrs["fingerprint"] = _FINGERPRINT
+            for n in range(_SHAPE[0]):
+                group = file.create_group(f"ensemble_{n}")
+                about = {"version": "3", "nwalkers": 4, "ndim": 2, "has_blobs": False, "iteration": steps if done else 0}
+                group.attrs.update(about)
+                group.create_dataset("accepted", data=np.zeros(4))
+                group.create_dataset("chain", data=rng.normal(size=(steps, 4, 2)), maxshape=(None, 4, 2), chunks=(2, 4, 2))
+                group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
+                for k, value in enumerate(np.random.RandomState(0).get_state()):
+                    group.attrs[f"random_state_{k}"] = value
+
+    return written(write, ".h5")
+
+
+def _read_chains(path: Path) -> None:
+    kept = posterior._Kept(path, _FINGERPRINT, _SHAPE)
+    try:
+        for n in range(_SHAPE[0]):
+            backend = kept.of(n)
+            assert backend.initialized and backend.shape == _SHAPE[1:]
+            if backend.iteration:
+                state = backend.get_last_sample()
+                np.random.RandomState().set_state(state.random_state)
+                assert backend.get_chain().shape == (backend.iteration, *_SHAPE[1:])
+    finally:
+        kept.live.unlink()
+
+
+def h5_number(data: bytes, random: Random) -> bytes:
+    """A length, an address or a size as the library keeps them: whole words of 8 bytes."""
+    body = bytearray(data)
+    places = [at for at in range(8, len(body) - 8, 8) if any(body[at : at + 8])]
+    for _ in range(random.randrange(1, 3)):
+        at = random.choice(places) if places else 0
+        old = int.from_bytes(body[at : at + 8], "little")
+        new = random.choice((0, 1, old + 1, old - 1, old * 2, old ^ 1 << random.randrange(64), 2**40, 2**63, 2**64 - 1))
+        body[at : at + 8] = (new % 2**64).to_bytes(8, "little")
+    return bytes(body)
+
+
+CHAINS = Target(
+    "hdf5",
+    ".h5",
+    lambda: [_chains(4, "earliest"), _chains(3, "latest"), _chains(2, "earliest", done=False)],
+    _read_chains,
+    (ValueError,),
+    {
+        "foldgauss.uncertainty.posterior": (
+            "FrameTimePosterior", "frame_time_posterior", "_free_of", "check_settings", "_checked_seed", "_checked_moves",
+            "_checked_backend", "check_asked", "_Run", "_tau", "_r_hat", "_usual_moves", "_described", "needed", "_version",
+            "_check_progress", "_shown", "_Settings", "_check_asked",
+        )
+    },
+    lambda data: 96,
+    lambda size: 4 * CONSTANT + 64 * size,
+    (h5_number,),
+    past_header=0,
+    share=1.0,
+)  # fmt: skip
+
+
+@functools.cache
+def _evidence() -> bytes:
+    times, heights = np.linspace(0, 1, 4), np.array([0.0, -1.0, -0.5, -2.0])
+    profiles = Profiles.of([times, times[:3], times], [heights, heights[:3], heights])
+    seen = Evidence(profiles, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",))
+    return written(lambda path: keep_evidence(path, "key", seen), ".npz")
+
+
+def _read_evidence(path: Path) -> None:
+    seen = kept_evidence(path, "key", 3)
+    if seen is None:
+        raise ValueError("expected evidence, got none")  # what the command does then: it draws the pictures
+    assert seen.profiles(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
+
+
+EVIDENCE = Target(
+    "evidence",
+    ".npz",
+    lambda: [_evidence()],
+    _read_evidence,
+    (ValueError,),
+    {"foldgauss.cli._evidence": ("keep_evidence",)},
+    lambda data: 4,
+    lambda size: 2 * CONSTANT + 64 * size,
+    (zip_resealed,),
+    past_header=1,
+    share=1.0,
+)
+
+TARGETS = (MASKS, PICTURES, VIDEO, CHAINS, EVIDENCE)
