@@ -2,7 +2,7 @@
 
 `guided` is a loop of our own in the manner of AFL: an input that takes a branch of the parser that none has taken is
 kept and changed further (see `branches`, `worker`). `hypothesis` lets Hypothesis choose the same changes. Without
-`--engine` both run, a fifth of the cases by Hypothesis. `--replay FILE --target NAME` reads one file and says what
+`--engine` both run, a tenth of the cases by Hypothesis. `--replay FILE --target NAME` reads one file and says what
 comes of it.
 """
 
@@ -23,7 +23,7 @@ from .targets import TARGETS
 
 #: Cases of all targets together, without `--cases`.
 CASES = 220_000
-BY_HYPOTHESIS = 0.2
+BY_HYPOTHESIS = 0.1
 #: Seconds without a sign of life after which a worker is ended: longer than a case may take.
 SILENCE = 300.0
 #: Deaths of a worker after which a target is given up.
@@ -38,25 +38,29 @@ class Result:
     past: int = 0
     seconds: float = 0.0
     outcomes: Counter = field(default_factory=Counter)
-    branches: int = 0
+    places: set = field(default_factory=set)
     missed: set = field(default_factory=set)
     memory: float = 0.0
     crashes: dict[str, str] = field(default_factory=dict)
     seen: bool = False
+
+    @property
+    def branches(self) -> int:
+        return len(self.places)
 
     def add(self, told: dict) -> None:
         self.cases += told["cases"]
         self.past += told["past"]
         self.seconds += told["seconds"]
         self.outcomes += Counter(told["outcomes"])
-        self.branches = told["branches"]
+        self.places |= set(map(tuple, told["places"]))
         missed = set(map(tuple, told["missed"]))
         self.missed = self.missed & missed if self.seen else missed
         self.seen, self.memory = True, max(self.memory, told["memory"])
         self.crashes |= told["crashes"]
 
 
-def run(target: Target, cases: int, seed: int, engine: str, folder: Path, result: Result) -> None:
+def run(target: Target, cases: int, seed: int, by_hypothesis: int, folder: Path, result: Result) -> None:
     """Cases in workers, a new one whenever one dies."""
     done, deaths = 0, 0
     modules = {name: list(without) for name, without in target.modules.items()}
@@ -65,7 +69,8 @@ def run(target: Target, cases: int, seed: int, engine: str, folder: Path, result
         status = folder / "status.json"
         status.unlink(missing_ok=True)
         words = [sys.executable, "-m", f"{__package__}.worker", target.name, "--cases", str(cases - done)]
-        words += ["--seed", str(seed + 1000 * deaths), "--engine", engine, "--folder", str(folder)]
+        words += ["--seed", str(seed + 1000 * deaths), "--folder", str(folder)]
+        words += ["--by-hypothesis", str(min(by_hypothesis, cases - done))]
         process = subprocess.Popen(words, env=environment)
         code = _watched(process, status)
         told = json.loads(status.read_text()) if status.exists() else None
@@ -129,23 +134,43 @@ def table(results: dict[str, Result]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, one in results.items():
-        errors = ", ".join(f"{kind} {n:,}" for kind, n in sorted(one.outcomes.items()) if kind not in ("accepted", "crash"))
+        past, accepted = one.past / max(1, one.cases), one.outcomes["accepted"]
+        errors = ", ".join(
+            f"{kind} {n:,}" for kind, n in sorted(one.outcomes.items()) if kind not in ("accepted", "crash")
+        )
         taken = one.branches - len(one.missed)
         lines.append(
-            f"| {name} | {one.cases:,} | {one.past / max(1, one.cases):.0%} | {one.outcomes['accepted']:,} | {errors} | "
+            f"| {name} | {one.cases:,} | {past:.0%} | {accepted:,} | {errors} | "
             f"{taken}/{one.branches} ({taken / max(1, one.branches):.1%}) | {one.memory:.0%} | "
             f"{one.cases / max(1e-9, one.seconds):.0f} | {len(one.crashes)} |"
         )
     cases, past = sum(one.cases for one in results.values()), sum(one.past for one in results.values())
     seconds = sum(one.seconds for one in results.values())
     crashes = sum(len(one.crashes) for one in results.values())
-    lines.append(f"| all | {cases:,} | {past / max(1, cases):.0%} | | | | | {cases / max(1e-9, seconds):.0f} | {crashes} |")
+    lines.append(
+        f"| all | {cases:,} | {past / max(1, cases):.0%} | | | | | {cases / max(1e-9, seconds):.0f} | {crashes} |"
+    )
     return "\n".join(lines)
+
+
+def by_module(results: dict[str, Result]) -> dict[str, tuple[int, list]]:
+    """(branches taken by any target, those by none) of each module."""
+    places = set().union(*(one.places for one in results.values()))
+    taken = set().union(*(one.places - one.missed for one in results.values()))
+    return {
+        module: (
+            sum(place[0] == module for place in taken),
+            sorted(place[1:] for place in places - taken if place[0] == module),
+        )
+        for module in sorted({place[0] for place in places})
+    }
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split("\n\n")[1])
-    parser.add_argument("--target", action="append", choices=sorted(TARGETS), help="one of them; several times for more")
+    parser.add_argument(
+        "--target", action="append", choices=sorted(TARGETS), help="one of them; several times for more"
+    )
     parser.add_argument("--cases", type=int, help=f"of each target; default: {CASES:,} in all, by their shares")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--engine", choices=("guided", "hypothesis"), help="default: both")
@@ -165,25 +190,28 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         result = results[target.name] = Result()
         cases = arguments.cases or round(CASES * target.share / shares)
-        engines = [arguments.engine] if arguments.engine else ["guided", "hypothesis"]
-        for engine in engines:
-            part = BY_HYPOTHESIS if engine == "hypothesis" else 1 - BY_HYPOTHESIS
-            run(target, round(cases * part) if len(engines) == 2 else cases, arguments.seed, engine, folder, result)
+        share = {"guided": 0.0, "hypothesis": 1.0, None: BY_HYPOTHESIS}[arguments.engine]
+        run(target, cases, arguments.seed, round(share * cases), folder, result)
         print(table({target.name: result}).split("\n")[-2], flush=True)
     print(table(results))
     crashed = False
     for name, one in results.items():
         for place, text in one.crashes.items():
             crashed = True
-            print(f"\n{name}: {text}\n    {place}\n    python -m tests.fuzz --target {name} --replay {base}/{name}/crashes/...")
-    for one in results.values():
-        for module, line, which in sorted(one.missed):
-            print(f"not taken: {module}:{line} {which}")
+            words = f"python -m tests.fuzz --target {name} --replay {base}/{name}/crashes/FILE"
+            print(f"\n{name}: {text}\n    {place}\n    {words}")
+    modules = by_module(results)
+    print("\n| module | branches taken | |\n|---|---|---|")
+    for module, (taken, missed) in modules.items():
+        num, told = taken + len(missed), ", ".join(f"{line} {which}" for line, which in missed)
+        print(f"| {module} | {taken}/{num} ({taken / max(1, num):.1%}) | not: {told} |")
     if arguments.json is not None:
-        about = {
-            name: vars(one) | {"outcomes": dict(one.outcomes), "missed": sorted(one.missed)} for name, one in results.items()
+        targets = {
+            name: vars(one) | {"outcomes": dict(one.outcomes), "missed": sorted(one.missed), "places": one.branches}
+            for name, one in results.items()
         }
-        arguments.json.write_text(json.dumps(about, indent=1) + "\n")
+        told = {module: {"taken": taken, "missed": missed} for module, (taken, missed) in modules.items()}
+        arguments.json.write_text(json.dumps({"targets": targets, "modules": told}, indent=1) + "\n")
     if not crashed and arguments.keep is None:
         shutil.rmtree(base)
     return int(crashed)

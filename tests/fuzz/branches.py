@@ -14,6 +14,8 @@ import sys
 from dataclasses import dataclass, field
 
 _NAME = "_branches_taken"
+#: Before the names of functions and classes: these, not all but these.
+ONLY = "only"
 _KERNELS = {"exact_kernel", "kernel", "inline"}
 
 
@@ -76,16 +78,20 @@ class _Loader(importlib.machinery.SourceFileLoader):
 class _Noting(ast.NodeTransformer):
     def __init__(self, branches: Branches, module: str, without: tuple[str, ...]):
         self.branches, self.module, self.without, self.inside = branches, module, without, 0
+        self.within = 0
 
     def _definition(self, node):
         names = {getattr(one, "id", getattr(one, "attr", "")) for one in node.decorator_list}
         compiled = names & _KERNELS and os.environ.get("NUMBA_DISABLE_JIT") != "1"
-        if node.name in self.without or compiled:
+        only = self.without[:1] == (ONLY,) and not self.within
+        if compiled or (node.name not in self.without if only else node.name in self.without):
             return node
+        self.within += 1
         is_function = not isinstance(node, ast.ClassDef)  # what runs at import is no reading
         self.inside += is_function
         node.body = [self.visit(one) for one in node.body]
         self.inside -= is_function
+        self.within -= 1
         return node
 
     visit_FunctionDef = visit_AsyncFunctionDef = visit_ClassDef = _definition

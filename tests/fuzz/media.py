@@ -18,6 +18,7 @@ from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.labels import MOST_PER_BYTE, MOST_PIXELS
 from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
 
+from .branches import ONLY
 from .models import written
 from .mutate import png_resealed, png_sized, zip_resealed
 from .target import CONSTANT, Target
@@ -57,7 +58,7 @@ def _picture_memory(size: int) -> int:
 def _read_mask(path: Path) -> None:
     given = {"label": 1} if zlib.crc32(path.read_bytes()) % 4 == 0 else {}
     masks = read_masks(path, **given)
-    assert masks.dtype == bool and masks.ndim == 2
+    assert (masks.dtype, masks.ndim) == (bool, 2)
 
 
 MASKS = Target(
@@ -70,8 +71,8 @@ MASKS = Target(
     lambda data: 8 if data.startswith(b"\x89PNG") else 2,
     _picture_memory,
     (png_resealed, png_sized),
-    past_header=2,
-    share=1.5,
+    past_header=1,
+    share=2.0,
 )
 
 
@@ -80,13 +81,14 @@ MASKS = Target(
 
 def _read_picture(path: Path) -> None:
     clip = read_video(path)
-    assert clip.frames.dtype == np.uint8 and clip.frames.ndim == 4
+    assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
 
-#: What `foldgauss.io.video_file` has beside reading.
-_NOT_READ = (
-    "write_video", "write_frames", "write_image", "memory_limit", "_write_folder", "_write_animation", "_write_file",
-    "image_size", "_resized", "centre_window", "aspect_window",
+#: The part of `foldgauss.io.video_file` that reads.
+_READ = (
+    ONLY, "read_video", "_read_file", "_read_folder", "_is_image", "_read_image_file", "_read_images", "_alike",
+    "image_paths", "_read_image", "_premultiplied", "_capture", "_refuse_alpha", "_decoded", "_same_size",
+    "_declared_frames", "_fit_to", "aspect_window", "_in_blocks", "_stacked", "_check_within",
 )  # fmt: skip
 
 PICTURES = Target(
@@ -95,12 +97,12 @@ PICTURES = Target(
     lambda: [data for data in _images() if not data.startswith(b"RIFF")][:5],
     _read_picture,
     (VideoError,),
-    {"foldgauss.io.video_file": _NOT_READ},
+    {"foldgauss.io.video_file": _READ},
     lambda data: 8,
     lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
     (png_resealed, png_sized),
-    past_header=2,
-    share=0.6,
+    past_header=1,
+    share=0.5,
 )
 
 
@@ -112,7 +114,7 @@ def _clips() -> tuple[bytes, ...]:
     for suffix in (".mp4", ".webm", ".gif"):
         found.append(written(lambda path: write_video(path, frames, 10), suffix))
     with tempfile.TemporaryDirectory() as folder:
-        for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v"), ("c.avi", "FFV1")):
+        for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v"), ("c.avi", "XVID")):
             path = str(Path(folder) / name)
             writer = cv2.VideoWriter(path, cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 10, (24, 16))
             for frame in frames:
@@ -135,10 +137,10 @@ VIDEO = Target(
     lambda: list(_clips()),
     lambda path: read_video(path, **({} if zlib.crc32(path.read_bytes()) % 3 else {"size": (8, 12), "frames": (0, 2)})),
     (VideoError,),
-    {"foldgauss.io.video_file": _NOT_READ},
+    {"foldgauss.io.video_file": _READ},
     _clip_body,
     lambda size: 1 << 32,
-    share=0.6,
+    share=0.7,
 )
 
 
@@ -156,10 +158,18 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
             file.attrs["fingerprint"] = _FINGERPRINT
             for n in range(_SHAPE[0]):
                 group = file.create_group(f"ensemble_{n}")
-                about = {"version": "3", "nwalkers": 4, "ndim": 2, "has_blobs": False, "iteration": steps if done else 0}
+                about = {
+                    "version": "3",
+                    "nwalkers": 4,
+                    "ndim": 2,
+                    "has_blobs": False,
+                    "iteration": steps if done else 0,
+                }
                 group.attrs.update(about)
                 group.create_dataset("accepted", data=np.zeros(4))
-                group.create_dataset("chain", data=rng.normal(size=(steps, 4, 2)), maxshape=(None, 4, 2), chunks=(2, 4, 2))
+                group.create_dataset(
+                    "chain", data=rng.normal(size=(steps, 4, 2)), maxshape=(None, 4, 2), chunks=(2, 4, 2)
+                )
                 group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
                 for k, value in enumerate(np.random.RandomState(0).get_state()):
                     group.attrs[f"random_state_{k}"] = value
@@ -168,11 +178,14 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
 
 
 def _read_chains(path: Path) -> None:
+    if not path.exists():
+        raise FileNotFoundError  # a run begins there
     kept = posterior._Kept(path, _FINGERPRINT, _SHAPE)
     try:
         for n in range(_SHAPE[0]):
             backend = kept.of(n)
-            assert backend.initialized and backend.shape == _SHAPE[1:]
+            assert backend.initialized
+            assert backend.shape == _SHAPE[1:]
             if backend.iteration:
                 state = backend.get_last_sample()
                 np.random.RandomState().set_state(state.random_state)
@@ -201,16 +214,14 @@ CHAINS = Target(
     (ValueError,),
     {
         "foldgauss.uncertainty.posterior": (
-            "FrameTimePosterior", "frame_time_posterior", "_free_of", "check_settings", "_checked_seed", "_checked_moves",
-            "_checked_backend", "check_asked", "_Run", "_tau", "_r_hat", "_usual_moves", "_described", "needed", "_version",
-            "_check_progress", "_shown", "_Settings", "_check_asked",
+            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state",
         )
     },
     lambda data: 96,
     lambda size: 4 * CONSTANT + 64 * size,
     (h5_number,),
     past_header=0,
-    share=1.0,
+    share=0.4,
 )  # fmt: skip
 
 

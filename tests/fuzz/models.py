@@ -11,8 +11,16 @@ from random import Random
 import numpy as np
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import ModelFileError, compact, load_compact, load_selection, load_video_model, save_selection
-from foldgauss.io import save_compact, save_video_model
+from foldgauss.io import (
+    ModelFileError,
+    compact,
+    load_compact,
+    load_selection,
+    load_video_model,
+    save_compact,
+    save_selection,
+    save_video_model,
+)
 from foldgauss.io.video_model import load_checkpoint, read_metadata, save_checkpoint
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
@@ -29,8 +37,10 @@ from .mutate import by_chance, json_changed, json_text_changed
 from .target import CONSTANT, Target
 
 
-def tiny_model(num: int = 3, degree: int = 1, *, plain: bool = True, frames: int = 3, seed: int = 0) -> VideoModel:
-    """Some Gaussians; not `plain`: with all that the stored form leaves out or shares."""
+def tiny_model(
+    num: int = 3, degree: int = 1, *, plain: bool = True, shared: bool = False, frames: int = 3, seed: int = 0
+) -> VideoModel:
+    """Some Gaussians; not `plain`: with all that the stored form leaves out or shares; `shared`: of one colour."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int) -> np.ndarray:
@@ -40,6 +50,8 @@ def tiny_model(num: int = 3, degree: int = 1, *, plain: bool = True, frames: int
         "loc": normal(2), "log_scale": normal(2) - 2, "angle_logit": normal(), "time_loc_logit": normal(),
         "log_time_scale": normal(), "coefficients": normal(degree, 2), "opacity_logit": normal(), "color_dc": normal(3),
     }  # fmt: skip
+    if shared:
+        leaves["color_dc"][:] = leaves["color_dc"][0]
     if not plain:
         lasting = np.arange(num) % 2 == 0
         leaves["coefficients"][lasting] = 0
@@ -81,6 +93,13 @@ def tensors_from(data: bytes) -> int:
     return min(8 + int.from_bytes(data[:8], "little"), len(data))
 
 
+#: What a header may say of itself that is none of ours, or of another kind.
+_KINDS = (
+    ("kind", "video"), ("kind", "edited-video"), ("kind", "selection"), ("kind", "fit-checkpoint"), ("kind", "x"),
+    ("version", "2"), ("format", "pt"), ("header", "[]"), ("header", "{"), ("metadata", "1"), ("metadata", "[" * 9999),
+)  # fmt: skip
+
+
 def facts_changed(data: bytes, random: Random) -> bytes:
     """One of the model's own facts, in the JSON within the JSON."""
     parts = unsealed(data)
@@ -88,6 +107,10 @@ def facts_changed(data: bytes, random: Random) -> bytes:
         return by_chance(data, random)
     header, tensors = parts
     about, name = header["__metadata__"], random.choice(("header", "header", "header", "metadata"))
+    if random.randrange(8) == 0:
+        name, value = random.choice(_KINDS)
+        about[name] = value
+        return sealed(header, tensors)
     try:
         about[name] = json.dumps(json_changed(json.loads(about[name]), random))
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -122,7 +145,7 @@ def resized(data: bytes, random: Random) -> bytes:
                 start += num
         facts = json.dumps(json.loads(header["__metadata__"]["header"]))
         entries["__metadata__"]["header"] = facts.replace(f": {old},", f": {new},").replace(f": {old}}}", f": {new}}}")
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError):
         return by_chance(data, random)
     room = min(start, 4096)
     return sealed(entries, (tensors * (room // max(1, len(tensors)) + 1))[:room] if tensors else bytes(room))
@@ -146,7 +169,7 @@ def halved(data: bytes, random: Random) -> bytes:
             entries[name] = {"dtype": kind, "shape": one["shape"], "data_offsets": [start, start + len(own)]}
             kept.append(own)
             start += len(own)
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
         return by_chance(data, random)
     return sealed(entries, b"".join(kept))
 
@@ -171,13 +194,15 @@ def _edited():
 
 def _video_seeds() -> list[bytes]:
     models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
+    models.append(tiny_model(16, 1, shared=True))
     return [written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a"})) for one in models]
 
 
 def _read_video(path: Path) -> None:
     read_metadata(path)
     model = load_video_model(path)
-    assert model.num_frames >= 1 and len(model.size) == 2
+    assert model.num_frames >= 1
+    assert len(model.size) == 2
     str(model)
 
 
@@ -190,8 +215,8 @@ VIDEO = Target(
     _MODEL_FILE
     | {
         "foldgauss.io.video_model": (
-            "save_video_model", "check_model_name", "save_checkpoint", "load_checkpoint", "_to_stored", "_describe_video",
-            "_describe_edited", "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
+            "save_video_model", "check_model_name", "save_checkpoint", "load_checkpoint", "_to_stored",
+            "_describe_video", "_describe_edited", "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
             "_palette_skeleton", "_checkpoint_skeleton",
         ),
         "foldgauss.video.stored": (
@@ -201,7 +226,7 @@ VIDEO = Target(
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
-    share=2.0,
+    share=0.6,
 )  # fmt: skip
 
 
@@ -237,7 +262,8 @@ CHECKPOINT = Target(
     _MODEL_FILE
     | {
         "foldgauss.io.video_model": (
-            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint", "_to_stored",
+            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint",
+            "_to_stored",
             "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
             "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton", "_describe_checkpoint",
             "_counts",
@@ -246,6 +272,7 @@ CHECKPOINT = Target(
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
+    share=0.3,
 )  # fmt: skip
 
 
@@ -267,6 +294,7 @@ SELECTION = Target(
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
+    share=1.0,
 )
 
 
@@ -349,7 +377,9 @@ def _read_compact(path: Path) -> None:
 
 
 def _compact_seeds() -> list[bytes]:
-    return [written(lambda path, one=one: save_compact(path, one, metadata={"clip": "a"}), ".fgz") for one in _quantised()]
+    return [
+        written(lambda path, one=one: save_compact(path, one, metadata={"clip": "a"}), ".fgz") for one in _quantised()
+    ]
 
 
 COMPACT = Target(
@@ -367,10 +397,10 @@ COMPACT = Target(
     lambda size: 4 * CONSTANT + 20_000 * size,  # a byte may hold 8 Gaussians of 16 powers: the format's own limit
     (numbers_changed, stream_changed, compact_header_changed),
     past_header=1,
+    share=0.25,
 )
 
 #: The same with kernels as Python, so that their branches are seen; slow.
-KERNELS = dataclasses.replace(COMPACT, name="compact-kernels", share=0.02, environment=(("NUMBA_DISABLE_JIT", "1"),))
+KERNELS = dataclasses.replace(COMPACT, name="compact-kernels", share=0.03, environment=(("NUMBA_DISABLE_JIT", "1"),))
 
 TARGETS = (VIDEO, CHECKPOINT, SELECTION, COMPACT, KERNELS)
-

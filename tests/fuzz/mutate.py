@@ -13,8 +13,8 @@ from typing import Any
 _NUMBERS = (0, 1, -1, 2, 127, 128, 255, 256, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**53 + 1, 2**63 - 1, 2**64)
 _TEXTS = (
     b"0", b"-1", b"1e999", b"-1e39", b"nan", b"inf", b"1e-320", b"99999999999999999999", b"0x10", b"1_0", b"\xff\xfe",
-    b"\x00", b"\n", b"\r", b" ", b"\\", b'"', b"'", b"[", b"]", b"{", b"}", b"#", b"/", b",", b".", b"=", b":", b"1" * 70,
-    b"\xe2\x80\xa8", b"\xed\xa0\x80", b"true", b"null",
+    b"\x00", b"\n", b"\r", b" ", b"\\", b'"', b"'", b"[", b"]", b"{", b"}", b"#", b"/", b",", b".", b"=", b":",
+    b"1" * 70,     b"\xe2\x80\xa8", b"\xed\xa0\x80", b"true", b"null",
 )  # fmt: skip
 _FLOATS = (math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-45, 1e-39, 3.4e38, -3.4e38, 1e30, -1e30, 88.8, -104.0, 1.0)
 
@@ -126,6 +126,21 @@ _PLAIN: tuple[Callable[[bytearray, Random], bytearray], ...] = (
 )  # fmt: skip
 
 
+_MAGICS = (
+    b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"ply\n", b"PK\x03\x04", b"{", b"\x8bFGZ", b"\x8bFGZ\n", b"GIF89a",
+    b"%!PS",     b"\x89HDF\r\n\x1a\n", b"\xff" * 8 + b"{", b"<html>", b"\x00" * 9, b"\xef\xbb\xbf", b"\xfe\xff",
+)  # fmt: skip
+
+
+def foreign(data: bytes, random: Random) -> bytes:
+    """A file that starts as another kind does, or is cut off within its first bytes."""
+    how = random.randrange(3)
+    if how == 0:
+        return data[: random.randrange(24)]
+    start = random.choice(_MAGICS)
+    return start + data[len(start) if how == 1 else len(data) :]
+
+
 def spliced(one: bytes, other: bytes, random: Random, start: int = 0) -> bytes:
     """The beginning of one file and the end of another."""
     return one[: max(start, random.randrange(len(one) + 1))] + other[random.randrange(len(other) + 1) :]
@@ -152,10 +167,14 @@ def json_changed(value: Any, random: Random) -> Any:
     elif how == 4:
         del holder[key]
     elif how == 5 and isinstance(holder[key], int | float) and not isinstance(holder[key], bool):
-        holder[key] = random.choice((holder[key] + 1, holder[key] - 1, -holder[key], float(holder[key]), holder[key] / 3))
+        holder[key] = random.choice(
+            (holder[key] + 1, holder[key] - 1, -holder[key], float(holder[key]), holder[key] / 3)
+        )
     elif how == 6:
         other, name = random.choice(places)
-        holder[key] = json.loads(json.dumps(other.get(name) if isinstance(other, dict) else other[0] if other else None))
+        holder[key] = json.loads(
+            json.dumps(other.get(name) if isinstance(other, dict) else other[0] if other else None)
+        )
     elif isinstance(holder, dict):
         holder[key + random.choice(("x", "_", " "))] = holder.pop(key)
     else:
@@ -197,7 +216,9 @@ def png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
 
 def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
     """A PNG of chunks, with right checksums."""
-    parts = [len(own).to_bytes(4, "big") + kind + own + zlib.crc32(kind + own).to_bytes(4, "big") for kind, own in chunks]
+    parts = [
+        len(own).to_bytes(4, "big") + kind + own + zlib.crc32(kind + own).to_bytes(4, "big") for kind, own in chunks
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
@@ -205,7 +226,7 @@ def png_resealed(data: bytes, random: Random) -> bytes:
     """A PNG with one of its chunks changed, its pixels inside of their compression, and right checksums."""
     chunks = png_chunks(data)
     if not data.startswith(b"\x89PNG") or len(chunks) < 2:
-        return by_chance(data, random)
+        return by_chance(data, random, 8)
     at = random.randrange(1, len(chunks))
     kind, own = chunks[at]
     if kind == b"IDAT" and random.randrange(4):
@@ -275,7 +296,18 @@ def npy_changed(data: bytes, random: Random) -> bytes:
     length = int.from_bytes(data[8:10], "little")
     header, rest = data[10 : 10 + length].decode("latin1"), data[10 + length :]
     shapes = ("()", "(0,)", "(1,)", "(3, 0)", f"({2**40},)", f"({2**33}, {2**33})", "(-1,)", "(2, 2, 2)", "'x'")
-    types = ("'<f8'", "'|O'", "'<i8'", "'|S1099511627776'", "'<c16'", "'|b1'", "'<U3'", "[('a', '<f8')]", "'<M8[s]'", "None")
+    types = (
+        "'<f8'",
+        "'|O'",
+        "'<i8'",
+        "'|S1099511627776'",
+        "'<c16'",
+        "'|b1'",
+        "'<U3'",
+        "[('a', '<f8')]",
+        "'<M8[s]'",
+        "None",
+    )
     if random.randrange(2):
         at = header.find("'shape': ") + 9
         header = header[:at] + random.choice(shapes) + "}"

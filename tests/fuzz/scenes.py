@@ -108,7 +108,9 @@ def columns_changed(data: bytes, random: Random) -> bytes:
     elif how == 4:
         lines[at] += random.choice((b"x", b"_1", b" y"))
     elif how == 5:
-        lines.insert(at, random.choice((b"", b"obj_info a", b"comment b", b"comment foldgauss {}", b"format ascii 1.0")))
+        lines.insert(
+            at, random.choice((b"", b"obj_info a", b"comment b", b"comment foldgauss {}", b"format ascii 1.0"))
+        )
     else:
         lines[1] = b"format " + random.choice((b"ascii", b"binary_little_endian", b"binary_big_endian", b"x")) + b" 1.0"
     return b"\n".join(lines)
@@ -189,14 +191,14 @@ SCENE = Target(
     | {
         "foldgauss.io.ply": (
             *_WRITERS, "read_vegas_ply", "_with_power", "_vegas_unit", "_check_vegas", "_degree", "_time_logits",
-            "_filled_in", "_note", 
+            "_filled_in", "_note",
         )
     },
     _ply_body,
     lambda size: 2 * CONSTANT + 200 * size,
     _PLY_MUTATIONS,
     past_header=1,
-    share=2.0,
+    share=3.0,
 )  # fmt: skip
 
 
@@ -239,9 +241,10 @@ def line_changed(data: bytes, random: Random) -> bytes:
     """A line of a kind that the format knows."""
     lines = data.split(b"\n")
     made = (
-        b"v 0 0 0", b"v nan 0 0", b"v 1e39 0 0", b"v 1e38 1e38 -1e38", b"v 1 2", b"v a b c", b"v", b"f 1 2 3", b"f 1 2 3 4",
-        b"f 3 2 1", b"f 0 1 2", b"f -1 -2 -3", b"f 1/2/3 2 3", b"f 99999999999 1 2", b"f " + b"9" * 5000 + b" 1 2", b"f",
-        b"vt 0 0", b"\\", b"v 1_0 0 0", b"v 0x1 0 0", b"f 1.0 2 3", "v １ 0 0".encode(), b"# " + b"a" * 100,
+        b"v 0 0 0", b"v nan 0 0", b"v 1e39 0 0", b"v 1e38 1e38 -1e38", b"v 1 2", b"v a b c", b"v", b"f 1 2 3",
+        b"f 1 2 3 4", b"f 3 2 1", b"f 0 1 2", b"f -1 -2 -3", b"f 1/2/3 2 3", b"f 99999999999 1 2",
+        b"f " + b"9" * 5000 + b" 1 2", b"f", b"vt 0 0", b"\\", b"v 1_0 0 0", b"v 0x1 0 0",
+        b"f 1.0 2 3", "v １ 0 0".encode(), b"# " + b"a" * 100,
         b"v 1e-46 0 0", b"v -0 -0 -0",
     )  # fmt: skip
     at = random.randrange(len(lines))
@@ -264,7 +267,7 @@ def _read_mesh(path: Path) -> None:
 
 _MESH = {
     "foldgauss.io.mesh": (
-        "Pseudomesh", "_flat_factor", "write_pseudomesh", "_obj_text", "_axes", 
+        "Pseudomesh", "_flat_factor", "write_pseudomesh", "_obj_text", "_axes",
     )
 }  # fmt: skip
 
@@ -279,7 +282,7 @@ OBJ = Target(
     lambda size: 2 * CONSTANT + 400 * size,
     (line_changed,),
     past_header=1,
-    share=2.0,
+    share=3.0,
     prepare=lambda folder: _beside(folder, "frame_0000.obj"),
     file_name="frame_0000",
 )
@@ -319,7 +322,7 @@ NOTES = Target(
     lambda size: 2 * CONSTANT + 400 * size,
     (one_fact_changed, json_text_changed),
     past_header=2,
-    share=0.7,
+    share=1.0,
     prepare=lambda folder: _beside(folder, "pseudomesh.json"),
     file_name="pseudomesh",
 )  # fmt: skip

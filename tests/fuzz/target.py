@@ -23,8 +23,9 @@ class Target:
     """A parser, as a user meets it.
 
     `seeds`: small valid files of all its kinds. `parse`: reads a file, and uses what comes of it where that is cheap.
-    `errors`: what it may raise, with a text that `says` one of these. `modules`: whose branches count, each with the functions in it that are no part of
-    reading. `body`: where what tells the kind of file ends. `memory`: bytes that a file of a size may take.
+    `errors`: what it may raise, with a text that `says` one of these. `modules`: whose branches count, each with the
+    functions in it that are no part of reading, or `ONLY` those that are. `body`: where what tells the kind of file
+    ends. `memory`: bytes that a file of a size may take.
     `mutations`: those that know the format; `past_header` says how many of them, the first ones, leave the header as
     it is. `prepare`: puts into the folder what the file stands beside. `share`: of all cases, in parts.
     """

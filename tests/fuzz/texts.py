@@ -15,6 +15,7 @@ from foldgauss.io.history import info_line
 from foldgauss.video.fit import FitInfo
 from foldgauss.video.select import Selection
 
+from .branches import ONLY
 from .models import tiny_model, written
 from .mutate import by_chance, json_changed, json_text_changed
 from .target import CONSTANT, Target
@@ -90,11 +91,24 @@ frame = 1
 do = "freeze"
 at = 0.5
 '''
-_KEYS = (b"do", b"select", b"offset", b"frames", b"mask", b"file", b"label", b"any", b"model", b"script", b"degrees", b"x")
+_KEYS = (
+    b"do",
+    b"select",
+    b"offset",
+    b"frames",
+    b"mask",
+    b"file",
+    b"label",
+    b"any",
+    b"model",
+    b"script",
+    b"degrees",
+    b"x",
+)
 _MADE = (
-    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]", b"{}",
-    b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"', b'"a\\u0000b"', b"[]",
-    b'"one.selection"', b'"case.toml"', b'"/"', b"1_000", b'["one"]', b'["none"]', b"{ do = 1 }",
+    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
+    b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
+    b'"a\\u0000b"', b"[]", b'"one.selection"', b'"case.toml"', b'"/"', b"1_000", b'["one"]', b'["none"]', b"{ do = 1 }",
 )  # fmt: skip
 
 
@@ -111,7 +125,16 @@ def toml_changed(data: bytes, random: Random) -> bytes:
     elif how == 3 and equals:
         lines[at] = random.choice(_KEYS) + b" = " + lines[at].partition(b" = ")[2]
     elif how == 4:
-        made = (b"[selections]", b"[[edits]]", b"[layers]", b"[[layers]]", b"[camera]", b"[a.b.c]", b"[selections.one]", b"[x]")
+        made = (
+            b"[selections]",
+            b"[[edits]]",
+            b"[layers]",
+            b"[[layers]]",
+            b"[camera]",
+            b"[a.b.c]",
+            b"[selections.one]",
+            b"[x]",
+        )
         lines.insert(at, random.choice(made))
     elif how == 5:
         lines[at] = b".".join([b"a"] * random.choice((2, 3, 15, 17, 5000))) + b" = 1"
@@ -131,7 +154,9 @@ def _beside_scripts(folder: Path) -> None:
     (folder / "other.safetensors").write_bytes(written(lambda path: save_video_model(path, tiny_model(seed=1))))
     selection = written(lambda path: save_selection(path, Selection(np.array([True, False, True])), tiny_model()))
     (folder / "one.selection").write_bytes(selection)
-    (folder / "again.toml").write_bytes(b'[[edits]]\ndo = "vanish"\n[[layers]]\nmodel = "other.safetensors"\nscript = "case.toml"\n')
+    (folder / "again.toml").write_bytes(
+        b'[[edits]]\ndo = "vanish"\n[[layers]]\nmodel = "other.safetensors"\nscript = "case.toml"\n'
+    )
 
 
 SCRIPT = Target(
@@ -145,7 +170,7 @@ SCRIPT = Target(
     lambda size: 6 * CONSTANT + 400 * size,
     (toml_changed,),
     past_header=1,
-    share=2.5,
+    share=1.5,
     prepare=_beside_scripts,
 )
 
@@ -184,12 +209,12 @@ HISTORY = Target(
     lambda: [_history(), b"", _history() + b'{"step": 9, "prog'],
     _read_history,
     (ValueError,),
-    {"foldgauss.io.history": ("write_curves", "__call__", "_opened", "__enter__", "__exit__")},
+    {"foldgauss.io.history": ("write_curves", "info_line", "_plain", "__call__", "_opened", "__enter__", "__exit__")},
     lambda data: 8 if data.startswith(b'{"step"') else 0,
     lambda size: 2 * CONSTANT + 200 * size,
     (one_line_changed,),
     past_header=1,
-    share=2.5,
+    share=3.0,
 )
 
 
@@ -198,7 +223,13 @@ HISTORY = Target(
 
 def _record() -> bytes:
     rows = [dict.fromkeys(COLUMNS, 1.0) | {"axis": "steps", "value": value, "command": "a"} for value in (100, 200)]
-    kept = {"settings": {"a": 1, "b": [1, 2]}, "machine": {"cpu": "x"}, "plan": {"steps": 100}, "left_out": {}, "fronts": {}}
+    kept = {
+        "settings": {"a": 1, "b": [1, 2]},
+        "machine": {"cpu": "x"},
+        "plan": {"steps": 100},
+        "left_out": {},
+        "fronts": {},
+    }
     return json.dumps(kept | {"points": rows}).encode()
 
 
@@ -213,9 +244,9 @@ TRADEOFF = Target(
     "tradeoff",
     ".json",
     lambda: [_record()],
-    lambda path: Record(path, {"a": 1, "b": [1, 2]}),
+    lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
     (WrongUse,),
-    {"foldgauss.cli._tradeoff": ()},
+    {"foldgauss.cli._tradeoff": (ONLY, "Record")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 200 * size,
     (record_changed, json_text_changed),

@@ -12,17 +12,19 @@ from pathlib import Path
 from random import Random
 
 from .branches import Branches
-from .mutate import by_chance, spliced
+from .mutate import by_chance, foreign, spliced
 from .target import Broken, Target, Weighed, judge
 
 #: Of every so many cases one is weighed.
-WEIGH = 20
+WEIGH = 50
 #: Share of the cases that leave the header as it is.
 PAST = 0.6
 #: Inputs kept because they took a way through the parser that none had taken, beside those with a new branch.
 MOST_WAYS = 200
 #: Bytes beyond which a mutant is kept for a new branch only, or twice the largest seed: files of a fuzzer grow.
 MOST_BYTES = 8192
+#: Cases after which it is told how things are: so many are lost where the process dies.
+REPORT = 200
 #: Beyond what the process has when it starts: what takes more gets a MemoryError, and so is seen.
 ROOM = 4 << 30
 
@@ -54,7 +56,21 @@ class Run:
                 self.valid.append(data)
         for data in kept:
             self.one(data)
+        self._odd_paths()
         self.cases, self.past, self.outcomes = 0, 0, Counter()
+
+    def _odd_paths(self) -> None:
+        """What is missing, and a folder in the place of a file."""
+        self.path.unlink()
+        for make in (lambda: None, self.path.mkdir):
+            make()
+            self.branches.forget()
+            try:
+                self.target.parse(self.path)
+            except (OSError, *self.target.errors):
+                pass
+            self.seen |= self.branches.seen()
+        self.path.rmdir()
 
     def one(self, data: bytes, *, weighed: bool = False) -> None:
         """One case; what breaks is kept, by what it says."""
@@ -71,7 +87,7 @@ class Run:
                 name = self.folder.parent / "crashes" / f"{self.target.name}-{len(self.crashes)}{self.target.suffix}"
                 name.parent.mkdir(exist_ok=True)
                 name.write_bytes(data)
-                print(f"crash {name}: {error}", file=sys.stderr, flush=True)
+                print(f"crash {name}: {error}", flush=True)
         self.outcomes[self.last] += 1
         self.cases += 1
         self._learn(data)
@@ -90,7 +106,7 @@ class Run:
     def guided(self, num: int, report) -> None:
         while self.cases < num:
             self.one(self.mutant(self.random, self.corpus, self.valid), weighed=self.cases % WEIGH == 0)
-            if self.cases % 100 == 0:
+            if self.cases % REPORT == 0:
                 report(self)
 
     def mutant(self, random: Random, corpus: list[bytes], valid: list[bytes]) -> bytes:
@@ -109,6 +125,8 @@ class Run:
             return by_chance(data, random, start)
         data = random.choice(corpus)
         how = random.random()
+        if how > 0.95:
+            return foreign(data, random)
         if target.mutations and how < 0.7:
             return random.choice(target.mutations)(data, random)
         return by_chance(data, random)
@@ -117,9 +135,9 @@ class Run:
         import hypothesis
         from hypothesis import strategies as st
 
-        first, corpus, valid = self.cases, list(self.corpus), list(self.valid)  # the same ones for every case
+        corpus, valid = list(self.corpus), list(self.valid)  # the same ones for every case
         settings = hypothesis.settings(
-            max_examples=num, database=None, deadline=None, phases=[hypothesis.Phase.generate],
+            max_examples=max(1, num - self.cases), database=None, deadline=None, phases=[hypothesis.Phase.generate],
             suppress_health_check=list(hypothesis.HealthCheck),
         )  # fmt: skip
 
@@ -128,11 +146,11 @@ class Run:
         @hypothesis.given(st.randoms(use_true_random=False))
         def case(random):
             self.one(self.mutant(random, corpus, valid), weighed=self.cases % WEIGH == 0)
-            if self.cases % 100 == 0:
+            if self.cases % REPORT == 0:
                 report(self)
 
         # It stops where it finds nothing new to draw; so it is called until the number is reached.
-        while self.cases - first < num:
+        while self.cases < num:
             case()
 
     def summary(self) -> dict:
@@ -141,7 +159,7 @@ class Run:
             "cases": self.cases,
             "past": self.past,
             "outcomes": dict(self.outcomes),
-            "branches": len(self.branches.places),
+            "places": self.branches.places,
             "missed": missed,
             "memory": Weighed.most,
             "crashes": self.crashes,
@@ -153,7 +171,7 @@ def main() -> None:
     parser.add_argument("target")
     parser.add_argument("--cases", type=int, required=True)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--engine", choices=("guided", "hypothesis"), required=True)
+    parser.add_argument("--by-hypothesis", type=int, default=0, help="how many of the cases, the last ones")
     parser.add_argument("--folder", type=Path, required=True)
     arguments = parser.parse_args()
     branches = Branches()
@@ -161,6 +179,9 @@ def main() -> None:
     branches.watch({name: tuple(without) for name, without in modules.items()})
     from .targets import TARGETS
 
+    # Decoders write about every damaged file, past Python.
+    with open(arguments.folder / "stderr", "ab") as told:
+        os.dup2(told.fileno(), sys.stderr.fileno())
     folder = arguments.folder / "case"
     folder.mkdir(parents=True, exist_ok=True)
     run = Run(TARGETS[arguments.target], branches, folder, Random(arguments.seed))
@@ -171,20 +192,18 @@ def main() -> None:
     if pages:
         limit = pages * resource.getpagesize() + ROOM
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    status, begun, told = arguments.folder / "status.json", time.monotonic(), [0]
+    status, begun, kept_so_far = arguments.folder / "status.json", time.monotonic(), [0]
 
     def report(run: Run) -> None:
         (arguments.folder / "new").write_text(json.dumps(run.summary() | {"seconds": time.monotonic() - begun}))
         os.replace(arguments.folder / "new", status)
-        for number, data in enumerate(run.corpus[told[0] :], start=told[0]):
-            (kept / f"{arguments.engine}-{number:05}{run.target.suffix}").write_bytes(data)
-        told[0] = len(run.corpus)
+        for number, data in enumerate(run.corpus[kept_so_far[0] :], start=kept_so_far[0]):
+            (kept / f"{number:05}{run.target.suffix}").write_bytes(data)
+        kept_so_far[0] = len(run.corpus)
 
     report(run)
-    if arguments.engine == "guided":
-        run.guided(arguments.cases, report)
-    else:
-        run.by_hypothesis(arguments.cases, arguments.seed, report)
+    run.guided(arguments.cases - arguments.by_hypothesis, report)
+    run.by_hypothesis(arguments.cases, arguments.seed, report)
     report(run)
 
 
