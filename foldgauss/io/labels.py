@@ -21,6 +21,10 @@ _WHITE = 255
 VOID = 255
 
 
+class _TooLarge(Exception):
+    """More pixels than the file can hold."""
+
+
 def read_labels(paths: Sequence[Path]) -> np.ndarray:
     """Masks as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 what is void.
 
@@ -52,6 +56,15 @@ def _read(path: Path) -> tuple[np.ndarray, str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about damage: it decodes or it does not
             mode, pixels = _decoded(path)
+    except (_TooLarge, Image.DecompressionBombError) as error:
+        most = max(MOST_PIXELS, MOST_PER_BYTE * path.stat().st_size)
+        most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
+        raise invalid(
+            "path",
+            expected=f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes",
+            got=f"more in {str(path)!r}",
+            cure="Is it a mask? If so, cut it, or store it uncompressed.",
+        ) from error
     except Exception as error:  # Pillow's decoders raise what comes: SyntaxError, struct.error, zlib.error, IndexError
         raise invalid(
             "path", expected="masks that decode", got=f"{str(path)!r}, which does not", cure="Copy it again."
@@ -73,7 +86,7 @@ def _decoded(path: Path) -> tuple[str, np.ndarray]:
     with Image.open(path, formats=_FORMATS) as image:
         width, height = image.size
         if width * height > max(MOST_PIXELS, MOST_PER_BYTE * path.stat().st_size):
-            raise ValueError(f"a file of {path.stat().st_size} bytes cannot hold {width}x{height} pixels")
+            raise _TooLarge
         return image.mode, np.array(image)
 
 

@@ -378,6 +378,13 @@ def test_evidence_that_does_not_fit_is_drawn_anew(changed, tmp_path):
     assert kept_evidence(path, "key", 3) is None
 
 
+@pytest.mark.parametrize("side", [2**13, 2**15])  # beyond our limit, and beyond Pillow's
+def test_a_mask_too_large_for_its_file_is_called_so(side, tmp_path):
+    (tmp_path / "m.png").write_bytes(_png(side, side))
+    with pytest.raises(ValueError, match="a mask of at most 33,554,432 pixels, as its file has"):
+        read_masks(tmp_path / "m.png")
+
+
 def test_good_neighbours_are_still_read(tmp_path):
     """Large and plain pictures are no bombs: the limit is far from them."""
     plain = np.zeros((4320, 7680), np.uint8)
