@@ -171,7 +171,7 @@ def main() -> int:
     parser.add_argument(
         "--target", action="append", choices=sorted(TARGETS), help="one of them; several times for more"
     )
-    parser.add_argument("--cases", type=int, help=f"of each target; default: {CASES:,} in all, by their shares")
+    parser.add_argument("--cases", type=int, help=f"of each target; default: its share of {CASES:,}")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--engine", choices=("guided", "hypothesis"), help="default: both")
     parser.add_argument("--json", type=Path, help="write what the table says, and the branches missed, to this file")
@@ -183,7 +183,7 @@ def main() -> int:
         return replay(targets[0], arguments.replay)
     room = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
     base = arguments.keep or Path(tempfile.mkdtemp(prefix="foldgauss-fuzz-", dir=room))
-    shares = sum(target.share for target in targets)
+    shares = sum(target.share for target in TARGETS.values())
     results: dict[str, Result] = {}
     for target in targets:
         folder = base / target.name

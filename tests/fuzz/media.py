@@ -4,7 +4,6 @@ import functools
 import io
 import tempfile
 import warnings
-import zlib
 from pathlib import Path
 from random import Random
 
@@ -21,7 +20,7 @@ from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
 from .branches import ONLY
 from .models import written
 from .mutate import png_resealed, png_sized, zip_resealed
-from .target import CONSTANT, Target
+from .target import CONSTANT, Target, chance
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -56,7 +55,7 @@ def _picture_memory(size: int) -> int:
 
 
 def _read_mask(path: Path) -> None:
-    given = {"label": 1} if zlib.crc32(path.read_bytes()) % 4 == 0 else {}
+    given = {"label": 1} if chance(path) % 4 == 0 else {}
     masks = read_masks(path, **given)
     assert (masks.dtype, masks.ndim) == (bool, 2)
 
@@ -135,7 +134,7 @@ VIDEO = Target(
     "video",
     ".mp4",
     lambda: list(_clips()),
-    lambda path: read_video(path, **({} if zlib.crc32(path.read_bytes()) % 3 else {"size": (8, 12), "frames": (0, 2)})),
+    lambda path: read_video(path, **({} if chance(path) % 3 else {"size": (8, 12), "frames": (0, 2)})),
     (VideoError,),
     {"foldgauss.io.video_file": _READ},
     _clip_body,

@@ -34,8 +34,9 @@ from foldgauss.video.select import Selection
 from foldgauss.video.sharing import Palette
 from foldgauss.video.state import TIME_ADAM, FitState
 
+from .branches import ONLY
 from .mutate import by_chance, json_changed, json_text_changed
-from .target import CONSTANT, Target
+from .target import CONSTANT, Target, chance
 
 
 def tiny_model(
@@ -97,7 +98,8 @@ def tensors_from(data: bytes) -> int:
 #: What a header may say of itself that is none of ours, or of another kind.
 _KINDS = (
     ("kind", "video"), ("kind", "edited-video"), ("kind", "selection"), ("kind", "fit-checkpoint"), ("kind", "x"),
-    ("version", "2"), ("format", "pt"), ("header", "[]"), ("header", "{"), ("metadata", "1"), ("metadata", "[" * 9999),
+    ("version", "2"),
+    ("format", "pt"), ("header", "[]"), ("header", "{"), ("metadata", "1"), ("metadata", "[" * 9999),
 )  # fmt: skip
 
 
@@ -197,13 +199,14 @@ def _edited():
 
 def _video_seeds() -> list[bytes]:
     models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
+    models.append(dataclasses.replace(_edited(), camera=None))
     models.append(tiny_model(16, 1, shared=True))
     return [written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a"})) for one in models]
 
 
 def _read_video(path: Path) -> None:
     read_metadata(path)
-    if zlib.crc32(path.read_bytes()) % 8 == 0:
+    if chance(path) % 8 == 0:
         load_model(path)  # the door below, which takes all kinds
     model = load_video_model(path)
     assert model.num_frames >= 1
@@ -403,6 +406,7 @@ COMPACT = Target(
     {
         "foldgauss.io.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
         "foldgauss.io._columns": (),
+        "foldgauss.io.video_model": (ONLY, "load_video_model", "read_metadata"),
         "foldgauss.io._range_coder": ("encode", "_encode", "_put", "_put_learned"),
     },
     _compact_body,

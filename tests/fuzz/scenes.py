@@ -4,7 +4,6 @@ import functools
 import json
 import struct
 import tempfile
-import zlib
 from pathlib import Path
 from random import Random
 
@@ -23,7 +22,7 @@ from foldgauss.io.mesh import read_obj
 
 from .models import tiny_model, written
 from .mutate import by_chance, json_changed, json_text_changed
-from .target import CONSTANT, Target
+from .target import CONSTANT, Target, chance
 
 
 def _text_of(data: bytes, order: str = "ascii") -> bytes:
@@ -147,7 +146,7 @@ def _scene() -> bytes:
 
 
 def _read_vegas(path: Path) -> None:
-    given = {} if zlib.crc32(path.read_bytes()) % 3 else {"size": (4, 6), "fps": 12}
+    given = {} if chance(path) % 3 else {"size": (4, 6), "fps": 12}
     model = import_model(path, **given)
     assert model.num_frames >= 2
 
@@ -185,7 +184,7 @@ SCENE = Target(
         _scene(), _text_of(_scene()), _text_of(_scene(), "binary_big_endian"), _with_lists(_scene()),
         written(lambda path: write_3dgs_ply(path, tiny_model(), 0.5, axes="y-up", sh_degree=1), ".ply"),
     ],
-    lambda path: read_3dgs_ply(path, axes="y-up" if zlib.crc32(path.read_bytes()) % 2 else "y-down"),
+    lambda path: read_3dgs_ply(path, axes="y-up" if chance(path) % 2 else "y-down"),
     (FormatError,),
     _PLY
     | {
@@ -260,7 +259,7 @@ def line_changed(data: bytes, random: Random) -> bytes:
 
 def _read_mesh(path: Path) -> None:
     read_obj(path)
-    axes = "y-up" if zlib.crc32(path.read_bytes()) % 2 else "y-down"
+    axes = "y-up" if chance(path) % 2 else "y-down"
     mesh = read_pseudomesh(path.parent, axes=axes)
     assert mesh.num_frames == 1
 
@@ -297,7 +296,7 @@ def one_fact_changed(data: bytes, random: Random) -> bytes:
 
 
 def _read_notes(path: Path) -> None:
-    given = {} if zlib.crc32(path.read_bytes()) % 4 else {"size": (4, 6), "fps": 12}
+    given = {} if chance(path) % 4 else {"size": (4, 6), "fps": 12}
     mesh = read_pseudomesh(path.parent, **given)
     assert mesh.fps > 0
 

@@ -4,6 +4,7 @@ import resource
 import signal
 import tracemalloc
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,12 @@ from random import Random
 TIME_LIMIT = 60.0
 #: Bytes that every parser may take whatever the file: what libraries set up once, caches, messages.
 CONSTANT = 8 << 20
+
+
+def chance(path: Path) -> int:
+    """A number that follows from what is in a file, for what a parser is told beside it."""
+    return zlib.crc32(path.read_bytes()) if path.is_file() else 1
+
 
 Mutation = Callable[[bytes, Random], bytes]
 

@@ -283,6 +283,11 @@ def test_a_history_without_psnr_is_another_fits(tmp_path):
         HistoryFile(tmp_path / "h.jsonl", resumed_at=5, psnr=20.0)
 
 
+def test_an_action_that_is_a_number_without_end_is_refused(tmp_path):
+    """Python writes no decimal number of more than 4,300 digits, but tomllib reads hexadecimal ones."""
+    assert _judged(texts.SCRIPT, tmp_path, b"[[edits]]\ndo = 0x" + b"f" * 4000 + b"\n") == "EditScriptError"
+
+
 def test_lines_that_go_on_are_read_in_time(tmp_path):
     """Joined one by one, these would be copied for minutes."""
     assert _judged(scenes.OBJ, tmp_path, b"v \\\n" + b"\\\n" * 1_500_000) == "FormatError"
