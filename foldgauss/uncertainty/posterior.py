@@ -516,8 +516,15 @@ def _described(value, depth: int = 2) -> Any:
     return kind, [(name, _described(each, depth - 1)) for name, each in sorted(inner.items())]
 
 
+#: Bytes before the HDF5 part of a file of draws, and how they begin: with this and the SHA-256 of all that follows.
+_BLOCK, _SEAL = 512, b"foldgauss draws, SHA-256 "
+
+
 class _Kept:
-    """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced."""
+    """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced.
+
+    It is sealed by a checksum, without which the HDF5 library never sees it: on a damaged file that may hang.
+    """
 
     def __init__(self, path: Path, fingerprint: str, shape: tuple[int, int, int]):
         """`shape`: ensembles, walkers of each, frames that move."""
@@ -532,7 +539,7 @@ class _Kept:
                 )
             shutil.copyfile(self.path, self.live)
         else:
-            with needed("h5py").File(self.live, "w") as file:
+            with needed("h5py").File(self.live, "w", userblock_size=_BLOCK) as file:
                 file.attrs["fingerprint"] = fingerprint
 
     def of(self, n: int):
@@ -544,6 +551,7 @@ class _Kept:
         """What is written so far replaces the file."""
         copy = self.path.with_name(f".{self.path.name}.new")
         shutil.copyfile(self.live, copy)
+        _seal(copy)
         os.replace(copy, self.path)
 
     def close(self) -> None:
@@ -551,9 +559,26 @@ class _Kept:
         self.live.unlink()
 
 
+def _seal(path: Path) -> None:
+    """Write the checksum of what a file holds into its first bytes."""
+    with open(path, "r+b") as file:
+        file.seek(_BLOCK)
+        seal = _SEAL + hashlib.file_digest(file, "sha256").hexdigest().encode()
+        file.seek(0)
+        file.write(seal)
+
+
+def _is_sealed(path: Path) -> bool:
+    with open(path, "rb") as file:
+        block = file.read(_BLOCK)
+        return block.startswith(_SEAL + hashlib.file_digest(file, "sha256").hexdigest().encode())
+
+
 def _fingerprint_of(path: Path, wanted: str | None = None, shape: tuple[int, int, int] = (0, 0, 0)) -> str:
     """Of the run that a file keeps, which holds all that `wanted` promises. A file may come from a stranger."""
     try:
+        if not _is_sealed(path):
+            raise _damaged(path)
         with needed("h5py").File(path) as file:
             found = file.attrs.get("fingerprint", "")
             whole = isinstance(found, str)
@@ -569,7 +594,7 @@ def _fingerprint_of(path: Path, wanted: str | None = None, shape: tuple[int, int
 
 def _damaged(path: Path) -> ValueError:
     cure = "Remove it, or choose another."
-    return invalid("backend", expected="an HDF5 file, or none yet", got=f"{path}, damaged", cure=cure)
+    return invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged", cure=cure)
 
 
 def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:

@@ -19,7 +19,7 @@ from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
 
 from .branches import ONLY
 from .models import written
-from .mutate import png_resealed, png_sized, zip_resealed
+from .mutate import by_chance, png_resealed, png_sized, zip_resealed
 from .target import CONSTANT, Target, chance
 
 with warnings.catch_warnings():
@@ -153,7 +153,7 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
 
     def write(path: Path) -> None:
         rng = np.random.default_rng(0)
-        with h5py.File(path, "w", libver=version) as file:
+        with h5py.File(path, "w", libver=version, userblock_size=posterior._BLOCK) as file:
             file.attrs["fingerprint"] = _FINGERPRINT
             for n in range(_SHAPE[0]):
                 group = file.create_group(f"ensemble_{n}")
@@ -172,6 +172,7 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
                 group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
                 for k, value in enumerate(np.random.RandomState(0).get_state()):
                     group.attrs[f"random_state_{k}"] = value
+        posterior._seal(path)
 
     return written(write, ".h5")
 
@@ -193,16 +194,51 @@ def _read_chains(path: Path) -> None:
         kept.live.unlink()
 
 
-def h5_number(data: bytes, random: Random) -> bytes:
-    """A length, an address or a size as the library keeps them: whole words of 8 bytes."""
-    body = bytearray(data)
-    places = [at for at in range(8, len(body) - 8, 8) if any(body[at : at + 8])]
-    for _ in range(random.randrange(1, 3)):
-        at = random.choice(places) if places else 0
-        old = int.from_bytes(body[at : at + 8], "little")
-        new = random.choice((0, 1, old + 1, old - 1, old * 2, old ^ 1 << random.randrange(64), 2**40, 2**63, 2**64 - 1))
-        body[at : at + 8] = (new % 2**64).to_bytes(8, "little")
-    return bytes(body)
+_VALUES = (
+    0, -1, 2, 5, 2**40, 1.5, np.nan, "x", b"x", [], [0, 1], True, np.zeros(3), np.zeros((2, 624), np.uint32), "MT19937",
+)  # fmt: skip
+
+
+def h5_changed(data: bytes, random: Random) -> bytes:
+    """A sound HDF5 file, under a right seal, in which something is missing, of another kind, or elsewhere."""
+
+    def write(path: Path) -> None:
+        path.write_bytes(data)
+        with h5py.File(path, "r+") as file:
+            group = file[f"ensemble_{random.randrange(_SHAPE[0])}"]
+            how = random.randrange(8)
+            if how <= 2:
+                holder = random.choice((file, group, group))
+                holder.attrs[random.choice(sorted(holder.attrs))] = random.choice(_VALUES)
+            elif how == 3:
+                del group.attrs[random.choice(sorted(group.attrs))]
+            elif how == 4:
+                holder, name = random.choice(
+                    ((file, group.name), (group, "chain"), (group, "log_prob"), (group, "accepted"))
+                )
+                del holder[name]
+            else:
+                name = random.choice(("chain", "log_prob", "accepted"))
+                del group[name]
+                if how == 5:
+                    group[name] = random.choice(
+                        (h5py.SoftLink("/a"), h5py.ExternalLink("/etc/a.h5", "/b"), np.zeros(4))
+                    )
+                else:
+                    shape = random.choice(((4,), (4, 4), (4, 4, 2), (2**40, 4, 2), (2**40, 4), (0, 4, 2), (3, 5, 2)))
+                    options = random.choice(
+                        ({}, {"compression": "gzip"}, {"chunks": True}, {"maxshape": (None, *shape[1:])})
+                    )
+                    kind = random.choice(("f8", "f8", "f4", "i8", "S3"))
+                    if int(np.prod(shape)) > 10**6:
+                        options = {"chunks": (1, *shape[1:])}
+                    group.create_dataset(name, shape, kind, **options)
+        posterior._seal(path)
+
+    try:
+        return written(write, ".h5")
+    except (OSError, KeyError, ValueError, TypeError, IndexError):
+        return by_chance(data, random, posterior._BLOCK)
 
 
 CHAINS = Target(
@@ -213,13 +249,13 @@ CHAINS = Target(
     (ValueError,),
     {
         "foldgauss.uncertainty.posterior": (
-            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state",
+            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "_is_sealed",
         )
     },
-    lambda data: 96,
+    lambda data: posterior._BLOCK,
     lambda size: 4 * CONSTANT + 64 * size,
-    (h5_number,),
-    past_header=0,
+    (h5_changed,),
+    past_header=1,
     share=0.4,
 )  # fmt: skip
 
