@@ -604,16 +604,17 @@ def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
     if not all(isinstance(file.get(link, getlink=True), h5py.HardLink) for link in links):
         return False
     group, *parts = (file[link] for link in links)
-    done, rows = int(group.attrs["iteration"]), parts[0].shape[0]
+    done, rows = group.attrs["iteration"], parts[0].shape[0]
     shapes = (rows, walkers, free), (rows, walkers), (walkers,)
     for part, want in zip(parts, shapes, strict=True):
         plain = part.dtype == np.float64 and part.external is None and not part.is_virtual and part.compression is None
         if not (plain and part.shape == want and part.id.get_storage_size() <= size):
             return False
-    told = [int(group.attrs[fact]) for fact in ("nwalkers", "ndim", "has_blobs")]
-    if not 0 <= done <= rows or told != [walkers, free, 0]:
+    told = [group.attrs[fact] for fact in ("nwalkers", "ndim")]
+    numbers = whole(done, 0) and all(whole(fact, 0) for fact in told) and np.shape(group.attrs["has_blobs"]) == ()
+    if not numbers or done > rows or told != [walkers, free] or bool(group.attrs["has_blobs"]):
         return False
-    needs = 8 * done * walkers * free, 8 * done * walkers
+    needs = 8 * int(done) * walkers * free, 8 * int(done) * walkers
     if any(part.id.get_storage_size() < need for part, need in zip(parts[:2], needs, strict=True)):
         return False
     return done == 0 or (bool(np.isfinite(parts[0][done - 1]).all()) and _is_random_state(group.attrs))
@@ -621,8 +622,9 @@ def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
 
 def _is_random_state(attributes) -> bool:
     """Whether NumPy may be handed it: it trusts the place within its numbers."""
-    kind, keys, place, _, _ = (attributes[f"random_state_{k}"] for k in range(5))
-    return kind == "MT19937" and keys.shape == (624,) and keys.dtype == np.uint32 and 0 <= int(place) <= 624
+    kind, keys, place, has_one, one = (attributes[f"random_state_{k}"] for k in range(5))
+    numbers = whole(place, 0) and place <= 624 and whole(has_one, 0) and isinstance(one, float) and np.isfinite(one)
+    return bool(numbers) and isinstance(kind, str) and (kind, keys.shape, keys.dtype) == ("MT19937", (624,), np.uint32)
 
 
 def needed(name: str):

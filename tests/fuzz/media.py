@@ -54,10 +54,15 @@ def _picture_memory(size: int) -> int:
     return 2 * CONSTANT + 12 * max(MOST_PIXELS, MOST_PER_BYTE * size)
 
 
+#: What is asked for besides: a label, a size, the folder that the image is alone in, frames of it.
+_ASKED = ({}, {}, {"label": 1}, {"size": (2, 3)}, {"folder": True}, {"folder": True, "frames": (0, 1)}, {"level": 0.4})
+
+
 def _read_mask(path: Path) -> None:
-    given = {"label": 1} if chance(path) % 4 == 0 else {}
-    masks = read_masks(path, **given)
-    assert (masks.dtype, masks.ndim) == (bool, 2)
+    given = dict(_ASKED[chance(path) % len(_ASKED)])
+    folder = given.pop("folder", False)
+    masks = read_masks(path.parent if folder else path, **given)
+    assert (masks.dtype, masks.ndim) == (bool, 3 if folder else 2)
 
 
 MASKS = Target(
@@ -79,7 +84,7 @@ MASKS = Target(
 
 
 def _read_picture(path: Path) -> None:
-    clip = read_video(path)
+    clip = read_video(path.parent if chance(path) % 4 == 0 else path)
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
 
@@ -130,13 +135,22 @@ def _clip_body(data: bytes) -> int:
     return min({b"\x1aE\xdf\xa3": 40, b"GIF8": 13, b"RIFF": 12}.get(data[:4], 0), len(data))
 
 
+def _read_clip(path: Path) -> None:
+    number = chance(path) % 4
+    if number == 0:
+        assert read_masks(path).dtype == bool
+    given = {"size": (8, 12), "frames": (0, 2)} if number == 1 else {"center_crop": (4, 4)} if number == 2 else {}
+    clip = read_video(path, **given)
+    assert clip.num_frames >= 1
+
+
 VIDEO = Target(
     "video",
     ".mp4",
     lambda: list(_clips()),
-    lambda path: read_video(path, **({} if chance(path) % 3 else {"size": (8, 12), "frames": (0, 2)})),
+    _read_clip,
     (VideoError,),
-    {"foldgauss.io.video_file": _READ},
+    {"foldgauss.io.video_file": _READ, "foldgauss.io.masks": ()},
     _clip_body,
     lambda size: 1 << 32,
     share=0.7,

@@ -329,6 +329,14 @@ def _random_place(file) -> None:
     file["ensemble_0"].attrs["random_state_2"] = 10**6
 
 
+def _random_texts(file) -> None:
+    file["ensemble_0"].attrs["random_state_3"] = "x"
+
+
+def _many_steps(file) -> None:
+    file["ensemble_0"].attrs["iteration"] = [4]
+
+
 def _not_finite(file) -> None:
     file["ensemble_0"]["chain"][3] = np.nan
 
@@ -340,7 +348,8 @@ def _text_for_numbers(file) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        _fingerprint_of_many, _no_ensemble, _no_chain, _linked, _outside, _more_steps, _random_place, _not_finite,
+        _fingerprint_of_many, _no_ensemble, _no_chain, _linked, _outside, _more_steps,
+        _random_place, _random_texts, _many_steps, _not_finite,
         _text_for_numbers,
     ],
 )  # fmt: skip
