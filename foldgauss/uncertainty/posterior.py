@@ -623,8 +623,14 @@ def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
 def _is_random_state(attributes) -> bool:
     """Whether NumPy may be handed it: it trusts the place within its numbers."""
     kind, keys, place, has_one, one = (attributes[f"random_state_{k}"] for k in range(5))
-    numbers = whole(place, 0) and place <= 624 and whole(has_one, 0) and isinstance(one, float) and np.isfinite(one)
-    return bool(numbers) and isinstance(kind, str) and (kind, keys.shape, keys.dtype) == ("MT19937", (624,), np.uint32)
+    numbers = whole(place, 0) and place <= 624 and whole(has_one, 0) and has_one <= 1
+    return (
+        numbers
+        and isinstance(one, float)
+        and np.isfinite(one)
+        and isinstance(kind, str)
+        and (kind, keys.shape, keys.dtype) == ("MT19937", (624,), np.uint32)
+    )
 
 
 def needed(name: str):

@@ -55,7 +55,7 @@ def _picture_memory(size: int) -> int:
 
 
 #: What is asked for besides: a label, a size, the folder that the image is alone in, frames of it.
-_ASKED = ({}, {}, {"label": 1}, {"size": (2, 3)}, {"folder": True}, {"folder": True, "frames": (0, 1)}, {"level": 0.4})
+_ASKED = ({}, {}, {"label": 1}, {"size": (2, 3)}, {"folder": True}, {"folder": True, "frames": (0, 1)})
 
 
 def _read_mask(path: Path) -> None:

@@ -333,6 +333,10 @@ def _random_texts(file) -> None:
     file["ensemble_0"].attrs["random_state_3"] = "x"
 
 
+def _random_flag(file) -> None:
+    file["ensemble_0"].attrs["random_state_3"] = 2**40
+
+
 def _many_steps(file) -> None:
     file["ensemble_0"].attrs["iteration"] = [4]
 
@@ -349,7 +353,7 @@ def _text_for_numbers(file) -> None:
     "change",
     [
         _fingerprint_of_many, _no_ensemble, _no_chain, _linked, _outside, _more_steps,
-        _random_place, _random_texts, _many_steps, _not_finite,
+        _random_place, _random_texts, _random_flag, _many_steps, _not_finite,
         _text_for_numbers,
     ],
 )  # fmt: skip
