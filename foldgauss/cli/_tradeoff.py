@@ -81,10 +81,12 @@ class Record:
     def _read(self) -> dict[str, Any]:
         try:
             kept = json.loads(self.path.read_text())
-            rows = [set(row) >= {*COLUMNS} - {"front", "knee"} for row in kept["points"]]
-            if not (all(rows) and isinstance(kept["settings"], dict) and {"plan", "machine"} <= set(kept)):
+            needed = {*COLUMNS} - {"front", "knee"}
+            rows = [isinstance(row, dict) and row.keys() >= needed for row in kept["points"]]
+            dicts = [isinstance(kept[name], dict) for name in ("settings", "plan", "machine")]
+            if not all(rows + dicts):
                 raise ValueError("parts are missing")
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise WrongUse(
                 f"--out: expected results of `foldgauss tradeoff` in {self.path}, got something else ({error}). "
                 "Choose another folder, or start anew with --overwrite."

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import hashlib
 import json
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from foldgauss import __version__
 from foldgauss._checks import invalid
 from foldgauss.cli._completion import among
+from foldgauss.cli._evidence import keep_evidence, kept_evidence
 from foldgauss.cli._shared import (
     TIME_LEFT,
     FittedClip,
@@ -36,8 +36,6 @@ from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.uncertainty import (
     Evidence,
-    FrameNoise,
-    Profiles,
     evidence,
     frame_time_log_prob,
     frame_time_posterior,
@@ -57,7 +55,6 @@ IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PICTURES)
 #: Draws of each ensemble that posterior.nc holds, evenly spaced: of all there would be gigabytes.
 MOST_DRAWS = 4000
-_PROFILES = ("nodes", "values", "slopes", "count")
 
 
 @app.command(name="uncertainty")
@@ -133,7 +130,9 @@ def uncertainty_command(
         raise WrongUse(str(invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)))
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
-    seen = _kept_evidence(out_dir, key, overwrite)
+    seen = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
+    if seen is None and (out_dir / CHAINS).exists() and not overwrite:
+        raise _of_another(out_dir / CHAINS)
     with _bars() as bars:
         if seen is not None:
             for note in seen.notes:
@@ -141,7 +140,7 @@ def uncertainty_command(
         else:
             seen = _evidence(model, clip, noise, level, wanted, bars)
             _make_folder(out_dir)
-            _keep_evidence(out_dir / EVIDENCE, key, seen)
+            keep_evidence(out_dir / EVIDENCE, key, seen)
         log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, seen=seen)
         settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
         posterior = _drawn(out_dir / CHAINS, overwrite, bars, seen=seen, log_prob=log_prob, **settings)
@@ -219,31 +218,6 @@ def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] |
 def _evidence(model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars) -> Evidence:
     seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
     return at_level(level, model, clip.frames, seen, only, lambda done, total: bars("frames", done, total))
-
-
-def _keep_evidence(path: Path, key: str, seen: Evidence) -> None:
-    """So that a run that goes on draws no pictures again."""
-    arrays = {name: getattr(seen.profiles, name) for name in _PROFILES}
-    arrays |= {"scale": seen.noise.scale, "share": seen.noise.share, "correlation": seen.residual_correlation}
-    with atomic_path(path) as temporary:
-        np.savez(temporary, key=key, num_drawn=seen.num_drawn, level=seen.level, notes=list(seen.notes), **arrays)
-
-
-def _kept_evidence(folder: Path, key: str, overwrite: bool) -> Evidence | None:
-    """What an earlier run has kept, or None. Refuses the folder of another run, before any work."""
-    try:
-        with np.load(folder / EVIDENCE) as kept:
-            kept = dict(kept)
-            if str(kept["key"]) == key:
-                profiles = Profiles(*(kept[name] for name in _PROFILES))
-                noise = FrameNoise(kept["scale"], kept["share"])
-                told = str(kept["level"]), tuple(map(str, kept["notes"]))
-                return Evidence(profiles, noise, kept["correlation"], int(kept["num_drawn"]), *told)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # none, or not one of ours: drawn anew
-        return None
-    if (folder / CHAINS).exists() and not overwrite:
-        raise _of_another(folder / CHAINS)
-    return None
 
 
 def _of_another(path: Path) -> WrongUse:

@@ -38,6 +38,15 @@ def format_error(path: object, *, expected: str, got: str, cure: str = "") -> Fo
     return FormatError(str(invalid(str(path), expected=expected, got=got, cure=cure)))
 
 
+def facts_error(path: object, error: Exception) -> FormatError:
+    """The error about facts that something else has refused: in its words, where those are ours."""
+    text = " ".join(str(error).split())[:300]
+    if ": expected " in text:
+        return FormatError(f"{path}: {text}")
+    got = f"others ({type(error).__name__}: {text})"
+    return format_error(path, expected="facts as foldgauss notes them", got=got, cure="Remove them.")
+
+
 @dataclass(frozen=True)
 class _Element:
     name: str

@@ -443,7 +443,7 @@ def _check_edit(place: _Place, table: dict[str, Any], selections: dict[str, Any]
     do = table.get("do")
     if not isinstance(do, str) or do not in ACTIONS:
         got = "none" if do is None else _shown(do)
-        raise place.error("do", "one of " + ", ".join(ACTIONS), got, _near(str(do), ACTIONS) if do else "")
+        raise place.error("do", "one of " + ", ".join(ACTIONS), got, _near(do, ACTIONS) if isinstance(do, str) else "")
     action = ACTIONS[do]
     _check_keys(place, table, {"do": _TEXT, "select": _TEXT, **action.keys}, action.needs)
     name = table.get("select")

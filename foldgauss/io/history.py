@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TextIO
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, whole
 from foldgauss.io._atomic import atomic_path, not_writable
 from foldgauss.io.figures import write_figure
 from foldgauss.plot import plot_history
@@ -39,7 +39,7 @@ class HistoryFile:
         if resumed_at is not None and self.path.exists():
             self._append, kept = True, [line for line in _lines(self.path) if line["step"] <= resumed_at]
             self._last = kept[-1]["step"] if kept else 0
-            same = psnr is None or (kept and kept[-1]["psnr"] == _plain(psnr))
+            same = psnr is None or (kept and kept[-1].get("psnr") == _plain(psnr))
             if self._last != resumed_at or not same:
                 raise invalid(
                     "history",
@@ -122,8 +122,13 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _parsed(text: str) -> dict[str, Any] | None:
+    """One line; None for what no fit writes. There may be more fields, of a later version, and fewer."""
     try:
         line = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
-    return line if isinstance(line, dict) and isinstance(line.get("step"), int) else None
+    if not isinstance(line, dict) or not whole(line.get("step"), 0):
+        return None
+    numbers = (line.get(name) for name in FitInfo._fields if name != "stopped_by")
+    sound = all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in numbers)
+    return line if sound and isinstance(line.get("stopped_by"), str | None) else None

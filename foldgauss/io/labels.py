@@ -1,19 +1,28 @@
 """Masks of objects from images: numbers, not colours."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from foldgauss._checks import invalid
 
 #: Kinds of image whose stored numbers are the labels: palette ("P"), grey ("L") and black and white ("1").
 _NUMBERED = ("P", "L", "1")
 _COLORED = ("RGB", "RGBA")
+#: Others are not decoded, whatever the name says: Pillow would hand some, as PostScript, to other programs.
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+#: Pixels of a mask: so many, 8K, or as many for each byte of its file as deflate can make of it, 1 bit each.
+MOST_PIXELS, MOST_PER_BYTE = 2**25, 8 * 1032
 _WHITE = 255
 #: The label of pixels that may be anything.
 VOID = 255
+
+
+class _TooLarge(Exception):
+    """More pixels than the file can hold."""
 
 
 def read_labels(paths: Sequence[Path]) -> np.ndarray:
@@ -44,9 +53,19 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
 def _read(path: Path) -> tuple[np.ndarray, str]:
     """(numbers, kind of image) of one mask."""
     try:
-        with Image.open(path) as image:
-            mode, pixels = image.mode, np.array(image)
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about damage: it decodes or it does not
+            mode, pixels = _decoded(path)
+    except (_TooLarge, Image.DecompressionBombError) as error:
+        most = max(MOST_PIXELS, MOST_PER_BYTE * path.stat().st_size)
+        most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
+        raise invalid(
+            "path",
+            expected=f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes",
+            got=f"more in {str(path)!r}",
+            cure="Is it a mask? If so, cut it, or store it uncompressed.",
+        ) from error
+    except Exception as error:  # Pillow's decoders raise what comes: SyntaxError, struct.error, zlib.error, IndexError
         raise invalid(
             "path", expected="masks that decode", got=f"{str(path)!r}, which does not", cure="Copy it again."
         ) from error
@@ -60,6 +79,15 @@ def _read(path: Path) -> tuple[np.ndarray, str]:
             cure="Its colours were stored in place of the labels; take the original PNG.",
         )
     return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
+
+
+def _decoded(path: Path) -> tuple[str, np.ndarray]:
+    """(kind of image, what is stored of its pixels); its size is judged before there is room for it."""
+    with Image.open(path, formats=_FORMATS) as image:
+        width, height = image.size
+        if width * height > max(MOST_PIXELS, MOST_PER_BYTE * path.stat().st_size):
+            raise _TooLarge
+        return image.mode, np.array(image)
 
 
 def _text(shape: tuple[int, ...]) -> str:

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 
 from foldgauss._checks import invalid, one_of
 from foldgauss.io._atomic import atomic_folder, check_replaceable
-from foldgauss.io._ply import FormatError, format_error
+from foldgauss.io._ply import facts_error, format_error
 from foldgauss.io.ply import checked_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.video_file import DEFAULT_FPS, natural_order
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
@@ -255,7 +255,7 @@ def _checked_notes(folder: Path, notes: dict, num_frames: int) -> dict:
             cure = "A frame was added or removed: mend the list too, or remove the file and give size."
             raise invalid("times", expected=expected, got=f"shape {times.shape}", cure=cure)
     except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{folder / NOTES}: {error}") from error
+        raise facts_error(folder / NOTES, error) from error
     facts = {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
     return facts | {"compositing": notes["compositing"]}
 
@@ -324,14 +324,14 @@ def _obj_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise FileNotFoundError(f"path: expected a file, got {str(path)!r}, which is missing.") from None
     except OSError as error:
         raise format_error(path, expected="a file that can be read", got=error.strerror or str(error)) from error
-    continued = ""
+    parts: list[str] = []  # of a line that goes on; joined once, as there may be a million
     for number, line in enumerate(text.split("\n"), start=1):
-        line = continued + line.rstrip("\r")
-        continued = ""
+        line = line.rstrip("\r")
         if line.endswith("\\"):
-            continued = line[:-1] + " "
+            parts.append(line[:-1])
             continue
-        words = line.split("#", 1)[0].split()
+        words = " ".join([*parts, line]).split("#", 1)[0].split()
+        parts = []
         if words:
             yield number, words
 

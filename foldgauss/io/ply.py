@@ -19,7 +19,7 @@ from scipy.special import expit, logit
 from foldgauss._checks import invalid, one_of, short_repr, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import atomic_folder, check_replaceable
-from foldgauss.io._ply import FormatError, Ply, format_error, read_ply, write_ply
+from foldgauss.io._ply import Ply, facts_error, format_error, read_ply, write_ply
 from foldgauss.io.video_file import DEFAULT_FPS, MAX_FPS
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, pixels_per_unit
 from foldgauss.render.camera import FIELD_OF_VIEW, THICKNESS
@@ -233,7 +233,7 @@ def _filled_in(
         if not within(fps, f"(0, {MAX_FPS}]"):
             raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{ply.path}: {error}") from error
+        raise facts_error(ply.path, error) from error
     return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)
 
 

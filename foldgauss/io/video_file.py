@@ -1048,4 +1048,4 @@ def _quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        home.setLogLevel(level)
+        logging.setLogLevel(level)

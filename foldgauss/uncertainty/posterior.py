@@ -348,7 +348,8 @@ class _Run:
         self.exact = exact_times(log_prob.profiles, log_prob.increments)
         self.laplace = laplace_times(log_prob.profiles, log_prob.increments, self.exact.quantile(0.5))
         fingerprint = self._fingerprint(settings.ensembles, moves)
-        self.file = None if settings.backend is None else _Kept(settings.backend, fingerprint)
+        shape = settings.ensembles, self.walkers, log_prob.num_free
+        self.file = None if settings.backend is None else _Kept(settings.backend, fingerprint, shape)
         self.samplers = [self._sampler(n, moves) for n in range(settings.ensembles)]
 
     def _fingerprint(self, ensembles: int, moves: list[tuple[Any, float]]) -> str:
@@ -524,15 +525,22 @@ def _described(value, depth: int = 2) -> Any:
 #: Room that an HDF5 file of draws takes beside them: of its pieces, the last ones are not full.
 SPARE, SPARE_BYTES = 1.2, 4 << 20
 
+#: Bytes before the HDF5 part of a file of draws, and how they begin: with this and the SHA-256 of all that follows.
+_BLOCK, _SEAL = 512, b"foldgauss draws, SHA-256 "
+
 
 class _Kept:
-    """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced."""
+    """An HDF5 file of all ensembles that is whole at any moment: sampling writes beside it, and it is replaced.
 
-    def __init__(self, path: Path, fingerprint: str):
+    It is sealed by a checksum, without which the HDF5 library never sees it: on a damaged file that may hang.
+    """
+
+    def __init__(self, path: Path, fingerprint: str, shape: tuple[int, int, int]):
+        """`shape`: ensembles, walkers of each, frames that move."""
         self.path = path
         self.live = path.with_name(f".{path.name}.running")
         if path.exists():
-            kept = _fingerprint_of(path)
+            kept = _fingerprint_of(path, fingerprint, shape)
             if kept != fingerprint:
                 cure = "Choose another file, or give the same model, video and settings."
                 raise invalid(
@@ -543,7 +551,7 @@ class _Kept:
             if path.exists():
                 shutil.copyfile(self.path, self.live)
             else:
-                with needed("h5py").File(self.live, "w") as file:
+                with needed("h5py").File(self.live, "w", userblock_size=_BLOCK) as file:
                     file.attrs["fingerprint"] = fingerprint
 
     def of(self, n: int):
@@ -557,8 +565,7 @@ class _Kept:
         try:
             with self.written():
                 shutil.copyfile(self.live, copy)
-                with open(copy, "rb") as file:
-                    os.fsync(file.fileno())
+                _seal(copy)
                 os.replace(copy, self.path)
         finally:
             copy.unlink(missing_ok=True)
@@ -570,9 +577,9 @@ class _Kept:
     def check_space(self, num_bytes: int) -> None:
         """Raise OSError where the disk has no room for so much more, and a copy: HDF5 may crash on one that is full."""
         there = self.live.stat().st_size if self.live.exists() else 0
-        needed = SPARE * (2 * num_bytes + there) + SPARE_BYTES
-        if shutil.disk_usage(self.path.parent).free < needed:
-            self.check_room(OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed"))
+        room = SPARE * (2 * num_bytes + there) + SPARE_BYTES
+        if shutil.disk_usage(self.path.parent).free < room:
+            self.check_room(OSError(errno.ENOSPC, f"{room / 1e6:.0f} MB are needed"))
 
     @contextlib.contextmanager
     def written(self) -> Iterator[None]:
@@ -593,14 +600,80 @@ class _Kept:
         raise OSError(number, os.strerror(number), str(self.path)) from error
 
 
-def _fingerprint_of(path: Path) -> str:
-    """Of the run that a file keeps."""
+def _seal(path: Path) -> None:
+    """Write the checksum of what a file holds into its first bytes."""
+    with open(path, "r+b") as file:
+        file.seek(_BLOCK)
+        seal = _SEAL + hashlib.file_digest(file, "sha256").hexdigest().encode()
+        file.seek(0)
+        file.write(seal)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _is_sealed(path: Path) -> bool:
+    with open(path, "rb") as file:
+        block = file.read(_BLOCK)
+        return block.startswith(_SEAL + hashlib.file_digest(file, "sha256").hexdigest().encode())
+
+
+def _fingerprint_of(path: Path, wanted: str | None = None, shape: tuple[int, int, int] = (0, 0, 0)) -> str:
+    """Of the run that a file keeps, which holds all that `wanted` promises. A file may come from a stranger."""
     try:
+        if not _is_sealed(path):
+            raise _damaged(path)
         with needed("h5py").File(path) as file:
-            return file.attrs.get("fingerprint", "")
-    except OSError as error:
-        cure = "Remove it, or choose another."
-        raise invalid("backend", expected="an HDF5 file, or none yet", got=f"{path}, damaged", cure=cure) from error
+            found = file.attrs.get("fingerprint", "")
+            complete = isinstance(found, str)
+            if complete and found == wanted:
+                num, *each = shape
+                complete = all(_is_whole(file, f"ensemble_{n}", *each, path.stat().st_size) for n in range(num))
+    except Exception as error:  # of what kind depends on where the library finds the damage
+        raise _damaged(path) from error
+    if not complete:
+        raise _damaged(path)
+    return found
+
+
+def _damaged(path: Path) -> ValueError:
+    cure = "Remove it, or choose another."
+    return invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged", cure=cure)
+
+
+def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
+    """Whether an ensemble is as emcee wrote it, in this file, of so many bytes: it reads no more than those."""
+    h5py = needed("h5py")
+    links = [name, *(f"{name}/{part}" for part in ("chain", "log_prob", "accepted"))]
+    if not all(isinstance(file.get(link, getlink=True), h5py.HardLink) for link in links):
+        return False
+    group, *parts = (file[link] for link in links)
+    done, rows = group.attrs["iteration"], parts[0].shape[0]
+    shapes = (rows, walkers, free), (rows, walkers), (walkers,)
+    for part, want in zip(parts, shapes, strict=True):
+        plain = part.dtype == np.float64 and part.external is None and not part.is_virtual and part.compression is None
+        if not (plain and part.shape == want and part.id.get_storage_size() <= size):
+            return False
+    told = [group.attrs[fact] for fact in ("nwalkers", "ndim")]
+    numbers = whole(done, 0) and all(whole(fact, 0) for fact in told) and np.shape(group.attrs["has_blobs"]) == ()
+    if not numbers or done > rows or told != [walkers, free] or bool(group.attrs["has_blobs"]):
+        return False
+    needs = 8 * int(done) * walkers * free, 8 * int(done) * walkers
+    if any(part.id.get_storage_size() < need for part, need in zip(parts[:2], needs, strict=True)):
+        return False
+    return done == 0 or (bool(np.isfinite(parts[0][done - 1]).all()) and _is_random_state(group.attrs))
+
+
+def _is_random_state(attributes) -> bool:
+    """Whether NumPy may be handed it: it trusts the place within its numbers."""
+    kind, keys, place, has_one, one = (attributes[f"random_state_{k}"] for k in range(5))
+    numbers = whole(place, 0) and place <= 624 and whole(has_one, 0) and has_one <= 1
+    return (
+        numbers
+        and isinstance(one, float)
+        and np.isfinite(one)
+        and isinstance(kind, str)
+        and (kind, keys.shape, keys.dtype) == ("MT19937", (624,), np.uint32)
+    )
 
 
 def needed(name: str):

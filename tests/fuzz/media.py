@@ -1,0 +1,306 @@
+"""Targets: pictures, videos, HDF5 and arrays of NumPy, which libraries decode."""
+
+import functools
+import io
+import tempfile
+import warnings
+from pathlib import Path
+from random import Random
+
+import cv2
+import h5py
+import numpy as np
+from PIL import Image
+
+from foldgauss.cli._evidence import keep_evidence, kept_evidence
+from foldgauss.io import VideoError, read_masks, read_video, write_video
+from foldgauss.io.labels import MOST_PER_BYTE, MOST_PIXELS
+from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
+
+from .branches import ONLY
+from .models import written
+from .mutate import by_chance, png_resealed, png_sized, zip_resealed
+from .target import CONSTANT, Target, chance
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    posterior.needed("arviz")
+
+_NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
+
+
+def _image(mode: str, format: str, **options) -> bytes:
+    file = io.BytesIO()
+    image = Image.fromarray(_NUMBERS)
+    if mode == "P":
+        image = Image.fromarray(_NUMBERS, "L").convert("P")
+        image.putpalette(bytes(range(256)) * 3)
+    elif mode == "1":
+        image = Image.fromarray(np.where(_NUMBERS > 0, 255, 0).astype(np.uint8)).convert("1")
+    elif mode != "L":
+        image = image.convert(mode)
+    image.save(file, format, **options)
+    return file.getvalue()
+
+
+def _images() -> list[bytes]:
+    made = [_image(mode, "PNG") for mode in ("P", "L", "1", "RGB", "RGBA")]
+    made += [_image("L", "BMP"), _image("L", "TIFF"), _image("L", "TIFF", compression="tiff_lzw")]
+    return [*made, _image("RGB", "WEBP", lossless=True)]
+
+
+def _picture_memory(size: int) -> int:
+    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.labels`."""
+    return 2 * CONSTANT + 12 * max(MOST_PIXELS, MOST_PER_BYTE * size)
+
+
+#: What is asked for besides: a label, a size, the folder that the image is alone in, frames of it.
+_ASKED = ({}, {}, {"label": 1}, {"size": (2, 3)}, {"folder": True}, {"folder": True, "frames": (0, 1)})
+
+
+def _read_mask(path: Path) -> None:
+    given = dict(_ASKED[chance(path) % len(_ASKED)])
+    folder = given.pop("folder", False)
+    masks = read_masks(path.parent if folder else path, **given)
+    assert (masks.dtype, masks.ndim) == (bool, 3 if folder else 2)
+
+
+MASKS = Target(
+    "masks",
+    ".png",
+    _images,
+    _read_mask,
+    (ValueError,),
+    {"foldgauss.io.labels": (), "foldgauss.io.masks": ()},
+    lambda data: 8 if data.startswith(b"\x89PNG") else 2,
+    _picture_memory,
+    (png_resealed, png_sized),
+    past_header=1,
+    share=2.0,
+)
+
+
+# ---------------------------------------------------------------------------------------------- pictures, videos
+
+
+def _read_picture(path: Path) -> None:
+    clip = read_video(path.parent if chance(path) % 4 == 0 else path)
+    assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
+
+
+#: The part of `foldgauss.io.video_file` that reads.
+_READ = (
+    ONLY, "read_video", "_read_file", "_read_folder", "_is_image", "_read_image_file", "_read_images", "_alike",
+    "image_paths", "_read_image", "_premultiplied", "_capture", "_refuse_alpha", "_decoded", "_same_size",
+    "_declared_frames", "_fit_to", "aspect_window", "_in_blocks", "_stacked", "_check_within",
+)  # fmt: skip
+
+PICTURES = Target(
+    "pictures",
+    ".png",
+    lambda: [data for data in _images() if not data.startswith(b"RIFF")][:5],
+    _read_picture,
+    (VideoError,),
+    {"foldgauss.io.video_file": _READ},
+    lambda data: 8,
+    lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
+    (png_resealed, png_sized),
+    past_header=1,
+    share=0.5,
+)
+
+
+@functools.cache
+def _clips() -> tuple[bytes, ...]:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 255, (3, 16, 24, 3), np.uint8)
+    found = []
+    for suffix in (".mp4", ".webm", ".gif"):
+        found.append(written(lambda path: write_video(path, frames, 10), suffix))
+    with tempfile.TemporaryDirectory() as folder:
+        for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v"), ("c.avi", "XVID")):
+            path = str(Path(folder) / name)
+            writer = cv2.VideoWriter(path, cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 10, (24, 16))
+            for frame in frames:
+                writer.write(frame)
+            writer.release()
+            found.append(Path(path).read_bytes())
+    return tuple(found)
+
+
+def _clip_body(data: bytes) -> int:
+    """Past what tells the kind: the first box of an MP4, Matroska's own header, a GIF's screen, an AVI's list."""
+    if data[4:8] == b"ftyp":
+        return min(int.from_bytes(data[:4], "big"), len(data))
+    return min({b"\x1aE\xdf\xa3": 40, b"GIF8": 13, b"RIFF": 12}.get(data[:4], 0), len(data))
+
+
+def _read_clip(path: Path) -> None:
+    number = chance(path) % 4
+    if number == 0:
+        assert read_masks(path).dtype == bool
+    given = {"size": (8, 12), "frames": (0, 2)} if number == 1 else {"center_crop": (4, 4)} if number == 2 else {}
+    clip = read_video(path, **given)
+    assert clip.num_frames >= 1
+
+
+VIDEO = Target(
+    "video",
+    ".mp4",
+    lambda: list(_clips()),
+    _read_clip,
+    (VideoError,),
+    {"foldgauss.io.video_file": _READ, "foldgauss.io.masks": ()},
+    _clip_body,
+    lambda size: 1 << 32,
+    share=0.7,
+)
+
+
+# ---------------------------------------------------------------------------------------------- HDF5, arrays
+
+_FINGERPRINT, _SHAPE = "0" * 64, (2, 4, 2)
+
+
+def _chains(steps: int, version: str, done: bool = True) -> bytes:
+    """A file of an interrupted run, as emcee writes it."""
+
+    def write(path: Path) -> None:
+        rng = np.random.default_rng(0)
+        with h5py.File(path, "w", libver=version, userblock_size=posterior._BLOCK) as file:
+            file.attrs["fingerprint"] = _FINGERPRINT
+            for n in range(_SHAPE[0]):
+                group = file.create_group(f"ensemble_{n}")
+                about = {
+                    "version": "3",
+                    "nwalkers": 4,
+                    "ndim": 2,
+                    "has_blobs": False,
+                    "iteration": steps if done else 0,
+                }
+                group.attrs.update(about)
+                group.create_dataset("accepted", data=np.zeros(4))
+                group.create_dataset(
+                    "chain", data=rng.normal(size=(steps, 4, 2)), maxshape=(None, 4, 2), chunks=(2, 4, 2)
+                )
+                group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
+                for k, value in enumerate(np.random.RandomState(0).get_state()):
+                    group.attrs[f"random_state_{k}"] = value
+        posterior._seal(path)
+
+    return written(write, ".h5")
+
+
+def _read_chains(path: Path) -> None:
+    if not path.exists():
+        raise FileNotFoundError  # a run begins there
+    kept = posterior._Kept(path, _FINGERPRINT, _SHAPE)
+    try:
+        for n in range(_SHAPE[0]):
+            backend = kept.of(n)
+            assert backend.initialized
+            assert backend.shape == _SHAPE[1:]
+            if backend.iteration:
+                state = backend.get_last_sample()
+                np.random.RandomState().set_state(state.random_state)
+                assert backend.get_chain().shape == (backend.iteration, *_SHAPE[1:])
+    finally:
+        kept.live.unlink()
+
+
+_VALUES = (
+    0, -1, 2, 5, 2**40, 1.5, np.nan, "x", b"x", [], [0, 1], True, np.zeros(3), np.zeros((2, 624), np.uint32), "MT19937",
+)  # fmt: skip
+
+
+def h5_changed(data: bytes, random: Random) -> bytes:
+    """A sound HDF5 file, under a right seal, in which something is missing, of another kind, or elsewhere."""
+
+    def write(path: Path) -> None:
+        path.write_bytes(data)
+        with h5py.File(path, "r+") as file:
+            group = file[f"ensemble_{random.randrange(_SHAPE[0])}"]
+            how = random.randrange(8)
+            if how <= 2:
+                holder = random.choice((file, group, group))
+                holder.attrs[random.choice(sorted(holder.attrs))] = random.choice(_VALUES)
+            elif how == 3:
+                del group.attrs[random.choice(sorted(group.attrs))]
+            elif how == 4:
+                holder, name = random.choice(
+                    ((file, group.name), (group, "chain"), (group, "log_prob"), (group, "accepted"))
+                )
+                del holder[name]
+            else:
+                name = random.choice(("chain", "log_prob", "accepted"))
+                del group[name]
+                if how == 5:
+                    group[name] = random.choice(
+                        (h5py.SoftLink("/a"), h5py.ExternalLink("/etc/a.h5", "/b"), np.zeros(4))
+                    )
+                else:
+                    shape = random.choice(((4,), (4, 4), (4, 4, 2), (2**40, 4, 2), (2**40, 4), (0, 4, 2), (3, 5, 2)))
+                    options = random.choice(
+                        ({}, {"compression": "gzip"}, {"chunks": True}, {"maxshape": (None, *shape[1:])})
+                    )
+                    kind = random.choice(("f8", "f8", "f4", "i8", "S3"))
+                    if int(np.prod(shape)) > 10**6:
+                        options = {"chunks": (1, *shape[1:])}
+                    group.create_dataset(name, shape, kind, **options)
+        posterior._seal(path)
+
+    try:
+        return written(write, ".h5")
+    except (OSError, KeyError, ValueError, TypeError, IndexError):
+        return by_chance(data, random, posterior._BLOCK)
+
+
+CHAINS = Target(
+    "hdf5",
+    ".h5",
+    lambda: [_chains(4, "earliest"), _chains(3, "latest"), _chains(2, "earliest", done=False)],
+    _read_chains,
+    (ValueError,),
+    {
+        "foldgauss.uncertainty.posterior": (
+            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "_is_sealed",
+        )
+    },
+    lambda data: posterior._BLOCK,
+    lambda size: 4 * CONSTANT + 64 * size,
+    (h5_changed,),
+    past_header=1,
+    share=0.4,
+)  # fmt: skip
+
+
+@functools.cache
+def _evidence() -> bytes:
+    times, heights = np.linspace(0, 1, 4), np.array([0.0, -1.0, -0.5, -2.0])
+    profiles = Profiles.of([times, times[:3], times], [heights, heights[:3], heights])
+    seen = Evidence(profiles, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",))
+    return written(lambda path: keep_evidence(path, "key", seen), ".npz")
+
+
+def _read_evidence(path: Path) -> None:
+    seen = kept_evidence(path, "key", 3)
+    if seen is None:
+        raise ValueError("expected evidence, got none")  # what the command does then: it draws the pictures
+    assert seen.profiles(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
+
+
+EVIDENCE = Target(
+    "evidence",
+    ".npz",
+    lambda: [_evidence()],
+    _read_evidence,
+    (ValueError,),
+    {"foldgauss.cli._evidence": ("keep_evidence",)},
+    lambda data: 4,
+    lambda size: 2 * CONSTANT + 64 * size,
+    (zip_resealed,),
+    past_header=1,
+    share=1.0,
+)
+
+TARGETS = (MASKS, PICTURES, VIDEO, CHAINS, EVIDENCE)

@@ -1,0 +1,422 @@
+"""Targets: our own files of models, safetensors and compact."""
+
+import dataclasses
+import functools
+import json
+import tempfile
+import zlib
+from pathlib import Path
+from random import Random
+
+import numpy as np
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import (
+    ModelFileError,
+    compact,
+    load_compact,
+    load_selection,
+    load_video_model,
+    save_compact,
+    save_selection,
+    save_video_model,
+)
+from foldgauss.io.model_file import load_model
+from foldgauss.io.video_model import load_checkpoint, read_metadata, save_checkpoint
+from foldgauss.render import Camera, RenderOptions
+from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
+from foldgauss.video.config import FitConfig
+from foldgauss.video.edit import edit
+from foldgauss.video.growth import Statistics
+from foldgauss.video.model import LASTING, OPAQUE
+from foldgauss.video.quantise import Rule, column_names, describe, is_whole, quantise
+from foldgauss.video.select import Selection
+from foldgauss.video.sharing import Palette
+from foldgauss.video.state import TIME_ADAM, FitState
+
+from .branches import ONLY
+from .mutate import by_chance, json_changed, json_text_changed
+from .target import CONSTANT, Target, chance
+
+
+def tiny_model(
+    num: int = 3, degree: int = 1, *, plain: bool = True, shared: bool = False, frames: int = 3, seed: int = 0
+) -> VideoModel:
+    """Some Gaussians; not `plain`: with all that the stored form leaves out or shares; `shared`: of one colour."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape: int) -> np.ndarray:
+        return (0.3 * rng.normal(size=(num, *shape))).astype(np.float32)
+
+    leaves = {
+        "loc": normal(2), "log_scale": normal(2) - 2, "angle_logit": normal(), "time_loc_logit": normal(),
+        "log_time_scale": normal(), "coefficients": normal(degree, 2), "opacity_logit": normal(), "color_dc": normal(3),
+    }  # fmt: skip
+    if shared:
+        leaves["color_dc"][:] = leaves["color_dc"][0]
+    if not plain:
+        lasting = np.arange(num) % 2 == 0
+        leaves["coefficients"][lasting] = 0
+        leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, LASTING
+        leaves["opacity_logit"][: num // 2] = OPAQUE
+        leaves["color_dc"][:], leaves["log_scale"][: num - 1] = leaves["color_dc"][0], leaves["log_scale"][0]
+    splats = FoldedSplats(**leaves, envelope=TimeLikelihood(np.float32(2), np.float32(0)))
+    return VideoModel(splats, FrameTimes.uniform(frames), (4, 6), 25.0, RenderOptions(), "over")
+
+
+def written(write, suffix: str = "") -> bytes:
+    """The bytes that a function of a path writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"one{suffix}"
+        write(path)
+        return path.read_bytes()
+
+
+# ---------------------------------------------------------------------------------------------- safetensors
+
+
+def unsealed(data: bytes) -> tuple[dict, bytes] | None:
+    """(header, tensors) of a safetensors file; None of what is none."""
+    length = int.from_bytes(data[:8], "little")
+    try:
+        header = json.loads(data[8 : 8 + length])
+    except (ValueError, RecursionError):
+        return None
+    return (header, data[8 + length :]) if isinstance(header, dict) else None
+
+
+def sealed(header: dict, tensors: bytes) -> bytes:
+    text = json.dumps(header).encode("utf-8", "surrogatepass")
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + tensors
+
+
+def tensors_from(data: bytes) -> int:
+    return min(8 + int.from_bytes(data[:8], "little"), len(data))
+
+
+#: What a header may say of itself that is none of ours, or of another kind.
+_KINDS = (
+    ("kind", "video"), ("kind", "edited-video"), ("kind", "selection"), ("kind", "fit-checkpoint"), ("kind", "x"),
+    ("version", "2"),
+    ("format", "pt"), ("header", "[]"), ("header", "{"), ("metadata", "1"), ("metadata", "[" * 9999),
+)  # fmt: skip
+
+
+def facts_changed(data: bytes, random: Random) -> bytes:
+    """One of the model's own facts, in the JSON within the JSON."""
+    parts = unsealed(data)
+    if parts is None or not isinstance(parts[0].get("__metadata__"), dict):
+        return by_chance(data, random)
+    header, tensors = parts
+    about, name = header["__metadata__"], random.choice(("header", "header", "header", "metadata"))
+    if random.randrange(8) == 0:
+        name, value = random.choice(_KINDS)
+        about[name] = value
+        return sealed(header, tensors)
+    try:
+        about[name] = json.dumps(json_changed(json.loads(about[name]), random))
+    except (ValueError, KeyError, TypeError, RecursionError):
+        about[name] = "[" * 5000
+    return sealed(header, tensors)
+
+
+def table_changed(data: bytes, random: Random) -> bytes:
+    """One thing in the table of tensors."""
+    parts = unsealed(data)
+    return by_chance(data, random) if parts is None else sealed(json_changed(parts[0], random), parts[1])
+
+
+def resized(data: bytes, random: Random) -> bytes:
+    """Another number of Gaussians, frames or powers, in the facts and in the table, with tensors to match."""
+    parts = unsealed(data)
+    if parts is None:
+        return by_chance(data, random)
+    header, tensors = parts
+    try:
+        shapes = [n for name, one in header.items() if name != "__metadata__" for n in one["shape"]]
+        old, new = random.choice(shapes), random.choice((0, 1, 2, 4, 9, 300, 2**40, 2**62))
+        entries, start = {"__metadata__": header["__metadata__"]}, 0
+        for name, one in header.items():
+            if name != "__metadata__":
+                shape = [new if n == old else n for n in one["shape"]]
+                size = {"F": 4, "I": 4, "U": 1, "B": 1}[one["dtype"][0]] if one["dtype"] != "F16" else 2
+                num = size
+                for n in shape:
+                    num *= n
+                entries[name] = {"dtype": one["dtype"], "shape": shape, "data_offsets": [start, start + num]}
+                start += num
+        facts = json.dumps(json.loads(header["__metadata__"]["header"]))
+        entries["__metadata__"]["header"] = facts.replace(f": {old},", f": {new},").replace(f": {old}}}", f": {new}}}")
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError):
+        return by_chance(data, random)
+    room = min(start, 4096)
+    return sealed(entries, (tensors * (room // max(1, len(tensors)) + 1))[:room] if tensors else bytes(room))
+
+
+def halved(data: bytes, random: Random) -> bytes:
+    """Some tensors of single precision kept in half."""
+    parts = unsealed(data)
+    if parts is None:
+        return by_chance(data, random)
+    header, tensors = parts
+    try:
+        entries, kept, start = {"__metadata__": header.get("__metadata__", {})}, [], 0
+        for name, one in header.items():
+            if name == "__metadata__":
+                continue
+            own, kind = tensors[slice(*one["data_offsets"])], one["dtype"]
+            if kind == "F32" and random.randrange(2):
+                with np.errstate(all="ignore"):
+                    own, kind = np.frombuffer(own, "<f4").astype("<f2").tobytes(), "F16"
+            entries[name] = {"dtype": kind, "shape": one["shape"], "data_offsets": [start, start + len(own)]}
+            kept.append(own)
+            start += len(own)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
+        return by_chance(data, random)
+    return sealed(entries, b"".join(kept))
+
+
+_MODEL_MUTATIONS = (facts_changed, table_changed, resized, halved)
+#: `_array_leaves` refuses models that are saved; what is loaded comes with the shapes of a skeleton.
+_MODEL_FILE = {
+    "foldgauss.io.model_file": (
+        "register_model", "save_model", "_write_safetensors", "_to_numpy", "_kind_of", "_check_described", "to_json",
+        "_array_leaves",
+        "_scalar", "plain",
+    ),
+}  # fmt: skip
+
+
+@functools.cache
+def _edited():
+    model = tiny_model()
+    found = edit(model).select_begun(Selection(np.array([True, False, True])))
+    moved = found.move((0.1, 0.0)).opacity(0.5, times=(0.2, 0.8)).recolor(hue=0.2).retime(shift=0.1).place(depth=0.1)
+    video = layers(moved.video(), tiny_model(seed=1))
+    return edit(video).seen_from(Camera.front(4 / 6).orbit(0.1, 0.0)).video()
+
+
+def _video_seeds() -> list[bytes]:
+    models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
+    models.append(dataclasses.replace(_edited(), camera=None))
+    models.append(tiny_model(16, 1, shared=True))
+    return [written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a"})) for one in models]
+
+
+def _read_video(path: Path) -> None:
+    read_metadata(path)
+    if chance(path) % 8 == 0:
+        load_model(path)  # the door below, which takes all kinds
+    model = load_video_model(path)
+    assert model.num_frames >= 1
+    assert len(model.size) == 2
+    str(model)
+
+
+VIDEO = Target(
+    "model",
+    ".safetensors",
+    _video_seeds,
+    _read_video,
+    (ModelFileError,),
+    _MODEL_FILE
+    | {
+        "foldgauss.io.video_model": (
+            "save_video_model", "check_model_name", "save_checkpoint", "load_checkpoint", "_to_stored",
+            "_describe_video", "_describe_edited",
+            "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
+            "_palette_skeleton", "_checkpoint_skeleton",
+        ),
+        "foldgauss.video.stored": (
+            "to_stored", "stored_counts", "_is_regular", "_by_kind", "_by_index", "_num_bytes",
+        ),
+    },
+    tensors_from,
+    lambda size: 2 * CONSTANT + 400 * size,
+    _MODEL_MUTATIONS,
+    share=0.6,
+)  # fmt: skip
+
+
+_CONFIG, _SOURCE = FitConfig(), {"clip": "a", "num_frames": 3}
+
+
+def _checkpoint_seeds() -> list[bytes]:
+    rng = np.random.default_rng(0)
+
+    def floats(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape).astype(np.float32)
+
+    counts, width, num = np.arange(3, dtype=np.int32), 14, 3
+    shared = Palette(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
+    plain = Palette(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
+    kept = []
+    for statistics in (None, Statistics(floats(num), floats(num), counts)):
+        state = FitState(
+            floats(num, width), floats(num, width), floats(num, width), counts, np.zeros(num, np.uint8),
+            np.zeros(num, bool), shared, plain, floats(3), floats(2), TIME_ADAM.init(floats(2)), statistics,
+            5, 100, 1.5, 0.01,
+        )  # fmt: skip
+        kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))
+    return kept
+
+
+CHECKPOINT = Target(
+    "checkpoint",
+    ".safetensors",
+    _checkpoint_seeds,
+    lambda path: load_checkpoint(path, config=_CONFIG, source=_SOURCE),
+    (ModelFileError, ValueError),
+    _MODEL_FILE
+    | {
+        "foldgauss.io.video_model": (
+            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint",
+            "_to_stored",
+            "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
+            "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton", "_describe_checkpoint",
+            "_counts",
+        )
+    },
+    tensors_from,
+    lambda size: 2 * CONSTANT + 400 * size,
+    _MODEL_MUTATIONS,
+    share=0.3,
+)  # fmt: skip
+
+
+@functools.cache
+def _selected() -> VideoModel:
+    return tiny_model()
+
+
+SELECTION = Target(
+    "selection",
+    ".selection",
+    lambda: [
+        written(lambda path, one=mask: save_selection(path, Selection(np.array(one)), _selected()))
+        for mask in ([True, False, True], [False, False, False])
+    ],
+    lambda path: load_selection(path, _selected()),
+    (ModelFileError, ValueError),
+    _MODEL_FILE | {"foldgauss.io.selections": ("save_selection", "_describe")},
+    tensors_from,
+    lambda size: 2 * CONSTANT + 400 * size,
+    _MODEL_MUTATIONS,
+    share=1.0,
+)
+
+
+# ---------------------------------------------------------------------------------------------- compact
+
+
+@functools.cache
+def _quantised() -> tuple:
+    found = []
+    for model, cells in (
+        (tiny_model(), (0, 0, 0)),
+        (tiny_model(16, 3, plain=False), (1, 1, 1)),
+        (tiny_model(4, 0, frames=1), (1, 0, 1)),
+    ):
+        described = describe(model)
+        names = column_names(model.degree, described.facts.shared)
+        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_whole(name)}
+        described = dataclasses.replace(described, facts=dataclasses.replace(described.facts, cells=cells))
+        found.append(quantise(described, np.arange(model.num_gaussians, dtype=np.int32) % 4, rules))
+    return tuple(found)
+
+
+def compact_resealed(data: bytes) -> bytes:
+    """With the checksum that belongs to it."""
+    return data[:16] + zlib.crc32(data[20:]).to_bytes(4, "little") + data[20:] if len(data) >= 20 else data
+
+
+def _compact_body(data: bytes) -> int:
+    return min(20 + int.from_bytes(data[12:16], "little"), len(data))
+
+
+def stream_changed(data: bytes, random: Random) -> bytes:
+    """Coded numbers changed, under a right checksum."""
+    return compact_resealed(by_chance(data, random, _compact_body(data)))
+
+
+def numbers_changed(data: bytes, random: Random) -> bytes:
+    """The numbers themselves changed, and coded as the writer codes them."""
+    quantised = random.choice(_quantised())
+    columns = {name: own.copy() for name, own in quantised.columns.items()}
+    values = (0, 1, -1, 2, 3, 4, 31, 255, 2**12, 2**20, 2**30 - 1, 1 - 2**30)
+    for _ in range(random.randrange(1, 4)):
+        name = random.choice(sorted(columns))
+        if name == "cell":
+            continue
+        own = columns[name]
+        if random.randrange(2):
+            own[random.randrange(len(own))] = random.choice(values)
+        else:
+            own[:] = random.choice(values)
+    rules = dict(quantised.rules)
+    if random.randrange(3) == 0:
+        name = random.choice(sorted(rules))
+        numbers = (0.0, 1.0, -1.0, 60.0, -60.0, 1e9, -1e9, 1e10, 1e-300)
+        slopes = tuple(random.choice(numbers) for _ in range(random.randrange(6)))
+        rules[name] = dataclasses.replace(
+            rules[name], origin=random.choice(numbers), exponent=random.choice(numbers), slopes=slopes
+        )
+    if random.randrange(8) == 0:  # long paths within a moment: powers beyond what single precision holds
+        for name in columns.keys() & {"duration", "x0", "y0", "x1", "y1"}:
+            columns[name][:] = -(2**29) if name == "duration" else 2**30 - 1
+            rules[name] = Rule(0.0, 60.0)
+    intervals = quantised.intervals.copy()
+    if len(intervals) and random.randrange(4) == 0:
+        intervals[random.randrange(len(intervals))] = random.choice(values)
+    changed = dataclasses.replace(quantised, columns=columns, rules=rules, intervals=intervals)
+    try:
+        with np.errstate(all="ignore"):
+            return compact.packed(changed, {"clip": "a"})
+    except (ValueError, IndexError, KeyError, OverflowError):
+        return stream_changed(data, random)
+
+
+def compact_header_changed(data: bytes, random: Random) -> bytes:
+    """One of the header's facts, with its length and the checksum to match."""
+    if random.randrange(10) == 0:
+        return compact_resealed(data[:8] + random.choice((0, 1, 3, 2**32 - 1)).to_bytes(4, "little") + data[12:])
+    length = int.from_bytes(data[12:16], "little")
+    header = json_text_changed(data[20 : 20 + length], random)
+    return compact_resealed(data[:12] + len(header).to_bytes(4, "little") + bytes(4) + header + data[20 + length :])
+
+
+def _read_compact(path: Path) -> None:
+    read_metadata(path) if compact.is_compact(path) else load_compact(path)
+    load_video_model(path) if compact.is_compact(path) else None
+
+
+def _compact_seeds() -> list[bytes]:
+    return [
+        written(lambda path, one=one: save_compact(path, one, metadata={"clip": "a"}), ".fgz") for one in _quantised()
+    ]
+
+
+COMPACT = Target(
+    "compact",
+    ".fgz",
+    _compact_seeds,
+    _read_compact,
+    (ModelFileError,),
+    {
+        "foldgauss.io.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
+        "foldgauss.io._columns": (),
+        "foldgauss.io.video_model": (ONLY, "load_video_model", "read_metadata"),
+        "foldgauss.io._range_coder": ("encode", "_encode", "_put", "_put_learned"),
+    },
+    _compact_body,
+    lambda size: 4 * CONSTANT + 20_000 * size,  # a byte may hold 8 Gaussians of 16 powers: the format's own limit
+    (numbers_changed, stream_changed, compact_header_changed),
+    past_header=1,
+    share=0.25,
+)
+
+#: The same with kernels as Python, so that their branches are seen; slow.
+KERNELS = dataclasses.replace(COMPACT, name="compact-kernels", share=0.03, environment=(("NUMBA_DISABLE_JIT", "1"),))
+
+TARGETS = (VIDEO, CHECKPOINT, SELECTION, COMPACT, KERNELS)

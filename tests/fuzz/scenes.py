@@ -1,0 +1,329 @@
+"""Targets: files of other programs, PLY and OBJ, and what lies beside them."""
+
+import functools
+import json
+import struct
+import tempfile
+from pathlib import Path
+from random import Random
+
+import numpy as np
+
+from foldgauss.io import (
+    FormatError,
+    import_model,
+    read_3dgs_ply,
+    read_pseudomesh,
+    write_3dgs_ply,
+    write_pseudomesh,
+    write_vegas_ply,
+)
+from foldgauss.io.mesh import read_obj
+
+from .models import tiny_model, written
+from .mutate import by_chance, json_changed, json_text_changed
+from .target import CONSTANT, Target, chance
+
+
+def _text_of(data: bytes, order: str = "ascii") -> bytes:
+    """A binary PLY of single precision, as text or in the other byte order."""
+    head, body = data.split(b"end_header\n", 1)
+    numbers = np.frombuffer(body, "<f4")
+    head = head.replace(b"binary_little_endian", order.encode())
+    if order != "ascii":
+        return head + b"end_header\n" + numbers.astype(">f4").tobytes()
+    return head + b"end_header\n" + b" ".join(f"{x:.9g}".encode() for x in numbers) + b"\n"
+
+
+def _with_lists(data: bytes, order: str = "<") -> bytes:
+    """With an element of lists, which is skipped, before the others, and a plain one after."""
+    head, body = data.split(b"end_header\n", 1)
+    lines = head.split(b"\n", 2)
+    lines[2] = b"element face 2\nproperty list uchar int vertex\nproperty short flag\n" + lines[2]
+    lines[2] += b"element extra 1\nproperty double a\n"
+    rows = b"2 0 1 7 0 -3\n" if order == "" else struct.pack("<BiihBh", 2, 0, 1, 7, 0, -3)
+    return b"\n".join(lines) + b"end_header\n" + rows + body + (b"1.5\n" if order == "" else struct.pack("<d", 1.5))
+
+
+def _rows_of_times(data: bytes) -> bytes:
+    """A VeGaS file whose times are rows of one column, not columns of one row; and of zeros in f_rest."""
+    head, _ = data.split(b"end_header\n", 1)
+    lines = [line for line in head.split(b"\n") if b"time_func" not in line]
+    lines = [b"element time 2\nproperty float w" if line.startswith(b"element time") else line for line in lines]
+    place = next(k for k, line in enumerate(lines) if line.startswith(b"element vertex")) + 1
+    lines.insert(place, b"property float f_rest_0")
+    width = sum(line.startswith(b"property") for line in lines) - 0
+    num = 3
+    rows = np.full((num, width), 0.1, np.float32)
+    rows[:, 0] = 0
+    return b"\n".join(lines) + b"end_header\n" + rows.tobytes() + np.zeros(2, "<f4").tobytes()
+
+
+def _ply_body(data: bytes) -> int:
+    at = data.find(b"end_header\n")
+    return at + 11 if at >= 0 else 0
+
+
+def note_changed(data: bytes, random: Random) -> bytes:
+    """One of our own facts, in a comment of the header."""
+    at = data.find(b"comment foldgauss ")
+    end = data.find(b"\n", at)
+    if at < 0 or end < 0:
+        return by_chance(data, random)
+    note = json_text_changed(data[at + 18 : end], random).replace(b"\n", b" ")
+    return data[: at + 18] + note + data[end:]
+
+
+def counted(data: bytes, random: Random) -> bytes:
+    """Another number of rows in the header."""
+    lines = data.split(b"\n")
+    places = [k for k, line in enumerate(lines) if line.startswith(b"element ")]
+    if not places:
+        return by_chance(data, random)
+    at = random.choice(places)
+    number = random.choice((0, 1, 2, 4, 255, 2**31, 2**40, 10**14, 10**15, 10**20, -1))
+    lines[at] = b" ".join(lines[at].split(b" ")[:2]) + b" " + str(number).encode()
+    return b"\n".join(lines)
+
+
+def columns_changed(data: bytes, random: Random) -> bytes:
+    """A property of another type or name, a list, one more or one less, with the body as it is."""
+    lines = data.split(b"\n")
+    places = [k for k, line in enumerate(lines) if line.startswith(b"property ")]
+    if not places:
+        return by_chance(data, random)
+    at = random.choice(places)
+    name = lines[at].split()[-1]
+    how = random.randrange(7)
+    if how == 0:
+        del lines[at]
+    elif how == 1:
+        kind = random.choice((b"char", b"uint8", b"double", b"short", b"int", b"quad", b"float32"))
+        lines[at] = b"property " + kind + b" " + name
+    elif how == 2:
+        lines[at] = b"property list " + random.choice((b"uchar", b"int", b"float", b"char")) + b" int " + name
+    elif how == 3:
+        lines.insert(at, lines[random.choice(places)])
+    elif how == 4:
+        lines[at] += random.choice((b"x", b"_1", b" y"))
+    elif how == 5:
+        lines.insert(
+            at, random.choice((b"", b"obj_info a", b"comment b", b"comment foldgauss {}", b"format ascii 1.0"))
+        )
+    else:
+        lines[1] = b"format " + random.choice((b"ascii", b"binary_little_endian", b"binary_big_endian", b"x")) + b" 1.0"
+    return b"\n".join(lines)
+
+
+def numbers_changed(data: bytes, random: Random) -> bytes:
+    """Numbers of the rows, each whole: extremes in place of some."""
+    start = _ply_body(data)
+    body = bytearray(data[start:])
+    if b"format ascii" in data[:start]:
+        words = bytes(body).split()
+        for _ in range(random.randrange(1, 4)):
+            if words:
+                extremes = (b"nan", b"inf", b"1e39", b"-1e308", b"1e400", b"0", b"1e-46", b"9" * 64, b"9" * 65, b"x")
+                words[random.randrange(len(words))] = random.choice(extremes)
+        return data[:start] + b" ".join(words) + b"\n"
+    order = ">" if b"big_endian" in data[:start] else "<"
+    for _ in range(random.randrange(1, 4)):
+        at = 4 * random.randrange(max(1, len(body) // 4))
+        body[at : at + 4] = struct.pack(
+            order + "f", random.choice((np.nan, np.inf, -np.inf, 0.0, 3.4e38, -3.4e38, 1e-45, 90.0, -200.0, 1.0))
+        )
+    return data[:start] + bytes(body)
+
+
+@functools.cache
+def _vegas() -> bytes:
+    return written(lambda path: write_vegas_ply(path, tiny_model()), ".ply")
+
+
+@functools.cache
+def _scene() -> bytes:
+    return written(lambda path: write_3dgs_ply(path, tiny_model(), 0.5, sh_degree=0), ".ply")
+
+
+def _read_vegas(path: Path) -> None:
+    given = {} if chance(path) % 3 else {"size": (4, 6), "fps": 12}
+    model = import_model(path, **given)
+    assert model.num_frames >= 2
+
+
+_PLY = {
+    "foldgauss.io._ply": ("write_ply", "_encoded"),
+}
+_WRITERS = (
+    "write_vegas_ply", "_check_writable_as_vegas", "frame_gaussians", "_alive", "write_gaussians_ply", "write_3dgs_ply",
+    "write_3dgs_frames", "_check_covers", "checked_times", "_scales_and_quaternion",
+)  # fmt: skip
+_PLY_MUTATIONS = (numbers_changed, note_changed, counted, columns_changed)
+
+VEGAS = Target(
+    "ply-vegas",
+    ".ply",
+    lambda: [
+        _vegas(), _text_of(_vegas()), _text_of(_vegas(), "binary_big_endian"), _with_lists(_vegas()),
+        _with_lists(_text_of(_vegas()), ""), _rows_of_times(_vegas()),
+    ],
+    _read_vegas,
+    (FormatError,),
+    _PLY | {"foldgauss.io.ply": (*_WRITERS, "read_3dgs_ply", "_turned")},
+    _ply_body,
+    lambda size: 2 * CONSTANT + 200 * size,
+    _PLY_MUTATIONS,
+    past_header=1,
+    share=2.0,
+)  # fmt: skip
+
+SCENE = Target(
+    "ply-3dgs",
+    ".ply",
+    lambda: [
+        _scene(), _text_of(_scene()), _text_of(_scene(), "binary_big_endian"), _with_lists(_scene()),
+        written(lambda path: write_3dgs_ply(path, tiny_model(), 0.5, axes="y-up", sh_degree=1), ".ply"),
+    ],
+    lambda path: read_3dgs_ply(path, axes="y-up" if chance(path) % 2 else "y-down"),
+    (FormatError,),
+    _PLY
+    | {
+        "foldgauss.io.ply": (
+            *_WRITERS, "read_vegas_ply", "_with_power", "_vegas_unit", "_check_vegas", "_degree", "_time_logits",
+            "_filled_in", "_note",
+        )
+    },
+    _ply_body,
+    lambda size: 2 * CONSTANT + 200 * size,
+    _PLY_MUTATIONS,
+    past_header=1,
+    share=3.0,
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------------------------------------- pseudomeshes
+
+
+@functools.cache
+def _mesh() -> dict[str, bytes]:
+    """The files of a folder with one frame."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_pseudomesh(Path(folder) / "mesh", tiny_model(), [0.5])
+        return {path.name: path.read_bytes() for path in made.iterdir()}
+
+
+def _beside(folder: Path, but: str) -> None:
+    for name, data in _mesh().items():
+        if name != but:
+            (folder / name).write_bytes(data)
+
+
+def _tool(data: bytes) -> bytes:
+    """As a mesh tool writes it: groups, normals, indices with slashes and from the end, lines that go on."""
+    lines = [b"# a tool", b"mtllib a.mtl", b"o frame", b"vn 0 0 1", b"", b"s off"]
+    for line in data.split(b"\n"):
+        words = line.split()
+        if line.startswith(b"v "):
+            lines.append(b"v " + b" \\\n ".join(words[1:4]) + b" # a comment")
+        elif line.startswith(b"f "):
+            lines.append(b"f " + b" ".join(word + b"//1" for word in words[1:]))
+    return b"\r\n".join(lines) + b"\r\n"
+
+
+def _from_the_end(data: bytes) -> bytes:
+    """Faces right behind their vertices, by indices that count back."""
+    vertices = [line for line in data.split(b"\n") if line.startswith(b"v ")]
+    return b"".join(b"\n".join(vertices[k : k + 3]) + b"\nf -3 -2 -1\n" for k in range(0, len(vertices), 3))
+
+
+def line_changed(data: bytes, random: Random) -> bytes:
+    """A line of a kind that the format knows."""
+    lines = data.split(b"\n")
+    made = (
+        b"v 0 0 0", b"v nan 0 0", b"v 1e39 0 0", b"v 1e38 1e38 -1e38", b"v 1 2", b"v a b c", b"v", b"f 1 2 3",
+        b"f 1 2 3 4", b"f 3 2 1", b"f 0 1 2", b"f -1 -2 -3", b"f 1/2/3 2 3", b"f 99999999999 1 2",
+        b"f " + b"9" * 5000 + b" 1 2", b"f", b"vt 0 0", b"\\", b"v 1_0 0 0", b"v 0x1 0 0",
+        b"f 1.0 2 3", "v １ 0 0".encode(), b"# " + b"a" * 100,
+        b"v 1e-46 0 0", b"v -0 -0 -0",
+    )  # fmt: skip
+    at = random.randrange(len(lines))
+    how = random.randrange(3)
+    if how == 0:
+        lines.insert(at, random.choice(made))
+    elif how == 1:
+        lines[at] = random.choice(made)
+    else:
+        lines[at] = lines[at].rstrip(b"\r") + random.choice((b"\\", b" \\", b"#", b" 1", b"\r\r", b"\x0b1", b"\x1c"))
+    return b"\n".join(lines)
+
+
+def _read_mesh(path: Path) -> None:
+    read_obj(path)
+    axes = "y-up" if chance(path) % 2 else "y-down"
+    mesh = read_pseudomesh(path.parent, axes=axes)
+    assert mesh.num_frames == 1
+
+
+_MESH = {
+    "foldgauss.io.mesh": (
+        "Pseudomesh", "_flat_factor", "write_pseudomesh", "_obj_text", "_axes",
+    )
+}  # fmt: skip
+
+OBJ = Target(
+    "obj",
+    ".obj",
+    lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"]), _from_the_end(_mesh()["frame_0000.obj"])],
+    _read_mesh,
+    (FormatError,),
+    {"foldgauss.io.mesh": (*_MESH["foldgauss.io.mesh"], "_notes", "_checked_notes")},
+    lambda data: 0,
+    lambda size: 2 * CONSTANT + 400 * size,
+    (line_changed,),
+    past_header=1,
+    share=3.0,
+    prepare=lambda folder: _beside(folder, "frame_0000.obj"),
+    file_name="frame_0000",
+)
+
+
+def one_fact_changed(data: bytes, random: Random) -> bytes:
+    """One thing in a JSON object, not the object itself."""
+    try:
+        return json.dumps(json_changed(json.loads(data), random)).encode("utf-8", "surrogatepass")
+    except (ValueError, RecursionError):
+        return by_chance(data, random)
+
+
+def _read_notes(path: Path) -> None:
+    given = {} if chance(path) % 4 else {"size": (4, 6), "fps": 12}
+    mesh = read_pseudomesh(path.parent, **given)
+    assert mesh.fps > 0
+
+
+NOTES = Target(
+    "mesh-notes",
+    ".json",
+    lambda: [
+        _mesh()["pseudomesh.json"],
+        b'{"size": [4, 6]}',
+        json.dumps({"size": [4, 6], "times": [0.5], "fps": 5, "extra": 1, "compositing": "sum"}).encode(),
+    ],
+    _read_notes,
+    (FormatError,),
+    {
+        "foldgauss.io.mesh": (
+            *_MESH["foldgauss.io.mesh"], "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parsed_vertex",
+            "_parsed_face", "_check_soup",
+        )
+    },
+    lambda data: 0,
+    lambda size: 2 * CONSTANT + 400 * size,
+    (one_fact_changed, json_text_changed),
+    past_header=2,
+    share=1.0,
+    prepare=lambda folder: _beside(folder, "pseudomesh.json"),
+    file_name="pseudomesh",
+)  # fmt: skip
+
+TARGETS = (VEGAS, SCENE, OBJ, NOTES)

@@ -1,0 +1,505 @@
+"""What no file may do: run code, ask for memory that it does not hold, speak in a page; and files that did harm."""
+
+import ast
+import html.parser
+import io
+import json
+import resource
+import struct
+import tracemalloc
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+import foldgauss
+from foldgauss.cli._evidence import kept_evidence
+from foldgauss.io import (
+    html_page,
+    read_history,
+    read_masks,
+    save_video_model,
+)
+from foldgauss.io.history import HistoryFile
+from foldgauss.uncertainty import posterior
+
+from . import media, models, scenes, texts
+from .models import sealed, tiny_model, unsealed
+from .mutate import png_chunks, png_of
+from .target import Target, judge
+from .targets import TARGETS
+
+PACKAGE = Path(foldgauss.__file__).parent
+HUGE = 2**40
+
+# ---------------------------------------------------------------------------------------------- no code is run
+
+_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib"}
+_CALLS = {"eval", "exec", "compile", "__import__"}
+_METHODS = {
+    "torch.load",
+    "yaml.load",
+    "yaml.unsafe_load",
+    "jax.numpy.load",
+    "jnp.load",
+    "np.fromregex",
+    "pd.read_pickle",
+}
+
+
+def _code_runners(source: str) -> list[str]:
+    """What in a module could run what a file says."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [one.name for one in node.names if one.name.split(".")[0] in _MODULES]
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in _MODULES:
+            found.append(node.module)
+        elif isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            if name in _CALLS or name in _METHODS:
+                found.append(name)
+            for one in node.keywords:
+                allows = not (isinstance(one.value, ast.Constant) and one.value.value is False)
+                if one.arg in ("allow_pickle", "shell") and allows:
+                    found.append(f"{name}({one.arg}=...)")
+            if name in ("os.system", "os.popen", "subprocess.getoutput"):
+                found.append(name)
+    return found
+
+
+def test_nothing_in_the_package_runs_what_a_file_says():
+    found = {
+        str(path.relative_to(PACKAGE)): wrong
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if (wrong := _code_runners(path.read_text(encoding="utf-8")))
+    }
+    assert found == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from marshal import loads",
+        "eval(text)",
+        "exec(text)",
+        "yaml.load(file)",
+        "np.load(path, allow_pickle=True)",
+        "np.load(path, allow_pickle=flag)",
+        "torch.load(path)",
+        "subprocess.run(words, shell=True)",
+    ],
+)
+def test_that_search_finds_them(source):
+    assert _code_runners(source)
+
+
+def test_no_picture_is_handed_to_another_program(tmp_path, monkeypatch):
+    """Pillow gives PostScript to Ghostscript, whatever the file's name says."""
+    script = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\n(a) = \n%%EOF\n"
+    (tmp_path / "mask.png").write_bytes(script)
+    Image.init()
+    assert "EPS" in Image.ID  # it would
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: pytest.fail("a program was started"))
+    monkeypatch.setattr("subprocess.check_call", lambda *_, **__: pytest.fail("a program was started"))
+    with pytest.raises(ValueError, match="masks that decode"):
+        read_masks(tmp_path / "mask.png")
+
+
+# ---------------------------------------------------------------------------------------------- room for what is there
+
+
+@contextmanager
+def _little_memory():
+    """256 MB more than there is now, in Python and out of it."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (256 << 20), before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _model(**facts) -> bytes:
+    header, tensors = unsealed(TARGETS["model"].seeds()[0])
+    about = header["__metadata__"]
+    about["header"] = json.dumps(json.loads(about["header"]) | facts)
+    return sealed(header, tensors)
+
+
+def _model_of_huge_tensors() -> bytes:
+    header, tensors = unsealed(_model(num_gaussians=HUGE))
+    for name, one in header.items():
+        if name != "__metadata__":
+            one["shape"] = [HUGE if n == 3 else n for n in one["shape"]]
+    return sealed(header, tensors)
+
+
+def _safetensors_header() -> bytes:
+    return HUGE.to_bytes(8, "little") + TARGETS["model"].seeds()[0][8:]
+
+
+def _compact(**facts) -> bytes:
+    data = TARGETS["compact"].seeds()[0]
+    length = int.from_bytes(data[12:16], "little")
+    header = json.dumps(json.loads(data[20 : 20 + length]) | facts).encode()
+    fixed = data[:12] + len(header).to_bytes(4, "little") + bytes(4)
+    return models.compact_resealed(fixed + header + data[20 + length :])
+
+
+def _ply(seed: int, old: bytes, new: bytes) -> bytes:
+    data = TARGETS["ply-vegas"].seeds()[seed]
+    assert old in data
+    return data.replace(old, new, 1)
+
+
+def _png(width: int, height: int) -> bytes:
+    chunks = png_chunks(TARGETS["masks"].seeds()[1])
+    chunks[0] = b"IHDR", struct.pack(">II", width, height) + chunks[0][1][8:]
+    return png_of(chunks)
+
+
+def _npz(shape: str) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(media._evidence())) as old:
+        members = {name: old.read(name) for name in old.namelist()}
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    members["nodes.npy"] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(96)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as new:
+        for name, data in members.items():
+            new.writestr(name, data)
+    return out.getvalue()
+
+
+def _npz_bomb() -> bytes:
+    """256 MB of zeros in a quarter of one."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new:
+        new.writestr("key.npy", bytes(256 << 20))
+    return out.getvalue()
+
+
+def _h5(change) -> bytes:
+    def write(path: Path) -> None:
+        path.write_bytes(media._chains(4, "earliest"))
+        with h5py.File(path, "r+") as file:
+            change(file)
+        posterior._seal(path)
+
+    return models.written(write, ".h5")
+
+
+def _huge_chain(file) -> None:
+    group = file["ensemble_1"]
+    for name, shape in (("chain", (4, 2)), ("log_prob", (4,))):
+        del group[name]
+        group.create_dataset(name, (HUGE, *shape), maxshape=(None, *shape), chunks=(2, *shape), dtype="f8")
+    group.attrs["iteration"] = HUGE
+
+
+CLAIMS = {
+    "model: Gaussians": ("model", lambda: _model(num_gaussians=HUGE)),
+    "model: frames": ("model", lambda: _model(num_frames=HUGE)),
+    "model: degree": ("model", lambda: _model(degree=2**31)),
+    "model: tensors": ("model", _model_of_huge_tensors),
+    "model: header": ("model", _safetensors_header),
+    "selection: Gaussians": (
+        "selection",
+        lambda: TARGETS["selection"].seeds()[0].replace(b'num_gaussians\\": 3', b'num_gaussians\\": 9'),
+    ),
+    "compact: Gaussians": ("compact", lambda: _compact(num_gaussians=HUGE)),
+    "compact: frames": ("compact", lambda: _compact(num_frames=HUGE)),
+    "compact: cells": ("compact", lambda: _compact(cells=[24, 24, 24])),
+    "compact: degree": ("compact", lambda: _compact(degree=HUGE)),
+    "compact: colours": ("compact", lambda: _compact(shared=HUGE)),
+    "ply: rows": ("ply-vegas", lambda: _ply(0, b"vertex 3", b"vertex %d" % HUGE)),
+    "ply: rows as text": ("ply-vegas", lambda: _ply(1, b"vertex 3", b"vertex %d" % HUGE)),
+    "ply: lists": ("ply-vegas", lambda: _ply(3, b"face 2", b"face %d" % HUGE)),
+    "ply: lists as text": ("ply-vegas", lambda: _ply(4, b"face 2", b"face %d" % HUGE)),
+    "ply: a list's length": ("ply-vegas", lambda: _ply(4, b"end_header\n2 ", b"end_header\n%d " % HUGE)),
+    "obj: a vertex": ("obj", lambda: TARGETS["obj"].seeds()[0].replace(b"f 1 ", b"f %d " % HUGE)),
+    "notes: frames": ("mesh-notes", lambda: b'{"size": [4, 6], "times": [0.5], "fps": -%d}' % HUGE),
+    "masks: pixels": ("masks", lambda: _png(2**31 - 1, 2**31 - 1)),
+    "masks: many pixels": ("masks", lambda: _png(2**15, 2**15)),
+    "pictures: pixels": ("pictures", lambda: _png(2**31 - 1, 2**31 - 1)),
+    "evidence: numbers": ("evidence", lambda: _npz(f"({HUGE},)")),
+    "evidence: over the top": ("evidence", lambda: _npz(f"({2**33}, {2**33})")),
+    "evidence: bomb": ("evidence", _npz_bomb),
+    "hdf5: steps": ("hdf5", lambda: _h5(_huge_chain)),
+}
+
+
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_what_a_header_claims_is_held_against_the_file(claim, tmp_path):
+    name, build = CLAIMS[claim]
+    target, path = TARGETS[name], TARGETS[name].path(tmp_path)
+    target.prepare(tmp_path)
+    path.write_bytes(target.seeds()[0])
+    assert judge(target, path) == "accepted"  # and what is made once is made
+    path.write_bytes(build())
+    tracemalloc.start()
+    try:
+        with _little_memory():
+            outcome = judge(target, path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert outcome in {error.__name__ for error in target.errors}
+    assert peak < 16 << 20
+
+
+# ---------------------------------------------------------------------------------------------- once did harm
+
+
+def _judged(target: Target, folder: Path, data: bytes) -> str:
+    target.prepare(folder)
+    path = target.path(folder)
+    path.write_bytes(data)
+    return judge(target, path)
+
+
+def test_a_history_nested_without_end_is_refused(tmp_path):
+    assert _judged(texts.HISTORY, tmp_path, b'{"step":' + b"[" * 100_000 + b"\n") == "ValueError"
+
+
+@pytest.mark.parametrize(
+    "line",
+    ['{"step": 1, "psnr": "high"}', '{"step": 1, "stopped_by": []}', '{"step": true}', '{"step": 1, "loss": {}}'],
+)
+def test_a_history_of_other_things_than_numbers_is_refused(tmp_path, line):
+    (tmp_path / "h.jsonl").write_text(line + "\n")
+    with pytest.raises(ValueError, match="one JSON object with a step per line, got something else in line 1"):
+        read_history(tmp_path / "h.jsonl")
+
+
+def test_a_history_without_psnr_is_another_fits(tmp_path):
+    (tmp_path / "h.jsonl").write_text('{"step": 5}\n')
+    with pytest.raises(ValueError, match="that of the fit which is resumed"):
+        HistoryFile(tmp_path / "h.jsonl", resumed_at=5, psnr=20.0)
+
+
+def test_an_action_that_is_a_number_without_end_is_refused(tmp_path):
+    """Python writes no decimal number of more than 4,300 digits, but tomllib reads hexadecimal ones."""
+    assert _judged(texts.SCRIPT, tmp_path, b"[[edits]]\ndo = 0x" + b"f" * 4000 + b"\n") == "EditScriptError"
+
+
+def test_lines_that_go_on_are_read_in_time(tmp_path):
+    """Joined one by one, these would be copied for minutes."""
+    assert _judged(scenes.OBJ, tmp_path, b"v \\\n" + b"\\\n" * 1_500_000) == "FormatError"
+
+
+@pytest.mark.parametrize("facts", [{"size": [4, 6], "options": None}, {"size": [4, 6], "fps": "x"}, {"size": 4}])
+def test_notes_of_a_mesh_are_refused_in_words(tmp_path, facts):
+    assert _judged(scenes.NOTES, tmp_path, json.dumps(facts).encode()) == "FormatError"
+
+
+def _fingerprint_of_many(file) -> None:
+    file.attrs["fingerprint"] = np.array([media._FINGERPRINT] * 2, dtype="S64")
+
+
+def _no_ensemble(file) -> None:
+    del file["ensemble_1"]
+
+
+def _no_chain(file) -> None:
+    del file["ensemble_0"]["chain"]
+
+
+def _linked(file) -> None:
+    del file["ensemble_0"]["chain"]
+    file["ensemble_0"]["chain"] = h5py.ExternalLink("/etc/other.h5", "/chain")
+
+
+def _outside(file) -> None:
+    del file["ensemble_0"]["accepted"]
+    file["ensemble_0"].create_dataset("accepted", (4,), "f8", external=[("/etc/hostname", 0, h5py.h5f.UNLIMITED)])
+
+
+def _more_steps(file) -> None:
+    file["ensemble_0"].attrs["iteration"] = 5
+
+
+def _random_place(file) -> None:
+    file["ensemble_0"].attrs["random_state_2"] = 10**6
+
+
+def _random_texts(file) -> None:
+    file["ensemble_0"].attrs["random_state_3"] = "x"
+
+
+def _random_flag(file) -> None:
+    file["ensemble_0"].attrs["random_state_3"] = 2**40
+
+
+def _many_steps(file) -> None:
+    file["ensemble_0"].attrs["iteration"] = [4]
+
+
+def _not_finite(file) -> None:
+    file["ensemble_0"]["chain"][3] = np.nan
+
+
+def _text_for_numbers(file) -> None:
+    file["ensemble_0"].attrs["iteration"] = "four"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _fingerprint_of_many, _no_ensemble, _no_chain, _linked, _outside, _more_steps,
+        _random_place, _random_texts, _random_flag, _many_steps, _not_finite,
+        _text_for_numbers,
+    ],
+)  # fmt: skip
+def test_chains_that_emcee_would_stumble_over_are_refused(change, tmp_path):
+    (tmp_path / "c.h5").write_bytes(_h5(change))
+    with pytest.raises(ValueError, match=r"backend: expected a file of draws, or none yet, got .*damaged"):
+        posterior._Kept(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_library_never_sees_draws_that_are_damaged(tmp_path, monkeypatch):
+    """On some it does not come back: on one of 800 with a bit or a length changed."""
+    whole = media._chains(4, "earliest")
+    monkeypatch.setattr("h5py.File", lambda *_, **__: pytest.fail("it was opened"))
+    for at in range(0, len(whole), len(whole) // 50):
+        (tmp_path / "c.h5").write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
+        if at in range(len(posterior._SEAL) + 64, posterior._BLOCK):  # idle
+            continue
+        with pytest.raises(ValueError, match=r"backend: .*damaged"):
+            posterior._Kept(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
+
+
+def _evidence_with(**changed) -> bytes:
+    with np.load(io.BytesIO(media._evidence())) as kept:
+        arrays = dict(kept) | changed
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"count": np.full(3, 10**9)},  # compiled code looks up to there
+        {"count": np.full(3, -1)},
+        {"count": np.array([4, 3])},
+        {"nodes": np.zeros((3, 4))},
+        {"nodes": np.zeros((3, 2))},
+        {"values": np.full((3, 4), np.nan)},
+        {"slopes": np.zeros((3, 4), np.float32)},
+        {"scale": np.ones(2)},
+        {"share": np.array(["a", "b", "c"])},
+        {"num_drawn": np.ones(2)},
+    ],
+)
+def test_evidence_that_does_not_fit_is_drawn_anew(changed, tmp_path):
+    path = tmp_path / "e.npz"
+    path.write_bytes(media._evidence())
+    assert kept_evidence(path, "key", 3).num_drawn == 12
+    assert kept_evidence(path, "other", 3) is None
+    assert kept_evidence(path, "key", 4) is None
+    path.write_bytes(_evidence_with(**changed))
+    assert kept_evidence(path, "key", 3) is None
+
+
+@pytest.mark.parametrize("side", [2**13, 2**15])  # beyond our limit, and beyond Pillow's
+def test_a_mask_too_large_for_its_file_is_called_so(side, tmp_path):
+    (tmp_path / "m.png").write_bytes(_png(side, side))
+    with pytest.raises(ValueError, match="a mask of at most 33,554,432 pixels, as its file has"):
+        read_masks(tmp_path / "m.png")
+
+
+def test_good_neighbours_are_still_read(tmp_path):
+    """Large and plain pictures are no bombs: the limit is far from them."""
+    plain = np.zeros((4320, 7680), np.uint8)
+    plain[:10] = 1
+    Image.fromarray(plain).save(tmp_path / "m.png")
+    assert (tmp_path / "m.png").stat().st_size < 50_000
+    assert read_masks(tmp_path / "m.png").sum() == 10 * 7680
+
+
+# ---------------------------------------------------------------------------------------------- what a page shows
+
+EVIL = [
+    "</script><script>alert(1)</script>",
+    "</title><img src=x onerror=alert(1)>",
+    "\"' onmouseover='alert(1)' x=\"",
+    "<!--<script>",
+    "a\u2028b\u2029c\x85",
+    "]]>{{script}}{{data}}\\g<0>\\1",
+    "&lt;b&gt;&amp;",
+    "a\ud800b",
+    "\x00\x1b[31m\x7f",
+    "${alert(1)}`",
+]
+
+
+class _Page(html.parser.HTMLParser):
+    """Tags with their attributes, and the text of each."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tags: list[tuple] = []
+        self.texts: dict[str, str] = {}
+        self.last = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, tuple(attributes)))
+        self.last = tag
+
+    def handle_endtag(self, tag):
+        self.last = ""
+
+    def handle_data(self, data):
+        self.texts[self.last] = self.texts.get(self.last, "") + data
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_a_page_shows_every_string_as_text(evil, tmp_path):
+    """The name in a model's metadata, that of its file, a title given: whatever a stranger can choose."""
+    safe = _Page(html_page(tiny_model(), title="x"))
+    shown = evil.encode("utf-8", "replace").decode()
+    pages = [html_page(tiny_model(), title=evil)]
+    pages.append(html_page(save_video_model(tmp_path / "m.safetensors", tiny_model(), metadata={"clip": evil})))
+    name = tmp_path / (evil.replace("/", "_").replace("\0", "").encode("utf-8", "replace").decode() + ".safetensors")
+    named = html_page(save_video_model(name, tiny_model()))
+    for page in (*pages, named):
+        found = _Page(page)
+        assert [tag for tag, _ in found.tags] == [tag for tag, _ in safe.tags]
+        assert [attributes for _, attributes in found.tags] == [attributes for _, attributes in safe.tags]
+    for page in pages:
+        assert _Page(page).texts["title"] == shown
+        assert _Page(page).texts["h1"] == shown
+
+
+@pytest.mark.parametrize("clip", [None, 5, ["</script>"], {"a": "<b>"}])
+def test_a_name_that_is_no_text_is_shown_as_one(clip, tmp_path):
+    safe = _Page(html_page(tiny_model(), title="x"))
+    page = _Page(html_page(save_video_model(tmp_path / "m.safetensors", tiny_model(), metadata={"clip": clip})))
+    assert [tag for tag, _ in page.tags] == [tag for tag, _ in safe.tags]
+
+
+def test_scripts_set_text_and_never_markup():
+    """So what a compact file's header says cannot become an element, whatever it is."""
+    scripts = [*sorted((PACKAGE / "io" / "player").glob("*.js")), PACKAGE / "io" / "compact.js"]
+    assert len(scripts) > 5
+    for path in scripts:
+        text = path.read_text(encoding="utf-8")
+        for word in (
+            "innerHTML",
+            "outerHTML",
+            "insertAdjacentHTML",
+            "document.write",
+            "eval(",
+            "new Function",
+            "srcdoc",
+        ):
+            assert word not in text, (path.name, word)

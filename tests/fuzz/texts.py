@@ -1,0 +1,301 @@
+"""Targets: texts that people and programs write, TOML and JSON."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from PIL import Image
+
+from foldgauss.cli._shared import WrongUse
+from foldgauss.cli._tradeoff import COLUMNS, Record
+from foldgauss.io import HistoryFile, read_history, save_selection, save_video_model
+from foldgauss.io.edit_script import EditScriptError, read_edit_script
+from foldgauss.io.history import info_line
+from foldgauss.video.fit import FitInfo
+from foldgauss.video.select import Selection
+
+from .branches import ONLY
+from .models import tiny_model, written
+from .mutate import by_chance, json_changed, json_text_changed
+from .target import CONSTANT, Target, chance
+
+_SCRIPT = b"""\
+# an edit
+[selections.one]
+box = [0, 0, 3, 3]
+frame = 1
+
+[selections.lively]
+times = [0.0, 1.0]
+alive = true
+
+[selections."two words"]
+file = "one.selection"
+
+[selections.both]
+any = ["one", "two words"]
+without = ["one"]
+
+[[edits]]
+do = "move"
+select = "one"
+offset = [0.1, -0.05]
+frames = "1:"
+ease = 0.2
+
+[[edits]]
+do = "recolor"
+gain = [1.0, 0.9, 0.8]
+matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+times = [0.0, 0.5]
+
+[[edits]]
+do = "place"
+degrees = [0.0, 20.0, 0.0]
+depth = 0.1
+
+[[layers]]
+model = "other.safetensors"
+where = "front"
+freeze = 0
+
+[camera]
+azimuth = 10.0
+"""
+_OTHER = b"""\
+selections = { left = { polygon = [[0, 0], [3, 0], [0, 3]], tolerance = 1.5, times = [0.0, 1.0] } }
+edits = [
+  { do = "vanish", select = "left" },  # gone
+  { do = 'scale', factor = 1.5, about = [0.0, 0.0] },
+]
+camera.elevation = 5
+layers = [{ model = "other.safetensors", script = "again.toml" }]
+"""
+_THIRD = b'''\
+[[edits]]
+do = """multiply"""
+offsets = [[0.1, 0.0], [0.2, 0.0]]
+degrees = [10.0, 20.0]
+"delays" = 0.1
+originals = false
+[[edits]]
+do = "retime"
+shift = 0.1
+outside = \'\'\'hold\'\'\'
+[[edits]]
+do = "to_front"
+[[edits]]
+do = "rotate"
+degrees = 30
+curve = "linear"
+frame = 1
+[[edits]]
+do = "freeze"
+at = 0.5
+'''
+_FOURTH = b"""\
+[selections.m]
+mask = "mask.png"
+label = 1
+frame = 0
+[selections.f]
+file = "one.selection"
+[selections.g]
+file = "one.selection"
+box = [0, 0, 6, 4]
+frames = [0, 2]
+[selections.every]
+all = ["m", "f"]
+[selections.rest]
+without = ["m"]
+[[edits]]
+do = "opacity"
+factor = 0.5
+[[layers]]
+model = "other.safetensors"
+script = "more.toml"
+freeze = 0.5
+[camera]
+elevation = 5
+"""
+_KEYS = (
+    b"do",
+    b"select",
+    b"offset",
+    b"frames",
+    b"mask",
+    b"file",
+    b"label",
+    b"any",
+    b"model",
+    b"script",
+    b"degrees",
+    b"x",
+)
+_MADE = (
+    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
+    b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
+    b'"a\\u0000b"', b"[]", b'"one.selection"', b'"case.toml"', b'"again.toml"', b'"mask.png"', b'"none"',
+    b'"rest"', b'"/"',
+    b"1_000", b'["one"]', b'["none"]', b"{ do = 1 }",
+)  # fmt: skip
+
+
+def toml_changed(data: bytes, random: Random) -> bytes:
+    """A value, a key or a header of another kind; keys in a row."""
+    lines = data.split(b"\n")
+    at = random.randrange(len(lines))
+    key, equals, _ = lines[at].partition(b" = ")
+    how = random.randrange(7)
+    if how <= 1 and equals:
+        lines[at] = key + b" = " + random.choice(_MADE)
+    elif how == 2:
+        lines.insert(at, random.choice(_KEYS) + b" = " + random.choice(_MADE))
+    elif how == 3 and equals:
+        lines[at] = random.choice(_KEYS) + b" = " + lines[at].partition(b" = ")[2]
+    elif how == 4:
+        made = (
+            b"[selections]",
+            b"[[edits]]",
+            b"[layers]",
+            b"[[layers]]",
+            b"[camera]",
+            b"[a.b.c]",
+            b"[selections.one]",
+            b"[x]",
+        )
+        lines.insert(at, random.choice(made))
+    elif how == 5:
+        lines[at] = b".".join([b"a"] * random.choice((2, 3, 15, 17, 5000))) + b" = 1"
+    else:
+        return by_chance(data, random)
+    return b"\n".join(lines)
+
+
+def _apply_script(path: Path) -> None:
+    """What the script asks for, too: selections, masks, other models, a camera."""
+    read_edit_script(path).apply(tiny_model())
+
+
+def _beside_scripts(folder: Path) -> None:
+    (folder / "other.safetensors").write_bytes(written(lambda path: save_video_model(path, tiny_model(seed=1))))
+    selection = written(lambda path: save_selection(path, Selection(np.array([True, False, True])), tiny_model()))
+    (folder / "one.selection").write_bytes(selection)
+    more = b'[[edits]]\ndo = "vanish"\nframe = 1\n'
+    (folder / "more.toml").write_bytes(more)
+    (folder / "again.toml").write_bytes(more + b'[[layers]]\nmodel = "other.safetensors"\nscript = "case.toml"\n')
+    mask = io.BytesIO()
+    Image.fromarray(np.tile(np.uint8([0, 1, 1, 2, 1, 1]), (4, 1))).save(mask, "PNG")
+    (folder / "mask.png").write_bytes(mask.getvalue())
+
+
+SCRIPT = Target(
+    "edit-script",
+    ".toml",
+    lambda: [_SCRIPT, _FOURTH, _THIRD, _OTHER.replace(b', script = "again.toml"', b""), b"", b"\xef\xbb\xbf" + _THIRD],
+    read_edit_script,
+    (EditScriptError,),
+    {"foldgauss.io.edit_script": (), "foldgauss.io._toml_lines": ()},
+    lambda data: 0,
+    lambda size: 2 * CONSTANT + 400 * size,
+    (toml_changed,),
+    past_header=1,
+    share=1.4,
+    prepare=_beside_scripts,
+)
+
+#: What is done by a script; the models are small and the same, and XLA's programs for them are the most of the memory.
+APPLIED = dataclasses.replace(
+    SCRIPT,
+    name="edit-applied",
+    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD],
+    parse=_apply_script,
+    errors=(EditScriptError, FileNotFoundError),
+    memory=lambda size: (256 << 20) + 400 * size,
+    share=0.1,
+)
+
+
+# ---------------------------------------------------------------------------------------------- histories
+
+
+def _infos() -> list[FitInfo]:
+    first = FitInfo(1, 0.1, 0.5, float("nan"), 10, 9, 0.2, float("inf"), None)
+    return [first, first._replace(step=2, psnr=20.5, loss=0.25), first._replace(step=5, psnr=21.5, stopped_by="steps")]
+
+
+def _history() -> bytes:
+    return b"".join(json.dumps(info_line(info)).encode() + b"\n" for info in _infos())
+
+
+def one_line_changed(data: bytes, random: Random) -> bytes:
+    """One value of one line."""
+    lines = data.split(b"\n")
+    at = random.randrange(len(lines))
+    lines[at] = json_text_changed(lines[at], random)
+    return b"\n".join(lines)
+
+
+def _read_history(path: Path) -> None:
+    for info in read_history(path):
+        assert f"{info.step:d} {info.psnr:.2f}"
+    if chance(path) % 2:
+        HistoryFile(path, resumed_at=5, psnr=21.5)
+
+
+HISTORY = Target(
+    "history",
+    ".jsonl",
+    lambda: [_history(), b"", _history() + b'{"step": 9, "prog'],
+    _read_history,
+    (ValueError,),
+    {"foldgauss.io.history": ("write_curves", "info_line", "_plain", "__call__", "_opened", "__enter__", "__exit__")},
+    lambda data: 8 if data.startswith(b'{"step"') else 0,
+    lambda size: 2 * CONSTANT + 200 * size,
+    (one_line_changed,),
+    past_header=1,
+    share=3.0,
+)
+
+
+# ---------------------------------------------------------------------------------------------- trade-offs
+
+
+def _record() -> bytes:
+    rows = [dict.fromkeys(COLUMNS, 1.0) | {"axis": "steps", "value": value, "command": "a"} for value in (100, 200)]
+    kept = {
+        "settings": {"a": 1, "b": [1, 2]},
+        "machine": {"cpu": "x"},
+        "plan": {"steps": 100},
+        "left_out": {},
+        "fronts": {},
+    }
+    return json.dumps(kept | {"points": rows}).encode()
+
+
+def record_changed(data: bytes, random: Random) -> bytes:
+    try:
+        return json.dumps(json_changed(json.loads(data), random)).encode("utf-8", "surrogatepass")
+    except (ValueError, RecursionError):
+        return by_chance(data, random)
+
+
+TRADEOFF = Target(
+    "tradeoff",
+    ".json",
+    lambda: [_record()],
+    lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
+    (WrongUse,),
+    {"foldgauss.cli._tradeoff": (ONLY, "Record")},
+    lambda data: 0,
+    lambda size: 2 * CONSTANT + 200 * size,
+    (record_changed, json_text_changed),
+    past_header=2,
+    share=0.5,
+    says=("expected", "holds results of other settings"),
+)
+
+TARGETS = (SCRIPT, APPLIED, HISTORY, TRADEOFF)
