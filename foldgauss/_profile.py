@@ -31,15 +31,15 @@ class Space(NamedTuple):
 class Profile(eqx.Module):
     """Points ready to be fitted: space centred and scaled, weights of sum 1."""
 
-    t: Float[Array, "n"]
+    t: Float[Array, " n"]
     y: Float[Array, "n d-1"]
-    weights: Float[Array, "n"]
+    weights: Float[Array, " n"]
     envelope: AbstractEnvelope
     used: Int[Array, ""]  # the polynomial's degree, at most `degree`
     degree: int = eqx.field(static=True)
     diagonal: bool = eqx.field(static=True)
 
-    def log_a(self, time_loc, time_scale) -> Float[Array, "n"]:
+    def log_a(self, time_loc, time_scale) -> Float[Array, " n"]:
         return self.envelope.log_a(self.t, time_loc=time_loc, time_scale=time_scale)
 
     def space(self, time_loc: Float[Array, ""], time_scale: Float[Array, ""]) -> Space:

@@ -53,10 +53,10 @@ def hermite_to_powers(degree: int) -> np.ndarray:
 
 
 def weighted_regression(
-    v: Float[Array, "n"],
+    v: Float[Array, " n"],
     y: _Points,
-    log_a: Float[Array, "n"],
-    weights: Float[Array, "n"],
+    log_a: Float[Array, " n"],
+    weights: Float[Array, " n"],
     degree: int,
     used: Int[Array, ""],
 ) -> Regression:

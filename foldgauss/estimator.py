@@ -156,7 +156,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         self._fit(X, sample_weight)
         return self
 
-    def fit_predict(self, X, y=None, sample_weight=None) -> Int[np.ndarray, "n"]:
+    def fit_predict(self, X, y=None, sample_weight=None) -> Int[np.ndarray, " n"]:
         """Fit, and the likeliest component of each row."""
         scaled = self._fit(X, sample_weight)
         with _precision(scaled.dtype):
@@ -396,7 +396,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     # --- what is known of points ------------------------------------------------------------------------------
 
-    def score_samples(self, X) -> Float[np.ndarray, "n"]:
+    def score_samples(self, X) -> Float[np.ndarray, " n"]:
         """log p(x) of each row, in the units of X."""
         y = self._scaled(X)
         with _precision(y.dtype):
@@ -408,7 +408,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         """The mean of `score_samples`."""
         return float(self.score_samples(X).mean(dtype=np.float64))
 
-    def predict(self, X) -> Int[np.ndarray, "n"]:
+    def predict(self, X) -> Int[np.ndarray, " n"]:
         """The likeliest component of each row."""
         return self.predict_proba(X).argmax(1)
 
@@ -460,7 +460,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 stacklevel=3,
             )
 
-    def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, "n"]]:
+    def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
         if not whole(n_samples, 1):
             raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
@@ -526,7 +526,7 @@ def _precision(dtype):
     return jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext()
 
 
-def _order(column: int, num_columns: int) -> Int[np.ndarray, "d"]:
+def _order(column: int, num_columns: int) -> Int[np.ndarray, " d"]:
     """The columns of X with time last."""
     return np.append(np.delete(np.arange(num_columns), column), column)
 

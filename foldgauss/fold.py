@@ -261,7 +261,7 @@ class CallableFold(AbstractFold):
     # Taken at construction, where there is one fold, so that a later vmap cannot blur where its axes begin.
     parameter_ranks: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, "d-1"]]):
+    def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
         self.parameters, self.static, self.parameter_ranks = split(function)

@@ -32,12 +32,12 @@ class GradientFit(NamedTuple):
 class _Raw(NamedTuple):
     """What is optimised: free of constraints, and in units of each component's own scale at the start."""
 
-    logits: Float[Array, "k"]
+    logits: Float[Array, " k"]
     loc: Float[Array, "k d-1"]
     log_diagonal: Float[Array, "k d-1"]
     below: Float[Array, "k d-1 d-1"]
-    time_loc: Float[Array, "k"]
-    log_time_scale: Float[Array, "k"]
+    time_loc: Float[Array, " k"]
+    log_time_scale: Float[Array, " k"]
     fold: PyTree
     envelope: PyTree
 
@@ -46,7 +46,7 @@ def fit_gradient(
     mixture: FoldedMixture,
     x: Float[ArrayLike, "n d"],
     *,
-    sample_weight: Float[ArrayLike, "n"] | None = None,
+    sample_weight: Float[ArrayLike, " n"] | None = None,
     steps: int = 500,
     optimiser: optax.GradientTransformation | None = None,
     batch_size: int | None = None,

@@ -62,7 +62,7 @@ _CRITERIA = {
 class CentreParameters(NamedTuple):
     """Something for every parameter of the centre's curve: `loc` (d-1,), `coefficients` (degree, d-1)."""
 
-    loc: Float[Array, "d-1"]
+    loc: Float[Array, " d-1"]
     coefficients: Float[Array, "degree d-1"]
 
 
@@ -93,7 +93,7 @@ class Fit(eqx.Module):
     steps: Int[Array, ""]
     # Cov of the Hermite coefficients of column j is residual_scale_j^2 triangle^-1 triangle^-T.
     triangle_inverse: Float[Array, "k k"]
-    residual_scale: Float[Array, "d-1"]
+    residual_scale: Float[Array, " d-1"]
     time: str = eqx.field(static=True)
     covariance: str = eqx.field(static=True)
 
@@ -168,7 +168,7 @@ def fit(
     time: str = "own",
     time_loc: ArrayLike | None = None,
     time_scale: ArrayLike | None = None,
-    weights: Float[ArrayLike, "n"] | None = None,
+    weights: Float[ArrayLike, " n"] | None = None,
     covariance: str = "full",
 ) -> Fit:
     """Maximum (weighted) likelihood of a Folded-Gaussian with a polynomial fold.
@@ -209,11 +209,11 @@ def fit(
 class _Data(NamedTuple):
     """Points centred and scaled: `s = shift + scale * y`; weights of sum 1; absent rows at the centre."""
 
-    t: Float[Array, "n"]
+    t: Float[Array, " n"]
     y: Float[Array, "n d-1"]
-    shift: Float[Array, "d-1"]
-    scale: Float[Array, "d-1"]
-    weights: Float[Array, "n"]
+    shift: Float[Array, " d-1"]
+    scale: Float[Array, " d-1"]
+    weights: Float[Array, " n"]
     total: Float[Array, ""]
     count: Int[Array, ""]
     finite: Bool[Array, ""]
@@ -223,7 +223,7 @@ class _Plan(eqx.Module):
     """What `fit` was asked, checked and in the type of x."""
 
     x: Float[Array, "n d"]
-    weights: Float[Array, "n"]
+    weights: Float[Array, " n"]
     given: tuple[Float[Array, ""], Float[Array, ""]] | None
     envelope: AbstractEnvelope
     degree: int = eqx.field(static=True)
@@ -245,7 +245,7 @@ def _plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights
 
 
 @eqx.filter_jit
-def _fit(plan: _Plan, weights: Float[Array, "n"], used: Int[Array, ""]) -> Fit:
+def _fit(plan: _Plan, weights: Float[Array, " n"], used: Int[Array, ""]) -> Fit:
     """The plan carried out with these weights and a polynomial of degree `used` <= plan.degree."""
     data = _prepared(plan.x, weights, plan.degree)
     time_loc, time_scale = _own_time(data) if plan.given is None else plan.given
@@ -395,7 +395,7 @@ class Replicates(eqx.Module):
     """
 
     distribution: FoldedGaussian
-    status: Int[Array, "replicates"]
+    status: Int[Array, " replicates"]
 
     @property
     def parameters(self) -> dict[str, Array]:
@@ -499,7 +499,7 @@ def select_degree(
 
 
 @eqx.filter_jit
-def _penalised(plan: _Plan, criterion: str) -> Float[Array, "degrees"]:
+def _penalised(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
     degrees = range(plan.degree + 1)
     fits = jax.vmap(lambda used: _fit(plan, plan.weights, used))(jnp.arange(len(degrees), dtype=jnp.int32))
     dim = plan.x.shape[1] - 1
@@ -507,13 +507,13 @@ def _penalised(plan: _Plan, criterion: str) -> Float[Array, "degrees"]:
     return _CRITERIA[criterion](fits.log_likelihood, free, fits.num_points)
 
 
-def _cv_parts(x, key) -> Int[Array, "n"]:
+def _cv_parts(x, key) -> Int[Array, " n"]:
     """The part of each point, parts of equal size in random order."""
     return jax.random.permutation(key, jnp.arange(x.shape[0]) % _CV_PARTS)
 
 
 @eqx.filter_jit
-def _held_out(plan: _Plan, parts) -> Float[Array, "degrees"]:
+def _held_out(plan: _Plan, parts) -> Float[Array, " degrees"]:
     """-2 times the log-likelihood of each part under the fit to the others; nan if one of those fails."""
 
     def score(used, part):
@@ -539,7 +539,7 @@ def _points(x) -> Float[Array, "n d"]:
     return x
 
 
-def _weights(weights, x) -> Float[Array, "n"]:
+def _weights(weights, x) -> Float[Array, " n"]:
     if weights is None:
         return jnp.ones(x.shape[0], x.dtype)
     weights = jnp.asarray(weights).astype(x.dtype)

@@ -152,7 +152,7 @@ def _expected_envelope(dist, function) -> Float[Array, "*batch"]:
     return jnp.tensordot(weights, function(_log_envelope(dist, z)), axes=1)
 
 
-def _log_envelope(dist, tau: Float[Array, "tau"]) -> Float[Array, "tau *batch"]:
+def _log_envelope(dist, tau: Float[Array, " tau"]) -> Float[Array, " tau *batch"]:
     dist = fill(dist, dist.batch_shape)
     rank = dist.time_loc.ndim + 1
     tau = tau.reshape(-1, *(1,) * (rank - 1))

@@ -199,7 +199,7 @@ class Panels(eqx.Module):
 
 
 def adaptive_panels(
-    log_f: _Log, guides: Float[Array, "guides"], *, search: _Log | None = None, spikes: Panels | None = None
+    log_f: _Log, guides: Float[Array, " guides"], *, search: _Log | None = None, spikes: Panels | None = None
 ) -> Panels:
     """Panels for the integral of exp(log_f) over [-REACH, REACH], fine around `guides` (see `peaks`).
 
@@ -233,7 +233,7 @@ def diverges(log_f: _Log, panels: Panels) -> Array:
     return ends + float(np.log(REACH)) > panels.log_total - 20.0
 
 
-def peaks(log_f: _Log, grid: Float[Array, "grid"], count: int, *, score: _Log | None = None) -> Float[Array, "count"]:
+def peaks(log_f: _Log, grid: Float[Array, " grid"], count: int, *, score: _Log | None = None) -> Float[Array, " count"]:
     """The `count` best local maxima of `log_f` (by `score`, if given), found on a grid and refined to rounding.
 
     NaN where there are fewer. **Shapes:** `log_f` is elementwise.

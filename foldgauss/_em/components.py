@@ -32,9 +32,9 @@ _LOG_2PI = math.log(2 * math.pi)
 class Parameters(NamedTuple):
     """K components; further leading axes are restarts, by vmap."""
 
-    log_weights: Float[Array, "k"]
-    time_loc: Float[Array, "k"]
-    time_scale: Float[Array, "k"]
+    log_weights: Float[Array, " k"]
+    time_loc: Float[Array, " k"]
+    time_scale: Float[Array, " k"]
     curve: Float[Array, "k q+1 d-1"]  # row j multiplies v^j
     tril: Float[Array, "k d-1 d-1"]
 
@@ -106,6 +106,6 @@ def _sum(terms):
     return functools.reduce(operator.add, terms)
 
 
-def log_likelihoods(log_density: Float[Array, "n k"]) -> Float[Array, "n"]:
+def log_likelihoods(log_density: Float[Array, "n k"]) -> Float[Array, " n"]:
     """log sum_k, -inf where every term is."""
     return jax.nn.logsumexp(log_density, axis=-1)

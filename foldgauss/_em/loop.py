@@ -38,15 +38,15 @@ class EMStatus(IntEnum):
 
 class State(NamedTuple):
     params: Parameters
-    share: Float[Array, "k"]  # of Newton's step of time; smaller after a step that did not go up
+    share: Float[Array, " k"]  # of Newton's step of time; smaller after a step that did not go up
 
 
 class Info(NamedTuple):
     """About one step: of the parameters it began with."""
 
     log_likelihood: Float[Array, ""]
-    mass: Float[Array, "k"]
-    stuck: Bool[Array, "k"]  # no update was possible
+    mass: Float[Array, " k"]
+    stuck: Bool[Array, " k"]  # no update was possible
     refused: Float[Array, ""]  # what steps of time promised and did not bring
 
 
@@ -222,6 +222,6 @@ def _reset(states: State, restart: int, dead: np.ndarray, mass: np.ndarray) -> S
     return State(params, states.share)
 
 
-def used_degrees(degrees, num_components: int) -> Int[Array, "k"]:
+def used_degrees(degrees, num_components: int) -> Int[Array, " k"]:
     """One degree for all, or one for each."""
     return jnp.broadcast_to(jnp.asarray(degrees, jnp.int32), (num_components,))

@@ -131,7 +131,7 @@ def _with_degrees(found: _Found, used: np.ndarray, fitted) -> _Found:
 
 
 @eqx.filter_jit
-def _without(params: Parameters, points: Points, envelope) -> Float[Array, "k"]:
+def _without(params: Parameters, points: Points, envelope) -> Float[Array, " k"]:
     """The log-likelihood without each component, the others as they are, but for the weights' sum."""
 
     def of_chunk(chunk):
@@ -147,7 +147,7 @@ def _without(params: Parameters, points: Points, envelope) -> Float[Array, "k"]:
 
 
 @eqx.filter_jit
-def _losses(params: Parameters, points: Points, envelope, model: Model) -> Float[Array, "k"]:
+def _losses(params: Parameters, points: Points, envelope, model: Model) -> Float[Array, " k"]:
     """What each component's highest power is worth in expected log-likelihood, its responsibilities held."""
     sums = accumulate(params, envelope, points)
     mass = jnp.where(sums.mass > 0, sums.mass, 1)

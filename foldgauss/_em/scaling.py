@@ -18,8 +18,8 @@ __all__ = ["Scaling", "from_mixture", "scaling_of", "to_mixture", "variances_of"
 class Scaling(NamedTuple):
     """x = shift + scale y, per coordinate, in float64."""
 
-    shift: Float[np.ndarray, "d"]
-    scale: Float[np.ndarray, "d"]
+    shift: Float[np.ndarray, " d"]
+    scale: Float[np.ndarray, " d"]
 
     def apply(self, x: np.ndarray) -> np.ndarray:
         """y in the dtype of x, rows in order. Centred in float64: an offset costs the variances no digits."""
@@ -31,7 +31,7 @@ class Scaling(NamedTuple):
         return float(np.log(self.scale).sum())
 
 
-def variances_of(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
+def variances_of(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean and variance per coordinate, in float64."""
     share = (weights / weights.sum(dtype=np.float64)).astype(np.float64)
     mean = share @ x

@@ -20,7 +20,7 @@ _CURVES, _CURVE_POINTS, _GROWTH_STEPS = 12, 2_000, 8
 
 
 def start(
-    kind: str, y: Float[np.ndarray, "n d"], weights: Float[np.ndarray, "n"], model: Model, degree: int, rng
+    kind: str, y: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"], model: Model, degree: int, rng
 ) -> Parameters:
     """Parameters for scaled points from one of `STARTS`; `rng` is NumPy's."""
     keep = np.flatnonzero(weights > 0)
@@ -75,7 +75,7 @@ def from_joint(weights, means, covariances, degree: int, dtype) -> Parameters:
 # --- shares of the points -----------------------------------------------------------------------------------
 
 
-def _one_hot(labels: Int[np.ndarray, "n"], num: int) -> Float[np.ndarray, "n k"]:
+def _one_hot(labels: Int[np.ndarray, " n"], num: int) -> Float[np.ndarray, "n k"]:
     return (labels[:, None] == np.arange(num)).astype(np.float64)
 
 

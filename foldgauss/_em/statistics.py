@@ -46,8 +46,8 @@ class Points(eqx.Module):
 class Times(NamedTuple):
     """time_loc and time_scale of each component: where the envelope is to be taken."""
 
-    loc: Float[Array, "k"]
-    scale: Float[Array, "k"]
+    loc: Float[Array, " k"]
+    scale: Float[Array, " k"]
 
 
 class Statistics(NamedTuple):
@@ -55,9 +55,9 @@ class Statistics(NamedTuple):
     (d0, d1, d00, d01, d11), see `time_steps`."""
 
     log_likelihood: Float[Array, ""]
-    mass: Float[Array, "k"]  # sum of w r
-    first: Float[Array, "k"]  # of w r v
-    second: Float[Array, "k"]  # of w r v^2
+    mass: Float[Array, " k"]  # sum of w r
+    first: Float[Array, " k"]  # of w r v
+    second: Float[Array, " k"]  # of w r v^2
     log_a: Float[Array, "order k"]  # of w r log a
     gram: Float[Array, "order k m m"]
 
@@ -123,7 +123,7 @@ def accumulate(
     return jax.tree.map(lambda z: z.sum(0), jax.vmap(of_device)(chunks))
 
 
-def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, "devices*chunks*rows"]:
+def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, " devices*chunks*rows"]:
     """log p(x) of every point."""
 
     def of_chunk(x):
@@ -137,7 +137,7 @@ def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Fl
     return value.reshape(-1)
 
 
-def _shared(log_density: Float[Array, "n k"], weights: Float[Array, "n"]):
+def _shared(log_density: Float[Array, "n k"], weights: Float[Array, " n"]):
     """log sum_k of every point, and its weight shared out by responsibilities: one exponential a pair for both."""
     largest = log_density.max(-1)
     # A point that no component reaches belongs to none; its log-likelihood of -inf tells the tale.

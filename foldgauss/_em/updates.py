@@ -28,14 +28,14 @@ _LEAST_CURVATURE = 0.2
 class Model(eqx.Module):
     """What is fitted, beside the parameters."""
 
-    used: Int[Array, "k"]  # the degree of each component's polynomial, at most that of the arrays
-    floor: Float[Array, "d"]  # variances added to those of each coordinate, time last
+    used: Int[Array, " k"]  # the degree of each component's polynomial, at most that of the arrays
+    floor: Float[Array, " d"]  # variances added to those of each coordinate, time last
     covariance: str = eqx.field(static=True)  # full, diag, spherical, tied
 
 
 def updated(
     params: Parameters, sums: Statistics, model: Model, steps: Float[Array, "2 k"] | None = None
-) -> tuple[Parameters, Bool[Array, "k"]]:
+) -> tuple[Parameters, Bool[Array, " k"]]:
     """The maximum given `sums`, and which components have none and stay: those without mass, or with a singular Sigma.
 
     The times are updated by moments, or by `steps` (see `time_steps`).
@@ -123,7 +123,7 @@ def _factor(tril, scatter, true_mass, mass, model: Model) -> Float[Array, "k p p
 # --- time, where the envelope hangs on it -------------------------------------------------------------------
 
 
-def profile(sums: Statistics, model: Model, degree: int, steps: Float[Array, "2 k"], gram, log_a) -> Float[Array, "k"]:
+def profile(sums: Statistics, model: Model, degree: int, steps: Float[Array, "2 k"], gram, log_a) -> Float[Array, " k"]:
     """The expected log-likelihood of each component with space in closed form, but for a constant.
 
     `gram` and `log_a` are those at the stepped times. With a tied Sigma: for the present one, as one component alone
@@ -144,7 +144,7 @@ def profile(sums: Statistics, model: Model, degree: int, steps: Float[Array, "2 
     return value - 0.5 * mass * dim * jnp.log(diagonal.sum(1) / mass)
 
 
-def newton_step(sums: Statistics, model: Model, degree: int) -> tuple[Float[Array, "2 k"], Float[Array, "k"]]:
+def newton_step(sums: Statistics, model: Model, degree: int) -> tuple[Float[Array, "2 k"], Float[Array, " k"]]:
     """The step of time, and what the profile promises for it; 0 where there is nothing to be learned."""
     (g0, g1), (h00, h01, h11) = _slopes(sums, model, degree)
     a, b, c = -h00, -h01, -h11

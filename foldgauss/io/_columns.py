@@ -44,7 +44,7 @@ class Walk:
         contexts = self._contexts(name, power, halves)
         return Column(present=unrolling.has(name), contexts=contexts, scale=scale, near=near, **known)
 
-    def add(self, name: str, numbers: Int32[np.ndarray, "rows"]) -> None:
+    def add(self, name: str, numbers: Int32[np.ndarray, " rows"]) -> None:
         """Its numbers."""
         unrolling, facts = self._unrolling, self._facts
         self._numbers[name] = numbers
@@ -80,12 +80,12 @@ class Walk:
         return np.stack(np.broadcast_arrays(first, second), 1).astype(np.uint8)
 
 
-def level(numbers: Int32[np.ndarray, "num"]) -> Int[np.ndarray, "num"]:
+def level(numbers: Int32[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
     """The size of numbers: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most."""
     return np.searchsorted(_LEVELS, np.abs(numbers), side="right")
 
 
-def latest_in(cell: Int32[np.ndarray, "num"], num_cells: int) -> Int32[np.ndarray, "num 4"]:
+def latest_in(cell: Int32[np.ndarray, " num"], num_cells: int) -> Int32[np.ndarray, "num 4"]:
     """The last Gaussians before each that are in its cell; where there are none, the one before it. -1: no more."""
     out = np.full((len(cell), NEIGHBOURS), -1, np.int32)
     _latest(cell, np.full(num_cells, -1, np.int32), np.full(len(cell), -1, np.int32), out)
@@ -107,7 +107,7 @@ def _latest(cell, last, before, out):
 
 
 def nearest_of(
-    x: Float[np.ndarray, "num"], y: Float[np.ndarray, "num"], time: Float[np.ndarray, "num"], bits: int
+    x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], bits: int
 ) -> Int32[np.ndarray, "num 4"]:
     """The nearest Gaussians before each, among the last ones of its square of a grid and of those around. -1: none."""
     side = 1 << bits

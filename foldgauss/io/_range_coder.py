@@ -63,11 +63,11 @@ class Column:
     leads to expect the row's own. Rows without a number count as `fill`.
     """
 
-    present: Bool[np.ndarray, "num"]
+    present: Bool[np.ndarray, " num"]
     contexts: UInt8[np.ndarray, "num 2"]
-    origin: Float[np.ndarray, "num"]
-    step: Float[np.ndarray, "num"]
-    scale: Float[np.ndarray, "num"]
+    origin: Float[np.ndarray, " num"]
+    step: Float[np.ndarray, " num"]
+    scale: Float[np.ndarray, " num"]
     near: Int32[np.ndarray, "num neighbours"]
     fill: float = 0.0
 
@@ -265,7 +265,7 @@ def _decode(data, present, contexts, origin, step, scale, near, fill, most, stat
     return reader[3] == len(data) + 3  # the encoder ends with one byte where four are looked at
 
 
-def encode(values: Int32[np.ndarray, "num"], column: Column) -> bytes:
+def encode(values: Int32[np.ndarray, " num"], column: Column) -> bytes:
     """The bytes of a column; magnitudes below 2^30."""
     room = 4 * len(values) + 2 * ROOM
     while True:
@@ -275,7 +275,7 @@ def encode(values: Int32[np.ndarray, "num"], column: Column) -> bytes:
         room *= 4  # a column that is dearer than the numbers themselves: it jumps about
 
 
-def decode(data: bytes, column: Column) -> Int32[np.ndarray, "num"]:
+def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
     """The column that `encode` had; raises ValueError for bytes that it cannot have written."""
     values = np.empty(len(column.present), np.int32)
     if not _decode(np.frombuffer(data, np.uint8), *column.arrays(), LARGEST_BITS, _state(), values):

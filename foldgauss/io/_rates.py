@@ -15,10 +15,10 @@ class Pace(NamedTuple):
     """How frames follow one another: at an even rate; or, as `times` in seconds from the first, at a mean one."""
 
     fps: float
-    times: Float[np.ndarray, "num_frames"] | None = None
+    times: Float[np.ndarray, " num_frames"] | None = None
 
 
-def pace_of(seconds: Float[np.ndarray, "num_frames"], fps: float) -> Pace:
+def pace_of(seconds: Float[np.ndarray, " num_frames"], fps: float) -> Pace:
     """The rate of frames shown at `seconds`, rising; `fps`, the container's, where they agree with it."""
     if len(seconds) < 2:
         return Pace(fps)
@@ -30,7 +30,7 @@ def pace_of(seconds: Float[np.ndarray, "num_frames"], fps: float) -> Pace:
     return Pace(mean, times)
 
 
-def risen(milliseconds: list[float], fps: float) -> Float[np.ndarray, "num_frames"]:
+def risen(milliseconds: list[float], fps: float) -> Float[np.ndarray, " num_frames"]:
     """Seconds that rise from frame to frame: what stands still or goes back, as in a raw stream, is taken as even."""
     seconds: list[float] = []
     for value in milliseconds:
@@ -39,7 +39,7 @@ def risen(milliseconds: list[float], fps: float) -> Float[np.ndarray, "num_frame
     return np.array(seconds)
 
 
-def promised(seconds: Float[np.ndarray, "num_frames"], duration: float, fps: float, reached: int) -> int:
+def promised(seconds: Float[np.ndarray, " num_frames"], duration: float, fps: float, reached: int) -> int:
     """Frames in all where a container tells its duration alone, and `reached` frames of it end at seconds[-1]."""
     left, intervals = duration - seconds[-1], np.diff(seconds)
     if left <= LAST * max(1 / fps, intervals.max(initial=0.0)):

@@ -162,8 +162,8 @@ def is_vegas(ply: Ply) -> bool:
 
 
 def _with_power(
-    log_time_scale: Float[np.ndarray, "num"], power: float | Float[np.ndarray, "*#num"], other: float
-) -> Float[np.ndarray, "num"]:
+    log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
+) -> Float[np.ndarray, " num"]:
     """log sigma_t that gives an envelope of the `other` power the same values; what lasts is 1 with either."""
     return np.where(log_time_scale == LASTING, log_time_scale, log_time_scale + 0.5 * np.log(other / power))
 
@@ -198,7 +198,7 @@ def _degree(ply: Ply) -> int:
     return num // 2
 
 
-def _time_logits(ply: Ply) -> Float[np.ndarray, "intervals"]:
+def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     """The frames' weights: columns of one row, or rows of one column."""
     names = sorted(ply.names("time"), key=lambda name: (len(name), name))
     weights = ply.columns("time", names)
@@ -433,7 +433,7 @@ def _check_covers(model: VideoModel) -> None:
         raise invalid("model's compositing", expected="over, as viewers blend", got=model.compositing, cure=cure)
 
 
-def checked_times(model: VideoModel, times: Sequence[float] | None) -> Float[np.ndarray, "frames"]:
+def checked_times(model: VideoModel, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)

@@ -42,7 +42,7 @@ class Gaussians3D(eqx.Module):
 
     mean: Float[Array, "num 3"]
     factor: Float[Array, "num 3 3"]
-    opacity: Float[Array, "num"]
+    opacity: Float[Array, " num"]
     color: Float[Array, "num channels"]
 
     def __check_init__(self) -> None:
@@ -64,8 +64,8 @@ class Gaussians3D(eqx.Module):
         cls,
         mean: Float[Array, "num 2"],
         scale: Float[Array, "num 2"],
-        angle: Float[Array, "num"],
-        opacity: Float[Array, "num"],
+        angle: Float[Array, " num"],
+        opacity: Float[Array, " num"],
         color: Float[Array, "num channels"],
         *,
         thickness: float = THICKNESS,

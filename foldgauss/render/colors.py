@@ -19,7 +19,7 @@ def solve_colors(
     splats: Splats2D | Sequence[Splats2D],
     images: Float[Array, "height width channels"] | Sequence[Float[Array, "height width channels"]],
     *,
-    background: Float[Array, "channels"] | None = None,
+    background: Float[Array, " channels"] | None = None,
     compositing: str = "over",
     engine: str = "auto",
     options: RenderOptions | None = None,

@@ -30,7 +30,7 @@ def render(
     splats: Splats2D,
     size: tuple[int, int],
     *,
-    background: Float[Array, "channels"] | None = None,
+    background: Float[Array, " channels"] | None = None,
     compositing: str = "over",
     engine: str = "auto",
     options: RenderOptions | None = None,

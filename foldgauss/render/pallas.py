@@ -87,7 +87,7 @@ def _plan(leaves, size, compositing, options) -> Plan:
 # ---------------------------------------------------------------------------------------------- programs
 
 
-def _pixels(plan: Plan, tile) -> tuple[Float[Array, "pixels"], Float[Array, "pixels"]]:
+def _pixels(plan: Plan, tile) -> tuple[Float[Array, " pixels"], Float[Array, " pixels"]]:
     """Coordinates x, y of the pixels' centres of a tile."""
     pixel = jax.lax.iota(jnp.int32, plan.tile**2)
     side, columns = jnp.int32(plan.tile), jnp.int32(plan.grid[1])

@@ -14,7 +14,7 @@ from foldgauss.render.splats import RenderOptions, Splats2D
 def render_reference(
     splats: Splats2D,
     size: tuple[int, int],
-    background: Float[Array, "channels"],
+    background: Float[Array, " channels"],
     *,
     compositing: str,
     options: RenderOptions,

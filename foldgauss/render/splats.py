@@ -30,7 +30,7 @@ class Splats2D(eqx.Module):
 
     mean: Float[Array, "num 2"]
     factor: Float[Array, "num 2 2"]
-    opacity: Float[Array, "num"]
+    opacity: Float[Array, " num"]
     color: Float[Array, "num channels"]
 
     def __check_init__(self) -> None:

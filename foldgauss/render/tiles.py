@@ -105,13 +105,13 @@ class Projected(NamedTuple):
     """What the tiles need to know of every splat."""
 
     white: Float[Array, "3 num"]
-    reach: Float[Array, "num"]  # squared Mahalanobis distance, with slack; not positive: not seen
-    radius_x: Float[Array, "num"]
+    reach: Float[Array, " num"]  # squared Mahalanobis distance, with slack; not positive: not seen
+    radius_x: Float[Array, " num"]
     first: Int[Array, "2 num"]  # (row, column) of tiles of the bounding box
     shape: Int[Array, "2 num"]  # its rows and columns; 0 where it is not seen
 
     @property
-    def slots(self) -> Int[Array, "num"]:
+    def slots(self) -> Int[Array, " num"]:
         return self.shape[0] * self.shape[1]
 
 
@@ -144,12 +144,12 @@ def _count_slots(plan: Plan, mean, factor, opacity) -> Int[Array, ""]:
     return _running_sum(project(plan, mean, factor, opacity).slots)[-1]
 
 
-def numbers(count: int) -> Int[Array, "count"]:
+def numbers(count: int) -> Int[Array, " count"]:
     """0, 1, ...: 32 bits also where JAX's default is 64."""
     return jnp.arange(count, dtype=jnp.int32)
 
 
-def _running_sum(counts: Int[Array, "num"]) -> Int[Array, "num"]:
+def _running_sum(counts: Int[Array, " num"]) -> Int[Array, " num"]:
     """Inclusive prefix sum that stays at `_MANY`: the pairs of a million large splats would overflow."""
     return jax.lax.associative_scan(lambda a, b: jnp.minimum(a + b, _MANY), jnp.minimum(counts, _MANY))
 
@@ -166,9 +166,9 @@ def fields_of(projected: Projected, mean, opacity, color) -> Float[Array, "num+1
 class Lists(NamedTuple):
     """Splats of every tile, front to back, at `splat[start[k] : start[k] + length[k]]`; tiles fill whole batches."""
 
-    splat: Int[Array, "capacity"]
-    start: Int[Array, "tiles"]
-    length: Int[Array, "tiles"]
+    splat: Int[Array, " capacity"]
+    start: Int[Array, " tiles"]
+    length: Int[Array, " tiles"]
     order: Int[Array, "batches batch"]  # tiles, longest lists first
 
 
@@ -205,7 +205,7 @@ def _place(projected: Projected, owner, local):
     return projected.first[0][owner] + down, projected.first[1][owner] + local - down * columns
 
 
-def _meets(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, "slots"]:
+def _meets(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, " slots"]:
     """Whether the splat's ellipse meets the pixel centres of a tile: within the tile's rows it is widest at its own
     turning point, or at the nearest of the rows.
     """

@@ -29,7 +29,7 @@ class Triangles(eqx.Module):
 
     origin: Float[Array, "num 3"]
     edges: Float[Array, "num 2 3"]
-    opacity: Float[Array, "num"]
+    opacity: Float[Array, " num"]
     color: Float[Array, "num channels"]
 
     def __check_init__(self) -> None:
@@ -39,7 +39,7 @@ class Triangles(eqx.Module):
     def from_vertices(
         cls,
         vertices: Float[Array, "num 3 3"],
-        opacity: Float[Array, "num"],
+        opacity: Float[Array, " num"],
         color: Float[Array, "num channels"],
     ) -> "Triangles":
         """From m, v1 and v2 along the second axis, each (x, y, z)."""

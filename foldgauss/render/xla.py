@@ -77,11 +77,11 @@ def _plan(leaves, size, compositing, options) -> Plan:
 class Batch(NamedTuple):
     """Some tiles and their lists."""
 
-    tiles: Int[Array, "batch"]
-    start: Int[Array, "batch"]
-    length: Int[Array, "batch"]
-    left: Float[Array, "batch"]  # x of the first pixels' centres
-    top: Float[Array, "batch"]
+    tiles: Int[Array, " batch"]
+    start: Int[Array, " batch"]
+    length: Int[Array, " batch"]
+    left: Float[Array, " batch"]  # x of the first pixels' centres
+    top: Float[Array, " batch"]
 
 
 def _batch(plan: Plan, lists: Lists, k, dtype) -> Batch:

@@ -54,13 +54,13 @@ class SimulatedRanks:
         below = self.ranks[:, :, None] < np.arange(1, self.num_ranks + 1)
         return below.mean(0)
 
-    def inside(self, level: float = 0.99) -> Bool[np.ndarray, "quantities"]:
+    def inside(self, level: float = 0.99) -> Bool[np.ndarray, " quantities"]:
         """Which quantities' ranks lie in the simultaneous envelope everywhere (see `ecdf_band`)."""
         low, high = ecdf_band(len(self.ranks), self.num_ranks, level)
         shares = self.ecdf()
         return ((shares >= low - 1e-12) & (shares <= high + 1e-12)).all(1)
 
-    def coverage(self, level: float) -> Float64[np.ndarray, "quantities"]:
+    def coverage(self, level: float) -> Float64[np.ndarray, " quantities"]:
         """See `coverage`."""
         return coverage(self.ranks, self.num_ranks, level)
 
@@ -159,7 +159,7 @@ def _band(replicates: int, num_ranks: int, level: float, seed: int) -> np.ndarra
 
 def coverage(
     ranks: Int[np.ndarray, "replicates quantities"], num_ranks: int, level: float
-) -> Float64[np.ndarray, "quantities"]:
+) -> Float64[np.ndarray, " quantities"]:
     """Share of replicates in which the central interval that holds `level` of the draws holds what is true.
 
     Raises ValueError where `level` leaves no whole number of ranks on either side.

@@ -121,7 +121,7 @@ def _chosen(frames: Sequence[int] | None, num_frames: int) -> list[int]:
     return [int(k) for k in chosen]
 
 
-def _between(times: Float64[np.ndarray, "num_frames"], k: int) -> tuple[float, float]:
+def _between(times: Float64[np.ndarray, " num_frames"], k: int) -> tuple[float, float]:
     """The neighbours' times, or the clip's ends where those are on the wrong side."""
     low, high = times[k - 1], times[k + 1]
     return (low if low < times[k] else 0.0), (high if high > times[k] else 1.0)

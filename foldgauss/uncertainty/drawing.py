@@ -56,7 +56,7 @@ class Evidence:
 
     profiles: Profiles
     noise: FrameNoise
-    residual_correlation: Float64[np.ndarray, "lags"]
+    residual_correlation: Float64[np.ndarray, " lags"]
     num_drawn: int
     level: str = "splats"
     notes: tuple[str, ...] = ()

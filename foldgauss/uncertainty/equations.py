@@ -43,7 +43,9 @@ class ColorEquations:
     clamp of colours at 0 is left out of it. `matrix`: sparse (num, num), `rhs`: (num, 3).
     """
 
-    def __init__(self, screen: Screen, noise: FrameNoise, times: Float64[np.ndarray, "num_frames"], prior_scale: float):
+    def __init__(
+        self, screen: Screen, noise: FrameNoise, times: Float64[np.ndarray, " num_frames"], prior_scale: float
+    ):
         self.screen, self.times, self.variance = screen, times, 1 / (2 * noise.weight)
         self.num = screen.model.num_gaussians
         dc = np.asarray(screen.model.splats.color_dc, np.float64)
@@ -137,7 +139,7 @@ def solved(
     precondition: Callable[[np.ndarray], np.ndarray],
     rhs: Float64[np.ndarray, "num columns"],
     start: Float64[np.ndarray, "num columns"],
-    tolerance: float | Float[np.ndarray, "columns"],
+    tolerance: float | Float[np.ndarray, " columns"],
 ) -> Float64[np.ndarray, "num columns"]:
     """Conjugate gradients, every column by itself, until residuals are `tolerance` of the right-hand sides.
 

@@ -53,15 +53,15 @@ class ExactTimes:
     """
 
     increments: Increments
-    grids: list[Float64[np.ndarray, "points"]]
-    densities: list[Float64[np.ndarray, "points"]]
+    grids: list[Float64[np.ndarray, " points"]]
+    densities: list[Float64[np.ndarray, " points"]]
     log_evidence: float
-    _forward: list[Float64[np.ndarray, "points"]] = dataclasses.field(repr=False)
+    _forward: list[Float64[np.ndarray, " points"]] = dataclasses.field(repr=False)
 
-    def mean(self) -> Float64[np.ndarray, "num_frames"]:
+    def mean(self) -> Float64[np.ndarray, " num_frames"]:
         return self._filled([_moment(*each, 0.0, 1) for each in zip(self.grids, self.densities, strict=True)])
 
-    def std(self) -> Float64[np.ndarray, "num_frames"]:
+    def std(self) -> Float64[np.ndarray, " num_frames"]:
         """Standard deviations; 0 for frames that are held."""
         found = np.zeros(self.increments.num_frames)
         means = self.mean()[self.increments.free]
@@ -69,7 +69,7 @@ class ExactTimes:
         found[self.increments.free] = [np.sqrt(_moment(grid, density, mean, 2)) for grid, density, mean in pairs]
         return found
 
-    def quantile(self, share: float) -> Float64[np.ndarray, "num_frames"]:
+    def quantile(self, share: float) -> Float64[np.ndarray, " num_frames"]:
         """The times below which each frame lies with probability `share`."""
         if not 0 <= share <= 1:
             raise invalid("share", expected="a number in [0, 1]", got=share)
@@ -255,7 +255,7 @@ def _density(grid: np.ndarray, told: np.ndarray, ends: tuple[float, float], shap
 
 def profile_grid(
     profiles: Profiles, k: int, start: float, end: float, finer: int = FINER
-) -> Float64[np.ndarray, "points"]:
+) -> Float64[np.ndarray, " points"]:
     """Times from `start` to `end`, as dense as frame k's profile is known, and `finer` times as dense near its top."""
     nodes, _ = profiles.one(k)
     low, high = max(start, nodes[0]), min(end, nodes[-1])

@@ -24,8 +24,8 @@ class LaplaceTimes:
     """
 
     increments: Increments
-    mode: Float64[np.ndarray, "num_frames"]
-    std: Float64[np.ndarray, "num_frames"]
+    mode: Float64[np.ndarray, " num_frames"]
+    std: Float64[np.ndarray, " num_frames"]
     precision: list[Float64[np.ndarray, "2 frames"]]
 
     def sample(self, num: int, seed: int | np.random.Generator = 0) -> Float64[np.ndarray, "num num_frames"]:
@@ -44,7 +44,7 @@ class LaplaceTimes:
         return times
 
 
-def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.ndarray, "num_frames"]) -> LaplaceTimes:
+def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.ndarray, " num_frames"]) -> LaplaceTimes:
     """Newton's method from `start`, rising times, in the density of the log-ratios.
 
     Slopes and curvatures of profiles are differences over `REACH` standard deviations to both sides.

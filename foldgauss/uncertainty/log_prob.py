@@ -58,9 +58,9 @@ class FrameTimeLogProb:
 def drawn_log_likelihood(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
-    times: Float[np.ndarray, "num_frames"],
+    times: Float[np.ndarray, " num_frames"],
     noise: FrameNoise,
-) -> Float64[np.ndarray, "num_frames"]:
+) -> Float64[np.ndarray, " num_frames"]:
     """The frames' log-likelihoods at `times`, drawn, without a look-up: what profiles are compared with.
 
     A frame's profile is this less its value where it is greatest. Raises ValueError for a video of another size, times
@@ -155,7 +155,7 @@ def frame_time_log_prob(
     level: str = "splats",
     frames: Sequence[int] | None = None,
     concentration: float = 1.0,
-    held: Float[np.ndarray, "num_frames"] | None = None,
+    held: Float[np.ndarray, " num_frames"] | None = None,
     seen: Evidence | None = None,
     on_picture: Callable[[int, int], None] | None = None,
 ) -> FrameTimeLogProb:
@@ -187,7 +187,7 @@ def frame_time_log_prob(
     return FrameTimeLogProb(seen.profiles, free)
 
 
-def _rising(times: Float64[np.ndarray, "num_frames"]) -> Float64[np.ndarray, "num_frames"]:
+def _rising(times: Float64[np.ndarray, " num_frames"]) -> Float64[np.ndarray, " num_frames"]:
     """Medians of frames that are all but one and the same may meet: apart by the least that float64 has."""
     if (np.diff(times) > 0).all():
         return times

@@ -34,8 +34,8 @@ class FrameNoise:
     likelihoods. **Raises:** ValueError for numbers out of range.
     """
 
-    scale: Float64[np.ndarray, "num_frames"]
-    share: Float64[np.ndarray, "num_frames"]
+    scale: Float64[np.ndarray, " num_frames"]
+    share: Float64[np.ndarray, " num_frames"]
 
     def __post_init__(self):
         told = {
@@ -64,7 +64,7 @@ class FrameNoise:
         return f"residuals of {255 * np.median(self.scale):.2g} grey levels, {counted}{between}"
 
     @property
-    def weight(self) -> Float64[np.ndarray, "num_frames"]:
+    def weight(self) -> Float64[np.ndarray, " num_frames"]:
         """What a squared error is multiplied by: share / (2 scale^2)."""
         return self.share / (2 * self.scale**2)
 
@@ -116,7 +116,7 @@ def autocorrelation(
     return same / same[most, most]
 
 
-def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "lags"]:
+def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, " lags"]:
     """Mean correlation by distance, in whole pixels from 0 on, of what `autocorrelation` gives."""
     most = len(correlation) // 2
     lags = np.arange(-most, most + 1)

@@ -190,7 +190,7 @@ def cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
     return np.asarray(is_cut(posterior.mean().astype(np.float32)))
 
 
-def even_pace(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, "num_frames"], float]:
+def even_pace(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, " num_frames"], float]:
     """Evenly spaced times between the first and the last frame of every shot, and what one frame is: their mean step.
 
     Without cuts: k / (num_frames - 1), and 1 / (num_frames - 1).

@@ -32,7 +32,7 @@ def plot_times(
     posterior: FrameTimePosterior,
     axes: "np.ndarray | None" = None,
     *,
-    fitted: Float[np.ndarray, "num_frames"] | None = None,
+    fitted: Float[np.ndarray, " num_frames"] | None = None,
     flagged: Sequence[Irregularity] | None = None,
 ) -> np.ndarray:
     """Above where each frame is: its time less even spacing within its shot. Below how sure that is: half widths.

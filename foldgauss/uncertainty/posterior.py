@@ -70,10 +70,10 @@ class FrameTimePosterior:
 
     log_prob: FrameTimeLogProb
     times: Float64[np.ndarray, "ensembles steps walkers num_frames"]
-    acceptance: Float64[np.ndarray, "ensembles"]
-    tau: Float64[np.ndarray, "num_free"]
-    r_hat: Float64[np.ndarray, "num_free"]
-    ess: Float64[np.ndarray, "num_free"]
+    acceptance: Float64[np.ndarray, " ensembles"]
+    tau: Float64[np.ndarray, " num_free"]
+    r_hat: Float64[np.ndarray, " num_free"]
+    ess: Float64[np.ndarray, " num_free"]
     converged: bool
     message: str
     laplace: LaplaceTimes
@@ -100,10 +100,10 @@ class FrameTimePosterior:
         """The model's softmax weights w of all draws, centred."""
         return self.log_prob.increments.logits(self.times)
 
-    def mean(self) -> Float64[np.ndarray, "num_frames"]:
+    def mean(self) -> Float64[np.ndarray, " num_frames"]:
         return self.times.mean((0, 1, 2))
 
-    def std(self) -> Float64[np.ndarray, "num_frames"]:
+    def std(self) -> Float64[np.ndarray, " num_frames"]:
         return self._by_frames(lambda draws: draws.std(0))
 
     def interval(self, level: float = 0.9) -> Float64[np.ndarray, "2 num_frames"]:
@@ -460,7 +460,7 @@ class _Run:
             message += f" {told} of {len(self.free)} frames {'tells its' if told == 1 else 'tell their'} time."
         return dataclasses.replace(found, converged=not wrong, message=message)
 
-    def _wrong(self, found: FrameTimePosterior, lengths: Float64[np.ndarray, "num_free"]) -> list[str]:
+    def _wrong(self, found: FrameTimePosterior, lengths: Float64[np.ndarray, " num_free"]) -> list[str]:
         """What is missing."""
         wrong, free = [], self.free
         if not lengths.min() > TIMES_TAU:

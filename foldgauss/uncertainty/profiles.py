@@ -35,7 +35,7 @@ class Profiles:
 
     @classmethod
     def of(
-        cls, nodes: Sequence[Float[np.ndarray, "nodes"]], values: Sequence[Float[np.ndarray, "nodes"]]
+        cls, nodes: Sequence[Float[np.ndarray, " nodes"]], values: Sequence[Float[np.ndarray, " nodes"]]
     ) -> "Profiles":
         """From one rising array of times and one of log-likelihoods a frame, at least three each.
 
@@ -68,7 +68,7 @@ class Profiles:
         _look_up(flat, self.nodes, self.values, self.slopes, self.count, found)
         return found.reshape(times.shape)
 
-    def one(self, k: int) -> tuple[Float64[np.ndarray, "nodes"], Float64[np.ndarray, "nodes"]]:
+    def one(self, k: int) -> tuple[Float64[np.ndarray, " nodes"], Float64[np.ndarray, " nodes"]]:
         """Nodes and values of frame k."""
         return self.nodes[k, : self.count[k]], self.values[k, : self.count[k]]
 

@@ -48,8 +48,8 @@ class Refit:
     """
 
     number: int
-    times: Float64[np.ndarray, "num_frames"]
-    unseen: Bool[np.ndarray, "num_frames"]
+    times: Float64[np.ndarray, " num_frames"]
+    unseen: Bool[np.ndarray, " num_frames"]
     model: VideoModel
     psnr: float
 
@@ -69,7 +69,7 @@ class RefitTimes:
 
     times: Float64[np.ndarray, "replicates num_frames"]
     unseen: Bool[np.ndarray, "replicates num_frames"]
-    own: Float64[np.ndarray, "num_frames"]
+    own: Float64[np.ndarray, " num_frames"]
 
     @classmethod
     def of(cls, model: VideoModel, refits: Sequence[Refit]) -> "RefitTimes":
@@ -90,26 +90,26 @@ class RefitTimes:
         return bool(self.unseen.any())
 
     @property
-    def mean(self) -> Float64[np.ndarray, "num_frames"]:
+    def mean(self) -> Float64[np.ndarray, " num_frames"]:
         """Mean time of each frame; with frames left out, the time found where it was unseen."""
         if not self.by_frames:
             return self.times.mean(0)
         return np.where(self.unseen.any(0), np.where(self.unseen, self.times, 0).sum(0), self.own)
 
     @property
-    def std(self) -> Float64[np.ndarray, "num_frames"]:
+    def std(self) -> Float64[np.ndarray, " num_frames"]:
         """Standard deviation of each frame's time, 0 for the first and the last."""
         return self._std(self.times, self.own)
 
     @property
-    def spread(self) -> Float64[np.ndarray, "num_frames"]:
+    def spread(self) -> Float64[np.ndarray, " num_frames"]:
         """`std` in frames: of the positions that the times have among the model's own."""
         places = np.arange(len(self.own), dtype=np.float64)
         rising = self.own + places * np.finfo(np.float64).eps  # where float32 has two at one time
         return self._std(np.interp(self.times, rising, places), places)
 
     @property
-    def local(self) -> Float64[np.ndarray, "num_frames"]:
+    def local(self) -> Float64[np.ndarray, " num_frames"]:
         r"""Standard deviation of $t_k - (t_{k-1} + t_{k+1}) / 2$, which hardly a smooth warp changes.
 
         Times that are independent with the same deviation sigma have sqrt(3/2) sigma here. 0 for the first and last.
@@ -137,7 +137,7 @@ class RefitTimes:
         reach = scipy.stats.t.ppf((1 + level) / 2, self.freedom) * self.std
         return np.clip(np.stack([self.own - reach, self.own + reach]), 0.0, 1.0)
 
-    def ratio_to(self, std: Float[np.ndarray, "num_frames"]) -> float:
+    def ratio_to(self, std: Float[np.ndarray, " num_frames"]) -> float:
         """How many times as unsure as `std` says: root mean square over frames, but for the first and the last.
 
         `std` (num_frames,), or one number, in the model's time: for instance that given the splats.
@@ -358,8 +358,8 @@ def _fitted(frames: np.ndarray, config: FitConfig, fps: float, state: FitState |
 
 
 def merged(
-    logits: Float[np.ndarray, "intervals"], unseen: Bool[np.ndarray, "num_frames"]
-) -> Float32[np.ndarray, "fewer"]:
+    logits: Float[np.ndarray, " intervals"], unseen: Bool[np.ndarray, " num_frames"]
+) -> Float32[np.ndarray, " fewer"]:
     """Softmax weights of the frames but the `unseen` ones, at the same times: the gaps they leave stay open."""
     kept = np.flatnonzero(~unseen)
     return np.logaddexp.reduceat(np.asarray(logits, np.float64), kept[:-1]).astype(np.float32)

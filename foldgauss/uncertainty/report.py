@@ -12,7 +12,7 @@ from foldgauss.uncertainty.posterior import FrameTimePosterior
 
 
 def frame_table(
-    posterior: FrameTimePosterior, fitted: Float[np.ndarray, "num_frames"] | None = None
+    posterior: FrameTimePosterior, fitted: Float[np.ndarray, " num_frames"] | None = None
 ) -> dict[str, np.ndarray]:
     """Columns with an entry for each frame: `frame`, `fitted` (NaN if not given), `mean`, `std`, `low_50`, `high_50`,
     `low_90`, `high_90`, `laplace_mode`, `laplace_std`, `exact_mean`, `exact_std`, `r_hat`, `tau`, `ess`, `identified`.
@@ -47,7 +47,7 @@ def frame_table(
 
 def summary(
     posterior: FrameTimePosterior,
-    fitted: Float[np.ndarray, "num_frames"] | None = None,
+    fitted: Float[np.ndarray, " num_frames"] | None = None,
     *,
     flagged: Sequence[Irregularity] | None = None,
     level: Literal["splats", "colors"] | None = None,

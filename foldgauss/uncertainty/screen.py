@@ -90,7 +90,7 @@ class Screen:
 
     def squared_errors(
         self, picture: Float32[np.ndarray, "3 height width"], which: Iterable[int]
-    ) -> Float64[np.ndarray, "which"]:
+    ) -> Float64[np.ndarray, " which"]:
         """Sums over pixels and channels of (frame - picture)^2, of the frames `which`."""
         which = np.asarray(which)
         sums = np.empty(len(which))
@@ -117,7 +117,7 @@ class Sketches:
         self._bins = rng.integers(0, BINS, num_values, dtype=np.int16)
         self._signs = rng.choice(np.array([-1, 1], np.float32), num_values)
 
-    def of(self, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, "bins"]:
+    def of(self, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, " bins"]:
         sketch = np.zeros(BINS)
         _sum_into(sketch, picture.reshape(-1), self._bins, self._signs)
         return sketch.astype(np.float32)

@@ -22,7 +22,7 @@ from foldgauss.video.overlays import Affine, Recolor
 Mask = Bool[np.ndarray, "num"]
 
 
-def gathered(splats: FoldedSplats, source: Int[np.ndarray, "num_new"]) -> FoldedSplats:
+def gathered(splats: FoldedSplats, source: Int[np.ndarray, " num_new"]) -> FoldedSplats:
     """The splats numbered `source`, in that order: some may be left out, some come twice."""
     num = splats.num_gaussians
 
@@ -70,7 +70,7 @@ def _mapped_axes(splats: FoldedSplats, mask: Mask, matrix: Float[np.ndarray, "2 
     return np.stack([first, second], -1), np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
 
 
-def _logit_of(angle: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+def _logit_of(angle: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     """The angle counts modulo pi; in [pi/2, 3 pi/2) the sigmoid is best conditioned."""
     return logit(((angle - np.pi / 2) % np.pi + np.pi / 2) / (2 * np.pi))
 
@@ -91,7 +91,7 @@ def recolored(splats: FoldedSplats, mask: Mask, recolor: Recolor) -> FoldedSplat
     return _changed(splats, mask, color_dc=(color - 0.5) / SH_C0)
 
 
-def looks(splats: FoldedSplats, mask: Mask) -> tuple[Float[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
+def looks(splats: FoldedSplats, mask: Mask) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, "num 3"]]:
     """Opacities and colours."""
     return expit(_wide(splats.opacity_logit)[mask]), np.maximum(0.5 + SH_C0 * _wide(splats.color_dc)[mask], 0.0)
 

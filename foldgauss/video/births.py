@@ -20,8 +20,8 @@ SMALLER = 0.6
 def newborns(
     num: int,
     frames: UInt8[np.ndarray, "num_frames height width 3"],
-    times: Float[np.ndarray, "num_frames"],
-    errors: Float[np.ndarray, "num_frames"],
+    times: Float[np.ndarray, " num_frames"],
+    errors: Float[np.ndarray, " num_frames"],
     squares: Callable[[int], Float32[np.ndarray, "height width"]],
     alive: float,
     *,

@@ -157,7 +157,7 @@ def _rounded(plan: "_Plan", loss: "_Loss", most: float, on_step: Callable) -> _T
     """The coarsest steps that lose no more than `most`, nothing mended."""
     tried = np.unique(np.linspace(0, loss.num_frames - 1, TRIED_FRAMES).round().astype(int))
 
-    def at(factor: float, which: Int[np.ndarray, "some"]) -> _Try:
+    def at(factor: float, which: Int[np.ndarray, " some"]) -> _Try:
         quantised = plan.at(factor, plan.kept(factor))
         model = dequantise(quantised)
         found = loss(model, which)
@@ -266,7 +266,7 @@ def _ordered(model: VideoModel, loss: "_Loss", most: float) -> VideoModel:
     return model
 
 
-def _some(model: VideoModel, kept: Bool[np.ndarray, "num"] | Int[np.ndarray, "some"]) -> VideoModel:
+def _some(model: VideoModel, kept: Bool[np.ndarray, " num"] | Int[np.ndarray, " some"]) -> VideoModel:
     """Its Gaussians of a mask, or of these numbers."""
     num = model.num_gaussians
 
@@ -321,7 +321,7 @@ class _Loss:
         self._before = np.minimum(self._before, EXACT_PSNR)
         self.psnr = float(self._before.mean())
 
-    def __call__(self, model: VideoModel, which: Int[np.ndarray, "some"]) -> float:
+    def __call__(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
         """Mean over the frames `which`."""
         pictures = Playback(model).frames(np.asarray(model.frame_times.times())[which])
         after = np.array([psnr_of(self._shown[k], picture) for k, picture in zip(which, pictures, strict=True)])
@@ -360,7 +360,7 @@ class _Plan:
         solid = np.where(opacity > 1 - _SOLID, sensitivity["luma"] * (0.1 / SH_C0) ** 2, 0)
         self._own = np.where(self._seen, np.maximum(own, solid), 0)
 
-    def _fit(self, sensitivity: dict[str, Float[np.ndarray, "num"]]) -> None:
+    def _fit(self, sensitivity: dict[str, Float[np.ndarray, " num"]]) -> None:
         """Logarithms of sensitivities as lines in the features; classes hold what all columns of a Gaussian share."""
         first = FEATURES[1:]
         raw = np.stack([self.described.values[name] for name in first], 1)
@@ -395,13 +395,13 @@ class _Plan:
                 summed = np.bincount(self.described.shade, sensitivity[name])
                 self._fits[name] = np.array([0.5 * np.log2(np.mean(summed) + 1e-30)])
 
-    def kept(self, factor: float) -> Bool[np.ndarray, "num"]:
+    def kept(self, factor: float) -> Bool[np.ndarray, " num"]:
         """The Gaussians that are worth their bits at such steps; one at least."""
         kept = self._own > _WORTH * 4.0**factor / 12
         kept[np.argmax(self._own)] = True
         return kept
 
-    def at(self, factor: float, kept: Bool[np.ndarray, "num"] | None = None) -> Quantised:
+    def at(self, factor: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantised:
         """The Gaussians `kept` (None: all), steps times 2^factor; the error of a number is then about 4^factor / 12."""
         kept = np.ones(len(self._own), bool) if kept is None else kept
         described = subset(self.described, kept)
@@ -420,7 +420,7 @@ class _Plan:
         return quantise(described, self._classes[kept], rules)
 
 
-def subset(described: Described, kept: Bool[np.ndarray, "num"]) -> Described:
+def subset(described: Described, kept: Bool[np.ndarray, " num"]) -> Described:
     """Some of a model's Gaussians, in their order."""
     num = int(kept.sum())
     facts = dataclasses.replace(described.facts, num_gaussians=num, cells=cells_for(num, described.facts.size))

@@ -115,7 +115,7 @@ class Economy:
         return self.psnr + SPARE - YET_TO_COME * (1 - progress)
 
 
-def frame_weights(errors: Float32[np.ndarray, "num_frames"]) -> Float[np.ndarray, "num_frames"]:
+def frame_weights(errors: Float32[np.ndarray, " num_frames"]) -> Float[np.ndarray, " num_frames"]:
     """What a frame's squared error counts where the mean of the frames' PSNR is what is asked for; 1 on the average.
 
     A dB of each frame is worth the same, so an error counts by the inverse of what there is: held within `_UNLIKE` of
@@ -138,9 +138,9 @@ class Cut(NamedTuple):
     `added`: squared error, as foretold; `price`: what a number had to save.
     """
 
-    stay: Int[np.ndarray, "left"]
+    stay: Int[np.ndarray, " left"]
     rows: Float32[np.ndarray, "left width"]
-    kinds: UInt8[np.ndarray, "left"]
+    kinds: UInt8[np.ndarray, " left"]
     added: float
     price: float
 
@@ -157,7 +157,7 @@ def price_of(ledger: Ledger, bits: float, progress: float = 1.0) -> float:
 
 def cut(
     rows: Float32[np.ndarray, "num width"],
-    kinds: UInt8[np.ndarray, "num"],
+    kinds: UInt8[np.ndarray, " num"],
     ledger: Ledger,
     economy: Economy,
     *,

@@ -88,7 +88,7 @@ class Edit:
     selection: Selection
     # By layer: how many Gaussians the chain was begun with, and which of those each one is now, or is a copy of.
     _begun_with: tuple[int, ...] = dataclasses.field(repr=False)
-    _sources: tuple[Int[np.ndarray, "num"], ...] = dataclasses.field(repr=False)
+    _sources: tuple[Int[np.ndarray, " num"], ...] = dataclasses.field(repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
         """What has been made: a folded model if all edits could be baked, else an edited video."""
@@ -562,7 +562,7 @@ class Edit:
         return self._with(made, self.selection)
 
     def _with(
-        self, layers: list[Layer], selection: Selection, sources: list[Int[np.ndarray, "num"]] | None = None
+        self, layers: list[Layer], selection: Selection, sources: list[Int[np.ndarray, " num"]] | None = None
     ) -> "Edit":
         """With other layers, whose Gaussians are those `sources` of now, by layer."""
         made = {"_video": dataclasses.replace(self._video, layers=tuple(layers)), "selection": selection}
@@ -582,7 +582,7 @@ class Edit:
                 raise invalid("when", expected=expected, got=name, cure=cure)
         return span_of(self._frame_times(), **when)
 
-    def _frame_times(self) -> Float[np.ndarray, "num_frames"]:
+    def _frame_times(self) -> Float[np.ndarray, " num_frames"]:
         return np.asarray(self._video.frame_times.times(), np.float64)
 
 
@@ -591,7 +591,7 @@ def _split(mask: Mask, counts: Sequence[int]) -> list[Mask]:
 
 
 def _gathered(
-    layer: Layer, source: Int[np.ndarray, "num_new"], chosen: Mask, copy: Int[np.ndarray, "num_new"]
+    layer: Layer, source: Int[np.ndarray, " num_new"], chosen: Mask, copy: Int[np.ndarray, " num_new"]
 ) -> Layer:
     """A layer of the Gaussians `source`, with all edits that they had; those of `copy` k are its k-th copies.
 

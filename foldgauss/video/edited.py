@@ -293,7 +293,7 @@ class _LayerStage:
         return float(out_of_cuts(t, self._times)) if self._holds_frames else t
 
 
-def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray, "num"] | None]]:
+def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray, " num"] | None]]:
     """Groups of Gaussians that go by the same clocks."""
     if not layer.clocks:
         return [((), None)]
@@ -314,7 +314,7 @@ class _Moment:
         self._middle = np.float32([width / 2, height / 2])
         self._solid_mean = self._solid_factor = self._lifted = None  # of all, once one is in space
 
-    def edit(self, mask: Bool[np.ndarray, "num"], change: Callable[[SelectedGaussians], SelectedGaussians]) -> None:
+    def edit(self, mask: Bool[np.ndarray, " num"], change: Callable[[SelectedGaussians], SelectedGaussians]) -> None:
         """Change the masked ones; all others keep their bits."""
         chosen = np.flatnonzero(mask[self.index])
         if chosen.size:
@@ -349,7 +349,7 @@ class _Moment:
         return self._lifted is not None
 
     @property
-    def depth(self) -> Float[np.ndarray, "num"]:
+    def depth(self) -> Float[np.ndarray, " num"]:
         """z of each; 0 in the plane of the frame."""
         return self._solid_mean[:, 2] if self.in_space else np.zeros(len(self.index), np.float32)
 
@@ -402,7 +402,7 @@ def _projected(
     size: tuple[int, int],
     mean: Float[Array, "num 3"],
     factor: Float[Array, "num 3 2"],
-    opacity: Float[Array, "num"],
+    opacity: Float[Array, " num"],
 ) -> tuple[Array, Array, Array]:
     flat = Gaussians3D(mean, jnp.concatenate([factor, jnp.zeros_like(factor[..., :1])], -1), opacity, mean)
     splats = project(flat, camera, size, order="array")

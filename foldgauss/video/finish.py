@@ -30,7 +30,7 @@ def refitted(
     passes: int,
     *,
     free: Collection[str] | None = None,
-    shared: Int32[np.ndarray, "num"] | None = None,
+    shared: Int32[np.ndarray, " num"] | None = None,
     seed: int = 0,
     on_pass: Callable[[], None] = lambda: None,
 ) -> VideoModel:

@@ -37,16 +37,16 @@ class Traits(NamedTuple):
     """
 
     light: Light
-    which: Int[np.ndarray, "num"]  # of those alive
-    index: Int[np.ndarray, "num"]  # of all
+    which: Int[np.ndarray, " num"]  # of those alive
+    index: Int[np.ndarray, " num"]  # of all
     position: Float32[np.ndarray, "num 2"]  # px
     motion: Float32[np.ndarray, "num 2"]  # px per frame
-    spread: Float32[np.ndarray, "num"]  # of the motion seen: its standard deviation, px per frame
+    spread: Float32[np.ndarray, " num"]  # of the motion seen: its standard deviation, px per frame
     own_motion: Float32[np.ndarray, "num 2"]  # px per frame
     color: Float32[np.ndarray, "num 3"]  # CIELAB
-    total: Float32[np.ndarray, "num"]  # px
+    total: Float32[np.ndarray, " num"]  # px
 
-    def those(self, keep: Bool[np.ndarray, "num"]) -> "Traits":
+    def those(self, keep: Bool[np.ndarray, " num"]) -> "Traits":
         """Some of them."""
         return Traits(self.light, *(leaf[keep] for leaf in self[1:]))
 
@@ -80,7 +80,7 @@ def lab(color: Float[np.ndarray, "num 3"]) -> Float32[np.ndarray, "num 3"]:
     return skimage.color.rgb2lab(np.clip(color, 0, 1)[None]).astype(np.float32)[0]
 
 
-def difference(one: Float[np.ndarray, "num 3"], other: Float[np.ndarray, "3"]) -> Float[np.ndarray, "num"]:
+def difference(one: Float[np.ndarray, "num 3"], other: Float[np.ndarray, "3"]) -> Float[np.ndarray, " num"]:
     """Delta E of CIELAB colours. Source: CIEDE2000."""
     return skimage.color.deltaE_ciede2000(one, np.broadcast_to(other, one.shape))
 
@@ -90,10 +90,10 @@ def difference(one: Float[np.ndarray, "num 3"], other: Float[np.ndarray, "3"]) -
 
 def followed(
     lit: LitModel,
-    label: Int8[np.ndarray, "num_gaussians"],
+    label: Int8[np.ndarray, " num_gaussians"],
     frames: Iterable[int],
-    best: Float[np.ndarray, "num_gaussians"],
-) -> Int8[np.ndarray, "num_gaussians"]:
+    best: Float[np.ndarray, " num_gaussians"],
+) -> Int8[np.ndarray, " num_gaussians"]:
     """Labels carried on from `frames` to the other ones of the same shots, the nearest first.
 
     Whoever is unknown, once seen clearly, joins those known that are most like it in place, motion and colour there.
@@ -116,8 +116,8 @@ def followed(
 
 
 def settled(
-    lit: LitModel, label: Int8[np.ndarray, "num_gaussians"], frames: Iterable[int]
-) -> Int8[np.ndarray, "num_gaussians"]:
+    lit: LitModel, label: Int8[np.ndarray, " num_gaussians"], frames: Iterable[int]
+) -> Int8[np.ndarray, " num_gaussians"]:
     """The rest of the labels, of those hidden: by the place of those known, in the frame next to their own time."""
     label, first = label.copy(), label
     rest = np.flatnonzero(first == UNKNOWN)
@@ -133,7 +133,7 @@ def settled(
     return label
 
 
-def _voted(known: np.ndarray, label: np.ndarray, asked: np.ndarray) -> Int8[np.ndarray, "num_asked"]:
+def _voted(known: np.ndarray, label: np.ndarray, asked: np.ndarray) -> Int8[np.ndarray, " num_asked"]:
     """The label of most of the nearest of those known, the nearer the more."""
     num = min(VOTERS, len(known))
     distance, who = scipy.spatial.cKDTree(known).query(asked, list(range(1, num + 1)))
@@ -152,7 +152,7 @@ def _outward(lit: LitModel, frames: list[int]) -> list[int]:
     return sorted(away, key=lambda k: (away[k], k))
 
 
-def _shots(lit: LitModel) -> Int[np.ndarray, "num_frames"]:
+def _shots(lit: LitModel) -> Int[np.ndarray, " num_frames"]:
     """The number of each frame's shot."""
     return np.concatenate([[0], np.cumsum(np.asarray(is_cut(lit.times)))])
 
@@ -160,7 +160,7 @@ def _shots(lit: LitModel) -> Int[np.ndarray, "num_frames"]:
 # -------------------------------------------------------------------------------------------------- growing
 
 
-def grown(lit: LitModel, pixel: tuple[int, int], k: int, tolerance: float) -> Bool[np.ndarray, "num_gaussians"] | None:
+def grown(lit: LitModel, pixel: tuple[int, int], k: int, tolerance: float) -> Bool[np.ndarray, " num_gaussians"] | None:
     """What is connected to a pixel (row, column) of frame k through neighbours that move alike, and of its colour.
 
     None where nothing is drawn at the pixel.
@@ -195,14 +195,14 @@ def _sampled(lit: LitModel, k: int) -> list[int]:
 class _Pairs(NamedTuple):
     """Neighbours that touch in a frame, frame after frame, both ways round, by number."""
 
-    one: Int[np.ndarray, "num"]
-    other: Int[np.ndarray, "num"]
-    firm: Bool[np.ndarray, "num"]  # neither stands at a border
-    alike: Bool[np.ndarray, "num"]  # they move alike, as seen
-    gap: Float32[np.ndarray, "num"]  # of one's *own* motion and the other's, px per frame; NaN if that is at a border
+    one: Int[np.ndarray, " num"]
+    other: Int[np.ndarray, " num"]
+    firm: Bool[np.ndarray, " num"]  # neither stands at a border
+    alike: Bool[np.ndarray, " num"]  # they move alike, as seen
+    gap: Float32[np.ndarray, " num"]  # of one's *own* motion and the other's, px per frame; NaN if that is at a border
 
 
-def _connected(num: int, pairs: _Pairs, seed: int) -> Bool[np.ndarray, "num_gaussians"]:
+def _connected(num: int, pairs: _Pairs, seed: int) -> Bool[np.ndarray, " num_gaussians"]:
     """Whom a chain of links leads to: firm pairs that move alike in most of the frames in which they touch.
 
     Chains do not go through those at borders: there the motion seen changes little by little, from one to the other.
@@ -217,7 +217,7 @@ def _connected(num: int, pairs: _Pairs, seed: int) -> Bool[np.ndarray, "num_gaus
     return part == part[seed]
 
 
-def _joining(num: int, pairs: _Pairs, inside: Bool[np.ndarray, "num_gaussians"]) -> Bool[np.ndarray, "num_gaussians"]:
+def _joining(num: int, pairs: _Pairs, inside: Bool[np.ndarray, " num_gaussians"]) -> Bool[np.ndarray, " num_gaussians"]:
     """Those at borders in all frames whose own motion is more like that of their neighbours inside than outside."""
     free = np.ones(num, bool)
     free[pairs.one[pairs.firm]] = False
@@ -230,7 +230,7 @@ def _joining(num: int, pairs: _Pairs, inside: Bool[np.ndarray, "num_gaussians"])
     return free & (gaps[0] < gaps[1])
 
 
-def _pairs(lit: LitModel, seen: list[Traits], among: Bool[np.ndarray, "num_gaussians"]) -> _Pairs:
+def _pairs(lit: LitModel, seen: list[Traits], among: Bool[np.ndarray, " num_gaussians"]) -> _Pairs:
     """All pairs among some, in each frame those seen clearly: of one that is hidden one sees what is in front."""
     best = np.zeros(lit.num_gaussians)
     for one in seen:
@@ -256,6 +256,6 @@ def _touching(seen: Traits, motion: float) -> _Pairs:
 
 def _move_alike(
     one: Float[np.ndarray, "num 2"], other: Float[np.ndarray, "num 2"], motion: float
-) -> Bool[np.ndarray, "num"]:
+) -> Bool[np.ndarray, " num"]:
     speed = np.maximum(np.hypot(*one.T), np.hypot(*other.T))
     return np.hypot(*(one - other).T) <= motion + MOTION_SHARE * speed

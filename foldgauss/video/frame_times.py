@@ -21,7 +21,7 @@ class FrameTimes(eqx.Module):
     Source: VeGaS, eq:frame_fitting.
     """
 
-    logits: Float[Array, "intervals"]
+    logits: Float[Array, " intervals"]
 
     @classmethod
     def uniform(cls, num_frames: int) -> "FrameTimes":
@@ -56,7 +56,7 @@ def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
 
 
 def times_at(
-    times: Float[np.ndarray, "num_frames"], positions: Float[np.ndarray, "*batch"]
+    times: Float[np.ndarray, " num_frames"], positions: Float[np.ndarray, "*batch"]
 ) -> Float[np.ndarray, "*batch"]:
     """The times of continuous frame positions: 2.5 is half way from frame 2 to frame 3.
 
@@ -68,7 +68,7 @@ def times_at(
     return np.interp(positions, np.arange(len(times)), times).astype(times.dtype)
 
 
-def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Float[np.ndarray, "shown"]:
+def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Float[np.ndarray, " shown"]:
     """Frame positions that are shown one after another, from the first frame to the last; backwards for speed < 0.
 
     `rate` is that of the pictures over that of the frames, `speed` how fast time goes by: 0.25 is slow motion. The last
@@ -84,7 +84,7 @@ def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Flo
 
 def remapped_positions(
     remap: Float[ArrayLike, "points 2"], fps: float, rate: float = 1.0
-) -> Float[np.ndarray, "shown"]:
+) -> Float[np.ndarray, " shown"]:
     """Frame positions that are shown when the clip's time is a piecewise linear function of the pictures' time.
 
     `remap` has rows (second shown, second of the clip), the first column rising from 0; `fps` is the clip's, `rate` as

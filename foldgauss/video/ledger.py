@@ -44,19 +44,19 @@ class Ledger:
       halved, at its size at its own time, and l = log a(t) / 2; `misses` (num,): frames at which it is not alive.
     """
 
-    errors: Float[np.ndarray, "num_frames"]
-    weights: Float[np.ndarray, "num_frames"]
+    errors: Float[np.ndarray, " num_frames"]
+    weights: Float[np.ndarray, " num_frames"]
     num_samples: int
     size: tuple[int, int]
     alike: Float[np.ndarray, "3"]
-    slope: Float[np.ndarray, "num"]
-    own: Float[np.ndarray, "num"]
+    slope: Float[np.ndarray, " num"]
+    own: Float[np.ndarray, " num"]
     by_path: Float[np.ndarray, "num moments 3"]
-    span: Float[np.ndarray, "num"]
-    by_color: Float[np.ndarray, "num"]
+    span: Float[np.ndarray, " num"]
+    by_color: Float[np.ndarray, " num"]
     by_axes: Float[np.ndarray, "num 2"]
     by_size: Float[np.ndarray, "num 3"]
-    misses: Float[np.ndarray, "num"]
+    misses: Float[np.ndarray, " num"]
 
     @property
     def squared_error(self) -> float:
@@ -87,13 +87,13 @@ class Ledger:
         return max(self.num_samples * (first + (frames - 1) * own) / frames, 1.0)
 
     @property
-    def removed(self) -> Float[np.ndarray, "num"]:
+    def removed(self) -> Float[np.ndarray, " num"]:
         """Squared error that leaving a Gaussian out adds."""
         return self.slope + self.own
 
     def lower(
         self, place: Float[np.ndarray, "num degree+1 2"], degree: int, which: np.ndarray
-    ) -> tuple[Float[np.ndarray, "some"], Float[np.ndarray, "some degree+1 2"]]:
+    ) -> tuple[Float[np.ndarray, " some"], Float[np.ndarray, "some degree+1 2"]]:
         """The squared error that a path of lower degree adds to the Gaussians `which`; and that path, the best there.
 
         `place`: m_s and c_k in pixels.
@@ -114,7 +114,7 @@ class Ledger:
         path[:, high] = 0
         return np.maximum(added, 0), path / scale
 
-    def lasting(self, grown: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+    def lasting(self, grown: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
         """Squared error that an end to waxing and waning adds, where the logarithm of a Gaussian's size is `grown`.
 
         Least by `mean_log_envelope`. Infinite where it is not alive at every frame, where there is another picture
@@ -124,7 +124,7 @@ class Ledger:
         added = second - 2 * grown * first + grown**2 * total
         return np.where(self.misses > 0, np.inf, np.maximum(added, 0))
 
-    def solid(self, opacity: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+    def solid(self, opacity: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
         """Squared error that Gaussians of this `opacity` add where no light comes through them any more.
 
         Pictures are linear in one opacity, so this is exact for each alone.
@@ -133,7 +133,7 @@ class Ledger:
         return np.maximum(more * (more * self.own - self.slope), 0)
 
     @property
-    def mean_log_envelope(self) -> Float[np.ndarray, "num"]:
+    def mean_log_envelope(self) -> Float[np.ndarray, " num"]:
         """The mean of log a(t) / 2 where it is seen: what the logarithm of a lasting one's size should change by."""
         total, first, _ = self.by_size.T
         return first / np.maximum(total, np.finfo(float).tiny)
@@ -149,13 +149,13 @@ def _normal(moments: np.ndarray, rows: np.ndarray, others: np.ndarray) -> np.nda
 def measured(
     rows: Float32[np.ndarray, "num width"],
     window: Float32[np.ndarray, "num 2"],
-    times: Float[np.ndarray, "num_frames"],
+    times: Float[np.ndarray, " num_frames"],
     shape: Shape,
     target: Target,
     *,
     compositing: str,
     options: RenderOptions,
-    weights: Float[np.ndarray, "num_frames"] | None = None,
+    weights: Float[np.ndarray, " num_frames"] | None = None,
     seed: int = 0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Ledger:

@@ -53,12 +53,12 @@ class LitModel:
         """The light at time t; between two shots the nearer one's, as pictures are drawn."""
         return Light(self, self.stage.at(float(out_of_cuts(t, self.times))))
 
-    def position(self, indices: Int[np.ndarray, "num"], t: float) -> Float32[np.ndarray, "num 2"]:
+    def position(self, indices: Int[np.ndarray, " num"], t: float) -> Float32[np.ndarray, "num 2"]:
         """Centres of the named Gaussians, in pixels, at any time, alive or not."""
         ever = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
         return condition(self.stage.rows[indices], ever, t, self.stage.shape).mean
 
-    def own_place(self, indices: Int[np.ndarray, "num"]) -> Float[np.ndarray, "num 2"]:
+    def own_place(self, indices: Int[np.ndarray, " num"]) -> Float[np.ndarray, "num 2"]:
         """Centres of the named Gaussians at their own times, in pixels: there the fold is 0."""
         height, width = self.size
         return np.asarray(self.model.splats.loc, np.float64)[indices] * max(self.size) + [width / 2, height / 2]
@@ -68,7 +68,7 @@ class LitModel:
         """m_t of every Gaussian."""
         return expit(np.asarray(self.model.splats.time_loc_logit, np.float64))
 
-    def nearest_frame(self, indices: Int[np.ndarray, "num"]) -> Int[np.ndarray, "num"]:
+    def nearest_frame(self, indices: Int[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
         """The frame next to each named Gaussian's own time."""
         return np.searchsorted((self.times[1:] + self.times[:-1]) / 2, self.own_times[indices])
 
@@ -81,7 +81,7 @@ class Light:
     splats: Conditioned
 
     @property
-    def alive(self) -> Int[np.ndarray, "num_alive"]:
+    def alive(self) -> Int[np.ndarray, " num_alive"]:
         """Numbers of the Gaussians alive, in array order."""
         return self.splats.alive
 
@@ -95,7 +95,7 @@ class Light:
         return self.trace.image
 
     @functools.cached_property
-    def total(self) -> Float32[np.ndarray, "num_alive"]:
+    def total(self) -> Float32[np.ndarray, " num_alive"]:
         """Sum over pixels of the weights, in pixels."""
         return self.gathered(np.ones((1, *self.lit.size), np.float32))[:, 0]
 
@@ -122,7 +122,9 @@ def _three(values: np.ndarray, axis: int) -> np.ndarray:
 
 def contributions(
     lit: LitModel, region: Region
-) -> tuple[Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"]]:
+) -> tuple[
+    Float[np.ndarray, " num_gaussians"], Float[np.ndarray, " num_gaussians"], Float[np.ndarray, " num_gaussians"]
+]:
     """What each Gaussian adds over the frames of a region: inside it, in all, and in its best frame; px, float64."""
     inside, total, best = np.zeros((3, lit.num_gaussians))
     everywhere = np.ones(lit.size, np.float32)
@@ -136,8 +138,8 @@ def contributions(
 
 
 def best_frames(
-    lit: LitModel, frames: Iterable[int], best: Float[np.ndarray, "num_gaussians"]
-) -> Float[np.ndarray, "num_gaussians"]:
+    lit: LitModel, frames: Iterable[int], best: Float[np.ndarray, " num_gaussians"]
+) -> Float[np.ndarray, " num_gaussians"]:
     """What each Gaussian adds in its best frame, of `frames` too, if that is more than `best`."""
     best = best.copy()
     for k in frames:
@@ -148,7 +150,7 @@ def best_frames(
 
 def seen_colors(
     lit: LitModel,
-) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, "num_gaussians"]]:
+) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, " num_gaussians"]]:
     """The picture's colour where each Gaussian is seen, the mean over all frames; and which are seen at all."""
 
     def parts():
@@ -163,7 +165,7 @@ def seen_colors(
 
 def weighted_mean(
     num: int, parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
-) -> tuple[Float[np.ndarray, "num 3"], Bool[np.ndarray, "num"]]:
+) -> tuple[Float[np.ndarray, "num 3"], Bool[np.ndarray, " num"]]:
     """Means of (index, value, weight) of several frames; and which of `num` there were any of."""
     value, total = np.zeros((num, 3)), np.zeros((num, 1))
     for index, own, weight in parts:
@@ -174,7 +176,7 @@ def weighted_mean(
 
 
 def drawn_share(
-    lit: LitModel, mask: Bool[np.ndarray, "num_gaussians"], t: float
+    lit: LitModel, mask: Bool[np.ndarray, " num_gaussians"], t: float
 ) -> Float32[np.ndarray, "height width"]:
     """The share of a set of Gaussians in each pixel at time t: sum of their weights over that of all; 0 where none."""
     light = lit.at(t)
@@ -183,7 +185,7 @@ def drawn_share(
     return np.divide(own, everyone, out=np.zeros_like(own), where=everyone > 0)
 
 
-def reached(lit: LitModel, mask: Bool[np.ndarray, "num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
+def reached(lit: LitModel, mask: Bool[np.ndarray, " num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
     """The pixels at time t that a set of Gaussians reaches: where the alpha of one is not cut off, seen or hidden."""
     splats = lit.at(t).splats
     chosen = mask[splats.alive]

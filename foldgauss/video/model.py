@@ -58,11 +58,11 @@ class FoldedSplats(eqx.Module):
 
     loc: Float[Array, "num 2"]
     log_scale: Float[Array, "num 2"]
-    angle_logit: Float[Array, "num"]
-    time_loc_logit: Float[Array, "num"]
-    log_time_scale: Float[Array, "num"]
+    angle_logit: Float[Array, " num"]
+    time_loc_logit: Float[Array, " num"]
+    log_time_scale: Float[Array, " num"]
     coefficients: Float[Array, "num degree 2"]
-    opacity_logit: Float[Array, "num"]
+    opacity_logit: Float[Array, " num"]
     color_dc: Float[Array, "num 3"]
     envelope: TimeLikelihood
 
@@ -75,7 +75,7 @@ class FoldedSplats(eqx.Module):
         return self.coefficients.shape[1]
 
     @property
-    def degrees(self) -> Int[np.ndarray, "num"]:
+    def degrees(self) -> Int[np.ndarray, " num"]:
         """Of each Gaussian: its last power whose coefficients are not both 0. Higher ones are not stored.
 
         A coefficient of -0 counts: it is not the bits that an absent one is restored with.
@@ -84,12 +84,12 @@ class FoldedSplats(eqx.Module):
         return (kept * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
 
     @property
-    def lasting(self) -> Bool[np.ndarray, "num"]:
+    def lasting(self) -> Bool[np.ndarray, " num"]:
         """Who is there throughout the clip: m_t = 0.5 and log sigma_t = `LASTING` exactly. Neither is stored."""
         return (np.asarray(self.log_time_scale) == LASTING) & ~_holds_bits(self.time_loc_logit)
 
     @property
-    def solid(self) -> Bool[np.ndarray, "num"]:
+    def solid(self) -> Bool[np.ndarray, " num"]:
         """Whom no light comes through: an opacity's logit of `OPAQUE` exactly, which is not stored."""
         return np.asarray(self.opacity_logit) == OPAQUE
 
@@ -171,7 +171,7 @@ def _holds_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
     return (leaf != 0) | np.signbit(leaf)
 
 
-def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, "num"]) -> Float[Array, "num 2 2"]:
+def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]) -> Float[Array, "num 2 2"]:
     """Lower-triangular factor of R(angle) diag(scale)^2 R(angle)^T, in closed form.
 
     The determinant is the product of the scales, so nothing is subtracted and the factor exists for any scales > 0.
@@ -185,7 +185,7 @@ def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, "num"])
     return jnp.stack(rows, -2)
 
 
-def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, "num"]]:
+def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
     """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
 
     Closed-form singular values of [[p, 0], [q, r]]. The angle counts modulo pi, and is from [pi/2, 3 pi/2].

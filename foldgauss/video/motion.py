@@ -45,7 +45,7 @@ class Tracks:
     known: Bool[np.ndarray, "num steps"]
 
     @property
-    def reach(self) -> Int[np.ndarray, "num"]:
+    def reach(self) -> Int[np.ndarray, " num"]:
         """Frames from the first to the last one known."""
         return self.known.sum(1) - 1
 
@@ -105,7 +105,7 @@ class Motion:
         return found
 
     def follow(
-        self, home: Int[np.ndarray, "num"], position: Float32[np.ndarray, "num 2"], *, longest: int = LONGEST
+        self, home: Int[np.ndarray, " num"], position: Float32[np.ndarray, "num 2"], *, longest: int = LONGEST
     ) -> Tracks:
         """Follow points, at `position` (x, y in pixels, centres at +0.5) in frame `home`, forth and back in time."""
         num, position = len(home), position.astype(np.float32)
@@ -264,8 +264,8 @@ NEEDED, GAINED = 0.3, 0.8
 
 
 def fitted_folds(
-    tracks: Tracks, spread: Float32[np.ndarray, "num"], degree: int
-) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, "num"]]:
+    tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int
+) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
     """Polynomials in u = own time - t along the tracks, seen through windows of width `spread` (num,), in frames.
 
     Returns coefficients (num, degree, 2), in pixels per frame^k, and the root mean square distance (num,) in pixels
@@ -284,8 +284,8 @@ def fitted_folds(
 
 
 def _fitted(
-    tracks: Tracks, spread: Float32[np.ndarray, "num"], degree: int, used: int
-) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, "num"]]:
+    tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int, used: int
+) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
     """`fitted_folds` with the first `used` powers."""
     num, steps, _ = tracks.shift.shape
     longest = steps // 2

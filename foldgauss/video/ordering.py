@@ -24,10 +24,10 @@ _EMPTY = -1
 
 
 #: Pairs of Gaussians that cover each other, the front ones and the back ones, and what changing places costs.
-Overlaps = tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]
+Overlaps = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]
 
 
-def free_order(cell: Int32[np.ndarray, "num"], found: Overlaps, room: float) -> Int[np.ndarray, "num"]:
+def free_order(cell: Int32[np.ndarray, " num"], found: Overlaps, room: float) -> Int[np.ndarray, " num"]:
     """The numbers of Gaussians in a new order, sweep after sweep through the cells; `found` is of `overlaps`.
 
     `room`: what the pairs that are let go may add to the squared error, were all of them to change places; colours
@@ -40,8 +40,8 @@ def free_order(cell: Int32[np.ndarray, "num"], found: Overlaps, room: float) -> 
 
 
 def swept(
-    cell: Int32[np.ndarray, "num"], front: Int[np.ndarray, "pairs"], back: Int[np.ndarray, "pairs"]
-) -> Int[np.ndarray, "num"]:
+    cell: Int32[np.ndarray, " num"], front: Int[np.ndarray, " pairs"], back: Int[np.ndarray, " pairs"]
+) -> Int[np.ndarray, " num"]:
     """An order in which every `front` comes before its `back`: of those that may come next the one in the next cell."""
     num, order = len(cell), np.argsort(front, kind="stable")
     start = np.searchsorted(front[order], np.arange(num + 1)).tolist()

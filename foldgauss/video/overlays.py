@@ -40,17 +40,17 @@ class SelectedGaussians:
     **Example:** `dataclasses.replace(gaussians, mean=gaussians.mean + [0.1, 0.0])`.
     """
 
-    index: Int[np.ndarray, "num"]
+    index: Int[np.ndarray, " num"]
     mean: Float[np.ndarray, "num dim"]
     factor: Float[np.ndarray, "num dim 2"]
-    opacity: Float[np.ndarray, "num"]
+    opacity: Float[np.ndarray, " num"]
     color: Float[np.ndarray, "num 3"]
 
     def __len__(self) -> int:
         return len(self.opacity)
 
     @property
-    def centre(self) -> Float[np.ndarray, "dim"]:
+    def centre(self) -> Float[np.ndarray, " dim"]:
         """Their own centre: the mean of the means, weighted by opacity times area.
 
         By area too, since Gaussians far from their own time are small and must not pull: the centre then moves evenly.
@@ -69,7 +69,7 @@ class SelectedGaussians:
         return dataclasses.replace(self, mean=mean, factor=factor)
 
 
-def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, "num"]:
+def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, " num"]:
     """Of the parallelograms that the two columns span, in the plane or in space."""
     first, second = np.moveaxis(factor, (2, 1), (0, 1))
     pairs = [(0, 1)] if len(first) == 2 else [(1, 2), (2, 0), (0, 1)]
@@ -92,7 +92,7 @@ class AbstractOverlay(eqx.Module):
     **Shapes:** `mask` bool (num_gaussians,).
     """
 
-    mask: eqx.AbstractVar[Bool[np.ndarray, "num_gaussians"]]
+    mask: eqx.AbstractVar[Bool[np.ndarray, " num_gaussians"]]
     span: eqx.AbstractVar[Span | None]
 
     @abstractmethod
@@ -115,7 +115,7 @@ class Affine(AbstractOverlay):
     **Units:** `angle` in radians, x towards y, so clockwise as one sees it; `offset` and `about` model space.
     """
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     angle: float = eqx.field(static=True)
     stretch: tuple[tuple[float, float], tuple[float, float]] = eqx.field(static=True)
@@ -166,7 +166,7 @@ class Affine(AbstractOverlay):
 class Opacity(AbstractOverlay):
     """Opacity times `factor`, held at 1; outside the span times `before`, on the way between the two."""
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     factor: float = eqx.field(static=True)
     before: float = eqx.field(static=True, default=1.0)
@@ -193,7 +193,7 @@ class Recolor(AbstractOverlay):
     kept and the direction is that of the pure hue.
     """
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     matrix: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
     offset: tuple[float, float, float] = eqx.field(static=True)
@@ -238,7 +238,7 @@ class Place(AbstractOverlay):
     **Source:** MiraGe, flat Gaussians in space; VeGaS eq:mirage.
     """
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     depth: float = eqx.field(static=True)
     rotation: tuple[float, float, float] = eqx.field(static=True)
@@ -263,7 +263,7 @@ class Place(AbstractOverlay):
 class Function(AbstractOverlay):
     """Any function of the conditioned Gaussians and the time. It cannot be saved."""
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     function: Callable[[SelectedGaussians, float], SelectedGaussians] = eqx.field(static=True)
 
@@ -278,7 +278,7 @@ class FaceFunction(AbstractOverlay):
     Source: GaMeS; VeGaS eq:traingle_face.
     """
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
 
@@ -380,7 +380,7 @@ def _between(before: SelectedGaussians, after: SelectedGaussians, progress: floa
 class Retimed(eqx.Module):
     """Gaussians with a clock of their own, over a span or always: where progress is s, t + s (clock(t) - t)."""
 
-    mask: Bool[np.ndarray, "num_gaussians"]
+    mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     clock: Clock = eqx.field(static=True)
 
@@ -413,7 +413,7 @@ def described(overlay: eqx.Module) -> dict:
     return {"kind": names[type(overlay)], **fields}
 
 
-def restored(description: dict, mask: Bool[np.ndarray, "num_gaussians"]) -> eqx.Module:
+def restored(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
     """The inverse of `described`. Raises ValueError, KeyError or TypeError for what describes no overlay."""
     one_of("kind", description["kind"], tuple(KINDS))
     kind = KINDS[description["kind"]]

@@ -88,7 +88,7 @@ class Rule:
     exponent: float
     slopes: tuple[float, ...] = ()
 
-    def halves(self, features: list[np.ndarray], num: int) -> Int32[np.ndarray, "num"]:
+    def halves(self, features: list[np.ndarray], num: int) -> Int32[np.ndarray, " num"]:
         """2 log2 step of every Gaussian, whole numbers."""
         total = np.full(num, self.exponent)
         for slope, feature in zip(self.slopes, features, strict=False):
@@ -96,7 +96,7 @@ class Rule:
         return np.clip(np.floor(2 * total + 0.5), -_FARTHEST, _FARTHEST).astype(np.int32)
 
 
-def steps_of(halves: Int32[np.ndarray, "num"], name: str = "") -> Float[np.ndarray, "num"]:
+def steps_of(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np.ndarray, " num"]:
     """2^(halves / 2), exact but for one rounding, and no wider than a step of the column may be."""
     steps = np.ldexp(np.where(halves % 2, _SQRT2, 1.0), halves // 2)
     return np.minimum(steps, _WIDEST[name]) if name in _WIDEST else steps
@@ -130,8 +130,8 @@ class Quantised:
 
     facts: Facts
     rules: dict[str, Rule]
-    columns: dict[str, Int32[np.ndarray, "num"]]
-    intervals: Int32[np.ndarray, "intervals"]
+    columns: dict[str, Int32[np.ndarray, " num"]]
+    intervals: Int32[np.ndarray, " intervals"]
 
 
 # ------------------------------------------------------------------------------------------ the way back
@@ -183,7 +183,7 @@ class Unrolling:
         self.values[name] = value
 
 
-def values_of(quantised: Quantised) -> dict[str, Float[np.ndarray, "num"]]:
+def values_of(quantised: Quantised) -> dict[str, Float[np.ndarray, " num"]]:
     """The values of all columns, of each Gaussian."""
     facts, unrolling = quantised.facts, Unrolling(quantised.rules, quantised.facts)
     for name in column_names(facts.degree, facts.shared):
@@ -205,8 +205,8 @@ def _sides(facts: Facts) -> tuple[float, float, float]:
 
 
 def cells_at(
-    x: Float[np.ndarray, "num"], y: Float[np.ndarray, "num"], time: Float[np.ndarray, "num"], facts: Facts
-) -> Int32[np.ndarray, "num"]:
+    x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], facts: Facts
+) -> Int32[np.ndarray, " num"]:
     """Numbers of the cells that places lie in, or next to; bits of x, y and time in turns, the lowest first."""
     out, place = np.zeros(len(x), np.int64), 0
     along = []
@@ -221,7 +221,7 @@ def cells_at(
     return out.astype(np.int32)
 
 
-def cell_middles(cell: Int[np.ndarray, "num"], facts: Facts) -> list[Float[np.ndarray, "num"]]:
+def cell_middles(cell: Int[np.ndarray, " num"], facts: Facts) -> list[Float[np.ndarray, " num"]]:
     """The middles of cells along x, y and time."""
     along, place = [np.zeros(len(cell), np.int64) for _ in range(3)], 0
     for k in range(max(facts.cells)):
@@ -235,7 +235,7 @@ def cell_middles(cell: Int[np.ndarray, "num"], facts: Facts) -> list[Float[np.nd
     return out
 
 
-def in_clip(time: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+def in_clip(time: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     """m_t, or an angle in turns, held where its logit is finite."""
     return np.minimum(np.maximum(time, 2.0**-24), 1 - 2.0**-24)
 
@@ -268,7 +268,7 @@ def dequantise(quantised: Quantised) -> VideoModel:
     return VideoModel(splats, times, *shared)
 
 
-def _log(x: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+def _log(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     """Natural logarithm by elementary operations alone, to 1e-13: libraries' differ in the last bit."""
     m, e = np.frexp(x)
     small = m < 0.7071067811865476
@@ -281,13 +281,13 @@ def _log(x: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
     return e * _LN2 + 2 * s * total
 
 
-def _logit(x: Float[np.ndarray, "num"]) -> Float[np.ndarray, "num"]:
+def _logit(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     return _log(x) - _log(1 - x)
 
 
 def span_of(
-    time: Float[np.ndarray, "num"], duration: Float[np.ndarray, "num"], reach: float
-) -> tuple[Float[np.ndarray, "num"], Float[np.ndarray, "num"]]:
+    time: Float[np.ndarray, " num"], duration: Float[np.ndarray, " num"], reach: float
+) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, " num"]]:
     """Middle and half-width of the span of time over which a path is described: `reach` durations, within the clip.
 
     sigma_t is rounded to a power of sqrt(2), which needs no exponential.
@@ -310,7 +310,7 @@ def legendre(degree: int) -> Float[np.ndarray, "degree+1 degree+1"]:
 
 
 def _monomials(
-    v: dict[str, np.ndarray], time: Float[np.ndarray, "num"], facts: Facts
+    v: dict[str, np.ndarray], time: Float[np.ndarray, " num"], facts: Facts
 ) -> Float[np.ndarray, "num degree+1 2"]:
     """Paths in powers of u = m_t - t: row 0 is m_s, row k is c_k."""
     degree, table = facts.degree, legendre(facts.degree)
@@ -343,15 +343,15 @@ class Described:
     """A model's Gaussians by the values of columns, before they are rounded; the path as powers of u until then."""
 
     facts: Facts
-    swapped: Bool[np.ndarray, "num"]
-    turn: Float[np.ndarray, "num"]
-    without: Int32[np.ndarray, "num"]
-    shade: Int32[np.ndarray, "num"] | None
-    values: dict[str, Float[np.ndarray, "num"]]
+    swapped: Bool[np.ndarray, " num"]
+    turn: Float[np.ndarray, " num"]
+    without: Int32[np.ndarray, " num"]
+    shade: Int32[np.ndarray, " num"] | None
+    values: dict[str, Float[np.ndarray, " num"]]
     place: Float[np.ndarray, "num degree+1 2"]
-    logits: Float[np.ndarray, "intervals"]
+    logits: Float[np.ndarray, " intervals"]
 
-    def has(self, name: str) -> Bool[np.ndarray, "num"]:
+    def has(self, name: str) -> Bool[np.ndarray, " num"]:
         """Who has a number in a column of one number each."""
         return (self.without & ABSENT.get(name, (0,))[0]) == 0
 
@@ -383,7 +383,7 @@ def describe(model: VideoModel) -> Described:
     return Described(facts, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
 
 
-def shades(model: VideoModel) -> Int32[np.ndarray, "num"] | None:
+def shades(model: VideoModel) -> Int32[np.ndarray, " num"] | None:
     """The number of each Gaussian's colour among those that there are, dark ones first; None if few share one."""
     color = np.asarray(model.splats.color_dc, np.float64)
     found, index = np.unique(color, axis=0, return_inverse=True)
@@ -438,7 +438,7 @@ def cells_for(num_gaussians: int, size: tuple[int, int]) -> tuple[int, int, int]
 
 
 def path_matrix(
-    time: Float[np.ndarray, "num"], duration: Float[np.ndarray, "num"], facts: Facts
+    time: Float[np.ndarray, " num"], duration: Float[np.ndarray, " num"], facts: Facts
 ) -> Float[np.ndarray, "num degree+1 degree+1"]:
     """M with (m_s, c_1, ..) = M (path's columns): by the way back, of unit vectors."""
     num, degree = len(time), facts.degree
@@ -451,7 +451,7 @@ def path_matrix(
 
 
 def moved_to(
-    place: Float[np.ndarray, "num degree+1 2"], shift: Float[np.ndarray, "num"]
+    place: Float[np.ndarray, "num degree+1 2"], shift: Float[np.ndarray, " num"]
 ) -> Float[np.ndarray, "num degree+1 2"]:
     """The same path in powers of u + shift: its Gaussian's m_t is later by `shift`."""
     place, degree = place.copy(), place.shape[1] - 1
@@ -463,9 +463,9 @@ def moved_to(
 
 def quantise(
     described: Described,
-    classes: Int32[np.ndarray, "num"],
+    classes: Int32[np.ndarray, " num"],
     rules: dict[str, Rule],
-    cells: Int32[np.ndarray, "num"] | None = None,
+    cells: Int32[np.ndarray, " num"] | None = None,
 ) -> Quantised:
     """Round every column by its rule; each is rounded against what is decoded of those before it.
 
@@ -490,14 +490,14 @@ def quantise(
     return Quantised(facts, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
 
 
-def cells_of(described: Described) -> Int32[np.ndarray, "num"]:
+def cells_of(described: Described) -> Int32[np.ndarray, " num"]:
     """The cells that Gaussians are in, by the middles of their paths."""
     values = described.values
     path = _paths(described, values)
     return cells_at(path["x0"], path["y0"], in_clip(values["time"]), described.facts)
 
 
-def _degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarray, "num"]:
+def _degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarray, " num"]:
     """The last power that is worth its bits; `saved` is the squared error that each one saves, in steps."""
     worth = np.arange(len(saved), dtype=np.int32)[:, None] * (saved > POWER_WORTH)
     return worth.max(axis=0, initial=0).astype(np.int32)
@@ -514,7 +514,7 @@ def lower_paths(quantised: Quantised, described: Described) -> Float[np.ndarray,
 
 def _rounded(
     names: tuple[str, ...], values: dict[str, np.ndarray], described: Described, rules: dict[str, Rule]
-) -> tuple[dict[str, Int32[np.ndarray, "rows"]], Float[np.ndarray, "degree+1 num"]]:
+) -> tuple[dict[str, Int32[np.ndarray, " rows"]], Float[np.ndarray, "degree+1 num"]]:
     """The numbers of all columns; and the squared error, in steps, that the path's powers save."""
     unrolling, columns = Unrolling(rules, described.facts), {}
     saved = np.zeros((described.facts.degree + 1, described.facts.num_gaussians))

@@ -48,7 +48,7 @@ class Selection:
         object.__setattr__(self, "mask", mask)
 
     @classmethod
-    def of(cls, model: VideoModel, indices: Int[np.ndarray, "num"]) -> "Selection":
+    def of(cls, model: VideoModel, indices: Int[np.ndarray, " num"]) -> "Selection":
         """The Gaussians of these numbers. Raises ValueError for numbers that the model has not."""
         check_model(model)
         indices, num = np.asarray(indices), model.splats.num_gaussians
@@ -73,7 +73,7 @@ class Selection:
         return cls(np.zeros(model.splats.num_gaussians, bool))
 
     @property
-    def indices(self) -> Int[np.ndarray, "num_selected"]:
+    def indices(self) -> Int[np.ndarray, " num_selected"]:
         """Numbers of the selected Gaussians, in array order."""
         return np.flatnonzero(self.mask)
 
@@ -186,7 +186,7 @@ def select(
 
 def contribution(
     model: VideoModel, mask: Masks, *, frame: int | None = None, frames: tuple[int, int] | None = None
-) -> tuple[Float[np.ndarray, "num_gaussians"], Float[np.ndarray, "num_gaussians"]]:
+) -> tuple[Float[np.ndarray, " num_gaussians"], Float[np.ndarray, " num_gaussians"]]:
     r"""What each Gaussian adds to the picture inside a mask, and everywhere.
 
     $$
@@ -371,7 +371,7 @@ def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndar
     return reached(lit, mask, t)
 
 
-def _known(model: VideoModel, selection: Selection) -> tuple[LitModel, Bool[np.ndarray, "num_gaussians"]]:
+def _known(model: VideoModel, selection: Selection) -> tuple[LitModel, Bool[np.ndarray, " num_gaussians"]]:
     """The model, ready to be asked, and the mask of a selection that fits it."""
     lit = LitModel(model)
     if not isinstance(selection, Selection):
@@ -398,8 +398,8 @@ def _inside(model: VideoModel, region: Region, threshold: float, follow: bool) -
 
 
 def _by_place(
-    lit: LitModel, region: Region, label: Int8[np.ndarray, "num_gaussians"]
-) -> Int8[np.ndarray, "num_gaussians"]:
+    lit: LitModel, region: Region, label: Int8[np.ndarray, " num_gaussians"]
+) -> Int8[np.ndarray, " num_gaussians"]:
     """Decide the unknown by their centres at their own time, where the frame next to it has a mask."""
     label, unknown = label.copy(), np.flatnonzero(label == UNKNOWN)
     home = lit.nearest_frame(unknown)

@@ -18,7 +18,7 @@ LEVELS = 255.0
 
 def sensitivities(
     lit: LitModel, described: Described, on_frame: Callable[[], None] = lambda: None
-) -> tuple[dict[str, Float[np.ndarray, "num"]], Float[np.ndarray, "num"]]:
+) -> tuple[dict[str, Float[np.ndarray, " num"]], Float[np.ndarray, " num"]]:
     """Squared change of the pictures, in levels, summed over pixels, channels and frames, by the square of each number.
 
     That is the diagonal of J^T J with J the derivative of all pictures by the columns of `described`; and what each

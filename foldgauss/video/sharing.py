@@ -26,19 +26,19 @@ class Palette:
     `index` is the number of each Gaussian's row; of length 0 where none is shared. The rows are the Gaussians' own.
     """
 
-    index: Int32[np.ndarray, "num"]
+    index: Int32[np.ndarray, " num"]
     first: Float32[np.ndarray, "entries width"]
     second: Float32[np.ndarray, "entries width"]
-    counts: Int32[np.ndarray, "entries"]
+    counts: Int32[np.ndarray, " entries"]
 
     @classmethod
-    def of(cls, index: Int[np.ndarray, "num"] | None, width: int) -> "Palette":
+    def of(cls, index: Int[np.ndarray, " num"] | None, width: int) -> "Palette":
         """One that has not learned yet; None: nothing is shared."""
         index = np.zeros(0, np.int32) if index is None else index.astype(np.int32)
         moments = np.zeros((int(index.max(initial=-1)) + 1, width), np.float32)
         return cls(index, moments, moments.copy(), np.zeros(len(moments), np.int32))
 
-    def kept(self, stay: Int[np.ndarray, "left"]) -> "Palette":
+    def kept(self, stay: Int[np.ndarray, " left"]) -> "Palette":
         """That of the Gaussians that stay."""
         return dataclasses.replace(self, index=self.index[stay]) if len(self.index) else self
 
@@ -46,8 +46,8 @@ class Palette:
         self,
         values: Float32[np.ndarray, "num width"],
         grad: Float32[np.ndarray, "num width"],
-        touched: Int[np.ndarray, "touched"],
-        rate: Float32[np.ndarray, "width"],
+        touched: Int[np.ndarray, " touched"],
+        rate: Float32[np.ndarray, " width"],
     ) -> None:
         """One of Adam's, by the sums of gradients, on the rows that took part: `values` change in place.
 
@@ -77,7 +77,7 @@ def shared(
     *,
     progress: float = 0.0,
     most: float = math.inf,
-) -> Int[np.ndarray, "num"] | None:
+) -> Int[np.ndarray, " num"] | None:
     """Which rows share their values: the number of each one's in a palette; None where sharing does not pay.
 
     `weight` is what the square of an error of a value adds to the squared error, `price` what a stored number has to
@@ -103,7 +103,7 @@ def shared(
 
 
 def averaged(
-    values: Float32[np.ndarray, "num width"], index: Int[np.ndarray, "num"]
+    values: Float32[np.ndarray, "num width"], index: Int[np.ndarray, " num"]
 ) -> Float32[np.ndarray, "num width"]:
     """Each row's mean with those of its number: of equal bits for equal numbers."""
     count = np.maximum(np.bincount(index), 1)

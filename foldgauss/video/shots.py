@@ -14,7 +14,7 @@ GAP, GAP_SHARE = 8.0, 3.0
 CUT_RATIO = 6.0
 
 
-def time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, "intervals"]:
+def time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " intervals"]:
     """Softmax weights (num_frames - 1,) of frame times evenly spaced but for a gap before each of the frames `cuts`.
 
     Where no fewer than half of the intervals are cuts, as between pictures of many things, there are no gaps: they
@@ -29,14 +29,14 @@ def time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, "in
     return logits
 
 
-def is_cut(times: Float[ArrayLike, "num_frames"]) -> Bool[Array, "intervals"]:
+def is_cut(times: Float[ArrayLike, " num_frames"]) -> Bool[Array, " intervals"]:
     """Which intervals between frame times are cuts."""
     intervals = jnp.diff(jnp.asarray(times))
     return intervals > CUT_RATIO * jnp.median(intervals) if len(intervals) else jnp.zeros(0, bool)
 
 
 @jax.jit
-def out_of_cuts(t: Float[ArrayLike, "*batch"], times: Float[ArrayLike, "num_frames"]) -> Float[Array, "*batch"]:
+def out_of_cuts(t: Float[ArrayLike, "*batch"], times: Float[ArrayLike, " num_frames"]) -> Float[Array, "*batch"]:
     """t; or where it lies between two shots, where there is nothing to see, the nearer frame's time.
 
     One frame alone is there at all times.

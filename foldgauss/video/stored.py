@@ -39,16 +39,16 @@ class StoredSplats(eqx.Module):
 
     loc: Float[Array, "num 2"]
     log_scale: Float[Array, "shapes 2"]
-    angle_logit: Float[Array, "num"]
-    time_loc_logit: Float[Array, "timed"]
-    log_time_scale: Float[Array, "timed"]
+    angle_logit: Float[Array, " num"]
+    time_loc_logit: Float[Array, " timed"]
+    log_time_scale: Float[Array, " timed"]
     coefficients: Float[Array, "powers 2"] | Float[Array, "num degree 2"]
-    opacity_logit: Float[Array, "clear"]
+    opacity_logit: Float[Array, " clear"]
     color_dc: Float[Array, "colors 3"]
     envelope: TimeLikelihood
-    kinds: UInt8[Array, "num"] | None
-    color_index: UInt[Array, "num"] | None
-    shape_index: UInt[Array, "num"] | None
+    kinds: UInt8[Array, " num"] | None
+    color_index: UInt[Array, " num"] | None
+    shape_index: UInt[Array, " num"] | None
     degree: int = eqx.field(static=True)
 
     @property
@@ -163,7 +163,7 @@ def _dense(splats: StoredSplats) -> dict[str, Array]:
     return leaves
 
 
-def _checked_degrees(splats: StoredSplats) -> Int[np.ndarray, "num"]:
+def _checked_degrees(splats: StoredSplats) -> Int[np.ndarray, " num"]:
     kinds = np.asarray(splats.kinds)
     degrees = degrees_of(kinds)
     _check_count("the greatest degree in kinds", int(degrees.max(initial=0)), 0, splats.degree)
@@ -177,7 +177,7 @@ def _checked_degrees(splats: StoredSplats) -> Int[np.ndarray, "num"]:
     return degrees
 
 
-def _has_power(degrees: Int[np.ndarray, "num"], degree: int) -> Bool[np.ndarray, "num degree"]:
+def _has_power(degrees: Int[np.ndarray, " num"], degree: int) -> Bool[np.ndarray, "num degree"]:
     return np.arange(degree) < degrees[:, None]
 
 

@@ -66,7 +66,7 @@ class Span:
 
 
 def span_of(
-    frame_times: Float[np.ndarray, "num_frames"],
+    frame_times: Float[np.ndarray, " num_frames"],
     *,
     frame: int | None = None,
     frames: tuple[int | None, int | None] | None = None,
