@@ -133,6 +133,7 @@ def test_time_given_space_integrates_to_one(power, floor):
         np.testing.assert_allclose(density.panels.probabilities.sum(-1), 1, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_time_given_space_by_scipy():
     # The second crossing has 1e-6 of the mass in 1e-5 of the interval: scipy's first rule on an interval between two
     # modes does not see it, and so it must be told not only where the modes are but how wide.
@@ -328,7 +329,8 @@ def _parabola(s, scale, power, dtype):
 _ACCURACY = {np.float64: 2e-13, np.float32: 2e-5}
 
 
-@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_mass_on_a_curve_narrower_than_numbers_lie_apart(dtype):
     s = np.array([-0.15, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 50.0])
     scales, powers = np.array([0.3, 1e-4, 1e-7, 1e-12]), np.array([1.0, 1.0, 2.0, 1.0])
@@ -353,7 +355,12 @@ def test_mass_on_a_curve_narrower_than_numbers_lie_apart(dtype):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "scale", "s"), [(np.float64, 1e-17, 0.09), (np.float32, 1e-9, 0.09), (np.float64, 0.3, 30.0)]
+    ("dtype", "scale", "s"),
+    [
+        (np.float64, 1e-17, 0.09),
+        pytest.param(np.float32, 1e-9, 0.09, marks=pytest.mark.slow),
+        (np.float64, 0.3, 30.0),
+    ],
 )
 def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):
     # s = u^2 passes twice, with half the mass at 0.4 - sqrt(s) and half at 0.4 + sqrt(s).
@@ -395,6 +402,7 @@ def test_the_other_coordinate_where_time_is_known_to_the_last_digit():
     np.testing.assert_allclose(CDF(given.marginal([0]), at), [0, 0, 0.5, 0.5, 1, 1], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_points_on_a_curve_to_rounding_are_said_to_be():
     # In two space coordinates the density next to the curve hangs on the rounding of s, if the curve is narrow enough.
     for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 1.0, np.inf)]:
@@ -412,6 +420,7 @@ def test_points_on_a_curve_to_rounding_are_said_to_be():
     assert line.error_estimate(turn + 0.1) < 1e-9  # before it, that is: the parabola is open upwards
 
 
+@pytest.mark.slow
 def test_far_points():
     dist = _dist(1, 1.0)
     marginal, far, t = dist.marginal([0]), jnp.array([[50.0], [-1e4], [1e6]]), jnp.full((3, 1), 0.3)

@@ -45,7 +45,7 @@ from foldgauss.uncertainty.increments import Increments
 from foldgauss.uncertainty.log_prob import LEVELS, at_level
 from foldgauss.uncertainty.noise import NOISES
 from foldgauss.uncertainty.pace import irregularities
-from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, needed
+from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, is_sealed, needed
 from foldgauss.uncertainty.report import frame_table, summary
 from foldgauss.video.model import VideoModel
 
@@ -132,7 +132,8 @@ def uncertainty_command(
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
     seen = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
     if seen is None and (out_dir / CHAINS).exists() and not overwrite:
-        raise _of_another(out_dir / CHAINS)
+        kept = out_dir / CHAINS
+        raise _of_another(kept) if is_sealed(kept) else _damaged(kept)
     with _bars() as bars:
         if seen is not None:
             for note in seen.notes:
@@ -226,6 +227,10 @@ def _of_another(path: Path) -> WrongUse:
     return WrongUse(str(invalid("--out", expected=expected, got=f"others in {path}", cure=cure)))
 
 
+def _damaged(path: Path) -> WrongUse:
+    return WrongUse(f"--out: {path} is damaged. Remove it, or add --overwrite.")
+
+
 @contextmanager
 def _bars() -> Iterator[Callable[[str, int, int], None]]:
     """A bar for the pictures and one for the steps, where somebody looks."""
@@ -263,7 +268,7 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
                 raise
             if not overwrite:
                 if "damaged" in str(error):
-                    raise WrongUse(f"--out: {path} is damaged. Remove it, or add --overwrite.") from error
+                    raise _damaged(path) from error
                 raise _of_another(path) from error
             path.unlink()
             existed, posterior = False, sample()

@@ -611,7 +611,8 @@ def _seal(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def _is_sealed(path: Path) -> bool:
+def is_sealed(path: Path) -> bool:
+    """Whether a file of draws is as it was written: what is damaged, or anything else, is not."""
     with open(path, "rb") as file:
         block = file.read(_BLOCK)
         return block.startswith(_SEAL + hashlib.file_digest(file, "sha256").hexdigest().encode())
@@ -620,7 +621,7 @@ def _is_sealed(path: Path) -> bool:
 def _fingerprint_of(path: Path, wanted: str | None = None, shape: tuple[int, int, int] = (0, 0, 0)) -> str:
     """Of the run that a file keeps, which holds all that `wanted` promises. A file may come from a stranger."""
     try:
-        if not _is_sealed(path):
+        if not is_sealed(path):
             raise _damaged(path)
         with needed("h5py").File(path) as file:
             found = file.attrs.get("fingerprint", "")

@@ -263,7 +263,7 @@ CHAINS = Target(
     (ValueError,),
     {
         "foldgauss.uncertainty.posterior": (
-            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "_is_sealed",
+            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "is_sealed",
         )
     },
     lambda data: posterior._BLOCK,

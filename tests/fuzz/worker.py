@@ -1,6 +1,7 @@
 """One target, many cases, in a process of its own: what it breaks is counted by whoever started it."""
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -46,6 +47,9 @@ class Run:
 
     def start(self, kept: list[bytes]) -> None:
         for number, data in enumerate(self.target.seeds()):
+            self.path.write_bytes(data)
+            with contextlib.suppress(Exception):  # what it compiles, once, is not the file's; if it breaks, `one` tells
+                self.target.parse(self.path)
             self.one(data, weighed=True)
             outcome = self.last
             if outcome != "accepted":

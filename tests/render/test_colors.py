@@ -26,7 +26,7 @@ def weights(splats, size, **how):
 
 @pytest.mark.parametrize(
     ("compositing", "engine"),
-    [("over", "cpu"), ("sum", "cpu"), ("over", "xla"), pytest.param("sum", "xla", marks=pytest.mark.slow)],
+    [("over", "cpu"), ("sum", "cpu"), *(pytest.param(how, "xla", marks=pytest.mark.slow) for how in ("over", "sum"))],
 )
 def test_equals_the_dense_solution(compositing, engine):
     """Two frames, of two sizes, that share their colours; the matrix is made from pictures of single splats."""

@@ -80,13 +80,15 @@ def assert_agrees(leaves, size, compositing="over", options=None):
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-@pytest.mark.parametrize("channels", [1, 4, 5, 11])
+@pytest.mark.parametrize(
+    "channels", [pytest.param(1, marks=pytest.mark.slow), 4, pytest.param(5, marks=pytest.mark.slow), 11]
+)
 def test_any_number_of_channels(channels, compositing):
     assert_agrees(*leaves_of("plain", channels), compositing)
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-@pytest.mark.parametrize("ceiling", [0.5, 0.9999, 1.0])
+@pytest.mark.parametrize("ceiling", [0.5, pytest.param(0.9999, marks=pytest.mark.slow), 1.0])
 @pytest.mark.parametrize("kind", ["opaque", "curtain"])
 def test_any_ceiling(kind, ceiling, compositing):
     assert_agrees(*leaves_of(kind), compositing, RenderOptions(alpha_ceiling=ceiling, transmittance_stop=1e-6))
@@ -126,7 +128,7 @@ def test_exact_options(kind):
     assert_agrees(*leaves_of(kind), "over", dataclasses.replace(RenderOptions.exact(), low_pass=0.05))
 
 
-@pytest.mark.parametrize("radius", [0.5, 2.0, 3.0])
+@pytest.mark.parametrize("radius", [0.5, pytest.param(2.0, marks=pytest.mark.slow), 3.0])
 @pytest.mark.parametrize("kind", ["plain", "needles"])
 def test_support_radius(kind, radius):
     options = RenderOptions(support_radius=radius)

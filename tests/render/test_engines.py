@@ -47,11 +47,14 @@ def weights_for(size, avoid):
 #: XLA takes seconds to compile each: half of the combinations.
 CASES = [("cpu", compositing, name) for compositing in ("over", "sum") for name in OPTIONS]
 CASES += [("xla", "over", "default"), ("xla", "sum", "sharp")]
-#: And of the sums, which are simpler, most are for the long runs.
-QUICK_SUMS = ("plain", "needles", "curtain", "none")
+#: And most of the sums, which are simpler, and of other scenes where XLA compiles or options are sharp, are for the long
+#: runs.
+QUICK = ("plain", "needles", "curtain", "none")
+QUICK_OVER = (*QUICK, "one pixel", "giant")
 COMBINATIONS = [
-    pytest.param(*case, kind, marks=[pytest.mark.slow] if case[1] == "sum" and kind not in QUICK_SUMS else [])
+    pytest.param(*case, kind, marks=[] if case == ("cpu", "over", "default") or kind in quick else [pytest.mark.slow])
     for case in CASES
+    for quick in [QUICK if case[1] == "sum" else QUICK_OVER]
     for kind in KINDS
 ]
 
@@ -361,7 +364,9 @@ def test_a_second_call_compiles_nothing(caplog):
             assert caplog.records  # so they are seen
 
 
-@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize(
+    "channels", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)]
+)
 def test_the_slower_callback_draws_the_same(channels, monkeypatch):
     """Where JAX no longer has `buffer_callback`."""
     splats, size = scene("plain")
