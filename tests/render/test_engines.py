@@ -47,8 +47,7 @@ def weights_for(size, avoid):
 #: XLA takes seconds to compile each: half of the combinations.
 CASES = [("cpu", compositing, name) for compositing in ("over", "sum") for name in OPTIONS]
 CASES += [("xla", "over", "default"), ("xla", "sum", "sharp")]
-#: And most of the sums, which are simpler, and of other scenes where XLA compiles or options are sharp, are for the long
-#: runs.
+#: Of the sums, which are simpler, and where XLA compiles or options are sharp, only these; others are for the long runs.
 QUICK = ("plain", "needles", "curtain", "none")
 QUICK_OVER = (*QUICK, "one pixel", "giant")
 COMBINATIONS = [
