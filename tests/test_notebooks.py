@@ -52,7 +52,7 @@ def test_stored_outputs(path):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-# Processor seconds at small size, nearly all of it spent in compiling: 60, 79, 14, 33 and 44.
+# Processor seconds at small size, nearly all of it spent in compiling: 45, 55, 11, 28 and 35.
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_it_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     """Small, in a kernel of its own and an empty folder; every cell shows what its stored output shows."""
@@ -62,7 +62,10 @@ def test_it_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
     notebook = nbformat.read(path, as_version=4)
     stored = [kinds(cell) for cell in code_of(notebook)]
-    for name, value in {"FOLDGAUSS_SMALL": "1", "PYTHONPATH": os.environ.get("PYTHONPATH", "")}.items():
+    # Compiling is most of the time, and nobody looks at how fast or to which last digit: XLA need not optimise.
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+    settings = {"FOLDGAUSS_SMALL": "1", "PYTHONPATH": os.environ.get("PYTHONPATH", ""), "XLA_FLAGS": flags}
+    for name, value in settings.items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, which puts pictures into the notebook
     client.NotebookClient(

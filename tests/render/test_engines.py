@@ -47,7 +47,7 @@ def weights_for(size, avoid):
 #: XLA takes seconds to compile each: half of the combinations.
 CASES = [("cpu", compositing, name) for compositing in ("over", "sum") for name in OPTIONS]
 CASES += [("xla", "over", "default"), ("xla", "sum", "sharp")]
-#: Of the sums, which are simpler, and where XLA compiles or options are sharp, only these; others are for the long runs.
+#: Of the sums, which are simpler, and where XLA compiles or options are sharp, only these; the long runs take the rest.
 QUICK = ("plain", "needles", "curtain", "none")
 QUICK_OVER = (*QUICK, "one pixel", "giant")
 COMBINATIONS = [
