@@ -4,7 +4,6 @@ Two signs: numbers that are none, and pictures that become much worse than they 
 are too high for the clip, or of a state that was broken before.
 """
 
-import dataclasses
 import math
 import warnings
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 
 from foldgauss.video.config import FitConfig
 from foldgauss.video.packing import columns
-from foldgauss.video.state import FitState
+from foldgauss.video.state import ARRAYS, FitState
 
 #: Steps from one sound state that is remembered to the next. (A copy of 40,000 Gaussians takes 4 ms.)
 REMEMBERED = 50
@@ -47,28 +46,24 @@ class FitDiverged(ArithmeticError):
         self.state = state
 
 
-@dataclasses.dataclass(frozen=True)
 class _Remembered:
-    """The arrays of a sound state, as they were."""
+    """The arrays of a sound state, as they were: here, or on the device that has them."""
 
-    arrays: dict[str, Any]
-    step: int
-    error: float
+    def __init__(self, state: FitState):
+        self.step, self.error = state.step, state.error
+        self._held = None if state.held is None else state.held.copied()
+        self._arrays = {}
+        if self._held is None:
+            self._arrays = {name: jax.tree.map(np.array, getattr(state, name)) for name in ARRAYS}
 
-    @classmethod
-    def of(cls, state: FitState) -> "_Remembered":
-        arrays = {name: jax.tree.map(np.array, getattr(state, name)) for name in _array_fields()}
-        return cls(arrays, state.step, state.error)
+    def array(self, name: str) -> Any:
+        return self._arrays[name] if self._held is None else self._held.fetch(name)
 
     def put_back(self, state: FitState) -> None:
         """Its arrays are handed over as copies: a state owns what it updates in place."""
-        for name, array in self.arrays.items():
-            setattr(state, name, jax.tree.map(np.array, array))
-
-
-def _array_fields() -> list[str]:
-    numbers = ("step", "plan", "seconds", "error", "best_error", "backoffs")
-    return [field.name for field in dataclasses.fields(FitState) if field.name not in numbers]
+        state.held = None
+        for name in ARRAYS:
+            setattr(state, name, jax.tree.map(np.array, self.array(name)))
 
 
 class Guard:
@@ -88,7 +83,7 @@ class Guard:
         if fault:
             cure = "Start anew, without the kept state."
             raise FitDiverged(f"state: expected finite numbers, got {fault} at step {state.step}. {cure}", None)
-        self.sound = _Remembered.of(state)
+        self.sound = _Remembered(state)
 
     def restart(self, step: int) -> None:
         """From `step` on errors are those of other pictures."""
@@ -97,7 +92,7 @@ class Guard:
 
     def fault(self, state: FitState, loss: float) -> str:
         """What is wrong after a step, in words; empty if nothing is."""
-        if not (math.isfinite(loss) and _finite(state.rows) and _finite(state.time_logits)):
+        if not (math.isfinite(loss) and state.finite("rows") and state.finite("time_logits")):
             return _broken(state, self.config) or f"a loss of {loss}"
         if state.backoffs >= MOST_BACKOFFS:
             return ""  # where no tries are left, bad pictures are better than none
@@ -139,8 +134,8 @@ class Guard:
         if state.backoffs and state.step < self.settled:
             return  # what the errors were, and are now, is not known of all frames
         bad = self.comparable and (self._times_worse(state) > MUCH_WORSE or self._times_start(state) > NO_BETTER)
-        if due and not bad and _finite(state.second):
-            self.sound = _Remembered.of(state)
+        if due and not bad and state.finite("second"):
+            self.sound = _Remembered(state)
 
     def finish(self, state: FitState) -> None:
         """At the end: where no tries were left and pictures came out worse than they were, they are those of before."""
@@ -181,12 +176,12 @@ class Guard:
 
     def _most_moved(self, state: FitState) -> str:
         """The leaf that is farthest from where it was when all was sound, by its own spread then."""
-        before = self.sound.arrays["rows"]
-        if before.shape != state.rows.shape:
+        before, rows = self.sound.array("rows"), state.rows
+        if before.shape != rows.shape:
             return "some leaves"
         with np.errstate(over="ignore", invalid="ignore"):
             moved = {
-                name: float(np.median(np.abs(state.rows[:, at] - before[:, at])))
+                name: float(np.median(np.abs(rows[:, at] - before[:, at])))
                 / max(float(before[:, at].std()), LEAST_UNIT.get(name, 1.0))
                 for name, at in columns(self.config.degree).items()
                 if at.stop > at.start
@@ -196,20 +191,15 @@ class Guard:
 
     def _times_moved(self, state: FitState) -> float:
         """The farthest that a frame time's logit is from where it was when all was sound."""
-        return float(np.abs(np.asarray(state.time_logits) - self.sound.arrays["time_logits"]).max(initial=0.0))
-
-
-def _finite(array: np.ndarray) -> bool:
-    """Whether all numbers are, by their sum: a third of the time of looking at each."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return bool(np.isfinite(array.sum()))
+        return float(np.abs(np.asarray(state.time_logits) - self.sound.array("time_logits")).max(initial=0.0))
 
 
 def _broken(state: FitState, config: FitConfig) -> str:
     """The leaves with numbers that are none, and how many Gaussians have them; empty if there are none."""
     found = []
+    rows = state.rows
     for name, at in columns(config.degree).items():
-        bad = np.flatnonzero(~np.isfinite(state.rows[:, at]).all(1))
+        bad = np.flatnonzero(~np.isfinite(rows[:, at]).all(1))
         if len(bad):
             found.append(f"no finite {name} in {len(bad):,} Gaussians, the first of them {bad[0]}")
     if not np.isfinite(state.time_logits).all():
