@@ -43,6 +43,12 @@ def chosen_engine(frames: np.ndarray, config: FitConfig, state: FitState | None 
     return config.engine
 
 
+def device_name() -> str:
+    """The device that steps are computed on where they are not on the CPU's kernels, as "NVIDIA H200"."""
+    first, *others = jax.local_devices()
+    return f"{len(others) + 1} times {first.device_kind}" if others else first.device_kind
+
+
 def _unknown(frames: np.ndarray, config: FitConfig, state: FitState | None) -> str:
     """What steps on a device do not know, in words; empty where there is nothing."""
     if config.economy is not None:

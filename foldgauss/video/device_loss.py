@@ -55,7 +55,8 @@ def losses(
     errors = _mean(difference * difference)
 
     def structural() -> Float[Array, " batch"]:
-        value = (1 - ssim_share) * _mean(jnp.abs(difference))
+        # Not `abs`, whose slope in JAX is 1 where both are equal: there it is 0.
+        value = (1 - ssim_share) * _mean(difference * jax.lax.stop_gradient(jnp.sign(difference)))
         return value if ssim_share == 0 else value + ssim_share * (1 - _mean(similarity(rendered, target)))
 
     return jax.lax.cond(squared, lambda: np.float32(SQUARE_WEIGHT) * errors, structural), errors

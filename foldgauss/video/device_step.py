@@ -117,12 +117,13 @@ def program(plan: Plan) -> jax.stages.Compiled:
     return lowered(plan).compile()
 
 
-def lowered(plan: Plan) -> jax.stages.Lowered:
-    """The program of a step before it is compiled."""
+def lowered(plan: Plan, platforms: tuple[str, ...] | None = None) -> jax.stages.Lowered:
+    """The program of a step before it is compiled; for `platforms`, by default those that are here."""
     place = everywhere(plan)
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), _shapes(plan))
     how = {} if place is None else {"out_shardings": place}
-    return jax.jit(functools.partial(step, plan), donate_argnums=0, **how).lower(*shapes)
+    traced = jax.jit(functools.partial(step, plan), donate_argnums=0, **how).trace(*shapes)
+    return traced.lower(lowering_platforms=platforms)
 
 
 def _shapes(plan: Plan) -> tuple[Arrays, jax.ShapeDtypeStruct, Control]:
