@@ -128,8 +128,7 @@ def fit_steps(
         cure = "Leave it out: the flow knows nothing of what is behind."
         raise invalid("between_share", expected="0 for frames with alpha", got=config.between_share, cure=cure)
     engine = chosen_engine(frames, config, state)
-    if engine == "cpu":
-        _warm_up(frames, config)
+    _warm_up(frames, config, engine)
     flow = _Flow(frames, motion)
     state = _started(frames, config, None, flow) if state is None else state
     step = _Stepper(frames, config, state, flow) if engine == "cpu" else DeviceStepper(frames, config, state, engine)
@@ -178,15 +177,18 @@ def fit_steps(
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
 
-def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
+def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile the kernels, or load them, on a corner of the clip, before any clock runs: the first time takes 20 s."""
+    looks = config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None)
+    if engine != "cpu" and not looks:
+        return
     tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
     tiny = dataclasses.replace(tiny, between_share=0.0)
     corner = np.ascontiguousarray(frames[:2, :32, :32])
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
-    for progress in (0.0, 1.0):  # with either loss
+    for progress in (0.0, 1.0) if engine == "cpu" else ():  # with either loss
         _Stepper(corner, tiny, state)(state, progress)
-    if config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None):
+    if looks:
         mean_psnr(state, tiny, corner)
 
 

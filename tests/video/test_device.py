@@ -123,8 +123,8 @@ def test_a_step_of_growing_batches_is_that_of_the_cpu():
 
 @pytest.mark.slow
 def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
-    monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 20)
-    assert [level.size for level in levels(CONFIG, FRAMES.shape[1:3])] == [(24, 32), (48, 64)]
+    monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 16)
+    assert [level.size for level in levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
     compare_steps(CONFIG, 0.1, level=0)
 
 
@@ -142,6 +142,12 @@ def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
 )
 def test_steps_of_other_settings(changes):
     compare_steps(dataclasses.replace(CONFIG, **changes), 0.1)
+
+
+@pytest.mark.slow
+def test_a_clip_of_one_frame():
+    result = fit(FRAMES[:1], dataclasses.replace(CONFIG, steps=60))
+    assert evaluate(result.model, FRAMES[:1]).mean_psnr > 25
 
 
 def pictures_of(seed=0, shape=(2, 23, 31, 3)):
