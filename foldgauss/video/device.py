@@ -11,7 +11,7 @@ import numpy as np
 
 from foldgauss._checks import invalid
 from foldgauss.render import pallas
-from foldgauss.video.config import UNIT_TIME, FitConfig, most_gaussians
+from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.device_step import Arrays, Control, Figures, Plan, error_of, everywhere, program
 from foldgauss.video.growth import Statistics
 from foldgauss.video.population import changes_at, grow
@@ -62,6 +62,11 @@ def _unknown(frames: np.ndarray, config: FitConfig, state: FitState | None) -> s
     return ""
 
 
+def _seen_at(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Frames at a level's size."""
+    return frames if frames.shape[1:3] == size else np.stack([shrunk(frame, size) for frame in frames])
+
+
 class OnDevice:
     """What a `FitState` holds on a device: `state.Held`. The next step consumes it."""
 
@@ -107,8 +112,7 @@ class DeviceStepper:
         self.capacity = 0
         self._adopt(state)
         place = everywhere(self.plans[-1])
-        pictures = [np.stack([shrunk(frame, level.size) for frame in frames]) for level in self.levels]
-        self.pictures = [jax.device_put(own, place) for own in pictures]
+        self.pictures = [jax.device_put(_seen_at(frames, level.size), place) for level in self.levels]
 
     def _adopt(self, state: FitState) -> None:
         """Take a state's arrays over, with room for as many Gaussians as there may be."""
@@ -147,7 +151,7 @@ class DeviceStepper:
         most = max(most_gaussians(config, self.num_frames), num)
         if config.max_gaussians is not None or config.max_size_mb is not None:
             return most
-        room = ROOM * (config.num_gaussians or num)
+        room = ROOM * chosen_num_gaussians(config, self.num_frames, *self.size)
         while room < num:
             room *= 2
         return min(room, most)

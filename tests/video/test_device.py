@@ -474,7 +474,7 @@ def test_room_grows_with_what_has_none():
     """Without a bound of the user's there is room for some times as many, then for twice that."""
     config = dataclasses.replace(GROWING, max_gaussians=None)
     stepper = DeviceStepper.__new__(DeviceStepper)
-    stepper.config, stepper.num_frames = config, 6
+    stepper.config, stepper.num_frames, stepper.size = config, 6, (32, 40)
     assert [stepper._room(num) for num in (240, 241, 480, 900)] == [240, 480, 480, 960]
     stepper.config = GROWING
     assert stepper._room(60) == 250
