@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -317,15 +318,19 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
     One that does not move is left to the decoder of images, which keeps its 16 bits.
     """
     _refuse_huge_image(path, _head(path))
-    kept, delays, fault = [], [], False
+    kept, delays, fault, size = [], [], False, None
     try:
-        with Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
             if animation.format != "GIF" and not getattr(animation, "is_animated", False):
                 return _read_image_file(path, start, stop, prepare)
             num_promised = _promised_pictures(animation)
             for number in islice(count(), min(num_promised or MOST_LOST, stop or MOST_LOST)):
                 animation.seek(number)
                 animation.load()
+                size = size or animation.size
+                if animation.size != size:  # Pillow lets a damaged frame enlarge the picture
+                    fault = True
+                    break
                 delays.append(animation.info.get("duration") or GIF_DELAY)
                 if number >= start:
                     rgba = np.asarray(animation.convert("RGBA"))
