@@ -22,6 +22,7 @@ from soft_models import soft_model
 from foldgauss import FoldedMixture, _threads
 from foldgauss.estimator import FoldedGaussianMixture
 from foldgauss.render import ENGINES, render
+from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import FitConfig, fit
 from foldgauss.video.playback import Playback
 
@@ -72,16 +73,19 @@ def run_script(script, *arguments, expected=0, **environment):
 def _pictures():
     """Pictures by every engine: functions that draw them. Models, times and sizes differ."""
     models = [soft_model(seed=seed, compositing=compositing) for seed, compositing in ((0, "over"), (1, "sum"))]
+    low = dataclasses.replace(models[0].options, alpha_ceiling=HIGHEST_CEILING)
 
-    def drawn(model, engine, t, size):
-        options = {"compositing": model.compositing, "options": model.options}
+    def drawn(model, engine, t, size, options=None):
+        options = {"compositing": model.compositing, "options": options or model.options}
         return lambda: np.asarray(render(model.at(jnp.float32(t), size), size, engine=engine, **options))
 
     works = [
         drawn(model, engine, t, size)
         for model, t, size in zip(models, (0.1, 0.6), ((40, 64), (200, 300)), strict=True)
         for engine in ENGINES
+        if engine != "pallas"  # which takes no ceiling of 1
     ]
+    works.append(drawn(models[0], "pallas", 0.1, (40, 64), low))
     return [*works, lambda: np.stack(list(Playback(models[0], (90, 150)).frames()))]
 
 
