@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from soft_models import soft_model
 
+from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import ENGINES, RenderOptions
 from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit
@@ -96,6 +97,27 @@ def test_a_fit_that_cannot_be_saved_gives_back_what_was_sound(at_start):
     assert "the fit ended at step 240" in told[-1]
     assert "lower these rates" in told[-1]
     assert psnr == pytest.approx(at_start, abs=0.3)
+
+
+@pytest.mark.parametrize(("leaf", "power"), [("loc", 6), ("color_dc", 6), ("log_scale", 3)])
+def test_a_fit_that_comes_apart_is_the_same_when_it_was_stopped(tmp_path, leaf, power):
+    """While it is taken back, and before it is seen to come apart: what was sound is kept with it."""
+    config, path = too_high(leaf, 10.0**power), tmp_path / "kept.safetensors"
+
+    def finished(stops):
+        kept = None
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            for stop in [*stops, config.steps]:
+                state = next(state for state, info in steps_of(CLIP, config, kept) if info.step == stop)
+                save_checkpoint(path, state, config=config, source={})
+                kept = load_checkpoint(path, config=config, source={})
+        return kept, len(warned)
+
+    (whole, told), (stopped, told_too) = finished([]), finished([10, 30, 60, 100, 150, 200])
+    assert told == told_too > 0
+    np.testing.assert_array_equal(stopped.rows, whole.rows)
+    np.testing.assert_array_equal(stopped.time_logits, whole.time_logits)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
