@@ -20,6 +20,7 @@ import pytest
 from soft_models import soft_model
 
 from foldgauss import FoldedMixture, _threads
+from foldgauss._interrupts import leaving_at_once
 from foldgauss.estimator import FoldedGaussianMixture
 from foldgauss.render import ENGINES, render
 from foldgauss.render.pallas import HIGHEST_CEILING
@@ -503,6 +504,46 @@ def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
             shown.frame(0.5)
     """
     assert run_script(script, expected=-signal.SIGINT, FOLDGAUSS_NUM_THREADS="3") == "True\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process alone; CI runs it on Linux")
+@pytest.mark.parametrize("module", ["typer", "numba"])
+def test_an_interrupt_while_modules_are_imported_ends_the_command(module):
+    """Native libraries lose a KeyboardInterrupt in their midst, as this finder does, or crash of it."""
+    script = """
+        import os, signal, sys
+
+        class Finder:
+            def find_spec(name, *others):
+                if name == sys.argv[1]:
+                    try:
+                        os.kill(os.getpid(), signal.SIGINT)
+                        for _ in range(1000):
+                            pass
+                    except KeyboardInterrupt:
+                        pass
+
+        sys.meta_path.insert(0, Finder)
+        from foldgauss.cli import main
+        main(["fit", "--help"])
+    """
+    assert run_script(script, module, expected=-signal.SIGINT) == ""
+
+
+def test_whoever_answers_interrupts_still_does():
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with leaving_at_once():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        for other in (signal.SIG_IGN, lambda number, frame: None):
+            signal.signal(signal.SIGINT, other)
+            with leaving_at_once():
+                assert signal.getsignal(signal.SIGINT) is other
+            assert signal.getsignal(signal.SIGINT) is other
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --------------------------------------------------------------------------------------------- the same bits
