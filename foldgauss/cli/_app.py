@@ -1,11 +1,13 @@
 """The application: its list of commands, each imported when it is called, and what it says things with."""
 
 import importlib
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from foldgauss import __version__
+from foldgauss._interrupts import leaving_at_once
 from foldgauss.cli._commands import COMMANDS
 from foldgauss.cli._help import App, Command, Group
 
@@ -43,11 +45,32 @@ out = Console(markup=False, highlight=False)
 err = Console(stderr=True, markup=False, highlight=False)
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"foldgauss {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit.
+
+    `foldgauss COMMAND --help` tells all of a command, with examples.
+    """
+    del debug, version  # read by `main`, before typer runs, and by the callback
+
+
 def loaded(*names: str) -> dict[str, Any]:
     """The commands by name, these imported, or all where none is named; there may be none of such a name."""
-    for name in names or COMMANDS:
-        if name in COMMANDS:
-            importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
+    with leaving_at_once():
+        for name in names or COMMANDS:
+            if name in COMMANDS:
+                importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
     return typer.main.get_command(app).commands
 
 

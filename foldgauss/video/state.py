@@ -37,8 +37,19 @@ TIME_ADAM = optax.scale_by_adam(eps=1e-15)
         "time_logits",
         "time_moments",
         "statistics",
+        "sound",
     ],
-    meta_fields=["step", "plan", "seconds", "error", "best_error", "backoffs"],
+    meta_fields=[
+        "step",
+        "plan",
+        "seconds",
+        "error",
+        "best_error",
+        "backoffs",
+        "settled",
+        "should_be_better",
+        "start_errors",
+    ],
 )
 @dataclasses.dataclass
 class FitState:
@@ -62,6 +73,11 @@ class FitState:
     error: float  # running mean of the squared error
     best_error: float = 0.0  # the least one that a later one is compared with, see `guard`; 0: none known
     backoffs: int = 0  # how often the fit was taken back, and its rates lowered
+    # What else `guard` goes by; kept, so that a fit that was stopped comes apart, and back, as if it had not been.
+    sound: "FitState | None" = None  # the last sound state, which has none of its own; None: none known
+    settled: int = 0  # steps from which on errors are compared with the best one, and with those of the start
+    should_be_better: int = 0
+    start_errors: tuple[tuple[int, float], ...] = ()  # frames, and their mean squared errors before the first step
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
