@@ -129,10 +129,10 @@ def _read_picture(path: Path) -> None:
 #: The part of `foldgauss.io.video_file` that reads.
 _READ = (
     ONLY, "read_video", "_reader", "_head", "_read_file", "_usable", "_gap_notes", "_pace_notes", "_read_folder",
-    "_is_image", "_read_image_file", "_read_animation", "_promised_pictures", "_read_images", "_alike", "image_paths",
-    "_read_image", "_undecoded", "_refuse_huge_image", "_refuse_huge", "_premultiplied", "_capture", "_refuse_alpha",
-    "_shape_notes", "_grabbed", "_decoded", "_Stays", "_same_size", "_declared_frames", "_fit_to", "aspect_window", "_in_blocks",
-    "_stacked", "_check_within",
+    "_is_image", "_read_image_file", "_read_animation", "_promised_pictures", "_read_images", "_alike",
+    "image_paths", "_read_image", "_undecoded", "_refuse_huge_image", "_refuse_huge", "_premultiplied", "_capture",
+    "_refuse_alpha", "_shape_notes", "_grabbed", "_decoded", "_Stays", "_same_size", "_declared_frames", "_fit_to",
+    "aspect_window", "_in_blocks", "_stacked", "_check_within",
 )  # fmt: skip
 
 PICTURES = Target(
