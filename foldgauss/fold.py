@@ -82,6 +82,7 @@ class ZeroFold(AbstractFold):
         return True
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
+        check_process()
         return jnp.zeros((*jnp.shape(u), self.dim), jnp.result_type(u))
 
 
@@ -120,6 +121,7 @@ class PolynomialFold(AbstractFold):
         return self.coefficients.shape[-2]
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+        check_process()
         u = jnp.asarray(u)
         u, coefficients = _aligned(u, self.coefficients)
         batch = jnp.broadcast_shapes(u.shape[:-1], coefficients.shape[:-2])
@@ -170,6 +172,7 @@ class SplineFold(AbstractFold):
         return True
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+        check_process()
         u, coefficients = _aligned(jnp.asarray(u), self.coefficients)
         n, k = coefficients.shape[-2], self.degree
         v = jnp.clip(u, self.knots[k], self.knots[n])
@@ -228,6 +231,7 @@ class FourierFold(AbstractFold):
         return self.sine.shape[-2]
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+        check_process()
         u = jnp.asarray(u)
         rank = max(u.ndim, self.period.ndim, self.sine.ndim - 2)
         sine, cosine = (_with_rank(x, rank + 2) for x in (self.sine, self.cosine))

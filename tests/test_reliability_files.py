@@ -17,7 +17,7 @@ from benchmarks import _kills, _long, _outputs, _soak
 from benchmarks.memory import write_clip
 from foldgauss import _kernels
 from foldgauss.cli import _shared, fitting, uncertainty
-from foldgauss.io import load_video_model, write_video
+from foldgauss.io import load_video_model, save_video_model, write_video
 from foldgauss.io._lock import only_writer
 from foldgauss.io.model_file import load_model, read_header
 
@@ -366,6 +366,17 @@ def test_one_output_by_any_name_has_one_fit(work, tmp_path, monkeypatch, capsys,
     assert os.listdir(folder) == []
 
 
+@pytest.mark.parametrize(("command", "name"), [("uncertainty", "chains.h5"), ("tradeoff", "tradeoff.json")])
+def test_a_folder_of_results_has_one_run(work, tmp_path, capsys, command, name):
+    if command == "uncertainty":
+        pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
+    words = [work / "model.safetensors"] if command == "uncertainty" else []
+    with only_writer(tmp_path / name):
+        assert run(command, *words, work / "clip.mp4", "--out", tmp_path) == 1
+        assert f"{command} is. Wait for that one" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == []
+
+
 def test_a_link_is_an_output_of_its_own(work, tmp_path):
     """A fit puts its file in the link's place; what the link led to stays, so two fits never write one file."""
     (tmp_path / "other").mkdir()
@@ -405,6 +416,15 @@ def test_draws_go_on_where_a_kill_left_a_picture(work, tmp_path):
     (tmp_path / "frame.png").write_bytes(OLDER)
     with pytest.raises(_shared.WrongUse, match="without other images"):
         uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
+
+
+def test_texts_of_a_file_command_no_terminal(work, tmp_path, capsys):
+    path = tmp_path / "m.safetensors"
+    save_video_model(path, load_video_model(work / "model.safetensors"), metadata={"clip": "a\x1b]0;b\x07c\u202ed"})
+    assert run("info", path) == 0
+    shown = capsys.readouterr().out
+    assert "a\ufffd]0;b\ufffdc\ufffdd" in shown
+    assert "\x1b" not in shown
 
 
 # --------------------------------------------------------------------------------------------- the long runs

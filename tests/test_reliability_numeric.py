@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from soft_models import soft_model
 
-from foldgauss.render import ENGINES
+from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.render import ENGINES, RenderOptions
+from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit
 from foldgauss.video import fit_steps as steps_of
 from foldgauss.video.fit import start, start_from, to_model
@@ -97,6 +99,27 @@ def test_a_fit_that_cannot_be_saved_gives_back_what_was_sound(at_start):
     assert psnr == pytest.approx(at_start, abs=0.3)
 
 
+@pytest.mark.parametrize(("leaf", "power"), [("loc", 6), ("color_dc", 6), ("log_scale", 3)])
+def test_a_fit_that_comes_apart_is_the_same_when_it_was_stopped(tmp_path, leaf, power):
+    """While it is taken back, and before it is seen to come apart: what was sound is kept with it."""
+    config, path = too_high(leaf, 10.0**power), tmp_path / "kept.safetensors"
+
+    def finished(stops):
+        kept = None
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            for stop in [*stops, config.steps]:
+                state = next(state for state, info in steps_of(CLIP, config, kept) if info.step == stop)
+                save_checkpoint(path, state, config=config, source={})
+                kept = load_checkpoint(path, config=config, source={})
+        return kept, len(warned)
+
+    (whole, told), (stopped, told_too) = finished([]), finished([10, 30, 60, 100, 150, 200])
+    assert told == told_too > 0
+    np.testing.assert_array_equal(stopped.rows, whole.rows)
+    np.testing.assert_array_equal(stopped.time_logits, whole.time_logits)
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
 @pytest.mark.parametrize("leaf", NAMED)
 def test_rates_that_are_none_are_refused(leaf, value):
@@ -162,6 +185,11 @@ def test_folds_of_degree_7_that_explode_stay_finite(huge):
 # --------------------------------------------------------------------------------------------- far from usual
 
 
+#: All engines but one: "pallas" takes no ceiling of 1, and is judged with the highest that it takes.
+DRAWN = [engine for engine in ENGINES if engine not in ("auto", "pallas")]
+LOW = dataclasses.replace(RenderOptions.exact(), alpha_ceiling=HIGHEST_CEILING)
+
+
 def _extreme():
     """Leaves of some Gaussians at the ends of what is finite; the others are as they were."""
     far = np.float32(3e38)
@@ -194,14 +222,17 @@ def test_models_far_from_usual_are_drawn_alike_by_all(name):
     model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **changed))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        pictures = {engine: np.asarray(model.render(0.37, engine=engine)) for engine in ENGINES if engine != "auto"}
+        pictures = {engine: np.asarray(model.render(0.37, engine=engine)) for engine in DRAWN}
         (played,) = model.frames(np.array([0.37]))
+        low = dataclasses.replace(model, options=LOW)
+        by_pallas, as_judged = (np.asarray(low.render(0.37, engine=engine)) for engine in ("pallas", "reference"))
     top = max(1.0, float(np.max(0.5 + 0.2821 * np.asarray(model.splats.color_dc))))
     for engine, picture in pictures.items():
         assert np.isfinite(picture).all(), engine
         assert picture.min() >= 0
         assert picture.max() <= top + 1e-4
         np.testing.assert_allclose(picture, pictures["reference"], atol=2e-4, err_msg=engine)
+    np.testing.assert_allclose(by_pallas, as_judged, atol=2e-4)
     np.testing.assert_allclose(played / 255, np.clip(pictures["reference"], 0, 1), atol=0.5 / 255 + 1e-3)
 
 

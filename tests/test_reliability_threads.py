@@ -4,6 +4,7 @@ What may hang runs in processes of its own, which tell their stacks when their t
 """
 
 import dataclasses
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -20,8 +21,10 @@ import pytest
 from soft_models import soft_model
 
 from foldgauss import FoldedMixture, _threads
+from foldgauss._interrupts import leaving_at_once
 from foldgauss.estimator import FoldedGaussianMixture
 from foldgauss.render import ENGINES, render
+from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import FitConfig, fit
 from foldgauss.video.playback import Playback
 
@@ -69,25 +72,30 @@ def run_script(script, *arguments, expected=0, **environment):
 # ------------------------------------------------------------------------------------------------ in threads
 
 
-def _pictures():
-    """Pictures by every engine: functions that draw them. Models, times and sizes differ."""
+def _pictures(pallas):
+    """Pictures by every engine, Pallas if asked for: functions that draw them. Models, times and sizes differ."""
     models = [soft_model(seed=seed, compositing=compositing) for seed, compositing in ((0, "over"), (1, "sum"))]
+    low = dataclasses.replace(models[0].options, alpha_ceiling=HIGHEST_CEILING)
 
-    def drawn(model, engine, t, size):
-        options = {"compositing": model.compositing, "options": model.options}
+    def drawn(model, engine, t, size, options=None):
+        options = {"compositing": model.compositing, "options": options or model.options}
         return lambda: np.asarray(render(model.at(jnp.float32(t), size), size, engine=engine, **options))
 
     works = [
         drawn(model, engine, t, size)
         for model, t, size in zip(models, (0.1, 0.6), ((40, 64), (200, 300)), strict=True)
         for engine in ENGINES
+        if engine != "pallas"  # which takes no ceiling of 1
     ]
+    if pallas:
+        works.append(drawn(models[0], "pallas", 0.1, (40, 64), low))
     return [*works, lambda: np.stack(list(Playback(models[0], (90, 150)).frames()))]
 
 
 @pytest.mark.usefixtures("three_threads")
-def test_every_engine_from_many_threads_draws_the_same_bits():
-    works = _pictures()
+@pytest.mark.parametrize("pallas", [False, pytest.param(True, marks=pytest.mark.slow)])  # long to compile
+def test_every_engine_from_many_threads_draws_the_same_bits(pallas):
+    works = _pictures(pallas)
     truths = [work() for work in works]
     for picture, truth in zip(at_once(2 * works), 2 * truths, strict=True):
         np.testing.assert_array_equal(picture, truth)
@@ -224,7 +232,7 @@ IN_FLIGHT = """
 """
 
 
-@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("cores", [1, pytest.param(2, marks=pytest.mark.slow)])  # one alone is the harder case
 def test_frames_in_flight_inside_jit(cores):
     done = run_script(IN_FLIGHT, cores, FOLDGAUSS_NUM_THREADS="3")
     assert done.split() == ["vmap", "map", "scan", "grad", "flying", "threads"]
@@ -261,21 +269,25 @@ MAIN = """
     if __name__ == "__main__":
         own = given()
         truth = work(own)
-        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-            print(pool.submit(work, own).result() == truth)
-        if "forkserver" in multiprocessing.get_all_start_methods():
-            with multiprocessing.get_context("forkserver").Pool(1) as pool:
+        if METHOD == "spawn":
+            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+                print(pool.submit(work, own).result() == truth)
+        else:
+            with multiprocessing.get_context(METHOD).Pool(1) as pool:
                 print(pool.apply(work, [own]) == truth)
 """
 
 
-def test_workers_that_are_spawned_make_the_same(tmp_path):
-    """By spawn, and by forkserver where there is one. Models, distributions, clips and settings travel there."""
+@pytest.mark.parametrize("method", ["spawn", pytest.param("forkserver", marks=pytest.mark.slow)])
+def test_workers_that_are_spawned_make_the_same(tmp_path, method):
+    """Models, distributions, clips and settings travel there."""
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"this system has no {method}; CI runs it on Linux")
     (tmp_path / "worker.py").write_text(textwrap.dedent(WORKER))
-    (tmp_path / "main.py").write_text(textwrap.dedent(MAIN))
+    (tmp_path / "main.py").write_text(textwrap.dedent(MAIN).replace("METHOD", repr(method)))
     script = f"import runpy; runpy.run_path({str(tmp_path / 'main.py')!r}, run_name='__main__')"
     done = run_script(script, PYTHONPATH=os.pathsep.join([str(tmp_path), str(TESTS), *sys.path]))
-    assert set(done.split()) == {"True"}
+    assert done.split() == ["True"]
 
 
 FORKED = """
@@ -298,7 +310,8 @@ FORKED = """
     mixture = model.splats.to_mixture()
     dist, x = mixture.components, np.random.default_rng(0).uniform(0, 1, (60, 3)).astype(np.float32)
     clip = np.zeros((7, 40, 64, 3), np.uint8)
-    estimator = FoldedGaussianMixture(2, random_state=0).fit(x)
+    fitted = sys.argv[2] == "fitted"
+    estimator = FoldedGaussianMixture(2, random_state=0).fit(x) if fitted else None
     path = save_video_model(sys.argv[1] + "/model.safetensors", model)
     picture = np.asarray(model.render(0.3))  # JAX is up
     calls = {
@@ -345,6 +358,9 @@ FORKED = """
         "gradient": lambda: fit_gradient(mixture, x),
     }
 
+    if not fitted:
+        del calls["predict"], calls["draws"]
+
     def refused(name):
         try:
             calls[name]()
@@ -372,9 +388,10 @@ FORKED = """
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="os.fork exists on POSIX only; CI runs it on Linux")
-def test_after_a_fork_every_door_says_what_to_do(tmp_path):
+@pytest.mark.parametrize("how", ["quick", pytest.param("fitted", marks=pytest.mark.slow)])  # EM compiles for long
+def test_after_a_fork_every_door_says_what_to_do(tmp_path, how):
     """A call that hangs would end by its alarm, with another exit code, and stand by name in the first line."""
-    done = run_script(FORKED, tmp_path)
+    done = run_script(FORKED, tmp_path, how)
     assert done.splitlines() == ["refused", "0", "True", "True", "True", "True True"]
 
 
@@ -499,6 +516,46 @@ def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
             shown.frame(0.5)
     """
     assert run_script(script, expected=-signal.SIGINT, FOLDGAUSS_NUM_THREADS="3") == "True\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process alone; CI runs it on Linux")
+@pytest.mark.parametrize("module", ["typer", "numba"])
+def test_an_interrupt_while_modules_are_imported_ends_the_command(module):
+    """Native libraries lose a KeyboardInterrupt in their midst, as this finder does, or crash of it."""
+    script = """
+        import os, signal, sys
+
+        class Finder:
+            def find_spec(name, *others):
+                if name == sys.argv[1]:
+                    try:
+                        os.kill(os.getpid(), signal.SIGINT)
+                        for _ in range(1000):
+                            pass
+                    except KeyboardInterrupt:
+                        pass
+
+        sys.meta_path.insert(0, Finder)
+        from foldgauss.cli import main
+        main(["fit", "--help"])
+    """
+    assert run_script(script, module, expected=-signal.SIGINT) == ""
+
+
+def test_whoever_answers_interrupts_still_does():
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with leaving_at_once():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        for other in (signal.SIG_IGN, lambda number, frame: None):
+            signal.signal(signal.SIGINT, other)
+            with leaving_at_once():
+                assert signal.getsignal(signal.SIGINT) is other
+            assert signal.getsignal(signal.SIGINT) is other
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --------------------------------------------------------------------------------------------- the same bits

@@ -1,13 +1,20 @@
 """The application: its list of commands, each imported when it is called, and what it says things with."""
 
 import importlib
-from typing import Any
+import re
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
+from foldgauss import __version__
+from foldgauss._interrupts import leaving_at_once
 from foldgauss.cli._commands import COMMANDS
 from foldgauss.cli._help import App, Command, Group
+
+#: What a terminal obeys, but for tab and new line; and what turns the direction of writing.
+_CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069]")
 
 
 class WrongUse(ValueError):
@@ -37,17 +44,45 @@ class _Root(Group):
         return super().resolve_command(ctx, args)
 
 
+class _Plain(Console):
+    """A console on which texts move no cursor and command no terminal: some come from the files of strangers."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(_CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text), **options)
+
+
 app = App(cls=_Root, no_args_is_help=True, pretty_exceptions_enable=False)
 # No markup: names of files may hold brackets.
-out = Console(markup=False, highlight=False)
-err = Console(stderr=True, markup=False, highlight=False)
+out = _Plain(markup=False, highlight=False)
+err = _Plain(stderr=True, markup=False, highlight=False)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"foldgauss {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit.
+
+    `foldgauss COMMAND --help` tells all of a command, with examples.
+    """
+    del debug, version  # read by `main`, before typer runs, and by the callback
 
 
 def loaded(*names: str) -> dict[str, Any]:
     """The commands by name, these imported, or all where none is named; there may be none of such a name."""
-    for name in names or COMMANDS:
-        if name in COMMANDS:
-            importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
+    with leaving_at_once():
+        for name in names or COMMANDS:
+            if name in COMMANDS:
+                importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
     return typer.main.get_command(app).commands
 
 

@@ -40,6 +40,7 @@ from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Record, Words, 
 from foldgauss.cli.compressing import save_compressed, save_halved
 from foldgauss.cli.fitting import make_folder, noted
 from foldgauss.io._atomic import atomic_path
+from foldgauss.io._lock import only_writer
 from foldgauss.io.video_file import Clip, read_video
 from foldgauss.io.video_model import load_video_model, save_video_model
 from foldgauss.video.compress import compress
@@ -74,6 +75,7 @@ Tell = Callable[[str], None]
 
 @app.command(name="tradeoff")
 def tradeoff_command(
+    context: typer.Context,
     video: NewClip,
     out_dir: Annotated[
         Path | None,
@@ -123,8 +125,10 @@ def tradeoff_command(
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
     tell_of(clip)
-    record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
     make_folder(out_dir)
+    own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))
+    context.with_resource(only_writer(out_dir / RECORD, own=own, what="tradeoff"))
+    record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
     run = _Run(clip, record, Words(video, size, frames, out_dir), noted(clip, seed, frames))
     base = run.planned(wanted, chosen, minutes, steps)
     made, left = points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)

@@ -32,6 +32,7 @@ from foldgauss.cli._shared import (
     out,
 )
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
+from foldgauss.io._lock import only_writer
 from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model, read_metadata
 from foldgauss.uncertainty import (
@@ -59,6 +60,7 @@ MOST_DRAWS = 4000
 
 @app.command(name="uncertainty")
 def uncertainty_command(
+    context: typer.Context,
     model_path: ModelFile,
     video: FittedClip,
     out_dir: Annotated[
@@ -130,6 +132,9 @@ def uncertainty_command(
         raise WrongUse(str(invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)))
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
+    _make_folder(out_dir)
+    own = tuple(out_dir / name for name in (*FILES, EVIDENCE))
+    context.with_resource(only_writer(out_dir / CHAINS, own=own, what="run of uncertainty"))
     seen = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
     if seen is None and (out_dir / CHAINS).exists() and not overwrite:
         kept = out_dir / CHAINS
@@ -140,7 +145,6 @@ def uncertainty_command(
                 err.print(f"warning: {note}", soft_wrap=True)
         else:
             seen = _evidence(model, clip, noise, level, wanted, bars)
-            _make_folder(out_dir)
             keep_evidence(out_dir / EVIDENCE, key, seen)
         log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, seen=seen)
         settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}

@@ -149,12 +149,12 @@ def atomic_folder(folder: str | os.PathLike) -> Iterator[Path]:
     try:
         with _told_where(folder, temporary):
             yield temporary
-        if folder.exists():
-            os.replace(folder, aside)
         try:
+            if folder.exists():
+                os.replace(folder, aside)
             os.replace(temporary, folder)
-        except BaseException:
-            if aside.exists():
+        except BaseException:  # Ctrl-C too, before, between and after the two
+            if aside.exists() and not folder.exists():
                 os.replace(aside, folder)
             raise
     finally:

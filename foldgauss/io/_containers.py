@@ -1,6 +1,8 @@
 """What a file is, told by its bytes: a name says nothing, and a decoder opens more than pictures."""
 
 import struct
+from collections.abc import Iterator
+from typing import BinaryIO
 
 HEAD_BYTES = 1 << 16
 
@@ -15,6 +17,12 @@ _PNG, _GIF, _MATROSKA = b"\x89PNG\r\n\x1a\n", b"GIF8", b"\x1a\x45\xdf\xa3"
 _IMAGES = (_PNG, _GIF, b"\xff\xd8\xff", b"II*\0", b"MM\0*")
 #: AlphaMode = 1 in Matroska's and WebM's description of a track, which stands before the first cluster.
 _ALPHA_MODE, _CLUSTER = b"\x53\xc0\x81\x01", b"\x1f\x43\xb6\x75"
+
+_SEGMENT, _MATROSKA_SOUND = b"\x18\x53\x80\x67", b"\x83\x81\x02"  # the second: TrackType = 2
+_ASF = bytes.fromhex("3026b2758e66cf11a6d900aa0062ce6c")
+_ASF_SOUND = bytes.fromhex("409e69f84d5bcf11a8fd00805f5c442b")
+#: Of an MP4: bytes of its index that are read, hours of video have some 10^7; and boxes that are passed by before it.
+MOST_INDEX, MOST_BOXES = 1 << 28, 1 << 16
 
 _LISTS = (b"#EXTM3U", b"ffconcat", b"v=0", b"[playlist]", b"[Reference]", b"<ASX", b"<asx", b"RTSPtext")
 _ADDRESS = (b"http://", b"https://", b"rtsp://", b"rtmp://", b"udp://", b"file://")
@@ -68,15 +76,119 @@ def has_alpha_beside(head: bytes) -> bool:
     return head.startswith(_MATROSKA) and _ALPHA_MODE in head.split(_CLUSTER)[0]
 
 
-def tells_duration(head: bytes) -> bool:
-    """Whether what the container says of its duration is what its frames take; Flash videos say up to 2 frames more."""
-    return not head.startswith(b"FLV")
+def tells_duration(head: bytes, file_bytes: int) -> bool:
+    """Whether what the container says of its duration is what its frames take.
+
+    Flash videos say up to 2 frames more. A stream's, and Ogg's, is where the file's last packets are: it promises none.
+    Where there is sound beside the pictures it may be the sound's, which lasts longer; but of a Matroska that breaks
+    off that is all there is to go by.
+    """
+    if head.startswith((b"FLV", b"OggS", b"\0\0\x01\xba")) or _is_transport_stream(head):
+        return False
+    if head.startswith(_MATROSKA):
+        return _MATROSKA_SOUND not in head.split(_CLUSTER)[0] or _breaks_off(head, file_bytes)
+    if head.startswith(_ASF):
+        return _ASF_SOUND not in head
+    return not (_is_mov(head) and b"soun" in head)
+
+
+def _is_transport_stream(head: bytes) -> bool:
+    """Packets of 188 bytes, which begin with a G; in a camera's files a time of 4 bytes stands before each."""
+    return any(
+        len(head) > at + 2 * step and all(head[at + k * step] == 0x47 for k in range(3))
+        for at, step in ((0, 188), (4, 192))
+    )
+
+
+def _breaks_off(head: bytes, file_bytes: int) -> bool:
+    """Whether a Matroska is longer than its file: its segment says its size, but where it was not known then."""
+    at = head.find(_SEGMENT) + len(_SEGMENT)
+    if at < len(_SEGMENT) or at >= len(head) or not head[at]:
+        return False
+    length = 9 - head[at].bit_length()
+    size = int.from_bytes(head[at : at + length], "big") & (1 << 7 * length) - 1
+    return size != (1 << 7 * length) - 1 and at + length + size > file_bytes
 
 
 def counts_frames(head: bytes) -> bool:
-    """Whether the container counts its frames (MP4, MOV, AVI); in others a count is the duration times a rate."""
-    is_mov = head[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
-    return is_mov or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
+    """Whether the container counts its frames (MP4, MOV, AVI); in others a count is the duration times a rate.
+
+    An MP4 of fragments has no count of all.
+    """
+    return (_is_mov(head) and b"mvex" not in head) or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
+
+
+def _is_mov(head: bytes) -> bool:
+    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+
+
+def shown_seconds(file: BinaryIO) -> float | None:
+    """How much of its video an MP4 or MOV shows, where it is less than it holds: by its edit list, as cutting leaves
+    one. None where it shows all, or where this cannot be told."""
+    file.seek(0, 2)
+    end, at = file.tell(), 0
+    if not _is_mov(_read_at(file, 0, 16)):
+        return None
+    for _ in range(MOST_BOXES):
+        head = _read_at(file, at, 16)
+        if len(head) < 8:
+            return None
+        size, first = int.from_bytes(head[:4], "big"), 8
+        if size == 1:
+            size, first = int.from_bytes(head[8:16], "big"), 16
+        size = size or end - at
+        if size < first:
+            return None
+        if head[4:8] == b"moov":
+            if size > min(end - at, MOST_INDEX):
+                return None
+            try:
+                return _edited_seconds(_read_at(file, at + first, size - first))
+            except (struct.error, StopIteration, IndexError):
+                return None
+        at += size
+    return None
+
+
+def _read_at(file: BinaryIO, at: int, size: int) -> bytes:
+    file.seek(at)
+    return file.read(size)
+
+
+def _boxes(data: bytes, name: bytes) -> Iterator[bytes]:
+    """The contents of all boxes of that name."""
+    at = 0
+    while at + 8 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        if size < 8:
+            return
+        if data[at + 4 : at + 8] == name:
+            yield data[at + 8 : at + size]
+        at += size
+
+
+def _edited_seconds(index: bytes) -> float | None:
+    """Of the first track of pictures in an index (moov)."""
+    ticks, _ = _clock(next(_boxes(index, b"mvhd")))
+    for track in _boxes(index, b"trak"):
+        media = next(_boxes(track, b"mdia"))
+        if next(_boxes(media, b"hdlr"))[8:12] != b"vide":
+            continue
+        edits = next(_boxes(next(_boxes(track, b"edts")), b"elst"))
+        entry = struct.Struct(">Qqi" if edits[0] == 1 else ">Iii")
+        (num,) = struct.unpack(">I", edits[4:8])
+        entries = entry.iter_unpack(edits[8 : 8 + entry.size * num])
+        shown = sum(duration for duration, begins, _ in entries if begins >= 0) / max(ticks, 1)
+        media_ticks, lasts = _clock(next(_boxes(media, b"mdhd")))
+        return shown if 0 < shown < lasts / max(media_ticks, 1) else None
+    return None
+
+
+def _clock(content: bytes) -> tuple[int, int]:
+    """Ticks of a second, and a duration in them, of a header (mvhd, mdhd)."""
+    return struct.unpack(
+        ">IQ" if content[:1] == b"\1" else ">II", content[20:32] if content[:1] == b"\1" else content[12:20]
+    )
 
 
 def claimed_size(head: bytes) -> tuple[int, int] | None:

@@ -16,8 +16,10 @@ LEFT = 3600.0
 
 
 @contextmanager
-def only_writer(path: Path, *, own: tuple[Path, ...] = ()) -> Iterator[None]:
+def only_writer(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") -> Iterator[None]:
     """Keep others that ask likewise from writing `path`, until the block or the process ends, however it does.
+
+    `what`: what a holder is called, in the message to others.
 
     `own`: files that nobody writes but who holds the lock. Unfinished ones of theirs, left by a kill, are removed, and
     so are those of `path` that a holder left; others of `path` once they are an hour old. Raises `OutputError` at once
@@ -31,7 +33,7 @@ def only_writer(path: Path, *, own: tuple[Path, ...] = ()) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise OutputError(
-            f"path: expected an output that nobody else is writing, got {str(path)!r}, which another fit is. "
+            f"path: expected an output that nobody else is writing, got {str(path)!r}, which another {what} is. "
             "Wait for that one, or choose another name."
         ) from error
     except OSError as error:
@@ -53,7 +55,7 @@ def _remove_unfinished(path: Path, kind: str, age: float) -> None:
     """What `atomic_path(path)` left in a process that was killed, see `temporary_name`."""
     name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
     for found in path.parent.iterdir():
-        with suppress(FileNotFoundError):  # another was faster
+        with suppress(OSError):  # another was faster, or it is of another user, or a folder: no reason not to work
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:
                 found.unlink()
 

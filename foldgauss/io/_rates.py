@@ -12,10 +12,14 @@ LAST = 1.5
 
 
 class Pace(NamedTuple):
-    """How frames follow one another: at an even rate; or, as `times` in seconds from the first, at a mean one."""
+    """How frames follow one another: at an even rate; or, as `times` in seconds from the first, at a mean one.
+
+    `guessed`: the file tells no rate that can be used.
+    """
 
     fps: float
     times: Float[np.ndarray, " num_frames"] | None = None
+    guessed: bool = False
 
 
 def pace_of(seconds: Float[np.ndarray, " num_frames"], fps: float) -> Pace:

@@ -1,12 +1,14 @@
 """Clips from video files and folders of images, and back: the one place where pixels meet the disk."""
 
 import math
+import mmap
 import os
 import re
 import struct
 import subprocess
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +31,7 @@ from foldgauss.io._containers import (
     is_image,
     kind_of,
     may_move,
+    shown_seconds,
     tells_duration,
 )
 from foldgauss.io._rates import Pace, pace_of, promised, risen
@@ -151,6 +154,8 @@ def read_video(
         got = f"{str(path)!r} ({error.strerror or error})"
         raise _error("path", expected="a file that can be read", got=got) from error
     clip_fps, times = (pace.fps, pace.times) if fps is None else (fps, None)
+    if fps is None:
+        notes += _pace_notes(pace)
     return Clip(_stacked(kept), float(clip_fps), str(path), num_declared, times, notes)
 
 
@@ -220,7 +225,10 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
         )
     seconds, head, reached = risen([one.milliseconds for one in seen], fps), _head(path), seen[-1].position + 1
     if declared and rate > 0 and not counts_frames(head):
-        declared = promised(seconds, declared / rate, fps, reached) if tells_duration(head) else reached
+        tells = tells_duration(head, path.stat().st_size)
+        declared = promised(seconds, declared / rate, fps, reached) if tells else reached
+    elif declared > reached:
+        declared = _shown_of(path, declared, seconds, fps, reached)
     num_total = max(declared, reached)
     # A container's count may be an estimate, so the range is judged against what decoded as well.
     _check_within(start, stop, num_total, path)
@@ -233,12 +241,21 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
         )
     num_declared = (num_total if stop is None else stop) - start
     pace = _usable(pace_of(seconds[len(seen) - len(kept) :], fps))
+    if np.ptp([one.milliseconds for one in seen]) == 0 and len(seen) > 1:  # a raw stream: the rate is FFmpeg's guess
+        pace = pace._replace(guessed=True)
     gaps = _gap_notes([start - 1, *(one.position for one in seen[len(seen) - len(kept) :])])
-    return kept, num_declared, pace, notes + gaps + _pace_notes(pace)
+    return kept, num_declared, pace, notes + gaps
+
+
+def _shown_of(path: Path, declared: int, seconds: np.ndarray, fps: float, reached: int) -> int:
+    """How many of the frames that a container counts are to be shown: cutting may leave others in an MP4, unseen."""
+    with open(path, "rb") as file:
+        shown = shown_seconds(file)
+    return declared if shown is None else min(declared, promised(seconds, shown, fps, reached))
 
 
 def _usable(pace: Pace) -> Pace:
-    return pace if pace.fps <= MAX_FPS else Pace(DEFAULT_FPS)
+    return pace if pace.fps <= MAX_FPS else Pace(DEFAULT_FPS, guessed=True)
 
 
 def _gap_notes(positions: list[int]) -> tuple[str, ...]:
@@ -255,6 +272,8 @@ def _gap_notes(positions: list[int]) -> tuple[str, ...]:
 
 
 def _pace_notes(pace: Pace) -> tuple[str, ...]:
+    if pace.guessed:
+        return (f"no rate is told that can be used; taken as {pace.fps:g} frames a second, unless fps says otherwise.",)
     if pace.times is None:
         return ()
     apart = np.diff(pace.times)
@@ -289,7 +308,25 @@ def _is_image(path: Path) -> bool:
     ):  # a TIFF, of which that decoder sees the first alone
         got = f"{num_images} in {str(path)!r}"
         raise _error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
+    if path.suffix.lower() not in IMAGE_SUFFIXES and _is_followed(path):
+        got, cure = (
+            f"a bare sequence of JPEGs, {str(path)!r}",
+            "Put it into a container: ffmpeg -i VIDEO -c copy NEW.avi.",
+        )
+        raise _error("path", expected="a video in a container", got=got, cure=cure)
     return num_images == 1
+
+
+def _is_followed(path: Path) -> bool:
+    """Whether a JPEG stands right after another: a video without container, which OpenCV does not open.
+
+    One that a camera keeps beside a picture, of other light or for the other eye, is announced ("MPF").
+    """
+    head = _head(path)
+    if not head.startswith(b"\xff\xd8\xff") or b"MPF\0" in head:
+        return False
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return data.find(b"\xff\xd9\xff\xd8\xff") >= 0
 
 
 def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
@@ -317,15 +354,19 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
     One that does not move is left to the decoder of images, which keeps its 16 bits.
     """
     _refuse_huge_image(path, _head(path))
-    kept, delays, fault = [], [], False
+    kept, delays, fault, size = [], [], False, None
     try:
-        with Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
             if animation.format != "GIF" and not getattr(animation, "is_animated", False):
                 return _read_image_file(path, start, stop, prepare)
             num_promised = _promised_pictures(animation)
             for number in islice(count(), min(num_promised or MOST_LOST, stop or MOST_LOST)):
                 animation.seek(number)
                 animation.load()
+                size = size or animation.size
+                if animation.size != size:  # Pillow lets a damaged frame enlarge the picture
+                    fault = True
+                    break
                 delays.append(animation.info.get("duration") or GIF_DELAY)
                 if number >= start:
                     rgba = np.asarray(animation.convert("RGBA"))
@@ -350,7 +391,7 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
     if pace.times is not None:
         pace = Pace(pace.fps, pace.times[:-1])
     pace = _usable(pace)
-    return _alike(kept), (num_total if stop is None else stop) - start, pace, _pace_notes(pace)
+    return _alike(kept), (num_total if stop is None else stop) - start, pace, ()
 
 
 def _promised_pictures(animation: Image.Image) -> int:

@@ -238,6 +238,10 @@ def _describe_checkpoint(state: FitState) -> dict:
         "error": state.error,
         "best_error": state.best_error,
         "backoffs": state.backoffs,
+        "settled": state.settled,
+        "should_be_better": state.should_be_better,
+        "start_errors": [list(pair) for pair in state.start_errors],
+        "sound": None if state.sound is None else _describe_checkpoint(state.sound),
     }
 
 
@@ -278,7 +282,16 @@ def _checkpoint_skeleton(header: dict) -> FitState:
         error=float(header["error"]),
         best_error=float(header.get("best_error", 0.0)),
         backoffs=int(header.get("backoffs", 0)),
+        sound=_checkpoint_skeleton(_sound_of(header)) if header.get("sound") else None,
+        settled=int(header.get("settled", 0)),
+        should_be_better=int(header.get("should_be_better", 0)),
+        start_errors=tuple((int(frame), float(error)) for frame, error in header.get("start_errors", ())),
     )
+
+
+def _sound_of(header: dict) -> dict:
+    """The header of the last sound state, which has none of its own."""
+    return header["sound"] | {name: header[name] for name in ("width", "num_intervals")} | {"sound": None}
 
 
 _FORMS = {"to_stored": _to_stored, "from_stored": _from_stored}

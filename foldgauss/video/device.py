@@ -72,6 +72,7 @@ class OnDevice:
 
     def __init__(self, arrays: Arrays, num: int, growing: bool, figures: Figures | None):
         self.arrays, self.num, self.growing, self.figures = arrays, num, growing, figures
+        self._here: dict[str, object] = {}  # what is small, and asked for in every step
 
     def fetch(self, name: str) -> object:
         if name == "young":
@@ -82,10 +83,11 @@ class OnDevice:
             return None
         if self.figures is not None and name in Figures._fields:
             return np.array(getattr(self.figures, name))
-        found = getattr(self.arrays, name)
         if name in ("time_logits", "time_moments", "frame_errors"):
-            return jax.tree.map(np.array, found)
-        return jax.tree.map(lambda leaf: np.array(leaf)[: self.num].copy(), found)
+            if name not in self._here:
+                self._here[name] = jax.tree.map(np.array, getattr(self.arrays, name))
+            return jax.tree.map(np.array, self._here[name])
+        return jax.tree.map(lambda leaf: np.array(leaf)[: self.num].copy(), getattr(self.arrays, name))
 
     def finite(self, name: str) -> bool:
         if self.figures is not None and name in ("rows", "second"):

@@ -136,7 +136,7 @@ def fit_steps(
     outlook = _Outlook(state, config, step.levels)
     guard = Guard(state, config, step.steps_per_pass, alpha=frames.shape[3] == 4)
     if state.step == 0 and guard.comparable and config.initialization == "clip":
-        guard.start_errors = step.errors_at_start(state)
+        state.start_errors = tuple(step.errors_at_start(state).items())
     stopped_by = _stopped_by(state, config, frames)
     if stopped_by:  # a kept state that needs no more steps
         yield state, _info(state, config, outlook, math.nan, 0, stopped_by)
@@ -151,7 +151,7 @@ def fit_steps(
             state.error = memory * state.error + (1 - memory) * squared_error
         state.step += 1
         if another or not state.plan:  # without a plan yet, levels take turns
-            guard.restart(state.step)
+            guard.restart(state)
             state.best_error = 0.0
         fault = guard.fault(state, loss)
         if fault:

@@ -4,9 +4,10 @@ Two signs: numbers that are none, and pictures that become much worse than they 
 are too high for the clip, or of a state that was broken before.
 """
 
+import copy
+import dataclasses
 import math
 import warnings
-from typing import Any
 
 import jax
 import numpy as np
@@ -46,28 +47,24 @@ class FitDiverged(ArithmeticError):
         self.state = state
 
 
-class _Remembered:
-    """The arrays of a sound state, as they were: here, or on the device that has them."""
+def _copied(state: FitState) -> FitState:
+    """As it is now, arrays and all, but for the sound state before; on the device that holds it."""
+    if state.held is None:
+        return jax.tree.map(np.array, dataclasses.replace(state, sound=None))
+    other = copy.copy(state)
+    other.sound, other.held = None, state.held.copied()
+    return other
 
-    def __init__(self, state: FitState):
-        self.step, self.error = state.step, state.error
-        self._held = None if state.held is None else state.held.copied()
-        self._arrays = {}
-        if self._held is None:
-            self._arrays = {name: jax.tree.map(np.array, getattr(state, name)) for name in ARRAYS}
 
-    def array(self, name: str) -> Any:
-        return self._arrays[name] if self._held is None else self._held.fetch(name)
-
-    def put_back(self, state: FitState) -> None:
-        """Its arrays are handed over as copies: a state owns what it updates in place."""
-        state.held = None
-        for name in ARRAYS:
-            setattr(state, name, jax.tree.map(np.array, self.array(name)))
+def _put_back(state: FitState) -> None:
+    """The arrays of its last sound state are handed over as copies: a state owns what it updates in place."""
+    state.held = None
+    for name in ARRAYS:
+        setattr(state, name, jax.tree.map(np.array, getattr(state.sound, name)))
 
 
 class Guard:
-    """Watches the steps of a fit. What it goes by across a stop is kept in the state: `best_error` and `backoffs`.
+    """Watches the steps of a fit. What it goes by is kept in the state, so that it knows as much after a stop.
 
     Errors are those of the same frames at the same size, each as it was last seen: a frame alone that is much harder
     than the others raises no alarm. Where they may rise for other reasons, only numbers are looked at: where Gaussians
@@ -77,18 +74,18 @@ class Guard:
     def __init__(self, state: FitState, config: FitConfig, steps_per_pass: int, *, alpha: bool):
         self.config, self.steps_per_pass = config, steps_per_pass
         self.comparable = config.growth is None and config.economy is None and not alpha
-        self.start_errors: dict[int, float] = {}  # by frame: of some, before the first step
-        self.restart(state.step)
         fault = _broken(state, config)
         if fault:
             cure = "Start anew, without the kept state."
             raise FitDiverged(f"state: expected finite numbers, got {fault} at step {state.step}. {cure}", None)
-        self.sound = _Remembered(state)
+        if state.sound is None:
+            self.restart(state)
+            state.sound = _copied(state)
 
-    def restart(self, step: int) -> None:
-        """From `step` on errors are those of other pictures."""
-        self.settled = step + max(PASSES * self.steps_per_pass, LEAST_STEPS)
-        self.should_be_better = step + LOST_PASSES * self.steps_per_pass
+    def restart(self, state: FitState) -> None:
+        """From this step on errors are those of other pictures."""
+        state.settled = state.step + max(PASSES * self.steps_per_pass, LEAST_STEPS)
+        state.should_be_better = state.step + LOST_PASSES * self.steps_per_pass
 
     def fault(self, state: FitState, loss: float) -> str:
         """What is wrong after a step, in words; empty if nothing is."""
@@ -97,14 +94,14 @@ class Guard:
         if state.backoffs >= MOST_BACKOFFS:
             return ""  # where no tries are left, bad pictures are better than none
         if self._times_moved(state) > FARTHEST_TIME:
-            return f"frame times moved by e^{self._times_moved(state):.0f} since step {self.sound.step}"
-        if not self.comparable or state.step < self.settled:
+            return f"frame times moved by e^{self._times_moved(state):.0f} since step {state.sound.step}"
+        if not self.comparable or state.step < state.settled:
             return ""
         worse = self._times_worse(state)
         if worse > MUCH_WORSE:
             decibels, moved = 10 * math.log10(worse), self._most_moved(state)
             return f"pictures {decibels:.0f} dB worse than they were, {moved} having moved most"
-        if state.step >= self.should_be_better and self._times_start(state) > NO_BETTER:
+        if state.step >= state.should_be_better and self._times_start(state) > NO_BETTER:
             moved = self._most_moved(state)
             return f"pictures are worse than at the start after {LOST_PASSES} passes, {moved} having moved most"
         error = float(state.frame_errors.mean())
@@ -119,23 +116,21 @@ class Guard:
 
     def _times_start(self, state: FitState) -> float:
         """The error by that of the start, both of the frames of which that is known."""
-        if not self.start_errors:
+        if not state.start_errors:
             return 0.0
-        before, now = (
-            float(np.mean(own))
-            for own in (list(self.start_errors.values()), state.frame_errors[list(self.start_errors)])
-        )
+        frames, errors = zip(*state.start_errors, strict=True)
+        before, now = float(np.mean(errors)), float(np.mean(state.frame_errors[list(frames)]))
         return now / before if before > 0 and now > FINE else 0.0
 
     def remember(self, state: FitState) -> None:
         """Now and then, of a state in which nothing is wrong. One whose moments overflow is not sound, nor one whose
         pictures look bad, be it by too few of them to say so."""
-        due = state.step - self.sound.step >= REMEMBERED
-        if state.backoffs and state.step < self.settled:
+        due = state.step - state.sound.step >= REMEMBERED
+        if state.backoffs and state.step < state.settled:
             return  # what the errors were, and are now, is not known of all frames
         bad = self.comparable and (self._times_worse(state) > MUCH_WORSE or self._times_start(state) > NO_BETTER)
         if due and not bad and state.finite("second"):
-            self.sound = _Remembered(state)
+            state.sound = _copied(state)
 
     def finish(self, state: FitState) -> None:
         """At the end: where no tries were left and pictures came out worse than they were, they are those of before."""
@@ -145,9 +140,9 @@ class Guard:
         if worse > MUCH_WORSE or self._times_start(state) > NO_BETTER:
             decibels = 10 * math.log10(worse)
             told = f"the fit ended at step {state.step} with pictures {decibels:.0f} dB worse than they were"
-            moved, start = self._most_moved(state), self.sound.step
-            self.sound.put_back(state)
-            state.error = self.sound.error or float(np.mean(list(self.start_errors.values()) or [0.0]))
+            moved, start = self._most_moved(state), state.sound.step
+            _put_back(state)
+            state.error = state.sound.error or float(np.mean([error for _, error in state.start_errors] or [0.0]))
             cure = f"What is kept is of step {start}: lower these rates."
             warnings.warn(f"{told}, {moved} having moved most. {cure}", DivergenceWarning, stacklevel=3)
 
@@ -157,8 +152,8 @@ class Guard:
         Raises FitDiverged if the fit is to stop, or has been taken back `MOST_BACKOFFS` times. Its state is then that
         before the step, whose running error was `error_before`, but for the arrays.
         """
-        step, start = state.step, self.sound.step
-        self.sound.put_back(state)
+        step, start = state.step, state.sound.step
+        _put_back(state)
         told = f"the fit came apart at step {step}: {fault}."
         lowest = state.backoffs >= MOST_BACKOFFS
         if self.config.on_divergence == "stop" or lowest:
@@ -169,14 +164,14 @@ class Guard:
                 cure = f"So it did with rates {lowest_rates}: lower these, or look at the frames."
             raise FitDiverged(f"{told} What is kept is of step {start}. {cure}", state)
         state.backoffs += 1
-        state.error = self.sound.error
-        self.restart(step)
+        state.error = state.sound.error
+        self.restart(state)
         rates = f"{LOWERED**state.backoffs:.0f}th"
         warnings.warn(f"{told} It goes on from step {start}, with rates a {rates}.", DivergenceWarning, stacklevel=3)
 
     def _most_moved(self, state: FitState) -> str:
         """The leaf that is farthest from where it was when all was sound, by its own spread then."""
-        before, rows = self.sound.array("rows"), state.rows
+        before, rows = state.sound.rows, state.rows
         if before.shape != rows.shape:
             return "some leaves"
         with np.errstate(over="ignore", invalid="ignore"):
@@ -191,7 +186,7 @@ class Guard:
 
     def _times_moved(self, state: FitState) -> float:
         """The farthest that a frame time's logit is from where it was when all was sound."""
-        return float(np.abs(np.asarray(state.time_logits) - self.sound.array("time_logits")).max(initial=0.0))
+        return float(np.abs(np.asarray(state.time_logits) - state.sound.time_logits).max(initial=0.0))
 
 
 def _broken(state: FitState, config: FitConfig) -> str:

@@ -54,8 +54,19 @@ class Held(Protocol):
         "time_logits",
         "time_moments",
         "statistics",
+        "sound",
     ],
-    meta_fields=["step", "plan", "seconds", "error", "best_error", "backoffs"],
+    meta_fields=[
+        "step",
+        "plan",
+        "seconds",
+        "error",
+        "best_error",
+        "backoffs",
+        "settled",
+        "should_be_better",
+        "start_errors",
+    ],
 )
 @dataclasses.dataclass
 class FitState:
@@ -82,6 +93,11 @@ class FitState:
     error: float  # running mean of the squared error
     best_error: float = 0.0  # the least one that a later one is compared with, see `guard`; 0: none known
     backoffs: int = 0  # how often the fit was taken back, and its rates lowered
+    # What else `guard` goes by; kept, so that a fit that was stopped comes apart, and back, as if it had not been.
+    sound: "FitState | None" = None  # the last sound state, which has none of its own; None: none known
+    settled: int = 0  # steps from which on errors are compared with the best one, and with those of the start
+    should_be_better: int = 0
+    start_errors: tuple[tuple[int, float], ...] = ()  # frames, and their mean squared errors before the first step
     held: ClassVar[Held | None] = None  # of a fit on a device, an attribute of the instance
 
     def __getattr__(self, name: str) -> Any:
@@ -123,8 +139,8 @@ class FitState:
 
 
 #: The fields of a `FitState` that are arrays, or trees of them.
-_NUMBERS = ("step", "plan", "seconds", "error", "best_error", "backoffs")
-ARRAYS = tuple(field.name for field in dataclasses.fields(FitState) if field.name not in _NUMBERS)
+_OTHERS = ("step", "plan", "seconds", "error", "best_error", "backoffs", "sound", "settled", "should_be_better")
+ARRAYS = tuple(field.name for field in dataclasses.fields(FitState) if field.name not in (*_OTHERS, "start_errors"))
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:

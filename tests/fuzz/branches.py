@@ -14,7 +14,7 @@ import sys
 from dataclasses import dataclass, field
 
 _NAME = "_branches_taken"
-#: Before the names of functions and classes: these, not all but these.
+#: Before the names of functions and classes: these, not all but these; of what is in them, all but names after "-".
 ONLY = "only"
 _KERNELS = {"exact_kernel", "kernel", "inline"}
 
@@ -84,7 +84,9 @@ class _Noting(ast.NodeTransformer):
         names = {getattr(one, "id", getattr(one, "attr", "")) for one in node.decorator_list}
         compiled = names & _KERNELS and os.environ.get("NUMBA_DISABLE_JIT") != "1"
         only = self.without[:1] == (ONLY,) and not self.within
-        if compiled or (node.name not in self.without if only else node.name in self.without):
+        if compiled or f"-{node.name}" in self.without:
+            return node
+        if node.name not in self.without if only else node.name in self.without:
             return node
         self.within += 1
         is_function = not isinstance(node, ast.ClassDef)  # what runs at import is no reading

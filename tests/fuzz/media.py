@@ -1,5 +1,6 @@
 """Targets: pictures, videos, HDF5 and arrays of NumPy, which libraries decode."""
 
+import contextlib
 import functools
 import io
 import tempfile
@@ -58,9 +59,21 @@ def _picture_memory(size: int) -> int:
 _ASKED = ({}, {}, {"label": 1}, {"size": (2, 3)}, {"folder": True}, {"folder": True, "frames": (0, 1)})
 
 
+#: What no image, folder or video bears being asked for.
+_REFUSED = ({"label": 0}, {"label": 255}, {"level": 0.5}, {"frames": (0, 9)}, {"level": 2.0}, {"size": (0, 1)})
+
+
+def _refused(path: Path) -> None:
+    for given in _REFUSED:
+        with contextlib.suppress(ValueError):
+            read_masks(path, **given)
+
+
 def _read_mask(path: Path) -> None:
     given = dict(_ASKED[chance(path) % len(_ASKED)])
     folder = given.pop("folder", False)
+    if chance(path) % 8 == 0:
+        _refused(path.parent if folder else path)
     masks = read_masks(path.parent if folder else path, **given)
     assert (masks.dtype, masks.ndim) == (bool, 3 if folder else 2)
 
@@ -83,6 +96,31 @@ MASKS = Target(
 # ---------------------------------------------------------------------------------------------- pictures, videos
 
 
+def _more_images() -> list[bytes]:
+    """What masks cannot be: of 16 bits, JPEG, and those that move."""
+    deep = cv2.imencode(".png", _NUMBERS.astype(np.uint16) << 8)[1].tobytes()
+    frames = np.random.default_rng(0).integers(0, 255, (3, 6, 8, 3), np.uint8)
+    moving = [written(lambda path: write_video(path, frames, 10), suffix) for suffix in (".webp", ".gif")]
+    file = io.BytesIO()
+    first, *others = (Image.fromarray(frame).convert("RGBA") for frame in frames)
+    first.save(file, "PNG", save_all=True, append_images=others, duration=[40, 120, 40])
+    return [deep, _image("RGB", "JPEG"), _image("L", "JPEG", progressive=True), *moving, file.getvalue()]
+
+
+@functools.cache
+def _other_pictures() -> list[bytes]:
+    """Pages, numbers that are no levels, another size."""
+    pages, floats = io.BytesIO(), io.BytesIO()
+    page = Image.fromarray(_NUMBERS)
+    page.save(pages, "TIFF", save_all=True, append_images=[page])
+    page.convert("F").save(floats, "TIFF")
+    return [pages.getvalue(), floats.getvalue(), cv2.imencode(".jpg", np.zeros((40, 9, 3), np.uint8))[1].tobytes()]
+
+
+def _another_picture(data: bytes, random: Random) -> bytes:
+    return random.choice(_other_pictures())
+
+
 def _read_picture(path: Path) -> None:
     clip = read_video(path.parent if chance(path) % 4 == 0 else path)
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
@@ -90,21 +128,23 @@ def _read_picture(path: Path) -> None:
 
 #: The part of `foldgauss.io.video_file` that reads.
 _READ = (
-    ONLY, "read_video", "_read_file", "_read_folder", "_is_image", "_read_image_file", "_read_images", "_alike",
-    "image_paths", "_read_image", "_premultiplied", "_capture", "_refuse_alpha", "_decoded", "_same_size",
-    "_declared_frames", "_fit_to", "aspect_window", "_in_blocks", "_stacked", "_check_within",
+    ONLY, "read_video", "_reader", "_head", "_read_file", "_usable", "_gap_notes", "_pace_notes", "_read_folder",
+    "_is_image", "_read_image_file", "_read_animation", "_promised_pictures", "_read_images", "_alike",
+    "image_paths", "_read_image", "_undecoded", "_refuse_huge_image", "_refuse_huge", "_premultiplied", "_capture",
+    "_refuse_alpha", "_shape_notes", "_grabbed", "_decoded", "_Stays", "_same_size", "_declared_frames", "_fit_to",
+    "aspect_window", "_in_blocks", "_stacked", "_check_within",
 )  # fmt: skip
 
 PICTURES = Target(
     "pictures",
     ".png",
-    lambda: [data for data in _images() if not data.startswith(b"RIFF")][:5],
+    lambda: [*_images(), *_more_images()],
     _read_picture,
     (VideoError,),
-    {"foldgauss.io.video_file": _READ},
+    {"foldgauss.io.video_file": _READ, "foldgauss.io._containers": (), "foldgauss.io._rates": ()},
     lambda data: 8,
     lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
-    (png_resealed, png_sized),
+    (png_resealed, png_sized, _another_picture),
     past_header=1,
     share=0.5,
 )
@@ -135,12 +175,29 @@ def _clip_body(data: bytes) -> int:
     return min({b"\x1aE\xdf\xa3": 40, b"GIF8": 13, b"RIFF": 12}.get(data[:4], 0), len(data))
 
 
+_WANTED = (
+    {}, {"size": (8, 12), "frames": (0, 2)}, {"center_crop": (4, 4)}, {"frames": (1, 3)},
+    {"fps": 12.5, "size": (4, 20)}, {"frames": (0, 1)}, {"frames": (1, None)}, {},
+)  # fmt: skip
+#: Files of other kinds.
+_OTHERS = (
+    b"ffconcat version 1.0\nfile 'a.mp4'\n", b"#EXTM3U\n#EXTINF:1,\na.ts\n", b"PK\x03\x04" + b"\0" * 40, b"%PDF-1.7\n",
+    b"\xff\xd8\xff\xe0" + b"\0" * 60, b"BM" + b"\xff" * 60, b"II*\0" + b"\0" * 40, b"\x1f\x8b" + b"\0" * 30,
+)  # fmt: skip
+
+
+def _another_kind(data: bytes, random: Random) -> bytes:
+    """The beginning of another file, with this one's rest or without."""
+    other = random.choice(_OTHERS)
+    return other + data[len(other) :] if random.random() < 0.5 else other
+
+
 def _read_clip(path: Path) -> None:
-    number = chance(path) % 4
+    number = chance(path) % 8
     if number == 0:
         assert read_masks(path).dtype == bool
-    given = {"size": (8, 12), "frames": (0, 2)} if number == 1 else {"center_crop": (4, 4)} if number == 2 else {}
-    clip = read_video(path, **given)
+        _refused(path)
+    clip = read_video(path, **_WANTED[number])
     assert clip.num_frames >= 1
 
 
@@ -150,9 +207,15 @@ VIDEO = Target(
     lambda: list(_clips()),
     _read_clip,
     (VideoError,),
-    {"foldgauss.io.video_file": _READ, "foldgauss.io.masks": ()},
+    {
+        "foldgauss.io.video_file": _READ,
+        "foldgauss.io.masks": (),
+        "foldgauss.io._containers": (),
+        "foldgauss.io._rates": (),
+    },
     _clip_body,
     lambda size: 1 << 32,
+    (by_chance, by_chance, by_chance, _another_kind),
     share=0.7,
 )
 
@@ -192,9 +255,11 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
 
 
 def _read_chains(path: Path) -> None:
-    if not path.exists():
-        raise FileNotFoundError  # a run begins there
+    there = path.exists()
     kept = posterior._Kept(path, _FINGERPRINT, _SHAPE)
+    if not there:  # a run begins there
+        kept.live.unlink()
+        raise FileNotFoundError
     try:
         for n in range(_SHAPE[0]):
             backend = kept.of(n)
@@ -263,7 +328,8 @@ CHAINS = Target(
     (ValueError,),
     {
         "foldgauss.uncertainty.posterior": (
-            ONLY, "_Kept", "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "is_sealed",
+            ONLY, "_Kept", "-check_space", "-check_room", "-written",
+            "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "is_sealed",
         )
     },
     lambda data: posterior._BLOCK,

@@ -251,12 +251,12 @@ def _checkpoint_seeds() -> list[bytes]:
     counts, width, num = np.arange(3, dtype=np.int32), 14, 3
     shared = Palette(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
     plain = Palette(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
-    kept = []
+    kept, state = [], None
     for statistics in (None, Statistics(floats(num), floats(num), counts)):
         state = FitState(
             floats(num, width), floats(num, width), floats(num, width), counts, np.zeros(num, np.uint8),
             np.zeros(num, bool), shared, plain, floats(3), floats(2), TIME_ADAM.init(floats(2)), statistics,
-            5, 100, 1.5, 0.01,
+            5, 100, 1.5, 0.01, sound=state, start_errors=((0, 0.1),),
         )  # fmt: skip
         kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))
     return kept

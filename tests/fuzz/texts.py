@@ -14,6 +14,7 @@ from foldgauss.cli._tradeoff import COLUMNS, Record
 from foldgauss.io import HistoryFile, read_history, save_selection, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
+from foldgauss.video import edit
 from foldgauss.video.fit import FitInfo
 from foldgauss.video.select import Selection
 
@@ -121,6 +122,21 @@ freeze = 0.5
 [camera]
 elevation = 5
 """
+_FIFTH = b"""\
+[selections.most]
+mask = "masks"
+[selections.some]
+mask = "masks"
+frames = [0, 2]
+[selections.now]
+mask = "masks"
+frame = 1
+[[edits]]
+do = "vanish"
+select = "most"
+[[layers]]
+model = "other.safetensors"
+"""
 _KEYS = (
     b"do",
     b"select",
@@ -166,6 +182,8 @@ def toml_changed(data: bytes, random: Random) -> bytes:
             b"[a.b.c]",
             b"[selections.one]",
             b"[x]",
+            b"[[camera]]",
+            b'where = "beside"',
         )
         lines.insert(at, random.choice(made))
     elif how == 5:
@@ -177,7 +195,10 @@ def toml_changed(data: bytes, random: Random) -> bytes:
 
 def _apply_script(path: Path) -> None:
     """What the script asks for, too: selections, masks, other models, a camera."""
-    read_edit_script(path).apply(tiny_model())
+    video = tiny_model()
+    if chance(path) % 8 == 0:
+        video = edit(video).opacity(0.5, frames=(0, 1)).video()  # of layers, or overlays, which files do not fit to
+    read_edit_script(path).apply(video)
 
 
 def _beside_scripts(folder: Path) -> None:
@@ -190,6 +211,9 @@ def _beside_scripts(folder: Path) -> None:
     mask = io.BytesIO()
     Image.fromarray(np.tile(np.uint8([0, 1, 1, 2, 1, 1]), (4, 1))).save(mask, "PNG")
     (folder / "mask.png").write_bytes(mask.getvalue())
+    (folder / "masks").mkdir(exist_ok=True)
+    for k in range(tiny_model().num_frames):
+        (folder / "masks" / f"{k}.png").write_bytes(mask.getvalue())
 
 
 SCRIPT = Target(
@@ -211,7 +235,7 @@ SCRIPT = Target(
 APPLIED = dataclasses.replace(
     SCRIPT,
     name="edit-applied",
-    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD],
+    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD, _FIFTH],
     parse=_apply_script,
     errors=(EditScriptError, FileNotFoundError),
     memory=lambda size: (256 << 20) + 400 * size,

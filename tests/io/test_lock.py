@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from foldgauss.io._atomic import OutputError
+from foldgauss.io._atomic import OutputError, atomic_folder
 from foldgauss.io._lock import LEFT, only_writer
 
 HOLDING = """
@@ -79,3 +79,31 @@ def test_a_folder_that_is_not_there(tmp_path):
     ):
         pass
     assert os.listdir(tmp_path) == []
+
+
+def test_what_cannot_be_removed_is_no_reason_not_to_work(tmp_path):
+    """Another user's file in a folder of all, or a folder of such a name."""
+    (tmp_path / ".m.own-01ab23cd.safetensors").mkdir()
+    with only_writer(tmp_path / "m.safetensors"):
+        pass
+    assert os.listdir(tmp_path) == [".m.own-01ab23cd.safetensors"]
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_a_folder_is_there_whenever_its_replacement_is_stopped(tmp_path, monkeypatch, at):
+    """Ctrl-C as the old folder has been moved aside, and as the new one has taken its place."""
+    folder, replace, moves = tmp_path / "frames", os.replace, []
+    folder.mkdir()
+    (folder / "old").touch()
+
+    def moving(source, target):
+        replace(source, target)
+        moves.append(source)
+        if len(moves) == at:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", moving)
+    with pytest.raises(KeyboardInterrupt), atomic_folder(folder) as temporary:
+        (temporary / "new").touch()
+    assert os.listdir(tmp_path) == ["frames"]
+    assert os.listdir(folder) == [["old"], ["new"]][at - 1]

@@ -18,7 +18,7 @@ import pytest
 from commands import run
 from PIL import Image
 
-from foldgauss.io import load_video_model, video_file
+from foldgauss.io import _containers, load_video_model, video_file
 from foldgauss.io.video_file import VideoError, read_video, write_video
 
 OLD = int(cv2.__version__.split(".")[0]) < 5
@@ -170,7 +170,7 @@ def test_uneven_times_are_told_and_no_frame_is_lost(tmp_path, mp4, uneven_mp4):
     steady = read_video(tmp_path / "uneven.mp4", frames=(4, 8))
     assert (steady.times, steady.fps) == (None, pytest.approx(2.5))
     given = read_video(tmp_path / "uneven.mp4", fps=12)
-    assert (given.times, given.fps) == (None, 12)
+    assert (given.times, given.fps, given.notes) == (None, 12, ())
 
 
 @pytest.mark.parametrize("name", ["clip.mkv", "clip.nut", "clip.mov"])
@@ -414,6 +414,92 @@ def test_no_count_at_all(tmp_path, webm):
     (tmp_path / "a.webm").write_bytes(webm.replace(b"\x44\x89\x88", b"\xec\x40\x08"))
     clip = read_video(tmp_path / "a.webm")
     assert (clip.num_frames, clip.num_declared) == (8, 8)
+
+
+def _cut_by_edits(mp4, first):
+    """An MP4 of which cutting without encoding left its first frames in place, unseen."""
+    at, clock = mp4.index(b"elst") + 4, mp4.index(b"mdhd") + 16
+    (ticks,) = struct.unpack_from(">I", mp4, clock)  # of a second
+    assert mp4[at] == 0
+    (shown,) = struct.unpack_from(">I", mp4, at + 8)
+    return mp4[: at + 8] + struct.pack(">II", shown * (8 - first) // 8, ticks * first // 10) + mp4[at + 16 :]
+
+
+def test_frames_that_an_edit_list_hides_are_not_missed(tmp_path, mp4):
+    (tmp_path / "a.mp4").write_bytes(mp4)
+    (tmp_path / "cut.mp4").write_bytes(_cut_by_edits(mp4, 3))
+    whole, clip = read_video(tmp_path / "a.mp4"), read_video(tmp_path / "cut.mp4")
+    assert (whole.num_declared, clip.num_declared, clip.fps, clip.times) == (8, 5, 10, None)
+    np.testing.assert_array_equal(clip.frames, whole.frames[3:])
+    with pytest.raises(VideoError, match="within 0:5"):
+        read_video(tmp_path / "cut.mp4", frames=(0, 6))
+
+
+@pytest.mark.parametrize("length", [0, 4, 9, 16, 20])
+def test_edit_lists_that_are_none(tmp_path, mp4, length):
+    """Each box that is asked, cut short or away: the container's count holds."""
+    for name in (b"mvhd", b"mdhd", b"hdlr", b"elst", b"mdia", b"edts"):
+        at = mp4.index(name)
+        (tmp_path / "a.mp4").write_bytes(mp4[:at] + b"free" + mp4[at + 4 :])
+        with open(tmp_path / "a.mp4", "rb") as file:
+            assert _containers.shown_seconds(file) is None
+        (tmp_path / "a.mp4").write_bytes(mp4[: at + length])
+        with open(tmp_path / "a.mp4", "rb") as file:
+            assert _containers.shown_seconds(file) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "options"),
+    [
+        ("a.mkv", "ffv1", ()),
+        ("a.webm", "libvpx-vp9", ()),
+        ("a.ts", "mpeg2video", ()),
+        ("a.m2ts", "mpeg2video", ()),
+        ("a.mpg", "mpeg2video", ()),
+        ("a.ogv", "libtheora", ()),
+        ("a.wmv", "wmv2", ()),
+        ("fragments.mp4", "libx264", ("-movflags", "frag_keyframe+empty_moov")),
+    ],
+)
+def test_sound_that_lasts_longer_promises_no_frames(tmp_path, name, codec, options):
+    """Their duration is the sound's: of these 8 frames 50 were once missed."""
+    given = ("-f", "lavfi", "-i", "sine=d=2", "-c:v", codec, "-q:v", "2", *options)
+    _ffmpeg(*given, tmp_path / name, frames=_waves(8), rate=25)
+    clip = read_video(tmp_path / name)
+    assert (clip.num_frames, clip.num_declared, clip.times) == (8, 8, None)
+
+
+def test_a_matroska_with_sound_that_breaks_off(tmp_path):
+    _ffmpeg("-f", "lavfi", "-i", "sine=d=0.8", "-c:v", "ffv1", tmp_path / "a.mkv", frames=_noise())
+    data = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "b.mkv").write_bytes(data[: len(data) // 2])
+    whole, half = read_video(tmp_path / "a.mkv"), read_video(tmp_path / "b.mkv")
+    assert (whole.num_frames, whole.num_declared) == (8, 8)
+    assert 2 <= half.num_frames < half.num_declared == 8
+
+
+def test_a_rate_that_is_not_known_is_told(tmp_path):
+    """A bare stream has no times, and above 1000 a second none are taken."""
+    _ffmpeg("-c:v", "libx264", "-crf", "5", tmp_path / "a.h264", frames=_waves())
+    _ffmpeg("-c:v", "libx264", "-crf", "5", tmp_path / "fast.mp4", frames=_waves(), rate=1200)
+    for name in ("a.h264", "fast.mp4"):
+        clip = read_video(tmp_path / name)
+        assert (clip.num_frames, clip.fps, len(clip.notes)) == (8, 25, 1)
+        assert "no rate is told that can be used; taken as 25" in clip.notes[0]
+        given = read_video(tmp_path / name, fps=30)
+        assert (given.fps, given.notes) == (30, ())
+
+
+@pytest.mark.parametrize("name", ["a.mjpeg", "a"])
+def test_bare_sequences_of_jpegs_are_refused(tmp_path, name):
+    """They were once read as their first picture."""
+    packets = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in _waves(3)]
+    (tmp_path / name).write_bytes(b"".join(packets))
+    _refused(tmp_path / name, "a bare sequence of JPEGs", "ffmpeg")
+    (tmp_path / name).write_bytes(packets[0] + b"more")
+    assert read_video(tmp_path / name).num_frames == 1
+    (tmp_path / "photo.jpg").write_bytes(b"".join(packets))  # a camera's, with what it keeps beside the picture
+    assert read_video(tmp_path / "photo.jpg").num_frames == 1
 
 
 @pytest.mark.parametrize("kind", ["matroska", "webm", "mpegts", "flv"])
