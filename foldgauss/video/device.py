@@ -12,7 +12,7 @@ import numpy as np
 from foldgauss._checks import invalid
 from foldgauss.render import pallas
 from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.device_step import Arrays, Control, Figures, Plan, error_of, everywhere, program
+from foldgauss.video.device_step import Arrays, Control, Figures, Plan, everywhere, look, program
 from foldgauss.video.growth import Statistics
 from foldgauss.video.population import changes_at, grow
 from foldgauss.video.pyramid import levels, shrunk
@@ -222,12 +222,9 @@ class DeviceStepper:
         times, num = np.asarray(frame_times(state.time_logits)), np.int32(state.held.num)
         looked_at = np.unique(np.linspace(0, self.num_frames - 1, LOOKED_AT).round().astype(int))
 
-        def error(k: int) -> float:
-            return float(error_of(plan, arrays.rows, num, times[k], self.pictures[-1][k]))
-
-        error(0)  # compiled, before the clock runs
+        error = look(plan)  # compiled, before the clock runs
         begun = time.perf_counter()
-        errors = {int(k): error(k) for k in looked_at}
+        errors = {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in looked_at}
         state.seconds += time.perf_counter() - begun
         return errors
 

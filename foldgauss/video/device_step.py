@@ -347,9 +347,17 @@ def _in_own_time(rows, kinds, degree: int, unit_time: float) -> Float[Array, "nu
 # ---------------------------------------------------------------------------------------------- looking
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def error_of(plan: Plan, rows, num, t, frame: UInt8[Array, "height width 3"]) -> Float[Array, ""]:
-    """Mean squared error of the picture of time t against a frame."""
+@functools.lru_cache(maxsize=8)
+def look(plan: Plan) -> jax.stages.Compiled:
+    """`look(plan)(rows, num, t, frame)`: the mean squared error of the picture of time t against a frame, compiled."""
+    place = everywhere(plan)
+    shapes = (plan.capacity, plan.width), (), (), (*plan.size, 3)
+    dtypes = np.float32, np.int32, np.float32, np.uint8
+    given = (jax.ShapeDtypeStruct(*own, sharding=place) for own in zip(shapes, dtypes, strict=True))
+    return jax.jit(functools.partial(_error, plan)).lower(*given).compile()
+
+
+def _error(plan: Plan, rows, num, t, frame: UInt8[Array, "height width 3"]) -> Float[Array, ""]:
     alive = alive_at(plan, rows, num, t)
     picture = _drawn(plan, _splats(plan, rows, t, alive, jnp.bool_(False)))
     difference = picture - frame.astype(jnp.float32) * np.float32(1 / 255)
