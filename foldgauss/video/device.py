@@ -183,6 +183,9 @@ class DeviceStepper:
 
     def __call__(self, state: FitState, progress: float, level: int = -1) -> tuple[float, float, int]:
         """Advance `state`, whose arrays are consumed; returns loss, mean squared error and how many took part."""
+        if state.changed:  # by who watches the fit
+            state.land()
+            self._adopt(state)
         held, config = state.held, self.config
         rates, rate_of_times = self.rates.at(progress, state.backoffs)
         control = Control(

@@ -72,7 +72,8 @@ class Held(Protocol):
 class FitState:
     """The arrays of a running fit. A step consumes its state: as with donated buffers, arrays are updated in place.
 
-    Those of a fit on a device are `held` there, and fetched anew whenever they are read.
+    Those of a fit on a device are `held` there, and fetched anew, as copies, whenever they are read; who sets one has
+    it taken over by the next step.
     """
 
     rows: np.ndarray  # float32 (num, width): see `packing`
@@ -130,12 +131,16 @@ class FitState:
         self.held = held
 
     def land(self) -> None:
-        """Fetch all arrays; nothing is held any more."""
+        """Fetch all arrays, but for those that were set since; nothing is held any more."""
         if self.held is not None:
-            arrays = {name: self.held.fetch(name) for name in ARRAYS}
+            arrays = {name: getattr(self, name) for name in ARRAYS}
             self.held = None
-            for name, array in arrays.items():
-                setattr(self, name, array)
+            self.__dict__.update(arrays)
+
+    @property
+    def changed(self) -> bool:
+        """Whether an array was set since arrays are held."""
+        return self.held is not None and not self.__dict__.keys().isdisjoint(ARRAYS)
 
 
 #: The fields of a `FitState` that are arrays, or trees of them.
