@@ -32,7 +32,7 @@ from foldgauss.io.video_file import (
     write_image,
     write_video,
 )
-from foldgauss.io.video_model import read_metadata
+from foldgauss.io.video_model import read_origin
 from foldgauss.render import RenderOptions
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
@@ -232,7 +232,7 @@ def clip_of_model(
 
     Raises WrongUse, with `as_many`, for another number of frames than the model's.
     """
-    about = read_metadata(model_path)
+    about = read_origin(model_path)
     kept = about.get("frames")
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     try:
@@ -256,7 +256,7 @@ def is_other_clip(model_path: Path, clip: Clip, got: Callable[[], float]) -> boo
 
     `got` gives the mean PSNR, and is asked only where the frames differ in some bit.
     """
-    about = read_metadata(model_path)
+    about = read_origin(model_path)
     digest, had = about.get("frames_digest"), about.get("mean_psnr")
     differs = digest is not None and digest != fingerprint(clip)["frames_digest"]
     return differs and had is not None and got() < had - OTHER
