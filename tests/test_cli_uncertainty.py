@@ -15,6 +15,7 @@ from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
 from foldgauss.cli import uncertainty as command
 from foldgauss.io import load_video_model, save_video_model
+from foldgauss.uncertainty.posterior import only_run
 from foldgauss.video import edit
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
@@ -167,6 +168,17 @@ def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no
     (target / "chains.h5").unlink()
     assert run(*arguments(work, target, *few)) == 2
     assert "frame_times.csv exists" in capsys.readouterr().err
+
+
+def test_draws_that_python_is_writing_are_left_alone(work, tmp_path, capsys, monkeypatch):
+    """Known before pictures are drawn."""
+    monkeypatch.setattr(command, "_evidence", None)
+    for more in ([], ["--overwrite"]):
+        with only_run(tmp_path / "chains.h5"):
+            assert run(*arguments(work, tmp_path, *SHORT, *more)) == 1
+        message = capsys.readouterr().err
+        assert "error: --out: expected a file that no other run is writing" in message
+        assert os.listdir(tmp_path) == []
 
 
 def test_wrong_use(work, tmp_path, capsys):

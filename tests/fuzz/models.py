@@ -201,7 +201,10 @@ def _video_seeds() -> list[bytes]:
     models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
     models.append(dataclasses.replace(_edited(), camera=None))
     models.append(tiny_model(16, 1, shared=True))
-    return [written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]})) for one in models]
+    return [
+        written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]}))
+        for one in models
+    ]
 
 
 def _read_video(path: Path) -> None:
