@@ -456,6 +456,18 @@ def test_other_settings_are_refused(done, clip, tmp_path, capsys):
     assert "'mine.txt' in it" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.parametrize("name", ["base.safetensors", "tradeoff.csv", "tradeoff.png"])
+def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, capsys, monkeypatch, name):
+    monkeypatch.setattr(command, "read_video", None)  # before any work
+    (tmp_path / name).write_text("mine")
+    assert run("tradeoff", clip, "--out", tmp_path, *QUICK) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start anew" in told
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+    assert run("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite") == 1
+    assert "NoneType" in capsys.readouterr().err
+
+
 def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeypatch, tmp_path):
     for name in ("matplotlib", "matplotlib.figure"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from foldgauss import __version__
 from foldgauss._checks import invalid
 from foldgauss.cli._completion import among
-from foldgauss.cli._evidence import keep_evidence, kept_evidence
+from foldgauss.cli._evidence import is_evidence, keep_evidence, kept_evidence
 from foldgauss.cli._shared import (
     TIME_LEFT,
     FittedClip,
@@ -185,6 +185,8 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder without other images", got=folder, cure=cure)))
     there = [name for name in FILES if (folder / name).exists()]
+    if (folder / EVIDENCE).exists() and not is_evidence(folder / EVIDENCE):  # a run that was killed may leave its own
+        there.append(EVIDENCE)
     if there and not (folder / CHAINS).exists() and not overwrite:
         raise WrongUse(f"--out: {folder / there[0]} exists. Choose another folder, or add --overwrite.")
     if folder.is_dir():
