@@ -5,7 +5,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -132,7 +132,7 @@ def uncertainty_command(
         raise WrongUse(str(invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)))
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
-    _make_folder(out_dir)
+    context.with_resource(_made_folder(out_dir))
     own = tuple(out_dir / name for name in (*FILES, EVIDENCE))
     context.with_resource(only_writer(out_dir / CHAINS, own=own, what="run of uncertainty"))
     with _no_other_run(), only_run(out_dir / CHAINS):
@@ -193,12 +193,21 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
         check_writable(folder / FILES[0])
 
 
-def _make_folder(path: Path) -> None:
+@contextmanager
+def _made_folder(path: Path) -> Iterator[None]:
+    """Within, the folder is there; one that was not, and into which nothing came, is gone afterwards."""
+    existed = path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
-    check_writable(path / FILES[0])
+    try:
+        check_writable(path / FILES[0])
+        yield
+    finally:
+        if not existed:
+            with suppress(OSError):  # there is something in it
+                path.rmdir()
 
 
 def _check_settings(num_frames: int, only, concentration: float, walkers, ensembles: int, steps: int) -> None:
