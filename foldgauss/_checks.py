@@ -27,12 +27,19 @@ def short_repr(value: object) -> str:
 
 def within(value: object, bounds: str) -> bool:
     """Whether `value` is a finite number in an interval written as "[0, 1)": "[" includes the bound, "(" does not."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+    if not isinstance(value, Real) or isinstance(value, bool) or not _is_finite(value):
         return False
     low, high = (float(part) for part in bounds[1:-1].split(","))
     return (low < value or (bounds[0] == "[" and low == value)) and (
         value < high or (bounds[-1] == "]" and value == high)
     )
+
+
+def _is_finite(value: Real) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond the floats
+        return False
 
 
 def whole(value: object, least: int) -> bool:

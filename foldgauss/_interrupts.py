@@ -1,24 +1,78 @@
-"""Ctrl-C while modules are imported."""
+"""Ctrl-C while modules are imported, and SIGTERM while a command runs."""
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+
+#: Seconds within which another SIGTERM is the same one: `timeout` sends it to a process, and then to its group.
+SAME = 5.0
+#: Exit status of a process that SIGTERM ended, as shells tell it.
+TERMINATED = 128 + signal.SIGTERM
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which is to leave no more behind than Ctrl-C does."""
+
+
+class _Answer:
+    """The first SIGTERM raises `Terminated`; a later one ends the process at once, whatever it is at."""
+
+    def __init__(self) -> None:
+        self.first: float | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if self.first is None:
+            self.first = now
+            raise Terminated("ended by SIGTERM")
+        if now - self.first > SAME:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+
+
+@contextmanager
+def ending_well() -> Iterator[None]:
+    """Within, SIGTERM raises `Terminated`, unless somebody else answers it; the process then exits with 143.
+
+    As the system ends it, what is unfinished would lie about for good.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    answer = _Answer()
+    signal.signal(signal.SIGTERM, answer)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if answer.first is not None:  # however it was told meanwhile
+            raise SystemExit(TERMINATED)
 
 
 @contextmanager
 def leaving_at_once() -> Iterator[None]:
-    """Within, Ctrl-C ends the process as the system does, unless somebody else answers it.
+    """Within, Ctrl-C and SIGTERM end the process as the system does, unless somebody else answers them.
 
     Nothing is open yet that would be lost; and of a KeyboardInterrupt in their midst the native libraries that are
     being imported crash, or lose it.
     """
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = {
+        number: handler
+        for number, handler in handlers.items()
+        if handler is signal.default_int_handler or isinstance(handler, _Answer)
+    }
+    for number in ours:
+        signal.signal(number, signal.SIG_DFL)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in ours.items():
+            signal.signal(number, handler)

@@ -358,15 +358,38 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
 def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
     monkeypatch.setattr(fitting, "DEMO_FRAMES", (0, 4))
-    (tmp_path / "model.safetensors").write_bytes(b"an earlier demo's")
+    (tmp_path / "model.safetensors").write_bytes(b"mine")
+    for record in (None, b"\xff", b"[]", b'{"psnr": [], "ssim": []}'):  # none, and none of a demo
+        if record is not None:
+            (tmp_path / "metrics.json").write_bytes(record)
+        assert run("demo", "--out", tmp_path) == 2
+        assert "in it, but no metrics.json of a demo. Choose another folder." in capsys.readouterr().err
+    assert (tmp_path / "model.safetensors").read_bytes() == b"mine"
+    (tmp_path / "metrics.json").write_text('{"fit_seconds": 1.0, "psnr": [], "ssim": []}')
     (tmp_path / "notes.txt").write_text("mine")
     assert run("demo", "--out", tmp_path) == 2
     assert "notes.txt" in capsys.readouterr().err
-    assert (tmp_path / "model.safetensors").read_bytes() == b"an earlier demo's"
+    assert (tmp_path / "model.safetensors").read_bytes() == b"mine"
     (tmp_path / "notes.txt").rename(tmp_path / ".hidden")
     assert run("demo", "--out", tmp_path) == 0
     assert load_video_model(tmp_path / "model.safetensors").num_frames == 4
     assert run("demo", "--out", tmp_path / ".hidden") == 1  # a file
+
+
+def test_a_demo_that_was_stopped_is_replaced_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(fitting, "DEMO_FRAMES", (0, 4))
+
+    def stopped(*given):
+        raise OSError("stopped")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fitting, "write_video", stopped)
+        assert run("demo", "--out", tmp_path) == 1
+    assert (tmp_path / "model.safetensors").exists()
+    assert run("demo", "--out", tmp_path) == 0
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["file_bytes"] == (tmp_path / "model.safetensors").stat().st_size
 
 
 @pytest.mark.slow

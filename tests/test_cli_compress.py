@@ -10,7 +10,7 @@ from commands import run
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
-from foldgauss.io.video_model import read_metadata
+from foldgauss.io.video_model import read_metadata, read_origin
 from foldgauss.render import RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
 
@@ -70,6 +70,38 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
     assert load_video_model("edited.safetensors").num_gaussians < load_video_model("model.fgz").num_gaussians
     with pytest.raises(ValueError, match="foldgauss compress"):
         save_video_model("again.fgz", load_video_model("model.fgz"))
+
+
+ODD = [
+    {"mean_psnr": "high"},
+    {"mean_psnr": 10**400},
+    {"mean_psnr": [33.3]},
+    {"frames": "0:5"},
+    {"frames": {"0": 5}},
+    {"frames": [0]},
+    {"frames": [0, "5"]},
+    {"frames": [-3, 5]},
+    {"frames": [5, 3]},
+    {"frames": 5},
+    {"frames_digest": ["another's"]},
+    {"clip": {"a": 1}, "seed": "0"},
+]
+
+
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: str(odd)[:40])
+def test_notes_of_another_kind_are_none(work, tmp_path, capsys, odd):
+    """Files come from strangers: what is no note of a fit is not there, for no command."""
+    path, made = tmp_path / "m.safetensors", tmp_path / "m.fgz"
+    about = {"clip": "clip", "mean_psnr": 33.3, "frames": [0, FRAMES], "frames_digest": "another's", "mine": [1]} | odd
+    save_video_model(path, load_video_model(work / "model.safetensors"), metadata=about)
+    assert read_origin(path) == {name: value for name, value in about.items() if name not in odd}
+    assert read_metadata(path) == about  # all that was written
+    assert run("compress", path, work / "clip", "--passes", 0, "--out", made) == 0
+    assert not odd.keys() & read_metadata(made).keys() - {"mean_psnr"}
+    assert run("evaluate", path, work / "clip") == 0
+    assert run("info", path) == 0
+    assert run("export", path, "--format", "html", "--out", tmp_path / "m.html") == 0
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):

@@ -14,7 +14,10 @@ from commands import run
 from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
 from foldgauss.cli import uncertainty as command
-from foldgauss.io import load_video_model, save_video_model
+from foldgauss.cli._evidence import keep_evidence
+from foldgauss.io import load_video_model, read_video, save_video_model
+from foldgauss.uncertainty import evidence
+from foldgauss.uncertainty.posterior import only_run
 from foldgauss.video import edit
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
@@ -167,6 +170,35 @@ def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no
     (target / "chains.h5").unlink()
     assert run(*arguments(work, target, *few)) == 2
     assert "frame_times.csv exists" in capsys.readouterr().err
+
+
+def test_draws_that_python_is_writing_are_left_alone(work, tmp_path, capsys, monkeypatch):
+    """Known before pictures are drawn."""
+    monkeypatch.setattr(command, "_evidence", None)
+    for more in ([], ["--overwrite"]):
+        with only_run(tmp_path / "chains.h5"):
+            assert run(*arguments(work, tmp_path, *SHORT, *more)) == 1
+        message = capsys.readouterr().err
+        assert "error: --out: expected a file that no other run is writing" in message
+        assert os.listdir(tmp_path) == []
+
+
+def test_evidence_that_is_none_is_left_alone(work, tmp_path, capsys, monkeypatch):
+    """What a killed run left goes on."""
+    monkeypatch.setattr(command, "load_video_model", None)  # before any work
+    mine = tmp_path / "evidence.npz"
+    for content in (lambda: mine.write_text("mine"), lambda: np.savez(mine, key="mine", nodes=np.zeros(2))):
+        content()
+        before = mine.read_bytes()
+        assert run(*arguments(work, tmp_path, *SHORT)) == 2
+        assert "evidence.npz exists. Choose another folder, or add --overwrite." in capsys.readouterr().err
+        assert mine.read_bytes() == before
+        assert os.listdir(tmp_path) == ["evidence.npz"]
+        assert run(*arguments(work, tmp_path, *SHORT, "--overwrite")) == 1
+        assert "NoneType" in capsys.readouterr().err
+    keep_evidence(mine, "another's", evidence(model_of_12(), read_video(work / "clip").frames))
+    assert run(*arguments(work, tmp_path, *SHORT)) == 1
+    assert "NoneType" in capsys.readouterr().err
 
 
 def test_wrong_use(work, tmp_path, capsys):

@@ -96,15 +96,16 @@ def test_a_port_that_is_taken_is_told(served, work):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
-def test_ctrl_c_ends_it_well(work):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_a_signal_ends_it_well(work, number, code):
     command = [sys.executable, "-m", "foldgauss", "view", str(work / "model.safetensors"), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         first = process.stdout.readline()
         assert re.search(r" at http://127\.0\.0\.1:\d+/$", first.rstrip()), first
         time.sleep(0.3)
-        process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
-    assert (process.returncode, told) == (0, "")
+        process.send_signal(number)
+        last, told = process.communicate(timeout=60)
+    assert (process.returncode, last, told) == (code, "Ended.\n", "")
 
 
 def test_export_writes_the_page(work, tmp_path, capsys):

@@ -7,7 +7,10 @@ files, which needs no rights. The long runs: `python -m benchmarks.reliability`.
 import contextlib
 import os
 import shutil
+import signal
 import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -254,7 +257,8 @@ def test_draws_without_room(size, what, work, small_disk, capsys):
     assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith(f"error: path: expected room for {str(out / what)!r}, got none")
-    assert os.listdir(out) == ([] if what == "evidence.npz" else ["evidence.npz"])
+    there = sorted(path.name for path in folder.rglob("*"))
+    assert there == ([] if what == "evidence.npz" else ["draws", "evidence.npz"])
 
 
 # ------------------------------------------------------------------------- places that cannot be written
@@ -408,6 +412,96 @@ def test_a_fit_writes_its_model_in_a_name_known_for_its_own(work, tmp_path, monk
     assert run("fit", work / "clip.mp4", "--out", tmp_path / "m.safetensors", *SMALL) == 0
     assert len(seen) == 2
     assert all(name.startswith(str(tmp_path / ".m.own-")) for name in seen)
+
+
+WRITING = {
+    "m.mp4": lambda model, clip: ["render", model],
+    "frames": lambda model, clip: ["render", model],
+    "one.png": lambda model, clip: ["render", model, "--times", "0.5"],
+    "m.json": lambda model, clip: ["evaluate", model, clip],
+    "m.fgz": lambda model, clip: ["compress", model],
+    "e.safetensors": lambda model, clip: ["edit", model, model.with_name("move.toml")],
+    "m.html": lambda model, clip: ["export", model, "--format", "html"],
+    "mesh": lambda model, clip: ["export", model, "--format", "obj"],
+    "m.safetensors": lambda model, clip: ["fit", clip, *SMALL],
+}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
+@pytest.mark.parametrize("name", WRITING)
+def test_sigterm_leaves_what_was_there_and_nothing_unfinished(work, tmp_path, monkeypatch, name):
+    """Sent as the whole of an output is to take its name."""
+    target, replace, sent = tmp_path / name, os.replace, []
+
+    def replacing(source, to):
+        if os.path.dirname(to) == str(tmp_path):
+            sent.append(to)
+            signal.raise_signal(signal.SIGTERM)
+        replace(source, to)
+
+    if "." in name:
+        target.write_bytes(OLDER)
+    words = [*WRITING[name](work / "model.safetensors", work / "clip.mp4"), "--overwrite"]
+    monkeypatch.setattr(os, "replace", replacing)
+    assert run(*words, "--json" if name == "m.json" else "--out", target) == 143
+    assert len(sent) == 1
+    assert os.listdir(tmp_path) == ([name] if "." in name else [])
+    assert "." not in name or target.read_bytes() == OLDER
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
+def test_sigterm_from_outside_twice(work, tmp_path):
+    """As `timeout` sends it, to a process of its own."""
+    words = ["render", work / "model.safetensors", "--speed", "0.001", "--out", tmp_path / "frames"]
+    with subprocess.Popen([sys.executable, "-m", "foldgauss", *map(str, words)], stderr=subprocess.PIPE) as process:
+        while not any(tmp_path.glob(".frames.tmp-*/*")):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGTERM)
+        _, told = process.communicate(timeout=120)
+    assert (process.returncode, told) == (143, b"")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
+@pytest.mark.parametrize("late", [False, True])
+def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
+    script = (
+        "import signal\n"
+        "from foldgauss import _interrupts\n"
+        f"_interrupts.SAME = {-1.0 if late else 1e9}\n"
+        "with _interrupts.ending_well():\n"
+        "    try:\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "    except KeyboardInterrupt:\n"
+        "        print('ending', flush=True)\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "        print('ended', flush=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stderr == ""
+    expected = (-signal.SIGTERM, "ending\n") if late else (143, "ending\nended\n")
+    assert (done.returncode, done.stdout) == expected
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
+def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
+    from foldgauss.uncertainty import posterior
+
+    keep = posterior._Kept.keep
+
+    def kept(self):
+        keep(self)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(posterior._Kept, "keep", kept)
+    words = ["uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", tmp_path, "--steps", "600"]
+    assert run(*words) == 143
+    assert "goes on when called again" in " ".join(capsys.readouterr().err.split())
+    assert sorted(os.listdir(tmp_path)) == ["chains.h5", "evidence.npz"]
 
 
 def test_draws_go_on_where_a_kill_left_a_picture(work, tmp_path):

@@ -540,6 +540,7 @@ def test_an_interrupt_while_modules_are_imported_ends_the_command(module):
         main(["fit", "--help"])
     """
     assert run_script(script, module, expected=-signal.SIGINT) == ""
+    assert run_script(script.replace("SIGINT", "SIGTERM"), module, expected=-signal.SIGTERM) == ""
 
 
 def test_whoever_answers_interrupts_still_does():

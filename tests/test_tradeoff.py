@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import os
 import shlex
 import signal
 import subprocess
@@ -454,6 +455,56 @@ def test_other_settings_are_refused(done, clip, tmp_path, capsys):
     (target / "mine.txt").write_text("mine")
     assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 2
     assert "'mine.txt' in it" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("where", "odd", "told"),
+    [
+        *[
+            (("points", 1, name), [1], "should be")
+            for name in ("psnr", "ssim", "seconds", "cpu_seconds", "bytes", "command")
+        ],
+        *[(("points", 1, name), "2", "not '2'") for name in ("floats", "gaussians", "frames_per_second", "settings")],
+        (("points", 1, "seconds"), -1.0, "'seconds' should be a number >= 0, not -1.0"),
+        (("points", 1, "psnr"), math.nan, "'psnr' should be a number, not nan"),
+        (("points", 1, "bytes"), 0, "'bytes' should be a whole number >= 1, not 0"),
+        (("points", 1, "frames_per_second"), 0, "'frames_per_second' should be a number > 0, not 0"),
+        (("points", 0, "axis"), 3, "row 1: 'axis' should be a text, not 3"),
+        (("points", 0), 3, "row 1: 3"),
+        (("points",), 3, "not iterable"),
+        (("plan", "steps"), "12", "plan: 'steps' should be a whole number >= 1, not '12'"),
+        (("plan", "motion"), {"wall": 1.0}, "plan: 'motion' should be seconds"),
+        (("machine", "cores"), None, "machine: 'cores' should be a number > 0, not None"),
+    ],
+)
+def test_a_record_that_was_edited_is_refused_by_its_place(done, clip, tmp_path, capsys, where, odd, told):
+    kept = record_of(done)
+    part = kept
+    for key in where[:-1]:
+        part = part[key]
+    part[where[-1]] = odd
+    (tmp_path / "tradeoff.json").write_text(json.dumps(kept))
+    before = (tmp_path / "tradeoff.json").read_bytes()
+    assert run("tradeoff", clip, "--out", tmp_path, "--frames", "1:6", *QUICK) == 2
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "--out: expected results of `foldgauss tradeoff` in" in shown
+    assert told in shown
+    if where[0] == "points" and len(where) == 3 and where[2] != "axis":
+        assert f"row 2, {name_of(kept['points'][1])}: {where[2]!r} should be" in shown
+    assert (tmp_path / "tradeoff.json").read_bytes() == before
+    assert os.listdir(tmp_path) == ["tradeoff.json"]
+
+
+@pytest.mark.parametrize("name", ["base.safetensors", "tradeoff.csv", "tradeoff.png"])
+def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, capsys, monkeypatch, name):
+    monkeypatch.setattr(command, "read_video", None)  # before any work
+    (tmp_path / name).write_text("mine")
+    assert run("tradeoff", clip, "--out", tmp_path, *QUICK) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start anew" in told
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+    assert run("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite") == 1
+    assert "NoneType" in capsys.readouterr().err
 
 
 def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeypatch, tmp_path):

@@ -4,7 +4,7 @@ from foldgauss._interrupts import leaving_at_once
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command and exit: 0 fine, 2 wrong use, 1 failure; one-line errors unless --debug."""
+    """Run the command and exit: 0 fine, 2 wrong use, 1 failure, 143 for SIGTERM; one-line errors unless --debug."""
     with leaving_at_once():
         from foldgauss.cli import _main
     _main.main(arguments)

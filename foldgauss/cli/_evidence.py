@@ -44,6 +44,15 @@ def kept_evidence(path: Path, key: str, num_frames: int) -> Evidence | None:
         return None
 
 
+def is_evidence(path: Path) -> bool:
+    """Whether `keep_evidence` may have written it: its parts have these names."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return set(archive.namelist()) >= {f"{name}.npy" for name in ("key", *_PROFILES)}
+    except Exception:  # as above
+        return False
+
+
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     """One member; stored as it is, and no longer than its header says."""
     info = archive.getinfo(name)

@@ -3,13 +3,19 @@
 import sys
 import warnings
 
+from foldgauss._interrupts import ending_well
 from foldgauss.cli._app import Stopped, WrongUse, app, as_option, err, loaded
 
 WRONG_USE, FAILURE = 2, 1
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command and exit: 0 fine, 2 wrong use, 1 failure; one-line errors unless --debug."""
+    """Run the command and exit: 0 fine, 2 wrong use, 1 failure, 143 for SIGTERM; one-line errors unless --debug."""
+    with ending_well():
+        _run(arguments)
+
+
+def _run(arguments: list[str] | None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments  # taken out, so that it may stand anywhere
     try:

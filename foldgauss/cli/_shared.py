@@ -32,7 +32,7 @@ from foldgauss.io.video_file import (
     write_image,
     write_video,
 )
-from foldgauss.io.video_model import read_metadata
+from foldgauss.io.video_model import read_origin
 from foldgauss.render import RenderOptions
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
@@ -232,7 +232,7 @@ def clip_of_model(
 
     Raises WrongUse, with `as_many`, for another number of frames than the model's.
     """
-    about = read_metadata(model_path)
+    about = read_origin(model_path)
     kept = about.get("frames")
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     try:
@@ -256,7 +256,7 @@ def is_other_clip(model_path: Path, clip: Clip, got: Callable[[], float]) -> boo
 
     `got` gives the mean PSNR, and is asked only where the frames differ in some bit.
     """
-    about = read_metadata(model_path)
+    about = read_origin(model_path)
     digest, had = about.get("frames_digest"), about.get("mean_psnr")
     differs = digest is not None and digest != fingerprint(clip)["frames_digest"]
     return differs and had is not None and got() < had - OTHER
@@ -325,18 +325,23 @@ def write_json(path: Path, figures: dict[str, Any]) -> None:
         temporary.write_text(json.dumps(figures, indent=2) + "\n")
 
 
-def refuse_foreign(folder: Path, own: Collection[str], command: str) -> None:
-    """A command replaces the files that it wrote into a folder, `own`, so nothing else may be among them."""
+def refuse_foreign(
+    folder: Path, own: Collection[str], command: str, *, record: str, known: bool, cure: str = ""
+) -> None:
+    """A command replaces the files that it wrote into a folder, `own`, so nothing else may be among them.
+
+    Nor may others of these names: they are its own if its `record` stands beside them, which is `known`.
+    """
     try:
         names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
     except OSError:  # missing, or no folder: making it says so
         return
-    foreign = sorted(names - set(own))
+    foreign, expected = sorted(names - set(own)), f"--out: expected a new folder or one that a {command} wrote"
     if foreign:
-        raise WrongUse(
-            f"--out: expected a new folder or one that a {command} wrote, got {folder} with {foreign[0]!r} in it. "
-            "Choose another folder."
-        )
+        raise WrongUse(f"{expected}, got {folder} with {foreign[0]!r} in it. Choose another folder.")
+    if names and not known:
+        got = f"{folder} with {min(names)!r} in it, but no {record} of a {command}"
+        raise WrongUse(f"{expected}, got {got}. Choose another folder{cure}.")
 
 
 def check_picture_path(path: Path, *, others: str = "", single: bool = False) -> None:

@@ -6,12 +6,14 @@ import io
 import itertools
 import json
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from foldgauss._checks import short_repr, whole, within
 from foldgauss._machine import machine
 from foldgauss.cli._shared import WrongUse, err, out, write_json
 from foldgauss.io._atomic import atomic_path
@@ -81,11 +83,11 @@ class Record:
     def _read(self) -> dict[str, Any]:
         try:
             kept = json.loads(self.path.read_text())
-            needed = {*COLUMNS} - {"front", "knee"}
-            rows = [isinstance(row, dict) and row.keys() >= needed for row in kept["points"]]
-            dicts = [isinstance(kept[name], dict) for name in ("settings", "plan", "machine")]
-            if not all(rows + dicts):
+            if not all(isinstance(kept[name], dict) for name in ("settings", "plan", "machine")):
                 raise ValueError("parts are missing")
+            for number, row in enumerate(kept["points"], 1):
+                _check_row(number, row)
+            _check_rest(kept)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise WrongUse(
                 f"--out: expected results of `foldgauss tradeoff` in {self.path}, got something else ({error}). "
@@ -97,6 +99,52 @@ class Record:
         kept = {"settings": self.settings, "machine": self.machine, "plan": self.plan}
         kept |= {"left_out": self.left_out, "fronts": self.fronts}
         write_json(self.path, kept | {"points": list(self.rows.values())})
+
+
+#: What rows hold by column: in words, and how it is told.
+_TEXT = "a text", lambda value: isinstance(value, str)
+_NUMBER = "a number", lambda value: within(value, "(-inf, inf)")
+_SECONDS = "a number >= 0", lambda value: within(value, "[0, inf)")
+_COUNT = "a whole number >= 0", lambda value: whole(value, 0)
+_CELLS: dict[str, tuple[str, Callable[[object], bool]]] = {
+    "axis": _TEXT,
+    "value": _TEXT,
+    "settings": ("settings by name", lambda value: isinstance(value, dict)),
+    "psnr": _NUMBER,
+    "ssim": _NUMBER,
+    "seconds": _SECONDS,
+    "cpu_seconds": _SECONDS,
+    "bytes": ("a whole number >= 1", lambda value: whole(value, 1)),
+    "floats": _COUNT,
+    "gaussians": _COUNT,
+    "frames_per_second": ("a number > 0", lambda value: within(value, "(0, inf)")),
+    "command": _TEXT,
+}
+
+
+def _check_row(number: int, row: object) -> None:
+    """Raise ValueError, by the names of row and column, for what was edited into something else."""
+    if not isinstance(row, dict):
+        raise ValueError(f"row {number}: {short_repr(row)}")
+    named = isinstance(row.get("axis"), str) and isinstance(row.get("value"), str)
+    name = f"row {number}" + (f", {row['axis']} {row['value']}".rstrip() if named else "")
+    for column, (expected, holds) in _CELLS.items():
+        if column not in row:
+            raise ValueError(f"{name}: no {column!r}")
+        if not holds(row[column]):
+            raise ValueError(f"{name}: {column!r} should be {expected}, not {short_repr(row[column])}")
+
+
+def _check_rest(kept: dict[str, Any]) -> None:
+    """Likewise for what else of it is used: the steps of the base, the seconds of its motion, the cores."""
+    plan, motion = kept["plan"], kept["plan"].get("motion", {"wall": 0.0, "cpu": 0.0})
+    if plan and not whole(plan.get("steps"), 1):
+        raise ValueError(f"plan: 'steps' should be a whole number >= 1, not {short_repr(plan.get('steps'))}")
+    known = isinstance(motion, dict) and motion.keys() == {"wall", "cpu"}
+    if not known or not all(within(value, "[0, inf)") for value in motion.values()):
+        raise ValueError(f"plan: 'motion' should be seconds, 'wall' and 'cpu', not {short_repr(motion)}")
+    if not within(kept["machine"].get("cores"), "(0, inf)"):
+        raise ValueError(f"machine: 'cores' should be a number > 0, not {short_repr(kept['machine'].get('cores'))}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,7 +27,7 @@ from foldgauss.cli._shared import (
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.video_file import Clip
-from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_video_model, read_metadata, save_video_model
+from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_video_model, read_origin, save_video_model
 from foldgauss.video.compress import Compressed, compress
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
@@ -82,7 +82,7 @@ def compress_command(
     refuse_input(target, "model", model_path)
     refuse_existing(target, overwrite)
     check_writable(target)
-    model, about = load_video_model(model_path), read_metadata(model_path)
+    model, about = load_video_model(model_path), read_origin(model_path)
     if not isinstance(model, VideoModel):
         cure = "Compress the model before it is edited, and edit that."
         raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
@@ -138,7 +138,6 @@ def _compressed(
     target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None, max_loss_db: float, passes: int
 ) -> dict[str, Any]:
     told = about.get("mean_psnr")
-    told = told if within(told, "(0, 100]") else None
     columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
     with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
         task = bar.add_task("Compressing", total=None)  # how often it must try nobody knows

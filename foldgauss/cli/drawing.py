@@ -45,7 +45,7 @@ from foldgauss.cli._shared import (
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.compact import is_compact
 from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
-from foldgauss.io.video_model import load_video_model, read_metadata
+from foldgauss.io.video_model import load_video_model, read_metadata, read_origin
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.model import VideoModel
@@ -127,7 +127,7 @@ def _named_after_model(model_path: Path, course: "_Course", image_format: str | 
         return named_after(model_path, "-frames")
     suffix = PICTURE_SUFFIX if course.chosen is not None and len(course.chosen) == 1 else VIDEO_SUFFIXES[0]
     path = named_after(model_path, suffix)
-    clip = read_metadata(model_path).get("clip", path.name)  # where it is not known, it may be of that name
+    clip = read_origin(model_path).get("clip", path.name)  # where it is not known, it may be of that name
     return named_after(model_path, f".rendered{suffix}") if path.name == clip else path
 
 

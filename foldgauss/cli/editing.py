@@ -33,7 +33,7 @@ from foldgauss.io.exchange import FORMATS, export, import_model
 from foldgauss.io.html import HTML_SUFFIX, QUALITY, write_html
 from foldgauss.io.mesh import read_pseudomesh
 from foldgauss.io.video_file import VIDEO_SUFFIXES, write_video
-from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, read_metadata, save_video_model
+from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, read_origin, save_video_model
 from foldgauss.video.model import VideoModel
 
 _CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles", "html": "player"}
@@ -96,7 +96,7 @@ def edit_command(
         refuse_huge(picture_size or model.size)
     edited = script.apply(model)
     if as_model:
-        about = read_metadata(model_path)
+        about = read_origin(model_path)
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
         save_video_model(out_path, edited, metadata=about)
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"

@@ -1,6 +1,7 @@
 """The commands that fit: `demo` and `fit`."""
 
 import dataclasses
+import json
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -69,7 +70,8 @@ from foldgauss.video.guard import FitDiverged
 #: A running fit is kept on disk this often, in seconds.
 CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
-DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
+DEMO_RECORD = "metrics.json"
+DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", DEMO_RECORD}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
 #: Panels of `fit --help`.
 MODEL, BUDGET, COURSE = "What is fitted", "When it ends: the first of these", "How it is fitted"
@@ -85,7 +87,7 @@ def demo(
     The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files in it is
     left alone.
     """
-    refuse_foreign(out_dir, DEMO_FILES, "demo")
+    refuse_foreign(out_dir, DEMO_FILES, "demo", record=DEMO_RECORD, known=_is_demos(out_dir / DEMO_RECORD))
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
     make_folder(out_dir)
     out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
@@ -95,6 +97,8 @@ def demo(
     pictures: list[np.ndarray] = []
     scores = evaluate_with_progress(model, clip.frames, pictures.append)
     figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+    frames = {"psnr": scores.psnr, "ssim": scores.ssim}
+    write_json(out_dir / DEMO_RECORD, figures | frames)  # first: whatever stops this demo, the next may replace it
     path = save_video_model(
         out_dir / "model.safetensors", model, metadata=provenance(clip, DEMO_CONFIG.seed) | scores_of(scores)
     )
@@ -104,15 +108,24 @@ def demo(
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
     picture = comparison([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
     write_image(out_dir / "comparison.png", picture)
-    write_json(out_dir / "metrics.json", figures | {"psnr": scores.psnr, "ssim": scores.ssim})
+    write_json(out_dir / DEMO_RECORD, figures | frames)
     print_figures("Demo", figures)
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),
         ("reconstruction.mp4", "plays in any browser (VP9)"),
         ("model.safetensors", "the model: try `foldgauss render` on it with --upsample 4"),
-        ("metrics.json", "the figures above, and by frame"),
+        (DEMO_RECORD, "the figures above, and by frame"),
     ):
         out.print(f"  {out_dir / name}  {what}", soft_wrap=True)
+
+
+def _is_demos(path: Path) -> bool:
+    """Whether it is the record of a demo."""
+    try:
+        kept = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(kept, dict) and kept.keys() >= {"fit_seconds", "psnr", "ssim"}
 
 
 @app.command()

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -121,7 +122,8 @@ def tradeoff_command(
     if not within(minutes, "(0, inf)"):
         raise WrongUse(str(invalid("--minutes", expected="a number above 0", got=minutes)))
     out_dir = named_after(video, "-tradeoff") if out_dir is None else out_dir
-    refuse_foreign(out_dir, FILES, "tradeoff")
+    known = overwrite or os.path.exists(out_dir / RECORD)
+    refuse_foreign(out_dir, FILES, "tradeoff", record=RECORD, known=known, cure=", or start anew with --overwrite")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
     tell_of(clip)

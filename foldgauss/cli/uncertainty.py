@@ -5,7 +5,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from foldgauss import __version__
 from foldgauss._checks import invalid
 from foldgauss.cli._completion import among
-from foldgauss.cli._evidence import keep_evidence, kept_evidence
+from foldgauss.cli._evidence import is_evidence, keep_evidence, kept_evidence
 from foldgauss.cli._shared import (
     TIME_LEFT,
     FittedClip,
@@ -34,7 +34,7 @@ from foldgauss.cli._shared import (
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
 from foldgauss.io._lock import only_writer
 from foldgauss.io.video_file import Clip
-from foldgauss.io.video_model import load_video_model, read_metadata
+from foldgauss.io.video_model import load_video_model, read_origin
 from foldgauss.uncertainty import (
     Evidence,
     evidence,
@@ -46,7 +46,7 @@ from foldgauss.uncertainty.increments import Increments
 from foldgauss.uncertainty.log_prob import LEVELS, at_level
 from foldgauss.uncertainty.noise import NOISES
 from foldgauss.uncertainty.pace import irregularities
-from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, is_sealed, needed
+from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, is_sealed, needed, only_run
 from foldgauss.uncertainty.report import frame_table, summary
 from foldgauss.video.model import VideoModel
 
@@ -126,15 +126,17 @@ def uncertainty_command(
         cure = "Take the model that was edited, and the clip that it was fitted to."
         raise WrongUse(str(invalid("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)))
     clip = clip_of_model(model, model_path, video, frames, as_many=False)
-    if clip.num_frames != model.num_frames and read_metadata(model_path).get("clip") == Path(clip.source).name:
+    if clip.num_frames != model.num_frames and read_origin(model_path).get("clip") == Path(clip.source).name:
         expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
         cure = "To draw the times of some of them: --only A:B."
         raise WrongUse(str(invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)))
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
-    _make_folder(out_dir)
+    context.with_resource(_made_folder(out_dir))
     own = tuple(out_dir / name for name in (*FILES, EVIDENCE))
     context.with_resource(only_writer(out_dir / CHAINS, own=own, what="run of uncertainty"))
+    with _no_other_run(), only_run(out_dir / CHAINS):
+        pass  # known now, not when pictures are drawn
     seen = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
     if seen is None and (out_dir / CHAINS).exists() and not overwrite:
         kept = out_dir / CHAINS
@@ -183,18 +185,29 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
         cure = "Pictures would be frames there."
         raise WrongUse(str(invalid("--out", expected="a folder without other images", got=folder, cure=cure)))
     there = [name for name in FILES if (folder / name).exists()]
+    if (folder / EVIDENCE).exists() and not is_evidence(folder / EVIDENCE):  # a run that was killed may leave its own
+        there.append(EVIDENCE)
     if there and not (folder / CHAINS).exists() and not overwrite:
         raise WrongUse(f"--out: {folder / there[0]} exists. Choose another folder, or add --overwrite.")
     if folder.is_dir():
         check_writable(folder / FILES[0])
 
 
-def _make_folder(path: Path) -> None:
+@contextmanager
+def _made_folder(path: Path) -> Iterator[None]:
+    """Within, the folder is there; one that was not, and into which nothing came, is gone afterwards."""
+    existed = path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
-    check_writable(path / FILES[0])
+    try:
+        check_writable(path / FILES[0])
+        yield
+    finally:
+        if not existed:
+            with suppress(OSError):  # there is something in it
+                path.rmdir()
 
 
 def _check_settings(num_frames: int, only, concentration: float, walkers, ensembles: int, steps: int) -> None:
@@ -223,6 +236,15 @@ def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] |
 def _evidence(model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars) -> Evidence:
     seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
     return at_level(level, model, clip.frames, seen, only, lambda done, total: bars("frames", done, total))
+
+
+@contextmanager
+def _no_other_run() -> Iterator[None]:
+    """Draws may be written from Python, too, which knows of no option."""
+    try:
+        yield
+    except BlockingIOError as error:
+        raise OutputError(str(error).replace("backend:", "--out:", 1)) from error
 
 
 def _of_another(path: Path) -> WrongUse:
@@ -262,7 +284,8 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
         bars(what, done, total)
 
     def sample() -> FrameTimePosterior:
-        return frame_time_posterior(progress=show, backend=path, **arguments)
+        with _no_other_run():
+            return frame_time_posterior(progress=show, backend=path, **arguments)
 
     try:
         try:
@@ -277,7 +300,7 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
             path.unlink()
             existed, posterior = False, sample()
     except KeyboardInterrupt as error:
-        raise Stopped(f"stopped by Ctrl-C; what {path} holds goes on when called again.") from error
+        raise Stopped(f"stopped; what {path} holds goes on when called again.") from error
     except OSError as error:
         if error.filename is None or Path(error.filename) != path:
             raise

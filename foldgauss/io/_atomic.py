@@ -5,7 +5,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -131,11 +131,12 @@ def atomic_path(path: str | os.PathLike, *, suffix: str | None = None) -> Iterat
 
 
 @contextmanager
-def atomic_folder(folder: str | os.PathLike) -> Iterator[Path]:
+def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = lambda: None) -> Iterator[Path]:
     """Lend a temporary folder beside `folder`; it takes that name, and the old one's place, at the end.
 
     The old folder is moved aside first and deleted last, so at any moment one of the two is whole.
-    Whether it *may* be replaced is the caller's question.
+    Whether it *may* be replaced is the caller's question: `check`, asked just before, raises where it may not; the
+    work between may have taken hours.
 
     Raises `OutputError` if the parent folder is missing or not writable.
     """
@@ -150,6 +151,7 @@ def atomic_folder(folder: str | os.PathLike) -> Iterator[Path]:
         with _told_where(folder, temporary):
             yield temporary
         try:
+            check()
             if folder.exists():
                 os.replace(folder, aside)
             os.replace(temporary, folder)

@@ -4,11 +4,10 @@ import hashlib
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
+from foldgauss._alone import Held, alone
 from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, not_writable
 
 #: Seconds after which an unfinished file beside an output is one that a killed process left.
@@ -28,27 +27,23 @@ def only_writer(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     for target in (path, *own):
         check_writable(target)  # the lock would make a folder that is missing
     file = path.with_name(f".{_short(path.name)}.lock")
-    lock = FileLock(file, timeout=0)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise OutputError(
-            f"path: expected an output that nobody else is writing, got {str(path)!r}, which another {what} is. "
-            "Wait for that one, or choose another name."
-        ) from error
-    except OSError as error:
-        raise not_writable(path, error) from error
-    try:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(alone(file))
+        except Held as error:
+            raise OutputError(
+                f"path: expected an output that nobody else is writing, got {str(path)!r}, which another {what} is. "
+                "Wait for that one, or choose another name."
+            ) from error
+        except OSError as error:
+            raise not_writable(path, error) from error
         for target in own:
             _remove_unfinished(target, "tmp", 0.0 if _is_told_whole(target) else LEFT)
         _remove_unfinished(path, "own", 0.0 if _is_told_whole(path) else LEFT)
         _remove_unfinished(path, "tmp", LEFT)
+        stack.callback(OWNED.discard, path.absolute())
         OWNED.add(path.absolute())
         yield
-    finally:
-        OWNED.discard(path.absolute())
-        file.unlink(missing_ok=True)  # while it is held: who opened it before finds that it is another's or none's
-        lock.release()
 
 
 def _remove_unfinished(path: Path, kind: str, age: float) -> None:

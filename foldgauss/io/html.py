@@ -22,7 +22,7 @@ from foldgauss._checks import invalid, short_repr, whole
 from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.compact import is_compact, load_compact_model, packed
 from foldgauss.io.video_file import Clip
-from foldgauss.io.video_model import load_video_model, read_metadata
+from foldgauss.io.video_model import load_video_model, read_origin
 from foldgauss.video.alpha import BLACK, composited
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.flat import flattened
@@ -118,7 +118,7 @@ def _compact(model: Model) -> tuple[bytes, VideoModel | EditedVideo | Quantised,
         return packed(model), model, "foldgauss"
     if isinstance(model, str | os.PathLike):
         path = checked_path(model, "model")
-        name = str(read_metadata(path).get("clip", path.stem))
+        name = read_origin(path).get("clip", path.stem)
         if is_compact(path):
             return path.read_bytes(), load_compact_model(path), name
         loaded = load_video_model(path)

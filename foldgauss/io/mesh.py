@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -139,8 +140,9 @@ def write_pseudomesh(
     **Source:** VeGaS eq:traingle_face; Waczyńska et al. 2024, GaMeS (pseudomesh).
     """
     folder, times = Path(folder), checked_times(model, times)
-    check_replaceable(folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
-    with atomic_folder(folder) as temporary:
+    check = partial(check_replaceable, folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
+    check()
+    with atomic_folder(folder, check=check) as temporary:
         playback = Playback(model)
         for number, t in enumerate(times):
             gaussians = frame_gaussians(playback, t, depth_step=0.0)

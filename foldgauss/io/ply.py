@@ -8,6 +8,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -417,9 +418,10 @@ def write_3dgs_frames(
     """
     folder, times = Path(folder), checked_times(model, times)
     _check_covers(model)
-    check_replaceable(folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply")
+    check = partial(check_replaceable, folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply")
+    check()
     playback = Playback(model)
-    with atomic_folder(folder) as temporary:
+    with atomic_folder(folder, check=check) as temporary:
         for number, t in enumerate(times):
             gaussians = frame_gaussians(playback, t, depth_step=depth_step)
             write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, axes=axes, sh_degree=sh_degree)

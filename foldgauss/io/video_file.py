@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -856,8 +857,9 @@ def write_frames(
     """
     one_of("image_format", image_format, IMAGE_FORMATS)
     folder, encode = Path(folder), _png if image_format == "png" else _webp
-    check_replaceable(folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)")
-    with atomic_folder(folder) as temporary:
+    check = partial(check_replaceable, folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)")
+    check()
+    with atomic_folder(folder, check=check) as temporary:
         for number, frame in enumerate(_checked_frames(frames)):
             (temporary / f"{number:05d}.{image_format}").write_bytes(encode(frame))
     return folder

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._checks import invalid, one_of, within
+from foldgauss._checks import invalid, one_of, whole, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import checked_path
 from foldgauss.io.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
@@ -78,6 +78,37 @@ def read_metadata(path: str | os.PathLike) -> dict:
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
+def read_origin(path: str | os.PathLike) -> dict:
+    """`read_metadata`, without those of `fit`'s notes that are of another kind than `fit` writes: none are there.
+
+    A file may come from a stranger, and metadata are free.
+    """
+    return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_range(value: object) -> bool:
+    """Whether these are frames A up to, not including, B, as `read_video` takes them."""
+    if not isinstance(value, list) or len(value) != 2:
+        return False
+    if not all(end is None or whole(end, 0) for end in value):
+        return False
+    return value[1] is None or value[1] > (value[0] or 0)
+
+
+#: What `fit` and `compress` note of a model's clip and are asked for later, and how it is told.
+_NOTES: dict[str, Callable[[object], bool]] = {
+    "clip": _is_text,
+    "frames_digest": _is_text,
+    "frames": _is_range,
+    "seed": lambda value: whole(value, 0),
+    "mean_psnr": lambda value: within(value, "(0, 100]"),
+}
+
+
 #: The one setting with which a fit may go on otherwise: no step depends on it while all is well.
 FREE = "on_divergence"
 
@@ -91,7 +122,8 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
     """Read a running fit. Raises ValueError if it was started with other settings or other frames."""
     kept = read_header(path)["metadata"]
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
-        before = kept.get(part) or {}
+        before = kept.get(part)
+        before = before if isinstance(before, dict) else {}
         now, before = ({name: value for name, value in held.items() if name != FREE} for held in (now, before))
         changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
         cure = f"Continue {str(path)!r} with the options it was started with, or start anew with --overwrite."

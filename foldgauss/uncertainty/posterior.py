@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from foldgauss._alone import Held, alone
 from foldgauss._checks import check_takes, invalid, short_repr, whole, within
 from foldgauss.uncertainty.drawing import Evidence, evidence
 from foldgauss.uncertainty.exact import ExactTimes, exact_times
@@ -187,7 +188,8 @@ def frame_time_posterior(
 
     Raises ValueError, before any picture is drawn, for fewer walkers than twice the frames that move at once, settings
     out of range or given beside what they would contradict, and a backend that cannot be written; later for a backend
-    of another run, a NaN log-probability, and whatever `frame_time_log_prob` refuses; ImportError without emcee.
+    of another run, a NaN log-probability, and whatever `frame_time_log_prob` refuses; BlockingIOError, before any
+    picture, where another run is writing the backend; ImportError without emcee.
 
     Example: `frame_time_posterior(model, frames).interval(0.9)`.
     """
@@ -205,7 +207,7 @@ def frame_time_posterior(
         moves,
         _checked_backend(backend),
     )
-    with _shown(progress) as show:
+    with only_run(settings.backend), _shown(progress) as show:
         if log_prob is None:
             look = None if show is None else (lambda done, total: show("pictures", done, total))
             if seen is None:
@@ -326,6 +328,31 @@ def _checked_backend(backend) -> Path | None:
     return path
 
 
+@contextlib.contextmanager
+def only_run(backend: Path | None) -> Iterator[None]:
+    """Keep other runs from writing the file, until the block or the process ends, however it does.
+
+    Raises BlockingIOError at once where another one is writing it, of this process too.
+    """
+    with contextlib.ExitStack() as stack:
+        if backend is not None:
+            try:
+                stack.enter_context(alone(_running(backend, ".lock")))
+            except Held as error:
+                raise BlockingIOError(
+                    f"backend: expected a file that no other run is writing, got {str(backend)!r}, which one is. "
+                    "Wait for that one, or choose another file."
+                ) from error
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, str(backend)) from error
+        yield
+
+
+def _running(backend: Path, ending: str = "") -> Path:
+    """What lies beside a file of draws while it is written."""
+    return backend.with_name(f".{backend.name}.running{ending}")
+
+
 @dataclasses.dataclass(frozen=True)
 class _Settings:
     """Of sampling, checked; `moves` None: the usual ones."""
@@ -380,6 +407,13 @@ class _Run:
         return sampler
 
     def until_converged(self, most: int, show, seen: Evidence | None) -> FrameTimePosterior:
+        try:
+            return self._until_converged(most, show, seen)
+        finally:
+            if self.file is not None:
+                self.file.close()
+
+    def _until_converged(self, most: int, show, seen: Evidence | None) -> FrameTimePosterior:
         done = min(sampler.iteration for sampler in self.samplers)
         goal = min(LOOK, most)
         while True:
@@ -387,7 +421,7 @@ class _Run:
                 found = self.result(seen)
                 if found.converged or done >= most:
                     if self.file is not None:
-                        self.file.close()
+                        self.file.keep()
                     return found
                 needed = 1.1 * (TIMES_TAU + BURN_IN) * found.tau.max() / self.thin_by
                 goal = min(max(int(min(needed, 2 * done)), done + max(LOOK, done // 4)), most)
@@ -538,7 +572,7 @@ class _Kept:
     def __init__(self, path: Path, fingerprint: str, shape: tuple[int, int, int]):
         """`shape`: ensembles, walkers of each, frames that move."""
         self.path = path
-        self.live = path.with_name(f".{path.name}.running")
+        self.live = _running(path)
         if path.exists():
             kept = _fingerprint_of(path, fingerprint, shape)
             if kept != fingerprint:
@@ -549,9 +583,10 @@ class _Kept:
         self.check_space(path.stat().st_size if path.exists() else 0)
         with self.written():
             if path.exists():
-                shutil.copyfile(self.path, self.live)
+                _copy_anew(self.path, self.live)
             else:
-                with needed("h5py").File(self.live, "w", userblock_size=_BLOCK) as file:
+                self.live.unlink(missing_ok=True)
+                with needed("h5py").File(self.live, "x", userblock_size=_BLOCK) as file:
                     file.attrs["fingerprint"] = fingerprint
 
     def of(self, n: int):
@@ -564,15 +599,15 @@ class _Kept:
         copy = self.path.with_name(f".{self.path.name}.new")
         try:
             with self.written():
-                shutil.copyfile(self.live, copy)
+                _copy_anew(self.live, copy)
                 _seal(copy)
                 os.replace(copy, self.path)
         finally:
             copy.unlink(missing_ok=True)
 
     def close(self) -> None:
-        self.keep()
-        self.live.unlink()
+        """Drop what is not kept."""
+        self.live.unlink(missing_ok=True)
 
     def check_space(self, num_bytes: int) -> None:
         """Raise OSError where the disk has no room for so much more, and a copy: HDF5 may crash on one that is full."""
@@ -598,6 +633,13 @@ class _Kept:
             return
         self.live.unlink(missing_ok=True)
         raise OSError(number, os.strerror(number), str(self.path)) from error
+
+
+def _copy_anew(source: Path, target: Path) -> None:
+    """Copy into a new file: what lay there may be a link of a stranger's to any other, and is not followed."""
+    target.unlink(missing_ok=True)
+    target.touch(exist_ok=False)
+    shutil.copyfile(source, target)
 
 
 def _seal(path: Path) -> None:

@@ -361,7 +361,7 @@ EVIDENCE = Target(
     lambda: [_evidence()],
     _read_evidence,
     (ValueError,),
-    {"foldgauss.cli._evidence": ("keep_evidence",)},
+    {"foldgauss.cli._evidence": ("keep_evidence", "is_evidence")},
     lambda data: 4,
     lambda size: 2 * CONSTANT + 64 * size,
     (zip_resealed,),

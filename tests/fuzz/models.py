@@ -22,7 +22,7 @@ from foldgauss.io import (
     save_video_model,
 )
 from foldgauss.io.model_file import load_model
-from foldgauss.io.video_model import load_checkpoint, read_metadata, save_checkpoint
+from foldgauss.io.video_model import load_checkpoint, read_origin, save_checkpoint
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
 from foldgauss.video.config import FitConfig
@@ -201,11 +201,14 @@ def _video_seeds() -> list[bytes]:
     models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
     models.append(dataclasses.replace(_edited(), camera=None))
     models.append(tiny_model(16, 1, shared=True))
-    return [written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a"})) for one in models]
+    return [
+        written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]}))
+        for one in models
+    ]
 
 
 def _read_video(path: Path) -> None:
-    read_metadata(path)
+    read_origin(path)
     if chance(path) % 8 == 0:
         load_model(path)  # the door below, which takes all kinds
     model = load_video_model(path)
@@ -272,7 +275,7 @@ CHECKPOINT = Target(
     | {
         "foldgauss.io.video_model": (
             "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint",
-            "_to_stored",
+            "read_origin", "_is_text", "_is_range", "_to_stored",
             "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
             "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton", "_describe_checkpoint",
             "_counts",
@@ -387,7 +390,7 @@ def compact_header_changed(data: bytes, random: Random) -> bytes:
 
 
 def _read_compact(path: Path) -> None:
-    read_metadata(path) if compact.is_compact(path) else load_compact(path)
+    read_origin(path) if compact.is_compact(path) else load_compact(path)
     load_video_model(path) if compact.is_compact(path) else None
 
 
@@ -406,7 +409,7 @@ COMPACT = Target(
     {
         "foldgauss.io.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
         "foldgauss.io._columns": (),
-        "foldgauss.io.video_model": (ONLY, "load_video_model", "read_metadata"),
+        "foldgauss.io.video_model": (ONLY, "load_video_model", "read_metadata", "read_origin", "_is_text", "_is_range"),
         "foldgauss.io._range_coder": ("encode", "_encode", "_put", "_put_learned"),
     },
     _compact_body,

@@ -1,13 +1,17 @@
 """One writer at a time, whoever dies."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
+from soft_models import soft_model
 
+from foldgauss.io import write_3dgs_frames, write_frames, write_pseudomesh
 from foldgauss.io._atomic import OutputError, atomic_folder
 from foldgauss.io._lock import LEFT, only_writer
 
@@ -87,6 +91,49 @@ def test_what_cannot_be_removed_is_no_reason_not_to_work(tmp_path):
     with only_writer(tmp_path / "m.safetensors"):
         pass
     assert os.listdir(tmp_path) == [".m.own-01ab23cd.safetensors"]
+
+
+def _frames(folder, meanwhile, **options):
+    def pictures():
+        yield np.zeros((16, 16, 3), np.uint8)
+        meanwhile()
+
+    write_frames(folder, pictures(), **options)
+
+
+def _mesh(folder, meanwhile, **options):
+    write_pseudomesh(folder, soft_model(), [0.5], on_frame=meanwhile, **options)
+
+
+def _scenes(folder, meanwhile, **options):
+    write_3dgs_frames(folder, soft_model(), [0.5], on_frame=meanwhile, **options)
+
+
+WRITERS = {"00000.png": _frames, "frame_0000.obj": _mesh, "frame_0000.ply": _scenes}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_is_put_into_a_folder_while_it_is_drawn_stays(tmp_path, name):
+    """Of others, with --overwrite too; frames of another run, without."""
+    folder, write = tmp_path / "frames", WRITERS[name]
+
+    def put(what):
+        folder.mkdir(exist_ok=True)
+        (folder / what).write_text("precious")
+
+    for what, options in (("notes.txt", {"overwrite": True}), (name, {})):
+        for old in ([], [name]) if options else ([],):
+            for each in old:
+                put(each)
+            with pytest.raises(OutputError, match="Choose another folder"):
+                write(folder, lambda what=what: put(what), **options)
+            assert sorted(os.listdir(folder)) == sorted([*old, what])
+            assert all((folder / each).read_text() == "precious" for each in (*old, what))
+            assert os.listdir(tmp_path) == ["frames"]
+            shutil.rmtree(folder)
+    put(name)
+    write(folder, lambda: put(name), overwrite=True)
+    assert (folder / name).read_bytes() != b"precious"
 
 
 @pytest.mark.parametrize("at", [1, 2])

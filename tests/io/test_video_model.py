@@ -8,7 +8,7 @@ import pytest
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
-from foldgauss.io.model_file import read_header
+from foldgauss.io.model_file import read_header, save_model
 from foldgauss.io.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit_steps
@@ -107,6 +107,10 @@ def test_checkpoint_of_another_fit_is_refused(tmp_path):
         load_checkpoint(path, config=dataclasses.replace(CONFIG, degree=3), source=SOURCE)
     with pytest.raises(ValueError, match="num_frames"):
         load_checkpoint(path, config=CONFIG, source=SOURCE | {"num_frames": 4})
+    for odd in ("none", ["num_frames"], 3):
+        save_model(path, state, metadata={"config": odd, "source": SOURCE})
+        with pytest.raises(ValueError, match="resume: expected"):
+            load_checkpoint(path, config=CONFIG, source=SOURCE)
 
 
 def test_kinds_are_not_mixed_up(tmp_path):

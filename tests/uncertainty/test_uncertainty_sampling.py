@@ -1,6 +1,8 @@
 """emcee's draws of frame times: a posterior that is known, seeds, files, and what is refused."""
 
 import dataclasses
+import subprocess
+import sys
 import tracemalloc
 
 import emcee
@@ -247,6 +249,64 @@ def test_another_runs_file_is_refused(tmp_path):
     (tmp_path / "text.h5").write_text("no such file")
     with pytest.raises(ValueError, match="backend"):
         sampled(toy(*NEAR), steps=100, backend=tmp_path / "text.h5")
+
+
+def test_a_folder_of_a_strangers_leads_nowhere(tmp_path):
+    """Links in the place of what is written beside a file of draws are not followed: neither at first nor later."""
+    precious, path = tmp_path / "precious", tmp_path / "draws" / "run.h5"
+    path.parent.mkdir()
+    precious.write_text("mine")
+    for steps in (20, 40):
+        for ending in ("running", "new"):
+            (path.parent / f".run.h5.{ending}").symlink_to(precious)
+        sampled(toy(*NEAR), steps=steps, ensembles=2, backend=path)
+        assert precious.read_text() == "mine"
+        assert [one.name for one in path.parent.iterdir()] == ["run.h5"]
+        assert not path.is_symlink()
+
+
+def test_a_file_of_draws_has_one_run(tmp_path):
+    path, told = tmp_path / "run.h5", []
+    settings = {"log_prob": toy(*NEAR), "steps": 20, "ensembles": 2, "backend": path}
+
+    def meanwhile(what, done, total):
+        with pytest.raises(BlockingIOError, match="backend: expected a file that no other run is writing") as error:
+            sampled(**settings)
+        told.append(str(error.value))
+
+    def interrupt(what, done, total):
+        raise KeyboardInterrupt
+
+    found = frame_time_posterior(**settings, progress=meanwhile)
+    assert told
+    with pytest.raises(KeyboardInterrupt):
+        frame_time_posterior(**settings | {"steps": 40}, progress=interrupt)
+    assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
+    np.testing.assert_array_equal(sampled(**settings).times, found.times)  # whatever happens, others may go on
+    assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_a_run_of_another_process_keeps_its_file(tmp_path):
+    """Until it is gone, which leaves a file that holds nobody up."""
+    path = tmp_path / "run.h5"
+    holding = (
+        "import pathlib, sys, time\n"
+        "from foldgauss.uncertainty.posterior import only_run\n"
+        "with only_run(pathlib.Path(sys.argv[1])):\n"
+        "    print('held', flush=True)\n"
+        "    time.sleep(240)\n"
+    )
+    words = [sys.executable, "-c", holding, path]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "held\n"
+            with pytest.raises(BlockingIOError, match="no other run"):
+                sampled(toy(*NEAR), steps=20, ensembles=2, backend=path)
+            assert not path.exists()
+        finally:
+            process.kill()
+    sampled(toy(*NEAR), steps=20, ensembles=2, backend=path)
+    assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
 
 
 def test_a_run_is_known_again_by_its_numbers(tmp_path):
