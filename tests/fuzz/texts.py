@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import warnings
 from pathlib import Path
 from random import Random
 
@@ -198,7 +199,8 @@ def _apply_script(path: Path) -> None:
     video = tiny_model()
     if chance(path) % 8 == 0:
         video = edit(video).opacity(0.5, frames=(0, 1)).video()  # of layers, or overlays, which files do not fit to
-    read_edit_script(path).apply(video)
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # of units that look mistaken
+        read_edit_script(path).apply(video)
 
 
 def _beside_scripts(folder: Path) -> None:
@@ -289,11 +291,12 @@ HISTORY = Target(
 
 
 def _record() -> bytes:
-    rows = [dict.fromkeys(COLUMNS, 1.0) | {"axis": "steps", "value": value, "command": "a"} for value in (100, 200)]
+    texts = {"axis": "steps", "command": "a", "settings": {"steps": 100}}
+    rows = [dict.fromkeys(COLUMNS, 1) | texts | {"value": value} for value in ("100", "200")]
     kept = {
         "settings": {"a": 1, "b": [1, 2]},
-        "machine": {"cpu": "x"},
-        "plan": {"steps": 100},
+        "machine": {"cpu": "x", "cores": 2},
+        "plan": {"steps": 100, "motion": {"wall": 1.5, "cpu": 2.0}},
         "left_out": {},
         "fronts": {},
     }
@@ -313,7 +316,7 @@ TRADEOFF = Target(
     lambda: [_record()],
     lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
     (WrongUse,),
-    {"foldgauss.cli._tradeoff": (ONLY, "Record")},
+    {"foldgauss.cli._tradeoff": (ONLY, "Record", "_check_row", "_check_rest")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 200 * size,
     (record_changed, json_text_changed),
