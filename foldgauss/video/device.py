@@ -16,7 +16,7 @@ from foldgauss.video.device_step import Arrays, Control, Figures, Plan, everywhe
 from foldgauss.video.growth import Statistics
 from foldgauss.video.population import changes_at, grow
 from foldgauss.video.pyramid import levels, shrunk
-from foldgauss.video.schedule import Rates, steps_per_pass, views_of
+from foldgauss.video.schedule import Rates, looked_at, steps_per_pass, views_of
 from foldgauss.video.sharing import Palette
 from foldgauss.video.state import FitState, frame_times
 
@@ -223,14 +223,8 @@ class DeviceStepper:
         """As `fit._Stepper.errors_at_start`."""
         plan, arrays = self.plans[-1], state.held.arrays
         times, num = np.asarray(frame_times(state.time_logits)), np.int32(state.held.num)
-        looked_at = np.unique(np.linspace(0, self.num_frames - 1, LOOKED_AT).round().astype(int))
-
         error = look(plan)  # compiled, before the clock runs
         begun = time.perf_counter()
-        errors = {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in looked_at}
+        errors = {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in looked_at(self.num_frames)}
         state.seconds += time.perf_counter() - begun
         return errors
-
-
-#: Frames that tell how good the start is.
-LOOKED_AT = 16

@@ -29,7 +29,7 @@ from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack
 from foldgauss.video.population import grow
 from foldgauss.video.pyramid import Level, level_at, levels, shrunk, work_done
-from foldgauss.video.schedule import Rates, steps_per_pass, views_of
+from foldgauss.video.schedule import Rates, looked_at, steps_per_pass, views_of
 from foldgauss.video.sharing import Palette
 from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
@@ -515,7 +515,7 @@ class _Stepper:
         """Mean squared errors of some frames at full size, by frame; takes time, which is the fit's."""
         begun, shape, errors = time.perf_counter(), self.shapes[-1], {}
         times = np.asarray(frame_times(state.time_logits))
-        for k in np.unique(np.linspace(0, self.num_frames - 1, LOOKED_AT).round().astype(int)):
+        for k in looked_at(self.num_frames):
             image = self._drawn(condition(state.rows, self.window, times[k], shape), shape).image
             errors[int(k)] = float(np.mean(np.square(image - planar(self.frames[k], self.background))))
         state.seconds += time.perf_counter() - begun
@@ -622,8 +622,6 @@ def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndar
     return mean * other + np.float32([width, 0]), factor * other[:, None]
 
 
-#: Frames that tell how good the start is.
-LOOKED_AT = 16
 #: A fit to a target looks at all frames once in so many passes, which is a tenth of its time.
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.

@@ -6,6 +6,9 @@ from foldgauss.video.config import FitConfig
 from foldgauss.video.guard import LOWERED
 from foldgauss.video.packing import columns
 
+#: Frames that tell how good the start is.
+LOOKED_AT = 16
+
 
 def num_views(config: FitConfig, num_frames: int) -> int:
     """Views of a pass: every frame, then with two cameras every frame mirrored."""
@@ -28,6 +31,11 @@ def views_of(config: FitConfig, num_frames: int, step: int) -> np.ndarray:
 
 def _order(config: FitConfig, num: int, epoch: int) -> np.ndarray:
     return np.random.default_rng([config.seed, 1, epoch]).permutation(num)
+
+
+def looked_at(num_frames: int) -> np.ndarray:
+    """Frames that tell how good the start is: evenly spaced, from the first to the last."""
+    return np.unique(np.linspace(0, num_frames - 1, LOOKED_AT).round().astype(int))
 
 
 class Rates:
