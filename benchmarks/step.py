@@ -81,7 +81,7 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
         backward=clock.timed("raster backward", cpu.backward),
     )
     parts = {
-        "_frame_times": "frame times",
+        "frame_times": "frame times",
         "_update_times": "frame times",
         "condition": "condition",
         "image_loss": "loss",

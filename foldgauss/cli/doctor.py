@@ -129,7 +129,7 @@ def _engine_rows(found: dict[str, Any]) -> list[Row]:
         return [(RED, "engines", found["unknown"])]
     seen = ", ".join(found["jax_devices"])
     accelerator = (
-        f"JAX sees {seen}: engine xla draws there; fits are made for the processor"
+        f"JAX sees {seen}: engine xla draws there, and fits are computed there"
         if found["gpu"]
         else f"none that JAX sees ({seen})"
     )

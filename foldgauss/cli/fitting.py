@@ -54,7 +54,15 @@ from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import Clip, read_video, write_image, write_video
 from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_checkpoint, save_checkpoint, save_video_model
 from foldgauss.render import COMPOSITINGS
-from foldgauss.video.config import ON_DIVERGENCE, PRESETS, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.config import (
+    FIT_ENGINES,
+    ON_DIVERGENCE,
+    PRESETS,
+    FitConfig,
+    chosen_num_gaussians,
+    planned_steps,
+)
+from foldgauss.video.device import chosen_engine, device_name
 from foldgauss.video.economy import Economy
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
 from foldgauss.video.guard import FitDiverged
@@ -231,6 +239,14 @@ def fit(
             help="Share of the steps with frames at half of their size [default: 0.4].", rich_help_panel=COURSE
         ),
     ] = None,
+    engine: Annotated[
+        str,
+        typer.Option(
+            help="What computes the steps: cpu, or on a GPU xla or pallas; auto: cpu unless there is a GPU.",
+            rich_help_panel=COURSE,
+            autocompletion=among(FIT_ENGINES),
+        ),
+    ] = "auto",
     seed: Annotated[
         int, typer.Option(help="Seed of the random starts and of the order of frames.", rich_help_panel=COURSE)
     ] = 0,
@@ -293,6 +309,7 @@ def fit(
         "quarter_share": quarter_share,
         "half_share": half_share,
         "on_divergence": on_divergence,
+        "engine": engine,
         "seed": seed,
     }
     target = named_after(video, MODEL_SUFFIX) if out_path is None else out_path
@@ -317,6 +334,10 @@ def fit(
     if resume and not kept.exists():
         raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
+    try:
+        chosen_engine(clip.frames, config)
+    except ValueError as error:
+        raise WrongUse(as_option(str(error))) from error
     _say_clip(clip, config, manner)
     source = fingerprint(clip)
     state = load_checkpoint(kept, config=config, source=source) if resume else None
@@ -544,10 +565,12 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
     if manner in ("json", "quiet"):
         return
     growing = "" if config.growth is None else " at the start"
+    engine = chosen_engine(clip.frames, config)
+    computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {device_name()}"
     number = "1 frame" if clip.num_frames == 1 else f"{clip.num_frames} frames"
     out.print(
         f"{clip.source}: {number} of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
         f"{num:,} Gaussians of degree {config.degree}{growing}, "
-        f"{plan}, {num_threads()} threads",
+        f"{plan}, {computed}",
         soft_wrap=True,
     )

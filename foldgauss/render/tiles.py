@@ -131,6 +131,12 @@ def project(plan: Plan, mean, factor, opacity) -> Projected:
     return Projected(white, reach, radius_x, jnp.stack(firsts), jnp.stack(shapes))
 
 
+def on_screen(mean, factor, opacity, size: tuple[int, int], options: RenderOptions) -> Bool[Array, " num"]:
+    """Which splats may reach a picture: those whose cutoff ellipse has a box around it that meets pixels' centres."""
+    plan = Plan(size, True, options, max(size), 1, 1)
+    return project(plan, mean, factor, opacity).slots > 0
+
+
 def _tiles_between(low, high, length: int, tile: int):
     """Tiles first <= k < last whose pixel centres lie within [low, high]; clipped before the cast to an integer."""
     first = jnp.clip(jnp.ceil(low - 0.5), 0, length)

@@ -45,6 +45,8 @@ MAX_DEGREE = 16
 FINE = RenderOptions(low_pass=0.1)
 #: Where Gaussians start, and which rates fall.
 INITIALIZATIONS, FALLING = ("clip", "uniform"), ("all", "loc")
+#: What computes the steps of a fit, as the engines of `render`; "auto" is "cpu" where there is no GPU.
+FIT_ENGINES = ("auto", "cpu", "xla", "pallas")
 #: What a fit does that comes apart, see `guard`.
 ON_DIVERGENCE = ("back-off", "stop")
 #: The published rates, those of lengths in our unit; published positions learn in units of the scene's extent.
@@ -141,6 +143,9 @@ class FitConfig:
     #: Where numbers become infinite or pictures much worse: "back-off" to the last sound state, with lower rates, or
     #: "stop" with `FitDiverged`.
     on_divergence: str = "back-off"
+    #: What computes the steps: "cpu", or on JAX's default device "xla" or "pallas", see docs/gpu.md; "auto": "cpu",
+    #: unless there is a GPU, and no setting that only "cpu" knows.
+    engine: str = "auto"
 
     def __post_init__(self) -> None:
         numbers = {"num_gaussians": 1, "max_gaussians": 1, "degree": 0, "steps": 1, "batch_size": 1, "seed": 0}
@@ -181,6 +186,7 @@ class FitConfig:
         one_of("initialization", self.initialization, INITIALIZATIONS)
         one_of("falling", self.falling, FALLING)
         one_of("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        one_of("engine", self.engine, FIT_ENGINES)
         one_of("compositing", self.compositing, COMPOSITINGS)
         if self.quarter_share + self.half_share > 1:
             got = f"{self.quarter_share:g} and {self.half_share:g}"

@@ -6,28 +6,30 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from foldgauss import _display
 from foldgauss._checks import invalid, whole, within
 from foldgauss._threads import check_process
-from foldgauss.render import cpu, pixels_per_unit
+from foldgauss.render import cpu
 from foldgauss.video.alpha import random_background
 from foldgauss.video.conditioning import Conditioned, Shape, condition, pull_back, update_windows
-from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians, planned_steps
+from foldgauss.video.config import UNIT_TIME, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.device import DeviceStepper, chosen_engine
 from foldgauss.video.economy import LEAST_PASSES, frame_weights
 from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.growth import Growth, Statistics, dim, grown
-from foldgauss.video.guard import LOWERED, Guard
+from foldgauss.video.growth import Statistics
+from foldgauss.video.guard import Guard
 from foldgauss.video.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.kinds import kinds_at_start, kinds_of
 from foldgauss.video.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.motion import Motion
 from foldgauss.video.packing import columns, pack
+from foldgauss.video.population import grow
 from foldgauss.video.pyramid import Level, level_at, levels, shrunk, work_done
+from foldgauss.video.schedule import Rates, looked_at, steps_per_pass, views_of
 from foldgauss.video.sharing import Palette
 from foldgauss.video.shots import time_logits
 from foldgauss.video.sparse_adam import sparse_adam
@@ -41,6 +43,7 @@ from foldgauss.video.state import (
     running_psnr,
     to_model,
 )
+from foldgauss.video.state import update_times as _update_times
 from foldgauss.video.stock import StockTaker
 
 
@@ -124,10 +127,11 @@ def fit_steps(
     if frames.shape[3] == 4 and config.between_share > 0:
         cure = "Leave it out: the flow knows nothing of what is behind."
         raise invalid("between_share", expected="0 for frames with alpha", got=config.between_share, cure=cure)
-    _warm_up(frames, config)
+    engine = chosen_engine(frames, config, state)
+    _warm_up(frames, config, engine)
     flow = _Flow(frames, motion)
     state = _started(frames, config, None, flow) if state is None else state
-    step = _Stepper(frames, config, state, flow)
+    step = _Stepper(frames, config, state, flow) if engine == "cpu" else DeviceStepper(frames, config, state, engine)
     pace = _Pace(config, [level.share for level in step.levels], len(frames))
     outlook = _Outlook(state, config, step.levels)
     guard = Guard(state, config, step.steps_per_pass, alpha=frames.shape[3] == 4)
@@ -152,10 +156,10 @@ def fit_steps(
         fault = guard.fault(state, loss)
         if fault:
             guard.back_off(state, fault, error_before)
-            step = _Stepper(frames, config, state, flow)
+            step = step.anew(state)
         else:
             guard.remember(state)
-        if state.statistics is not None and state.plan:
+        if state.growing and state.plan:
             step.grow(state)
         if config.economy is not None and state.plan:
             step.take_stock(state)
@@ -173,15 +177,18 @@ def fit_steps(
         yield state, _info(state, config, outlook, loss, num_alive, stopped_by)
 
 
-def _warm_up(frames: np.ndarray, config: FitConfig) -> None:
+def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile the kernels, or load them, on a corner of the clip, before any clock runs: the first time takes 20 s."""
+    looks = config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None)
+    if engine != "cpu" and not looks:
+        return
     tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
     tiny = dataclasses.replace(tiny, between_share=0.0)
     corner = np.ascontiguousarray(frames[:2, :32, :32])
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
-    for progress in (0.0, 1.0):  # with either loss
+    for progress in (0.0, 1.0) if engine == "cpu" else ():  # with either loss
         _Stepper(corner, tiny, state)(state, progress)
-    if config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None):
+    if looks:
         mean_psnr(state, tiny, corner)
 
 
@@ -259,18 +266,9 @@ def _reaches(target: float, state: FitState, config: FitConfig, frames: np.ndarr
     The running one says little of it: it lags, is that of a mean over unlike frames, and with alpha one over random
     backgrounds.
     """
-    steps = _steps_per_pass(config, len(frames))
+    steps = steps_per_pass(config, len(frames))
     due = state.step > 0 and state.step % (LOOK_PASSES * steps) == 0
     return due and bool(np.isfinite(state.rows).all()) and mean_psnr(state, config, frames) >= target
-
-
-def _steps_per_pass(config: FitConfig, num_frames: int) -> int:
-    return -(-_num_views(config, num_frames) // config.batch_size)
-
-
-def _num_views(config: FitConfig, num_frames: int) -> int:
-    """Views of a pass: every frame, then with two cameras every frame mirrored."""
-    return 2 * num_frames if config.two_cameras else num_frames
 
 
 class _Outlook:
@@ -295,9 +293,8 @@ def _info(
 ) -> FitInfo:
     done = 1.0 if stopped_by else min(_progress(state, config), 0.999)  # a PSNR asked for may take overtime
     left = 0.0 if stopped_by else outlook.seconds_left(state, done)
-    return FitInfo(
-        state.step, done, loss, running_psnr(state), len(state.rows), num_alive, state.seconds, left, stopped_by
-    )
+    num = state.num_gaussians
+    return FitInfo(state.step, done, loss, running_psnr(state), num, num_alive, state.seconds, left, stopped_by)
 
 
 def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
@@ -449,11 +446,7 @@ class _Stepper:
         own = config.degree, config.power, config.floor
         self.shapes = [Shape(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
         self.shapes.append(Shape(*own, (height, width)))
-        self.rates = np.empty(state.rows.shape[1], np.float32)
-        self.falling = np.ones(state.rows.shape[1], bool)
-        for name, place in columns(config.degree).items():
-            self.rates[place] = getattr(config.rates, name)
-            self.falling[place] = config.falling in ("all", name)
+        self.rates = Rates(config)
         self.flow = _Flow(frames) if flow is None else flow
         self.between = _Between(frames, config, self.flow.motion) if config.between_share > 0 else None
         if config.economy is not None:
@@ -474,7 +467,6 @@ class _Stepper:
         """
         if self.frames.shape[3] == 4:
             self.background = random_background(self.config.seed, state.step)
-        decay = self.config.final_rate**progress if self.config.final_rate > 0 else max(1 - progress, 0.0)
         times = np.asarray(frame_times(state.time_logits))
         by_time = np.zeros_like(times)
         losses, alive, squared, errors = [], [], progress >= 1 - self.config.square_share, []
@@ -497,8 +489,7 @@ class _Stepper:
         num_alive = len(touched)
         if not self.config.only_alive:
             touched = np.arange(len(state.rows))
-        slower = LOWERED**-state.backoffs
-        rates = np.where(self.falling, self.rates * np.float32(decay), self.rates) * np.float32(slower)
+        rates, rate_of_times = self.rates.at(progress, state.backoffs)
         moments = state.first, state.second, state.counts
         unit = UNIT_TIME if self.config.own_time else 0.0
         for name, palette in (("color_dc", state.colors), ("log_scale", state.shapes)):
@@ -507,57 +498,33 @@ class _Stepper:
         sparse_adam(state.rows, self.grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit)
         update_windows(state.rows, touched, self.window)
         if self.config.learn_frame_times and self.num_frames > 2:
-            rate = np.float32(self.config.rates.frame_times * (decay if self.config.falling == "all" else 1.0) * slower)
-            state.time_logits, state.time_moments = _update_times(state.time_logits, state.time_moments, by_time, rate)
+            moved = _update_times(state.time_logits, state.time_moments, by_time, rate_of_times)
+            state.time_logits, state.time_moments = moved
         squared_error = float(np.mean(errors)) if errors else math.nan
         return float(np.mean([loss.value for loss in losses])), squared_error, num_alive
 
     @property
     def steps_per_pass(self) -> int:
-        return _steps_per_pass(self.config, self.num_frames)
+        return steps_per_pass(self.config, self.num_frames)
+
+    def anew(self, state: FitState) -> "_Stepper":
+        """For a state whose arrays are others now."""
+        return _Stepper(self.frames, self.config, state, self.flow)
 
     def errors_at_start(self, state: FitState) -> dict[int, float]:
         """Mean squared errors of some frames at full size, by frame; takes time, which is the fit's."""
         begun, shape, errors = time.perf_counter(), self.shapes[-1], {}
         times = np.asarray(frame_times(state.time_logits))
-        for k in np.unique(np.linspace(0, self.num_frames - 1, LOOKED_AT).round().astype(int)):
+        for k in looked_at(self.num_frames):
             image = self._drawn(condition(state.rows, self.window, times[k], shape), shape).image
             errors[int(k)] = float(np.mean(np.square(image - planar(self.frames[k], self.background))))
         state.seconds += time.perf_counter() - begun
         return errors
 
     def grow(self, state: FitState) -> None:
-        """Births, deaths and resets that are due now that the plan is known; after the last, statistics end."""
-        growth = self.config.growth.for_plan(state.plan)
-        if growth.grows_at(state.step):
-            self._replace(state, growth)
-        if growth.resets_at(state.step):
-            dim(state.rows, state.first, state.second, growth, self.config.degree)
-        if state.step + 1 >= growth.until_step:
-            state.statistics = None
-
-    def _replace(self, state: FitState, growth: Growth) -> None:
-        """Births and deaths: moments of those that stay are theirs, those of the new ones are zero."""
-        stay, born = grown(
-            state.rows,
-            state.statistics,
-            growth,
-            degree=self.config.degree,
-            pixels=pixels_per_unit(self.shapes[-1].size),
-            most=most_gaussians(self.config, self.num_frames),
-            step=state.step,
-            seed=self.config.seed,
-        )
-        state.rows = np.concatenate([state.rows[stay], born])
-        state.first, state.second = (
-            np.concatenate([part[stay], np.zeros_like(born)]) for part in (state.first, state.second)
-        )
-        state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
-        state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, self.config.degree)])
-        state.young = np.concatenate([state.young[stay], np.zeros(len(born), bool)])
-        state.colors, state.shapes = Palette.of(None, 3), Palette.of(None, 2)  # those born have their own
-        state.statistics = Statistics.zeros(len(state.rows))
-        self._make_room(state)
+        """Births, deaths and resets that are due."""
+        if grow(state, self.config, self.shapes[-1].size):
+            self._make_room(state)
 
     def _weight(self, errors: np.ndarray, k: int) -> float:
         """Of frame k's loss. For the mean PSNR what counts is by how many dB a frame gets better."""
@@ -569,17 +536,7 @@ class _Stepper:
             self._make_room(state)
 
     def _batch(self, step: int) -> np.ndarray:
-        """Views of a step: every pass visits all once, in an order that depends on seed and pass only.
-
-        View k is frame k; from the number of frames on, frame k - num_frames, mirrored.
-        """
-        first, num = step * self.config.batch_size, _num_views(self.config, self.num_frames)
-        positions = np.arange(first, first + self.config.batch_size)
-        return np.array([self._order(p // num)[p % num] for p in positions])
-
-    def _order(self, epoch: int) -> np.ndarray:
-        num = _num_views(self.config, self.num_frames)
-        return np.random.default_rng([self.config.seed, 1, epoch]).permutation(num)
+        return views_of(self.config, self.num_frames, step)
 
     def _frame(
         self,
@@ -665,8 +622,6 @@ def _mirrored(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndar
     return mean * other + np.float32([width, 0]), factor * other[:, None]
 
 
-#: Frames that tell how good the start is.
-LOOKED_AT = 16
 #: A fit to a target looks at all frames once in so many passes, which is a tenth of its time.
 LOOK_PASSES = 4
 #: A fit that is to be the smallest at a PSNR, and has not reached that, goes on to so many times its plan.
@@ -680,12 +635,3 @@ ROUND = 2.0
 WARM_UP, LEAST_STEPS, MEASURED = 5, 10, 0.05
 #: Steps of the whole fit are slower than the first ones by this: Gaussians grow longer in time.
 SLOWER = 1.05
-
-
-@jax.jit
-def _update_times(logits, moments, by_time, rate):
-    """Adam on the softmax weights, given dL/dt_k."""
-    _, pull = jax.vjp(lambda w: FrameTimes(w).times(), logits)
-    with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
-        update, moments = TIME_ADAM.update(pull(by_time)[0], moments)
-    return logits - rate * update, moments

@@ -4,6 +4,7 @@ Two signs: numbers that are none, and pictures that become much worse than they 
 are too high for the clip, or of a state that was broken before.
 """
 
+import copy
 import dataclasses
 import math
 import warnings
@@ -13,7 +14,7 @@ import numpy as np
 
 from foldgauss.video.config import FitConfig
 from foldgauss.video.packing import columns
-from foldgauss.video.state import FitState
+from foldgauss.video.state import ARRAYS, FitState
 
 #: Steps from one sound state that is remembered to the next. (A copy of 40,000 Gaussians takes 4 ms.)
 REMEMBERED = 50
@@ -47,20 +48,19 @@ class FitDiverged(ArithmeticError):
 
 
 def _copied(state: FitState) -> FitState:
-    """As it is now, arrays and all, but for the sound state before."""
-    return jax.tree.map(np.array, dataclasses.replace(state, sound=None))
+    """As it is now, arrays and all, but for the sound state before; on the device that holds it."""
+    if state.held is None:
+        return jax.tree.map(np.array, dataclasses.replace(state, sound=None))
+    other = copy.copy(state)
+    other.sound, other.held = None, state.held.copied()
+    return other
 
 
 def _put_back(state: FitState) -> None:
     """The arrays of its last sound state are handed over as copies: a state owns what it updates in place."""
-    for name in _array_fields():
+    state.held = None
+    for name in ARRAYS:
         setattr(state, name, jax.tree.map(np.array, getattr(state.sound, name)))
-
-
-def _array_fields() -> list[str]:
-    others = ("step", "plan", "seconds", "error", "best_error", "backoffs")
-    others += ("sound", "settled", "should_be_better", "start_errors")
-    return [field.name for field in dataclasses.fields(FitState) if field.name not in others]
 
 
 class Guard:
@@ -89,7 +89,7 @@ class Guard:
 
     def fault(self, state: FitState, loss: float) -> str:
         """What is wrong after a step, in words; empty if nothing is."""
-        if not (math.isfinite(loss) and _finite(state.rows) and _finite(state.time_logits)):
+        if not (math.isfinite(loss) and state.finite("rows") and state.finite("time_logits")):
             return _broken(state, self.config) or f"a loss of {loss}"
         if state.backoffs >= MOST_BACKOFFS:
             return ""  # where no tries are left, bad pictures are better than none
@@ -129,7 +129,7 @@ class Guard:
         if state.backoffs and state.step < state.settled:
             return  # what the errors were, and are now, is not known of all frames
         bad = self.comparable and (self._times_worse(state) > MUCH_WORSE or self._times_start(state) > NO_BETTER)
-        if due and not bad and _finite(state.second):
+        if due and not bad and state.finite("second"):
             state.sound = _copied(state)
 
     def finish(self, state: FitState) -> None:
@@ -171,12 +171,12 @@ class Guard:
 
     def _most_moved(self, state: FitState) -> str:
         """The leaf that is farthest from where it was when all was sound, by its own spread then."""
-        before = state.sound.rows
-        if before.shape != state.rows.shape:
+        before, rows = state.sound.rows, state.rows
+        if before.shape != rows.shape:
             return "some leaves"
         with np.errstate(over="ignore", invalid="ignore"):
             moved = {
-                name: float(np.median(np.abs(state.rows[:, at] - before[:, at])))
+                name: float(np.median(np.abs(rows[:, at] - before[:, at])))
                 / max(float(before[:, at].std()), LEAST_UNIT.get(name, 1.0))
                 for name, at in columns(self.config.degree).items()
                 if at.stop > at.start
@@ -189,17 +189,12 @@ class Guard:
         return float(np.abs(np.asarray(state.time_logits) - state.sound.time_logits).max(initial=0.0))
 
 
-def _finite(array: np.ndarray) -> bool:
-    """Whether all numbers are, by their sum: a third of the time of looking at each."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return bool(np.isfinite(array.sum()))
-
-
 def _broken(state: FitState, config: FitConfig) -> str:
     """The leaves with numbers that are none, and how many Gaussians have them; empty if there are none."""
     found = []
+    rows = state.rows
     for name, at in columns(config.degree).items():
-        bad = np.flatnonzero(~np.isfinite(state.rows[:, at]).all(1))
+        bad = np.flatnonzero(~np.isfinite(rows[:, at]).all(1))
         if len(bad):
             found.append(f"no finite {name} in {len(bad):,} Gaussians, the first of them {bad[0]}")
     if not np.isfinite(state.time_logits).all():

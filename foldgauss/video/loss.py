@@ -23,7 +23,9 @@ C1, C2 = 0.01**2, 0.03**2  # Wang et al. 2004: (K1 L)^2 and (K2 L)^2 with L = 1
 STRIP = 40
 
 _taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(RADIUS + 1)]
-_W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(tap / (2 * sum(_taps) - _taps[0])) for tap in _taps)
+#: Weights of the tap in the middle and of those 1 to RADIUS pixels away.
+TAPS = tuple(np.float32(tap / (2 * sum(_taps) - _taps[0])) for tap in _taps)
+_W0, _W1, _W2, _W3, _W4, _W5 = TAPS
 
 _f, _u = nb.float32, nb.uint64
 

@@ -22,8 +22,8 @@ _f, _u = nb.float32, nb.uint64
 
 #: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Powers taken anew
 #: for each row were a third of a step's optimiser.)
-_UNBIAS = np.ones((20_000, 2), np.float32)
-_UNBIAS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(_UNBIAS))[:, None])
+UNBIAS = np.ones((20_000, 2), np.float32)
+UNBIAS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(UNBIAS))[:, None])
 
 
 @kernel
@@ -100,7 +100,7 @@ def sparse_adam(
             rates,
             np.float32(unit_time),
             at,
-            _UNBIAS,
+            UNBIAS,
         )
 
     run_tasks(work, range(0, num, CHUNK))

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import jax
@@ -20,6 +21,22 @@ from foldgauss.video.playback import Playback
 from foldgauss.video.sharing import Palette
 
 TIME_ADAM = optax.scale_by_adam(eps=1e-15)
+
+
+class Held(Protocol):
+    """Arrays of a fit that are elsewhere, on a device: fetched only where somebody asks for them."""
+
+    num: int  #: Gaussians
+    growing: bool  #: whether statistics of growth are kept
+
+    def fetch(self, name: str) -> Any:
+        """A field of `FitState`, as an array of NumPy's, a copy."""
+
+    def finite(self, name: str) -> bool:
+        """Whether all numbers of a field are, by a look on the device."""
+
+    def copied(self) -> "Held":
+        """A copy that later steps leave as it is, on the device as well."""
 
 
 @functools.partial(
@@ -53,7 +70,11 @@ TIME_ADAM = optax.scale_by_adam(eps=1e-15)
 )
 @dataclasses.dataclass
 class FitState:
-    """The arrays of a running fit. A step consumes its state: as with donated buffers, arrays are updated in place."""
+    """The arrays of a running fit. A step consumes its state: as with donated buffers, arrays are updated in place.
+
+    Those of a fit on a device are `held` there, and fetched anew, as copies, whenever they are read; who sets one has
+    it taken over by the next step.
+    """
 
     rows: np.ndarray  # float32 (num, width): see `packing`
     first: np.ndarray  # Adam's moments, likewise
@@ -78,6 +99,53 @@ class FitState:
     settled: int = 0  # steps from which on errors are compared with the best one, and with those of the start
     should_be_better: int = 0
     start_errors: tuple[tuple[int, float], ...] = ()  # frames, and their mean squared errors before the first step
+    held: ClassVar[Held | None] = None  # of a fit on a device, an attribute of the instance
+
+    def __getattr__(self, name: str) -> Any:
+        """An array that is not here is fetched."""
+        held = self.__dict__.get("held")
+        if held is None or name not in ARRAYS:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return held.fetch(name)
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.rows) if self.held is None else self.held.num
+
+    @property
+    def growing(self) -> bool:
+        """Whether births and deaths are still to come."""
+        return self.statistics is not None if self.held is None else self.held.growing
+
+    def finite(self, name: str) -> bool:
+        """Whether all numbers of an array are, by their sum: a third of the time of looking at each."""
+        if self.held is not None:
+            return self.held.finite(name)
+        with np.errstate(invalid="ignore", over="ignore"):
+            return bool(np.isfinite(getattr(self, name).sum()))
+
+    def hold(self, held: Held) -> None:
+        """From now on all arrays are those of `held`."""
+        for name in ARRAYS:
+            self.__dict__.pop(name, None)
+        self.held = held
+
+    def land(self) -> None:
+        """Fetch all arrays, but for those that were set since; nothing is held any more."""
+        if self.held is not None:
+            arrays = {name: getattr(self, name) for name in ARRAYS}
+            self.held = None
+            self.__dict__.update(arrays)
+
+    @property
+    def changed(self) -> bool:
+        """Whether an array was set since arrays are held."""
+        return self.held is not None and not self.__dict__.keys().isdisjoint(ARRAYS)
+
+
+#: The fields of a `FitState` that are arrays, or trees of them.
+_OTHERS = ("step", "plan", "seconds", "error", "best_error", "backoffs", "sound", "settled", "should_be_better")
+ARRAYS = tuple(field.name for field in dataclasses.fields(FitState) if field.name not in (*_OTHERS, "start_errors"))
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
@@ -110,6 +178,15 @@ def envelope_of(config: FitConfig) -> TimeLikelihood:
 @jax.jit
 def frame_times(logits):
     return FrameTimes(logits).times()
+
+
+@jax.jit
+def update_times(logits, moments, by_time, rate):
+    """Adam on the softmax weights, given dL/dt_k."""
+    _, pull = jax.vjp(lambda w: FrameTimes(w).times(), logits)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
+        update, moments = TIME_ADAM.update(pull(by_time)[0], moments)
+    return logits - rate * update, moments
 
 
 def planar(frame: np.ndarray, background: np.ndarray) -> np.ndarray:

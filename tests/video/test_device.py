@@ -1,0 +1,571 @@
+"""Fits whose steps are one program on a JAX device: as those of the CPU's kernels, and never by way of the host."""
+
+import copy
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from clips import moving_blobs
+from commands import run
+
+from benchmarks import gpu
+from foldgauss.io import write_image
+from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint
+from foldgauss.render import RenderOptions
+from foldgauss.video import (
+    DivergenceWarning,
+    Economy,
+    FitConfig,
+    FitDiverged,
+    Growth,
+    LearningRates,
+    evaluate,
+    fit,
+    fit_steps,
+)
+from foldgauss.video.conditioning import Shape, condition, update_windows
+from foldgauss.video.device import DeviceStepper, OnDevice, chosen_engine
+from foldgauss.video.device_loss import losses, similarity
+from foldgauss.video.device_step import _splats, adam, alive_at, lowered
+from foldgauss.video.fit import _Stepper, start
+from foldgauss.video.kinds import LASTS, SOLID
+from foldgauss.video.loss import image_loss, squared_loss, ssim_map
+from foldgauss.video.packing import columns
+from foldgauss.video.pyramid import levels
+from foldgauss.video.sparse_adam import sparse_adam
+from foldgauss.video.state import FitState
+
+#: Nothing in it is black: at a colour of 0 the slope is one thing or another by rounding.
+FRAMES = moving_blobs(height=32, width=40) // 2 + 40
+CONFIG = FitConfig(num_gaussians=150, steps=100, engine="xla")
+#: As the paper's: batches, both cameras, Adam for all, growth, here within few steps.
+GROWTH = Growth(
+    from_step=1,
+    until_step=29_000,
+    big_from=30_000,
+    screen_gradient=1e-5,
+    time_gradient=1e-5,
+    clone_below=0.25,
+    reset_every=14_000,
+)
+GROWING = FitConfig(
+    num_gaussians=60,
+    max_gaussians=250,
+    steps=34,
+    batch_size=4,
+    power=2.0,
+    two_cameras=True,
+    only_alive=False,
+    growth=GROWTH,
+    engine="xla",
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_quickly():
+    """Compiling steps is most of the time here, and nobody looks at how fast they are."""
+    compiling = jax.stages.Lowered.compile
+    with pytest.MonkeyPatch.context() as patch:
+        options = {"xla_backend_optimization_level": 0}
+        patch.setattr(jax.stages.Lowered, "compile", lambda self: compiling(self, options))
+        yield
+
+
+def warm_state(config: FitConfig, steps: int = 20) -> FitState:
+    """A state with moments: Adam's first steps go by the signs of gradients, which are rounding's where they are 0."""
+    state = start(FRAMES, config)
+    step = _Stepper(FRAMES, config, state)
+    for _ in range(steps):
+        step(state, 0.1)
+        state.step += 1
+    return state
+
+
+def close(one, other, share=1e-5):
+    """By the size of the largest number."""
+    one, other = np.asarray(one), np.asarray(other)
+    np.testing.assert_allclose(one, other, atol=share * max(np.abs(other).max(initial=0), 1e-12), rtol=1e-4)
+
+
+def compare_steps(config: FitConfig, progress: float, level: int = -1, outside: int = 0):
+    """By the CPU and by XLA; the first Gaussians `outside` the picture."""
+    here, there = warm_state(config), warm_state(config)
+    for state in (here, there):
+        state.rows[:outside, columns(config.degree)["loc"]] = 5.0
+    figures = _Stepper(FRAMES, config, here)(here, progress, level)
+    stepper = DeviceStepper(FRAMES, config, there, "xla")
+    own = stepper(there, progress, level)
+    close(own, figures, share=1e-6)
+    assert own[2] == figures[2]
+    for name in ("rows", "first", "second", "frame_errors", "time_logits"):
+        close(getattr(there, name), getattr(here, name))
+    np.testing.assert_array_equal(there.counts, here.counts)
+    np.testing.assert_array_equal(there.kinds, here.kinds)
+    for one, other in zip(jax.tree.leaves(there.time_moments), jax.tree.leaves(here.time_moments), strict=True):
+        close(one, other, share=1e-4)
+    return here, there
+
+
+@pytest.mark.parametrize("progress", [0.1, 1.0], ids=["image loss", "squared loss"])
+def test_a_step_is_that_of_the_cpu(progress):
+    _, there = compare_steps(CONFIG, progress)
+    assert there.statistics is None
+    assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
+
+
+def test_a_step_of_growing_batches_is_that_of_the_cpu():
+    """Twice the views of a pass, all rows by momentum, statistics, and rows that are not in use."""
+    here, there = compare_steps(GROWING, 0.1, outside=7)
+    for one, other in zip(there.statistics, here.statistics, strict=True):
+        close(one, other)
+    assert here.statistics.seen[7:].max() == 21
+    assert there.statistics.seen[:7].max() == 20  # who is outside is alive, but not seen
+    arrays = there.held.arrays
+    assert arrays.rows.shape == (250, 17)
+    for array in (arrays.rows, arrays.first, arrays.second, arrays.statistics.screen):
+        assert not np.asarray(array)[60:].any()
+
+
+@pytest.mark.slow
+def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
+    monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 16)
+    assert [level.size for level in levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
+    compare_steps(CONFIG, 0.1, level=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"degree": 0},
+        {"floor": 0.1, "power": 0.5},
+        {"own_time": False, "learn_frame_times": False},
+        {"ssim_share": 0.0},
+        {"compositing": "sum", "options": RenderOptions()},
+    ],
+    ids=str,
+)
+def test_steps_of_other_settings(changes):
+    compare_steps(dataclasses.replace(CONFIG, **changes), 0.1)
+
+
+@pytest.mark.slow
+def test_a_clip_of_one_frame():
+    result = fit(FRAMES[:1], dataclasses.replace(CONFIG, steps=60))
+    assert evaluate(result.model, FRAMES[:1]).mean_psnr > 25
+
+
+def pictures_of(seed=0, shape=(2, 23, 31, 3)):
+    rng = np.random.default_rng(seed)
+    smooth = np.cumsum(rng.normal(size=shape), axis=2) / 20 + 0.5
+    return [np.float32(smooth + 0.1 * rng.normal(size=shape)) for _ in range(2)]
+
+
+@pytest.mark.parametrize(("ssim_share", "squared"), [(0.2, False), (0.0, False), (0.2, True)])
+def test_losses_are_those_of_the_cpu(ssim_share, squared):
+    """Values, errors and gradients."""
+    rendered, target = pictures_of()
+    rendered[0, 3:9, 4:9] = target[0, 3:9, 4:9]  # where |x - y| has a kink
+
+    def total(rendered):
+        own, errors = losses(rendered, target, jnp.bool_(squared), ssim_share)
+        return jnp.sum(own), (own, errors)
+
+    gradient, (values, errors) = jax.jit(jax.grad(total, has_aux=True))(rendered)
+    for k in range(2):
+        planes = [np.ascontiguousarray(np.moveaxis(one[k], -1, 0)) for one in (rendered, target)]
+        judge = squared_loss(*planes) if squared else image_loss(*planes, ssim_share=ssim_share)
+        assert float(values[k]) == pytest.approx(judge.value, rel=1e-5)
+        assert float(errors[k]) == pytest.approx(judge.mean_squared_error, rel=1e-5)
+        close(np.moveaxis(gradient[k], -1, 0), judge.gradient)
+
+
+def test_similarity_is_that_of_the_cpu():
+    rendered, target = (np.ascontiguousarray(one[0, ..., 0]) for one in pictures_of())
+    own = jax.jit(similarity)(rendered[..., None], target[..., None])
+    close(own[..., 0], ssim_map(rendered, target))
+
+
+@pytest.mark.parametrize("unit_time", [0.0, 0.06])
+def test_adam_is_that_of_the_cpu(unit_time):
+    """Of rows with any number of steps behind them, of all kinds; those that took no part stay to the bit."""
+    rng, num, width = np.random.default_rng(0), 400, 17
+    rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
+    second = (rng.normal(size=(num, width)) ** 2).astype(np.float32)
+    counts = rng.integers(0, 30_000, num).astype(np.int32)
+    counts[:50] = np.arange(50)
+    kinds = rng.integers(0, 4, num).astype(np.uint8) + LASTS * rng.integers(0, 2, num).astype(np.uint8)
+    kinds |= (SOLID * rng.integers(0, 2, num)).astype(np.uint8)
+    touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
+    arrays = rows, grad, first, second, counts
+    how = {"kinds": kinds, "unit_time": unit_time}
+    own = jax.jit(lambda *arrays: adam(*arrays, touched, rates, **how))(*arrays)
+    judge = [array.copy() for array in arrays]
+    sparse_adam(*judge, np.flatnonzero(touched), rates, **how)
+    for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(np.asarray(one)[~touched], before[~touched])
+
+
+@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
+def test_conditioning_is_that_of_the_cpu(power, floor):
+    """The fold equation's home, `FoldedGaussian.condition_time`, as the step calls it, against the fused twin."""
+    config = dataclasses.replace(CONFIG, power=power, floor=floor)
+    state = warm_state(config, steps=5)
+    step = DeviceStepper(FRAMES, CONFIG, copy.deepcopy(state), "xla")  # of whose plan only the sizes count
+    plan = dataclasses.replace(step.plans[-1], power=power, floor=floor)
+    window = np.empty((len(state.rows), 2), np.float32)
+    update_windows(state.rows, np.arange(len(state.rows)), window)
+
+    @jax.jit
+    def conditioned(rows, t):
+        alive = alive_at(plan, rows, np.int32(150), t)
+        return alive, _splats(plan, rows, t, alive, jnp.bool_(False))
+
+    for t in np.float32([0.0, 0.37, 1.0]):
+        alive, splats = conditioned(state.rows, t)
+        judge = condition(state.rows, window, t, Shape(3, power, floor, plan.size))
+        np.testing.assert_array_equal(np.flatnonzero(alive), judge.alive)
+        splats = jax.tree.map(lambda leaf, keep=judge.alive: np.asarray(leaf)[keep], splats)
+        close(splats.mean, judge.mean)
+        close(splats.opacity, judge.opacity)
+        close(splats.color, judge.color)
+        own, twin = (factor @ factor.swapaxes(1, 2) for factor in (splats.factor, judge.factor))
+        close(own, twin)
+        assert not np.asarray(alive_at(plan, state.rows, np.int32(7), t))[7:].any()
+
+
+def test_it_learns_as_well_as_the_cpu():
+    scores = {
+        engine: evaluate(fit(FRAMES, dataclasses.replace(CONFIG, engine=engine)).model, FRAMES).mean_psnr
+        for engine in ("xla", "cpu")
+    }
+    assert scores["cpu"] > 30
+    assert abs(scores["xla"] - scores["cpu"]) < 0.3
+
+
+@pytest.mark.slow
+def test_pallas_steps_are_those_of_xla():
+    """Interpreted here; the same step but for the engine."""
+    own = {}
+    for engine in ("pallas", "xla"):
+        state = warm_state(CONFIG)
+        step = DeviceStepper(FRAMES, CONFIG, state, engine)
+        for _ in range(2):
+            step(state, 0.1)
+            state.step += 1
+        own[engine] = state.land() or state
+    for name in ("rows", "first", "second", "frame_errors", "time_logits"):
+        close(getattr(own["pallas"], name), getattr(own["xla"], name), share=1e-4)
+
+
+# ------------------------------------------------------------------------------------------- on the device
+
+
+def test_what_a_step_consumes_is_gone():
+    state = start(FRAMES, CONFIG)
+    step = DeviceStepper(FRAMES, CONFIG, state, "xla")
+    before = jax.tree.leaves(state.held.arrays)
+    step(state, 0.0)
+    assert before
+    assert all(leaf.is_deleted() for leaf in before)
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(state.held.arrays))
+    assert not any(leaf.is_deleted() for leaf in step.pictures)
+    assert step.pictures[-1].dtype == np.uint8
+
+
+@pytest.mark.parametrize(
+    ("engine", "config"),
+    [
+        pytest.param("pallas", GROWING, id="pallas-growing"),
+        pytest.param("xla", CONFIG, id="xla-plain"),
+        pytest.param("pallas", CONFIG, id="pallas-plain", marks=pytest.mark.slow),
+        pytest.param("xla", GROWING, id="xla-growing", marks=pytest.mark.slow),
+    ],
+)
+def test_no_step_asks_the_host(engine, config):
+    """For a GPU the whole step is one program: triton's are the only calls out of it."""
+    step = DeviceStepper(FRAMES, config, start(FRAMES, config), "xla")
+    plan = dataclasses.replace(step.plans[-1], engine=engine)
+    text = lowered(plan, ("cuda",)).as_text()
+    assert "callback" not in text
+    assert "infeed" not in text
+    assert "outfeed" not in text
+    calls = {line.split("@")[1].split("(")[0] for line in text.splitlines() if "custom_call @" in line}
+    triton = {"__gpu$xla.gpu.triton", "xla.gpu.triton"}
+    assert calls <= {*triton, "Sharding", "mhlo.erf"}, calls
+    assert (engine == "pallas") == bool(calls & triton)
+
+
+def compiled_by(function) -> int:
+    """How many programs were compiled meanwhile."""
+    count, counting = [], [True]
+
+    def note(event: str, duration: float, **_) -> None:
+        if counting and event.endswith("backend_compile_duration"):
+            count.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        function()
+    finally:
+        counting.clear()
+    return len(count)
+
+
+def test_births_and_deaths_compile_nothing():
+    steps, numbers = fit_steps(FRAMES, GROWING), []
+    numbers.append(next(steps)[0].num_gaussians)
+
+    def rest() -> None:
+        for state, info in steps:
+            numbers.append(state.num_gaussians)
+            assert info.num_gaussians == state.num_gaussians
+
+    assert compiled_by(rest) == 0
+    assert 60 < numbers[-1] <= 250  # some were born
+    assert len(set(numbers)) > 2
+    assert compiled_by(lambda: jax.jit(lambda x: x + 17)(1.0)) == 1  # it would have been seen
+
+
+def test_the_same_are_born_as_on_the_cpu():
+    """From one state, at the step of the first births: clones, halves at the same places, and moments that are 0."""
+    kept, after = None, {}
+    for state, _ in fit_steps(FRAMES, dataclasses.replace(GROWING, engine="cpu")):
+        if state.step == 9:
+            kept = jax.tree.map(np.array, state)
+            break
+    for engine in ("cpu", "xla"):
+        own = fit_steps(FRAMES, dataclasses.replace(GROWING, engine=engine), jax.tree.map(np.array, kept))
+        after[engine] = jax.tree.map(np.array, next(own)[0])
+    assert after["xla"].num_gaussians == after["cpu"].num_gaussians > 60
+    for name in ("rows", "first", "second"):
+        close(getattr(after["xla"], name), getattr(after["cpu"], name))
+    np.testing.assert_array_equal(after["xla"].counts, after["cpu"].counts)
+    assert not after["xla"].statistics.seen.any()
+    born = after["xla"].counts == 0
+    assert 0 < born.sum() < len(born)
+    assert not after["xla"].first[born].any()
+    assert after["xla"].first[~born].any(axis=1).all()
+
+
+def test_only_what_is_looked_at_is_fetched(monkeypatch):
+    fetched, fetch = [], OnDevice.fetch
+    monkeypatch.setattr(OnDevice, "fetch", lambda self, name: fetched.append(name) or fetch(self, name))
+    steps = fit_steps(FRAMES, CONFIG)
+    state, _ = next(steps)
+    fetched.clear()
+    for _ in range(60):  # in which the guard remembers a state, on the device
+        next(steps)
+    assert set(fetched) == {"frame_errors", "time_logits"}  # which every step tells
+    before = state.rows
+    assert fetched[-1] == "rows"
+    next(steps)
+    assert not np.array_equal(state.rows, before)  # what was fetched is a copy
+    with pytest.raises(AttributeError, match="rowz"):
+        state.rowz  # noqa: B018
+
+
+def test_what_is_set_is_taken_over():
+    steps = fit_steps(FRAMES, CONFIG)
+    state, _ = next(steps)
+    place = columns(CONFIG.degree)["loc"]
+    rows = state.rows
+    rows[:, place] += 3.0  # a copy: nobody knows of that
+    next(steps)
+    assert np.abs(state.rows[:, place]).max() < 2
+    rows, first = state.rows, state.first
+    rows[:, place] += 3.0
+    state.rows = rows
+    next(steps)
+    assert state.rows[:, place].min() > 2
+    assert np.abs(state.first - first).max() < 1e-2  # all else is as it was
+    assert not state.changed
+
+
+FOUR_DEVICES = """
+import sys
+import jax
+kept, done, *folders = sys.argv[1:]
+sys.path[:0] = folders
+from test_device import FRAMES, GROWING, STEPS, load_checkpoint, save_checkpoint, stepped
+assert len(jax.devices()) == 4
+state = stepped(load_checkpoint(kept, config=GROWING, source={}))
+assert state.held.arrays.rows.sharding.num_devices == 4
+save_checkpoint(done, state, config=GROWING, source={})
+"""
+STEPS = 3
+
+
+def stepped(state: FitState) -> FitState:
+    step = DeviceStepper(FRAMES, GROWING, state, "xla")
+    for _ in range(STEPS):
+        state.error = step(state, 0.1)[0]
+        state.step += 1
+    return state
+
+
+def test_four_devices_are_as_one(tmp_path):
+    """Frames of a batch are shared out; sums over devices differ by rounding alone."""
+    flags = "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0"
+    kept, done = tmp_path / "kept.safetensors", tmp_path / "done.safetensors"
+    here = os.path.dirname(__file__)
+    state = warm_state(GROWING)
+    save_checkpoint(kept, state, config=GROWING, source={})
+    subprocess.run(
+        [sys.executable, "-c", FOUR_DEVICES, str(kept), str(done), here, os.path.dirname(here)],
+        check=True,
+        env=os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}", "JAX_PLATFORMS": "cpu"},
+        timeout=600,
+    )
+    one, four = stepped(state), load_checkpoint(done, config=GROWING, source={})
+    assert one.held.arrays.rows.sharding.num_devices == 1
+    assert four.error == pytest.approx(one.error, rel=1e-6)
+    for name in ("rows", "first", "second", "frame_errors", "time_logits"):
+        close(getattr(four, name), getattr(one, name), share=1e-4)
+    for own, other in zip(four.statistics, one.statistics, strict=True):
+        close(own, other, share=1e-4)
+
+
+# ---------------------------------------------------------------------------------------------- the door
+
+
+def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
+    assert chosen_engine(FRAMES, FitConfig()) == "cpu"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert chosen_engine(FRAMES, FitConfig()) == "xla"
+    assert chosen_engine(FRAMES, FitConfig(economy=Economy())) == "cpu"
+    assert chosen_engine(FRAMES, FitConfig(engine="cpu")) == "cpu"
+    assert chosen_engine(FRAMES, FitConfig(engine="pallas")) == "pallas"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"economy": Economy()}, "with an economy, got 'xla'. Give engine='cpu'"),
+        ({"between_share": 0.5}, "with between_share 0.5, got 'xla'. Give engine='cpu'"),
+        ({"engine": "pallas", "options": RenderOptions(alpha_ceiling=1.0)}, "alpha_ceiling"),
+        ({"engine": "pallas", "options": RenderOptions(tile_size=12)}, "tile_size"),
+    ],
+    ids=str,
+)
+def test_what_it_does_not_know_is_refused(changes, message):
+    """Before anything is computed."""
+    with pytest.raises(ValueError, match=message):
+        chosen_engine(FRAMES, dataclasses.replace(CONFIG, **changes))
+
+
+def test_a_fit_refuses_it(monkeypatch):
+    monkeypatch.setattr(sys.modules["foldgauss.video.fit"], "_warm_up", lambda *_: pytest.fail("too late"))
+    with pytest.raises(ValueError, match="with an economy"):
+        next(fit_steps(FRAMES, dataclasses.replace(CONFIG, economy=Economy())))
+
+
+def test_alpha_is_refused():
+    frames = np.concatenate([FRAMES, FRAMES[..., :1]], axis=-1)
+    with pytest.raises(ValueError, match="engine: expected 'cpu' with frames that have alpha, got 'xla'"):
+        next(fit_steps(frames, CONFIG))
+
+
+def test_unknown_engines_are_refused():
+    with pytest.raises(ValueError, match="engine: expected one of"):
+        FitConfig(engine="reference")
+
+
+@pytest.mark.parametrize("config", [CONFIG, GROWING], ids=["plain", "growing"])
+def test_a_stopped_fit_goes_on_to_the_same_bits(config, tmp_path):
+    """From a checkpoint, written while the arrays are on the device."""
+    path = tmp_path / "kept.safetensors"
+    config = dataclasses.replace(config, steps=min(config.steps, 40))
+    for state, _ in fit_steps(FRAMES, config):
+        if state.step == 23:
+            save_checkpoint(path, state, config=config, source={})
+    for again, info in fit_steps(FRAMES, config, load_checkpoint(path, config=config, source={})):
+        pass
+    assert info.step == config.steps
+    one, other = (jax.tree.map(np.array, own) for own in (state, again))
+    for name in ("rows", "first", "second", "counts", "time_logits", "frame_errors"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_fit_that_comes_apart_is_taken_back():
+    config = dataclasses.replace(CONFIG, rates=LearningRates(log_scale=3e38), steps=12)
+    with pytest.warns(DivergenceWarning, match="the fit came apart at step"):
+        done = [(np.isfinite(state.rows).all(), info.step) for state, info in fit_steps(FRAMES, config)]
+    assert all(finite for finite, _ in done)
+    assert done[-1][1] == 12
+    with pytest.raises(FitDiverged, match="What is kept is of step 0") as caught:
+        list(fit_steps(FRAMES, dataclasses.replace(config, on_divergence="stop")))
+    assert np.isfinite(caught.value.state.rows).all()
+
+
+def test_minutes_targets_and_plans():
+    by_clock = dataclasses.replace(CONFIG, steps=None, minutes=0.02)
+    *_, (_, info) = fit_steps(FRAMES, by_clock)
+    assert info.stopped_by == "minutes"
+    *_, (_, info) = fit_steps(FRAMES, dataclasses.replace(CONFIG, target_psnr=22.0))
+    assert info.stopped_by == "target_psnr"
+
+
+def test_room_grows_with_what_has_none():
+    """Without a bound of the user's there is room for some times as many, then for twice that."""
+    config = dataclasses.replace(GROWING, max_gaussians=None)
+    stepper = DeviceStepper.__new__(DeviceStepper)
+    stepper.config, stepper.num_frames, stepper.size = config, 6, (32, 40)
+    assert [stepper._room(num) for num in (240, 241, 480, 900)] == [240, 480, 480, 960]
+    stepper.config = GROWING
+    assert stepper._room(60) == 250
+    stepper.config = CONFIG
+    assert stepper._room(123) == 123
+
+
+def test_the_command(tmp_path, capsys):
+    (tmp_path / "clip").mkdir()
+    for k, frame in enumerate(FRAMES):
+        write_image(tmp_path / "clip" / f"{k:02}.png", frame)
+    model = tmp_path / "model.safetensors"
+    options = ["--gaussians", "150", "--steps", "40", "--out", str(model)]
+    assert run("fit", tmp_path / "clip", *options, "--engine", "xla") == 0
+    assert "engine xla on " in capsys.readouterr().out
+    assert evaluate(load_video_model(model), FRAMES).mean_psnr > 25
+    for wrong, message in ((["xla", "--economy"], "--engine: expected 'cpu' with an economy"), (["gpu"], "--engine")):
+        assert run("fit", tmp_path / "clip", *options, "--overwrite", "--engine", *wrong) == 2
+        assert message in capsys.readouterr().err
+
+
+# -------------------------------------------------------------------------------------- its own benchmark
+
+
+def test_figures_of_a_gpu_are_not_measured_without_one(capsys):
+    with pytest.raises(SystemExit):
+        gpu.main([])
+    assert "expected a GPU that JAX sees, got none" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        gpu.main(["--anyway"])
+
+
+def test_floors_are_those_of_the_device():
+    """An H200 moves bytes faster and computes as fast as an H100."""
+    few, many = 10_000, 10_000_000_000
+    for pairs, faster in ((few, 4.8 / 3.35), (many, 1.0)):
+        one, other = (gpu.floors(100_000, (640, 1280), pairs, f"NVIDIA {name}") for name in ("H100 80GB", "H200"))
+        assert one["forward"] / other["forward"] == pytest.approx(faster)
+        assert one["both"] > one["forward"]
+    assert gpu.floors(100_000, (640, 1280), many, "NVIDIA H200")["forward"] == pytest.approx(1e3 * many * 23 / 67e12)
+    assert gpu.floors(1, (1, 1), 1, "cpu") == {}
+
+
+@pytest.mark.slow
+def test_the_benchmark_runs(tmp_path):
+    path = tmp_path / "gpu.json"
+    gpu.main(["--anyway", "--tiny", "--json", str(path)])
+    figures = json.loads(path.read_text())["figures"]
+    for name in ("quality_xla_psnr", "quality_pallas_steps", "playback_pallas_fps", "playback_xla_fps"):
+        assert figures[name] > 0
+    assert figures["engines_200_24x40_xla_over_pallas_both"] > 0
