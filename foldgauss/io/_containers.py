@@ -137,10 +137,10 @@ def shown_seconds(file: BinaryIO) -> float | None:
         if size == 1:
             size, first = int.from_bytes(head[8:16], "big"), 16
         size = size or end - at
-        if size < first:
+        if size < first or size > end - at:  # a size may be any number of 64 bits
             return None
         if head[4:8] == b"moov":
-            if size > min(end - at, MOST_INDEX):
+            if size > MOST_INDEX:
                 return None
             try:
                 return _edited_seconds(_read_at(file, at + first, size - first))

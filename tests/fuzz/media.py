@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import struct
 import tempfile
 import warnings
 from pathlib import Path
@@ -14,7 +15,8 @@ import numpy as np
 from PIL import Image
 
 from foldgauss.cli._evidence import keep_evidence, kept_evidence
-from foldgauss.io import VideoError, read_masks, read_video, write_video
+from foldgauss.io import VideoError, _containers, read_masks, read_video, write_video
+from foldgauss.io._containers import _ASF_SOUND, _CLUSTER, _MATROSKA_SOUND
 from foldgauss.io.labels import MOST_PER_BYTE, MOST_PIXELS
 from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
 
@@ -165,7 +167,7 @@ def _clips() -> tuple[bytes, ...]:
                 writer.write(frame)
             writer.release()
             found.append(Path(path).read_bytes())
-    return tuple(found)
+    return (*found, _with_edits(found[4]))
 
 
 def _clip_body(data: bytes) -> int:
@@ -183,7 +185,48 @@ _WANTED = (
 _OTHERS = (
     b"ffconcat version 1.0\nfile 'a.mp4'\n", b"#EXTM3U\n#EXTINF:1,\na.ts\n", b"PK\x03\x04" + b"\0" * 40, b"%PDF-1.7\n",
     b"\xff\xd8\xff\xe0" + b"\0" * 60, b"BM" + b"\xff" * 60, b"II*\0" + b"\0" * 40, b"\x1f\x8b" + b"\0" * 30,
+    b"RIFF\0\0\0\0WAVEfmt ", b"\x10\0\0\0\0\0\0\0{}", b"\0\0\0\x08ftyp\0\0\0\0soun", b"FLV\1\5", b"OggS\0\2",
+    b"G" + b"\0" * 187 + b"G" + b"\0" * 187 + b"G" + b"\0" * 187, b"\xff\xd8\xff\xff\xff\xc0\0\x0b\x08\0\x10\0\x10",
 )  # fmt: skip
+
+
+def _with_edits(data: bytes) -> bytes:
+    """An MP4 whose index stands last, with a list of edits in its first track that shows half of it."""
+
+    def into(parent: int, new: bytes) -> None:
+        nonlocal data
+        size = int.from_bytes(data[parent - 4 : parent], "big")
+        data = data[: parent - 4] + (size + len(new)).to_bytes(4, "big") + data[parent:]
+
+    index, track = data.rindex(b"moov"), data.rindex(b"trak")
+    edits = struct.pack(">I4sI4sIIIii", 36, b"edts", 28, b"elst", 0, 1, 100, 0, 1 << 16)
+    into(index, edits)
+    into(track, edits)
+    return data[: track + 4] + edits + data[track + 4 :]
+
+
+#: What may stand in a header, and what is asked of it.
+_MARKS = (
+    _MATROSKA_SOUND,
+    _CLUSTER,
+    _ASF_SOUND,
+    b"soun",
+    b"vide",
+    b"mvex",
+    b"elst",
+    b"edts",
+    b"\0\0\0\1moov",
+    b"\0\0\0\0mdat",
+)
+
+
+def _marked(data: bytes, random: Random) -> bytes:
+    """Such a mark over what stands somewhere near the beginning, or where the index of an MP4 is."""
+    mark, changed = random.choice(_MARKS), bytearray(data)
+    first = max(data.find(b"moov"), 0) if random.random() < 0.5 else 0
+    at = first + random.randrange(600)
+    changed[at : at + len(mark)] = mark
+    return bytes(changed)
 
 
 def _another_kind(data: bytes, random: Random) -> bytes:
@@ -215,8 +258,47 @@ VIDEO = Target(
     },
     _clip_body,
     lambda size: 1 << 32,
-    (by_chance, by_chance, by_chance, _another_kind),
+    (by_chance, by_chance, _marked, _another_kind),
     share=0.7,
+)
+
+
+def _read_head(path: Path) -> None:
+    """All that is asked of a file's first bytes, and of an index, without decoding."""
+    size, head = path.stat().st_size, path.read_bytes()[: _containers.HEAD_BYTES]
+    for ask in ("kind_of", "is_image", "may_move", "has_alpha_beside", "counts_frames"):
+        getattr(_containers, ask)(head)
+    _containers.tells_duration(head, size)
+    claimed = _containers.claimed_size(head)
+    assert claimed is None or _containers.fewest_bytes(head, claimed) >= 0
+    with open(path, "rb") as file:
+        shown = _containers.shown_seconds(file)
+    assert shown is None or shown > 0
+
+
+def _resized_box(data: bytes, random: Random) -> bytes:
+    """A box of an MP4 of another size: none, one of 64 bits, the rest, beyond the end; or of version 1."""
+    name = random.choice(
+        (b"ftyp", b"free", b"mdat", b"moov", b"mvhd", b"trak", b"edts", b"elst", b"mdia", b"hdlr", b"mdhd")
+    )
+    at = data.find(name)
+    if at < 4:
+        return by_chance(data, random)
+    if random.random() < 0.2:
+        return data[: at + 4] + b"\1" + data[at + 5 :]
+    return data[: at - 4] + random.choice((0, 1, 4, 8, 60, 1 << 31)).to_bytes(4, "big") + data[at:]
+
+
+HEADERS = Target(
+    "headers",
+    ".mp4",
+    lambda: [*_clips(), *_images(), *_more_images()],
+    _read_head,
+    (),
+    {"foldgauss.io._containers": ()},
+    lambda data: 8,
+    mutations=(_resized_box, png_sized, _marked, _another_kind),
+    past_header=2,
 )
 
 
@@ -369,4 +451,4 @@ EVIDENCE = Target(
     share=1.0,
 )
 
-TARGETS = (MASKS, PICTURES, VIDEO, CHAINS, EVIDENCE)
+TARGETS = (MASKS, PICTURES, VIDEO, HEADERS, CHAINS, EVIDENCE)

@@ -24,6 +24,7 @@ from foldgauss.io import (
     read_masks,
     save_video_model,
 )
+from foldgauss.io._containers import shown_seconds
 from foldgauss.io.history import HistoryFile
 from foldgauss.uncertainty import posterior
 
@@ -503,3 +504,9 @@ def test_scripts_set_text_and_never_markup():
             "srcdoc",
         ):
             assert word not in text, (path.name, word)
+
+
+def test_a_box_of_any_64_bits_is_passed_by():
+    """Python's files cannot seek that far."""
+    box = b"\0\0\0\x10ftypisom\0\0\0\0" + b"\0\0\0\1free" + b"\xff" * 8
+    assert shown_seconds(io.BytesIO(box)) is None
