@@ -266,7 +266,7 @@ VIDEO = Target(
 def _read_head(path: Path) -> None:
     """All that is asked of a file's first bytes, and of an index, without decoding."""
     size, head = path.stat().st_size, path.read_bytes()[: _containers.HEAD_BYTES]
-    for ask in ("kind_of", "is_image", "may_move", "has_alpha_beside", "counts_frames"):
+    for ask in ("is_image", "may_move", "has_alpha_beside", "counts_frames"):
         getattr(_containers, ask)(head)
     _containers.tells_duration(head, size)
     claimed = _containers.claimed_size(head)
@@ -274,6 +274,9 @@ def _read_head(path: Path) -> None:
     with open(path, "rb") as file:
         shown = _containers.shown_seconds(file)
     assert shown is None or shown > 0
+    kind = _containers.kind_of(head)
+    if kind is not None:
+        raise ValueError(f"expected a video or an image, got {kind}")
 
 
 def _resized_box(data: bytes, random: Random) -> bytes:
@@ -294,7 +297,7 @@ HEADERS = Target(
     ".mp4",
     lambda: [*_clips(), *_images(), *_more_images()],
     _read_head,
-    (),
+    (ValueError,),
     {"foldgauss.io._containers": ()},
     lambda data: 8,
     mutations=(_resized_box, png_sized, _marked, _another_kind),
