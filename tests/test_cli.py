@@ -419,6 +419,24 @@ def interrupted(monkeypatch):
     return arm
 
 
+def test_stopped_while_scores_are_measured_and_resumed(work, tmp_path, capsys, monkeypatch):
+    """The model is there, and a resumed fit notes in it what an undisturbed one does."""
+    fit = ("fit", work / "clip.mp4", "--gaussians", 50, "--steps", 12, "--quiet", "--out")
+    assert run(*fit, tmp_path / "whole.safetensors") == 0
+
+    def stopped(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fitting, "evaluate_with_progress", stopped)
+        assert run(*fit, tmp_path / "model.safetensors") == 130
+    assert "add --resume --overwrite" in capsys.readouterr().err
+    load_video_model(tmp_path / "model.safetensors")
+    assert run(*fit, tmp_path / "model.safetensors", "--resume", "--overwrite") == 0
+    assert (tmp_path / "model.safetensors").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.safetensors", "whole.safetensors"]
+
+
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):

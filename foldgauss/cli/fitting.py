@@ -361,14 +361,21 @@ def fit(
         save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
     except OSError as error:
         raise _unsaved(error, keep, state, kept) from error
-    kept.unlink(missing_ok=True)
-    if history is not None:
-        _draw_curves(curves, history)
-    scores = evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
+    try:
+        if history is not None:
+            _draw_curves(curves, history)
+        scores = evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
+    except KeyboardInterrupt:
+        _keep_if_possible(keep, state)
+        if kept.exists():
+            text = f"{target} is written, its scores are not measured yet: add --resume --overwrite for them."
+            err.print(text, soft_wrap=True)
+        raise
     try:
         save_video_model(target, model, metadata=about | scores_of(scores))
     except OSError as error:  # of the second write; the model is there
         err.print(f"warning: {target} is written, but its scores could not be noted in it: {error}", soft_wrap=True)
+    kept.unlink(missing_ok=True)
     if smallest_at_psnr is not None and info.stopped_by != "smallest_at_psnr":
         got = f"{scores.mean_psnr:.2f} dB after {info.step:,} steps"
         err.print(
@@ -491,7 +498,7 @@ def _unsaved(error: OSError, keep: Callable[[FitState], object], state: FitState
     """The fit is done, its model cannot be written: keep the fit if that can be, and say how to go on."""
     _keep_if_possible(keep, state)
     if not kept.exists():
-        return OutputError(str(error))
+        return OutputError(f"{error} There was no room to keep the fit either: it is lost.")
     return OutputError(f"{error} The fit is kept in {kept}: --resume goes on from there, and writes the model.")
 
 
