@@ -8,6 +8,7 @@ import resource
 import struct
 import tracemalloc
 import zipfile
+import zlib
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,10 +20,13 @@ from PIL import Image
 import foldgauss
 from foldgauss.cli._evidence import kept_evidence
 from foldgauss.io import (
+    VideoError,
     html_page,
     read_history,
     read_masks,
+    read_video,
     save_video_model,
+    write_video,
 )
 from foldgauss.io._containers import shown_seconds
 from foldgauss.io.history import HistoryFile
@@ -510,3 +514,26 @@ def test_a_box_of_any_64_bits_is_passed_by():
     """Python's files cannot seek that far."""
     box = b"\0\0\0\x10ftypisom\0\0\0\0" + b"\0\0\0\1free" + b"\xff" * 8
     assert shown_seconds(io.BytesIO(box)) is None
+
+
+def test_a_gif_whose_frame_grows_is_damaged_there(tmp_path):
+    """Pillow enlarges the picture for it."""
+    frames = np.random.default_rng(0).integers(0, 255, (3, 16, 24, 3), np.uint8)
+    data = bytearray(write_video(tmp_path / "clip.gif", frames, 10).read_bytes())
+    last = data.rindex(b"\x2c" + struct.pack("<HHHH", 0, 0, 24, 16))
+    data[last + 7 : last + 9] = struct.pack("<H", 144)
+    (tmp_path / "clip.gif").write_bytes(data)
+    clip = read_video(tmp_path / "clip.gif")
+    assert clip.frames.shape == (2, 16, 24, 3)
+    assert clip.num_declared == 3
+
+
+def test_a_moving_png_without_frames_is_refused(tmp_path):
+    """Pillow warns of it, and warnings are errors here."""
+    data = bytearray(media._more_images()[-1])
+    at = data.index(b"acTL")
+    data[at + 4 : at + 8] = bytes(4)
+    data[at + 12 : at + 16] = zlib.crc32(data[at : at + 12]).to_bytes(4, "big")
+    (tmp_path / "picture.png").write_bytes(data)
+    with pytest.raises(VideoError, match="images that decode"):
+        read_video(tmp_path / "picture.png")
