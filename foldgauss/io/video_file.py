@@ -234,12 +234,7 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
     # A container's count may be an estimate, so the range is judged against what decoded as well.
     _check_within(start, stop, num_total, path)
     if not kept:
-        raise _error(
-            "frames",
-            expected="a range with frames that decode",
-            got=f"{_text(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}",
-            cure="Ask for earlier frames.",
-        )
+        raise _none_decodes(start, stop, num_decoded, num_total, path)
     num_declared = (num_total if stop is None else stop) - start
     pace = _usable(pace_of(seconds[len(seen) - len(kept) :], fps))
     if np.ptp([one.milliseconds for one in seen]) == 0 and len(seen) > 1:  # a raw stream: the rate is FFmpeg's guess
@@ -381,12 +376,7 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
     num_total = max(num_promised, len(delays) + fault)
     _check_within(start, stop, num_total, path)
     if not kept:
-        raise _error(
-            "frames",
-            expected="a range with frames that decode",
-            got=f"{_text(start, stop)}, while {len(delays)} of {num_total} frames decode in {str(path)!r}",
-            cure="Ask for earlier frames.",
-        )
+        raise _none_decodes(start, stop, len(delays), num_total, path)
     shown = np.array(delays[start:])
     pace = pace_of(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
     if pace.times is not None:
@@ -471,6 +461,12 @@ def _read_image(path: Path) -> np.ndarray:
     if image.ndim == 3 and image.shape[2] == 4:
         return _premultiplied(image)
     return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+
+
+def _none_decodes(start: int, stop: int | None, num_decoded: int, num_total: int, path: Path) -> VideoError:
+    """Of the frames asked for."""
+    got = f"{_text(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}"
+    return _error("frames", expected="a range with frames that decode", got=got, cure="Ask for earlier frames.")
 
 
 def _undecoded(path: Path) -> VideoError:

@@ -265,12 +265,16 @@ def png_sized(data: bytes, random: Random) -> bytes:
     return png_of(chunks)
 
 
+#: What `zipfile` raises of damaged archives; a RuntimeError, too, where one is encrypted or packed in a way unknown to it.
+_BAD_ZIP = (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, zlib.error)
+
+
 def zip_resealed(data: bytes, random: Random) -> bytes:
     """A zip archive with one of its members changed and right checksums."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as old:
             members = [(info.filename, old.read(info)) for info in old.infolist()]
-    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, EOFError, RuntimeError, zlib.error):
+    except _BAD_ZIP:
         return by_chance(data, random)
     if not members:
         return by_chance(data, random)
