@@ -265,7 +265,7 @@ def png_sized(data: bytes, random: Random) -> bytes:
     return png_of(chunks)
 
 
-#: What `zipfile` raises of damaged archives; a RuntimeError, too, where one is encrypted or packed in a way unknown to it.
+#: What `zipfile` raises of damaged archives; a RuntimeError, too, of encryption and of packing that it does not know.
 _BAD_ZIP = (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, zlib.error)
 
 
