@@ -18,6 +18,7 @@ from foldgauss.io.ply import (
     write_gaussians_ply,
     write_vegas_ply,
 )
+from foldgauss.io.segmented import join_segments
 from foldgauss.io.selections import load_selection, save_selection
 from foldgauss.io.video_file import Clip, VideoError, read_video, write_frames, write_image, write_video
 from foldgauss.io.video_model import load_video_model, save_video_model
@@ -34,6 +35,7 @@ __all__ = [
     "frame_gaussians",
     "html_page",
     "import_model",
+    "join_segments",
     "load_compact",
     "load_selection",
     "load_video_model",

@@ -3,7 +3,8 @@
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,12 @@ _DTYPES = {
     "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8",
     "uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8",
 }  # fmt: skip
+#: Bytes of an element of each.
+_ITEM_BYTES = {
+    "F64": 8, "F32": 4, "F16": 2, "BF16": 2, "BOOL": 1,
+    "I64": 8, "I32": 4, "I16": 2, "I8": 1, "U64": 8, "U32": 4, "U16": 2, "U8": 1,
+}  # fmt: skip
+_LONGEST_HEADER = 100_000_000  # bytes; the library reads no longer one
 _PREFIX = 8  # bytes: the length of the JSON header, little-endian, opens a safetensors file
 _RESERVED = "__metadata__"  # the one name that safetensors keeps for itself
 _MAGIC = {
@@ -102,38 +109,52 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     kind = _kind_of(model)
     model = kind.to_stored(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
-    header = to_json("header", kind.to_header(model))
-    _check_described(kind, model, header)
-    about = {
-        "format": FORMAT,
-        "version": VERSION,
-        "kind": kind.name,
-        "header": header,
-        "metadata": to_json("metadata", plain(metadata or {})),
-    }
+    header = kind.to_header(model)
+    _check_described(kind, model, to_json("header", header))
+    specs = {key: {"dtype": _DTYPES[one.dtype.name], "shape": list(one.shape)} for key, one in arrays.items()}
     path = Path(path)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        _write_safetensors(file, arrays, about)
+    about = {"kind": kind.name, "header": header, "metadata": metadata or {}}
+    write_tensors(path, specs, lambda keys: (arrays[key] for key in keys), **about)
     return path
 
 
-def _write_safetensors(file: Any, arrays: dict[str, np.ndarray], about: dict[str, str]) -> None:
-    """The container itself. The library's writer orders its header at random: same model, other bytes."""
-    order = sorted(arrays, key=lambda key: (-arrays[key].dtype.itemsize, key))  # so every tensor is aligned
+def write_tensors(
+    path: Path,
+    specs: Mapping[str, dict],
+    tensors: Callable[[list[str]], Iterable[np.ndarray]],
+    *,
+    kind: str,
+    header: dict,
+    metadata: dict,
+) -> None:
+    """Write a file of ours, whole or not at all: the tensors that `specs` describe, as `read_header` does.
+
+    `tensors(keys)` gives them one by one in that order, little-endian. Raises as `save_model`.
+    """
+    about = {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": kind,
+        "header": to_json("header", header),
+        "metadata": to_json("metadata", plain(metadata)),
+    }
+    # The library's writer orders its header at random: same model, other bytes.
+    order = sorted(specs, key=lambda key: (-_ITEM_BYTES[specs[key]["dtype"]], key))  # so every tensor is aligned
     entries: dict[str, Any] = {_RESERVED: about}
     end = 0
     for key in order:
-        start, end = end, end + arrays[key].nbytes
-        entries[key] = {
-            "dtype": _DTYPES[arrays[key].dtype.name],
-            "shape": list(arrays[key].shape),
-            "data_offsets": [start, end],
-        }
+        start, end = end, end + math.prod(specs[key]["shape"]) * _ITEM_BYTES[specs[key]["dtype"]]
+        entries[key] = {**specs[key], "data_offsets": [start, end]}
     text = json.dumps(entries, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
-    file.write(len(text).to_bytes(_PREFIX, "little") + text)
-    for key in order:
-        file.write(arrays[key].tobytes())
+    if len(text) > _LONGEST_HEADER:
+        got = f"one of {len(text):,} bytes for {len(specs):,} tensors"
+        cure = "Write the clip as several files."
+        raise _error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(len(text).to_bytes(_PREFIX, "little") + text)
+        for array in tensors(order):
+            file.write(array.tobytes())
 
 
 def _array_leaves(tree: Any) -> dict[str, Any]:
@@ -242,16 +263,41 @@ def load_model(path: str | os.PathLike) -> Any:
     """
     path = Path(path)
     about = read_header(path)
-    kind = _KINDS.get(about["kind"])
+    return load_part(path, about["kind"], about["header"], about["tensors"])
+
+
+def load_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict], prefix: str = "") -> Any:
+    """The model of that kind and header whose `tensors` stand in the file under `prefix` and their keys.
+
+    Raises `ModelFileError` as `load_model`.
+    """
+    kind, skeleton = _described(path, kind_name, header, tensors)
+    check_process()
+    filled = _filled(skeleton, path, prefix)
+    try:
+        return kind.from_stored(filled)
+    except ValueError as error:
+        got = f"others in {str(path)!r} ({_line(error)})"
+        raise _error("path", expected="tensors that fit each other", got=got) from error
+
+
+def check_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> None:
+    """Raise `ModelFileError` unless the header describes these tensors; none of them is read."""
+    _described(path, kind_name, header, tensors)
+
+
+def _described(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> tuple[_Kind, Any]:
+    """The kind, and the skeleton of a model of it that the header describes and that the tensors fit."""
+    kind = _KINDS.get(kind_name)
     if kind is None:
         raise _error(
             "path",
             expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
-            got=f"kind {about['kind']!r} in {str(path)!r}",
+            got=f"kind {kind_name!r} in {str(path)!r}",
             cure="Load it with the program that wrote it.",
         )
     try:
-        skeleton = kind.from_header(about["header"])
+        skeleton = kind.from_header(header)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         raise _error(
             "path",
@@ -259,14 +305,8 @@ def load_model(path: str | os.PathLike) -> Any:
             got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_line(error)})",
         ) from error
     described = _specs(_array_leaves(skeleton))
-    _check_tensors(_widened(about["tensors"], described), described, str(path))
-    check_process()
-    filled = _filled(skeleton, path)
-    try:
-        return kind.from_stored(filled)
-    except ValueError as error:
-        got = f"others in {str(path)!r} ({_line(error)})"
-        raise _error("path", expected="tensors that fit each other", got=got) from error
+    _check_tensors(_widened(tensors, described), described, str(path))
+    return kind, skeleton
 
 
 def read_header(path: str | os.PathLike) -> dict:
@@ -279,15 +319,12 @@ def read_header(path: str | os.PathLike) -> dict:
     """
     path = Path(path)
     _check_container(path)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            strings = file.metadata() or {}
-            tensors = {}
-            for key in file.keys():  # noqa: SIM118 - it is not a dict
-                part = file.get_slice(key)
-                tensors[key] = {"dtype": part.get_dtype(), "shape": list(part.get_shape())}
-    except SafetensorError as error:
-        raise _unreadable(path, f"a damaged or truncated file ({_line(error)})") from error
+    with open_tensors(path) as file:
+        strings = file.metadata() or {}
+        tensors = {}
+        for key in file.keys():  # noqa: SIM118 - it is not a dict
+            part = file.get_slice(key)
+            tensors[key] = {"dtype": part.get_dtype(), "shape": list(part.get_shape())}
     _check_version(path, strings)
     about = {name: strings[name] for name in ("format", "version", "kind")}
     return about | {name: _from_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
@@ -368,19 +405,26 @@ def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> 
             )
 
 
-def _filled(skeleton: Any, path: Path) -> Any:
+def _filled(skeleton: Any, path: Path, prefix: str) -> Any:
     """The skeleton with each `ShapeDtypeStruct` replaced by its tensor."""
+    with open_tensors(path) as file:
+
+        def fill(keys: tuple, leaf: Any) -> Any:
+            if not isinstance(leaf, jax.ShapeDtypeStruct):
+                return leaf
+            key = jax.tree_util.keystr(keys, simple=True, separator=".")
+            array = file.get_tensor(prefix + key)
+            return _to_leaf(key, array.astype(np.float32) if _is_half(array, leaf) else array)
+
+        return jax.tree_util.tree_map_with_path(fill, skeleton)
+
+
+@contextmanager
+def open_tensors(path: Path) -> Iterator[Any]:
+    """The file as the library opens it: `get_tensor(key)` reads one. Raises `ModelFileError` for a damaged one."""
     try:
         with safe_open(path, framework="numpy") as file:
-
-            def fill(keys: tuple, leaf: Any) -> Any:
-                if not isinstance(leaf, jax.ShapeDtypeStruct):
-                    return leaf
-                key = jax.tree_util.keystr(keys, simple=True, separator=".")
-                array = file.get_tensor(key)
-                return _to_leaf(key, array.astype(np.float32) if _is_half(array, leaf) else array)
-
-            return jax.tree_util.tree_map_with_path(fill, skeleton)
+            yield file
     except SafetensorError as error:
         raise _unreadable(path, f"a damaged or truncated file ({_line(error)})") from error
 

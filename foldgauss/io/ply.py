@@ -28,7 +28,6 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.model import LASTING, SH_C0, FoldedSplats, VideoModel
 from foldgauss.video.playback import Playback
-from foldgauss.video.shots import out_of_cuts
 
 #: The envelope's power of the published code, which scales standard deviations by exp(-tau^2 / 2).
 VEGAS_POWER = 2.0
@@ -326,7 +325,7 @@ def frame_gaussians(model: VideoModel | Playback, t: float, *, depth_step: float
 
 def _alive(playback: Playback, t: float) -> tuple[np.ndarray, ...]:
     """(mean, factor, opacity, color) of what is drawn at time t (or near it, in a cut), in model space, float64."""
-    splats = playback.splats(float(out_of_cuts(t, np.asarray(playback.model.frame_times.times()))))
+    splats = playback.shown(t)
     seen = np.asarray(splats.opacity) > 0
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     mean, factor, opacity, color = (_float64(leaf)[seen] for leaf in leaves)

@@ -15,7 +15,8 @@ from foldgauss._checks import invalid, one_of, whole, within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import checked_path
 from foldgauss.io.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
-from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
+from foldgauss.io.model_file import ModelFileError, load_part, read_header, register_model, save_model
+from foldgauss.io.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.config import FitConfig
 from foldgauss.video.edit import Edit
@@ -25,16 +26,22 @@ from foldgauss.video.growth import Statistics
 from foldgauss.video.model import VideoModel
 from foldgauss.video.overlays import described, restored
 from foldgauss.video.packing import columns, unpack
+from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.sharing import Palette
 from foldgauss.video.state import TIME_ADAM, FitState
 from foldgauss.video.stored import from_stored, stored_counts, stored_skeleton, to_stored
 
 MODEL_SUFFIX = ".safetensors"
-VIDEO, EDITED, CHECKPOINT = "video", "edited-video", "fit-checkpoint"
+VIDEO, EDITED = PARTS
+CHECKPOINT = "fit-checkpoint"
 
 
-def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *, metadata: dict | None = None) -> Path:
-    """Write a fitted or an edited video; `metadata` is free: where it came from, how good it is. See `save_model`.
+def save_video_model(
+    path: str | os.PathLike, model: VideoModel | EditedVideo | SegmentedVideo, *, metadata: dict | None = None
+) -> Path:
+    """Write a fitted, an edited or a segmented video; `metadata` is free: where it came from, how good it is.
+
+    Segments are written one after another, each with its own metadata. See `save_model`.
 
     The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
     that hold code: `apply`, `apply_triangles`, a camera that is a function.
@@ -42,9 +49,12 @@ def save_video_model(path: str | os.PathLike, model: VideoModel | EditedVideo, *
     if isinstance(model, Edit):
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
     checked_path(path, "path, model")
-    if not isinstance(model, VideoModel | EditedVideo):
-        raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__)
+    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
+        expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
+        raise invalid("model", expected=expected, got=type(model).__name__)
     check_model_name(path)
+    if isinstance(model, SegmentedVideo):
+        return save_segmented(Path(path), model, metadata)
     return save_model(path, model, metadata=metadata)
 
 
@@ -63,13 +73,20 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
         )
 
 
-def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo:
-    """Read a fitted or an edited video, or a compact file (told by its first bytes, not by its name).
+def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
+    """Read a fitted, an edited or a segmented video, or a compact file (told by its first bytes, not by its name).
+
+    Of segments no more than the header is read: see `SegmentedVideo`, which loads them as they are drawn.
 
     Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
     """
     path = checked_path(path)
-    return load_compact_model(path) if is_compact(path) else _load(path, VIDEO, EDITED)
+    if is_compact(path):
+        return load_compact_model(path)
+    about = _header(path, VIDEO, EDITED, SEGMENTED)
+    if about["kind"] == SEGMENTED:
+        return load_segmented(path, about)
+    return load_part(path, about["kind"], about["header"], about["tensors"])
 
 
 def read_metadata(path: str | os.PathLike) -> dict:
@@ -136,18 +153,20 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
                 got=", ".join(f"{name}={now.get(name)!r}" for name in changed),
                 cure=cure,
             )
-    state = _load(path, CHECKPOINT)
+    about = _header(path, CHECKPOINT)
+    state = load_part(Path(path), about["kind"], about["header"], about["tensors"])
     return jax.tree.map(np.array, state)  # the fit updates its arrays in place: they must be its own
 
 
-def _load(path: str | os.PathLike, *kinds: str) -> Any:
-    found = read_header(path)["kind"]
-    if found not in kinds:
+def _header(path: str | os.PathLike, *kinds: str) -> dict:
+    """What a file of one of these kinds says of itself."""
+    about = read_header(path)
+    if about["kind"] not in kinds:
         raise ModelFileError(
-            f"path: expected a model of kind {' or '.join(map(repr, kinds))}, got {found!r} in {str(path)!r}. "
+            f"path: expected a model of kind {' or '.join(map(repr, kinds))}, got {about['kind']!r} in {str(path)!r}. "
             "Give the file that `foldgauss fit` wrote to --out."
         )
-    return load_model(path)
+    return about
 
 
 def _to_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:

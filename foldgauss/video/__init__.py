@@ -14,6 +14,7 @@ from foldgauss.video.independent import IndependentFrames, independent_frames
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.overlays import SelectedGaussians
+from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
 from foldgauss.video.select import (
     Selection,
     by_box,
@@ -48,6 +49,8 @@ __all__ = [
     "IndependentFrames",
     "Layer",
     "LearningRates",
+    "Segment",
+    "SegmentedVideo",
     "SelectedGaussians",
     "Selection",
     "Span",
@@ -70,6 +73,7 @@ __all__ = [
     "interpolated_times",
     "layers",
     "matte",
+    "plan_segments",
     "played_positions",
     "psnr",
     "remapped_positions",

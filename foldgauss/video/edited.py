@@ -226,6 +226,7 @@ class EditedStage:
         self._size, self._camera = tuple(size), video.camera
         self._layers = [_LayerStage(layer, self._size, height / width) for layer in video.layers]
         self._front = partial(Camera.front, height / width)
+        self._times = np.asarray(video.frame_times.times())
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
@@ -242,6 +243,10 @@ class EditedStage:
         depth = np.concatenate([moment.depth for moment in moments])
         nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
         return jax.tree.map(lambda leaf: leaf[nearest_first], _together(moments))
+
+    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
+        """One picture, see `foldgauss.video.playback.Staged`."""
+        return [(1.0, self.splats(out_of_cuts(t, self._times)))]
 
     def _camera_at(self, t: float) -> Camera:
         camera = self._camera

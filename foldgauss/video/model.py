@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -21,6 +22,9 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.alpha import BLACK, checked_background
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.shots import out_of_cuts
+
+if TYPE_CHECKING:
+    from foldgauss.video.stage import Stage
 
 #: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
 SH_C0 = 0.28209479177387814
@@ -291,6 +295,12 @@ class VideoModel(eqx.Module):
 
         leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
         return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
+
+    def stage(self, size: tuple[int, int]) -> "Stage":
+        """Made ready to be conditioned many times, for pictures of `size`."""
+        from foldgauss.video.stage import Stage  # which knows this class
+
+        return Stage(self, size)
 
     def at(self, t: Float[Array, ""], size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, in pixels of a picture of `size` (default: the fitted one)."""

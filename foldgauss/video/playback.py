@@ -5,7 +5,7 @@ no XLA, and no work for Gaussians that are not alive.
 """
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numba as nb
 import numpy as np
@@ -14,23 +14,43 @@ from jaxtyping import Float, UInt8
 from foldgauss._checks import invalid, short_repr
 from foldgauss._kernels import kernel
 from foldgauss._threads import run_tasks
-from foldgauss.render import Splats2D, cpu
+from foldgauss.render import RenderOptions, Splats2D, cpu
 from foldgauss.render.splats import check_size
 from foldgauss.video.alpha import BLACK, checked_background
-from foldgauss.video.model import VideoModel
-from foldgauss.video.shots import out_of_cuts
-from foldgauss.video.stage import Stage
-
-if TYPE_CHECKING:
-    from foldgauss.video.edited import EditedVideo  # which knows this module
 
 ROWS = 64  # of pixels per task
 
 _f, _byte = nb.float32, nb.uint8
 
 
+class Staged(Protocol):
+    """A video made ready for pictures of one size, as its `stage(size)` gives it."""
+
+    def splats(self, t: float) -> Splats2D:
+        """The splats of time t, front to back; NumPy leaves."""
+
+    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
+        """The pictures whose weighted sum is seen at time t, each as weight and splats; the weights sum to 1.
+
+        Between two shots they are the nearer one's.
+        """
+
+
+class Drawable(Protocol):
+    """What all videos have: `VideoModel`, `EditedVideo`, `SegmentedVideo`."""
+
+    size: tuple[int, int]
+    fps: float
+    options: RenderOptions
+    compositing: str
+    num_frames: int
+
+    def stage(self, size: tuple[int, int]) -> Staged:
+        """Made ready to be conditioned many times, for pictures of `size`."""
+
+
 class Playback:
-    """A video made ready to be drawn many times, at one size: a model, or an edited one.
+    """A video made ready to be drawn many times, at one size: a model, an edited one, or one of segments.
 
     **Shapes:** pictures are uint8 (height, width, 3). **Units:** times are those of the model, in [0, 1].
 
@@ -44,7 +64,7 @@ class Playback:
 
     def __init__(
         self,
-        model: "VideoModel | EditedVideo",
+        model: Drawable,
         size: tuple[int, int] | None = None,
         *,
         background: tuple[float, float, float] = BLACK,
@@ -53,13 +73,16 @@ class Playback:
         size = model.size if size is None else size
         check_size(size)
         self.size = tuple(size)
-        self._stage = Stage(model, self.size) if isinstance(model, VideoModel) else model.stage(self.size)
-        self._times = np.asarray(model.frame_times.times())
+        self._stage = model.stage(self.size)
         self._background = checked_background(background, model.compositing)
 
     def splats(self, t: float) -> Splats2D:
         """The splats of the Gaussians alive at time t, in pixels of a picture of `size`; NumPy leaves."""
         return self._stage.splats(t)
+
+    def shown(self, t: float) -> Splats2D:
+        """As `splats`, of what is seen: between two shots the nearer one; in a fade, what is seen more of."""
+        return max(self._stage.parts(t), key=lambda part: part[0])[1]
 
     def frame(self, t: float) -> UInt8[np.ndarray, "height width 3"]:
         """The picture at time t; between two shots the nearer one's."""
@@ -67,7 +90,7 @@ class Playback:
 
     def frames(self, times: Float[np.ndarray, "frames"] | None = None) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         """The pictures at `times` (default: the model's frame times), one by one."""
-        shown = np.asarray(self._times if times is None else times)
+        shown = np.asarray(self.model.frame_times.times() if times is None else times)
         close = 1e-6  # sums of steps miss the ends by their rounding
         if shown.ndim != 1 or shown.dtype.kind not in "fiu" or not ((shown >= -close) & (shown <= 1 + close)).all():
             cure = "Frame k is at frame_times.times()[k]."
@@ -77,7 +100,15 @@ class Playback:
 
     def image(self, t: float) -> Float[np.ndarray, "3 height width"]:
         """The picture at time t before it is rounded to 8 bits: planar float32, about [0, 1]."""
-        splats = self.splats(out_of_cuts(t, self._times))
+        (first, splats), *others = self._stage.parts(t)
+        image = self._drawn(splats)
+        if others:
+            image = np.float32(first) * image
+            for weight, splats in others:
+                image += np.float32(weight) * self._drawn(splats)
+        return image
+
+    def _drawn(self, splats: Splats2D) -> Float[np.ndarray, "3 height width"]:
         leaves = splats.mean, splats.factor, splats.opacity, splats.color
         drawn = {"compositing": self.model.compositing, "options": self.model.options}
         return cpu.forward(*leaves, self._background, self.size, **drawn).image

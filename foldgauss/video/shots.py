@@ -31,8 +31,10 @@ def time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " i
 
 def is_cut(times: Float[ArrayLike, " num_frames"]) -> Bool[Array, " intervals"]:
     """Which intervals between frame times are cuts."""
-    intervals = jnp.diff(jnp.asarray(times))
-    return intervals > CUT_RATIO * jnp.median(intervals) if len(intervals) else jnp.zeros(0, bool)
+    # By NumPy what is NumPy's: JAX would round float64, in which a clip of a million frames has its times.
+    arrays = jnp if isinstance(times, jax.Array) else np
+    intervals = arrays.diff(arrays.asarray(times))
+    return intervals > CUT_RATIO * arrays.median(intervals) if len(intervals) else arrays.zeros(0, bool)
 
 
 @jax.jit

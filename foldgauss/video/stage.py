@@ -9,6 +9,7 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.conditioning import Conditioned, Shape, condition, narrow_windows, update_windows
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.packing import pack
+from foldgauss.video.shots import out_of_cuts
 
 
 class Stage:
@@ -31,6 +32,7 @@ class Stage:
         self.window = np.empty((len(self.rows), 2), np.float32)
         update_windows(self.rows, np.arange(len(self.rows)), self.window)
         narrow_windows(self.rows, self.window, self.shape, model.scale_cutoff)
+        self._times = np.asarray(model.frame_times.times())
 
     def at(self, t: float, members: np.ndarray | None = None) -> Conditioned:
         """The Gaussians alive at time t, any number; of `members`, bool (num_gaussians,), if given."""
@@ -40,6 +42,10 @@ class Stage:
         """The splats of the Gaussians alive at time t, front to back; NumPy leaves."""
         done = self.at(t)
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
+
+    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
+        """One picture, see `foldgauss.video.playback.Staged`."""
+        return [(1.0, self.splats(out_of_cuts(t, self._times)))]
 
 
 def _check_finite(rows: np.ndarray) -> None:
