@@ -4,6 +4,7 @@ from foldgauss.io._atomic import OutputError
 from foldgauss.io._ply import FormatError
 from foldgauss.io.compact import load_compact, save_compact
 from foldgauss.io.exchange import export, import_model
+from foldgauss.io.frame_index import FrameIndex, LazyFrames, index_video, read_indexed
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.html import html_page, write_html
 from foldgauss.io.masks import read_masks
@@ -26,7 +27,9 @@ from foldgauss.io.video_model import load_video_model, save_video_model
 __all__ = [
     "Clip",
     "FormatError",
+    "FrameIndex",
     "HistoryFile",
+    "LazyFrames",
     "ModelFileError",
     "OutputError",
     "Pseudomesh",
@@ -36,11 +39,13 @@ __all__ = [
     "html_page",
     "import_model",
     "join_segments",
+    "index_video",
     "load_compact",
     "load_selection",
     "load_video_model",
     "read_3dgs_ply",
     "read_history",
+    "read_indexed",
     "read_masks",
     "read_pseudomesh",
     "read_vegas_ply",

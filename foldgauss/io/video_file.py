@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -135,33 +135,47 @@ def read_video(
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
+    path = readable_path(path)
+    start, stop = checked_range(frames)
+    prepare = fit_to(checked_size(size), checked_size(center_crop, "center_crop"))
+    if fps is not None:
+        check_fps(fps)
+    with unreadable_told(path):
+        kept, num_declared, pace, notes = reader_of(path)(path, start, stop, prepare)
+    clip_fps, times = (pace.fps, pace.times) if fps is None else (fps, None)
+    if fps is None:
+        notes += pace_notes(pace)
+    kept = alike_frames(kept)
+    return Clip(stacked(kept), float(clip_fps), str(path), num_declared, times, notes)
+
+
+def readable_path(path: PathLike) -> Path:
+    """`path` of a file or a folder that is there. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
     address, path = str(path), checked_path(path)
     if not os.path.exists(path):
         raise FileNotFoundError(_missing(address))
     if not (path.is_dir() or path.is_file()):
-        raise _error(
+        raise video_error(
             "path",
             expected="a video file or a folder of images",
             got=f"{str(path)!r}, a pipe or a device",
             cure="Save what comes out of it to a file.",
         )
-    start, stop = _checked_range(frames)
-    prepare = _fit_to(_checked_size(size), _checked_size(center_crop, "center_crop"))
-    if fps is not None:
-        _check_fps(fps)
-    try:
-        kept, num_declared, pace, notes = _reader(path)(path, start, stop, prepare)
-    except OSError as error:
-        got = f"{str(path)!r} ({error.strerror or error})"
-        raise _error("path", expected="a file that can be read", got=got) from error
-    clip_fps, times = (pace.fps, pace.times) if fps is None else (fps, None)
-    if fps is None:
-        notes += _pace_notes(pace)
-    return Clip(_stacked(kept), float(clip_fps), str(path), num_declared, times, notes)
+    return path
 
 
 #: (prepared frames, frames declared within the range, how they follow one another, notes)
 _Read = tuple[list[np.ndarray], int, Pace, tuple[str, ...]]
+
+
+@contextmanager
+def unreadable_told(path: Path) -> Iterator[None]:
+    """The system's refusals to read `path` as a `VideoError`."""
+    try:
+        yield
+    except OSError as error:
+        got = f"{str(path)!r} ({error.strerror or error})"
+        raise video_error("path", expected="a file that can be read", got=got) from error
 
 
 def _missing(address: str) -> str:
@@ -173,12 +187,12 @@ def _missing(address: str) -> str:
     )
 
 
-def _reader(path: Path) -> Callable[..., _Read]:
+def reader_of(path: Path) -> Callable[..., _Read]:
     if path.is_dir():
-        return _read_folder
+        return read_folder
     if may_move(_head(path)):
         return _read_animation
-    return _read_image_file if _is_image(path) else _read_file
+    return _read_image_file if _is_image(path) else read_file
 
 
 def _head(path: Path) -> bytes:
@@ -187,28 +201,49 @@ def _head(path: Path) -> bytes:
         str(path.resolve()).encode()
     except UnicodeEncodeError as error:
         got, cure = f"{str(path)!a}, which is no Unicode", "Rename the file or its folder."
-        raise _error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
+        raise video_error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
     with open(path, "rb") as file:
         return file.read(HEAD_BYTES)
 
 
-def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
+def read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
     """The frames of a video file."""
-    seen: list[_Seen] = []
+    kept, seen, told = pass_through(path, start, stop, lambda frames: _in_blocks(map(prepare, frames)))
+    milliseconds, positions = [one.milliseconds for one in seen], [one.position for one in seen]
+    return kept, *told_of_span(told, milliseconds, positions, len(kept), start, stop)
+
+
+class Told(NamedTuple):
+    """What a pass through a video file tells beside its frames.
+
+    `fps`: the container's rate, or what stands for it. `num_total`: frames in all, with those that are missing.
+    `notes`: of the shape of its pixels. `seconds`: of each frame seen, rising.
+    """
+
+    fps: float
+    num_total: int
+    notes: tuple[str, ...]
+    seconds: np.ndarray
+
+
+def pass_through(
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], list]
+) -> tuple[list, list["Seen"], Told]:
+    """Decode a video file once: what `keep` makes of its frames from `start` up to `stop`, BGR, all frames seen, and
+    what else is told. Raises `VideoError` for all that is refused."""
+    seen: list[Seen] = []
     with _capture(path) as capture:
-        _refuse_alpha(capture, path)
-        _refuse_huge(path, (capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
         declared, rate = _declared_frames(capture), capture.get(cv2.CAP_PROP_FPS)
         notes = _shape_notes(capture)
         fps = rate if 0 < rate <= MAX_FPS else DEFAULT_FPS
         stays = _Stays(seen)
-        decoded = stays.watched(_decoded(capture, fps, start, stop, seen))
-        kept = _in_blocks(prepare(frame) for frame in _same_size(decoded, path))
+        watched = stays.watched(frames_decoded(capture, fps, start, stop, seen))
+        kept = keep(_same_size(watched, path))
         if len(kept) == 1:  # nothing to compare it with yet
-            list(stays.watched(islice(_decoded(capture, fps, 0, None, []), 1)))
+            list(stays.watched(islice(frames_decoded(capture, fps, 0, None, []), 1)))
     num_decoded = len(seen)
     if num_decoded == 0:
-        raise _error(
+        raise video_error(
             "path",
             expected="a video with frames that decode",
             got=f"none in {str(path)!r}",
@@ -216,9 +251,9 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
         )
     if num_decoded == 1 and rate > MAX_FPS:  # the rate of one picture among sound
         got = f"sound with a picture of its cover, {str(path)!r}"
-        raise _error("path", expected="a video", got=got, cure="Give a file with moving pictures.")
+        raise video_error("path", expected="a video", got=got, cure="Give a file with moving pictures.")
     if stays.last and not _converts(path, stays.last):
-        raise _error(
+        raise video_error(
             "path",
             expected="a video of whole pictures",
             got=f"one of interlaced fields, {str(path)!r}, which OpenCV does not convert",
@@ -234,13 +269,23 @@ def _read_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _
     # A container's count may be an estimate, so the range is judged against what decoded as well.
     _check_within(start, stop, num_total, path)
     if not kept:
-        raise _none_decodes(start, stop, num_decoded, num_total, path)
-    num_declared = (num_total if stop is None else stop) - start
-    pace = _usable(pace_of(seconds[len(seen) - len(kept) :], fps))
-    if np.ptp([one.milliseconds for one in seen]) == 0 and len(seen) > 1:  # a raw stream: the rate is FFmpeg's guess
+        raise none_decodes(start, stop, num_decoded, num_total, path)
+    return kept, seen, Told(fps, num_total, notes, seconds)
+
+
+def told_of_span(
+    told: Told, milliseconds: Sequence[float], positions: Sequence[int], num_kept: int, start: int, stop: int | None
+) -> tuple[int, Pace, tuple[str, ...]]:
+    """Frames declared from `start` up to `stop`, how they follow one another, and notes.
+
+    `milliseconds` and `positions` are those of all frames seen up to there, of which the last `num_kept` are kept.
+    """
+    num_seen = len(positions)
+    pace = _usable(pace_of(told.seconds[num_seen - num_kept : num_seen], told.fps))
+    if np.ptp(milliseconds) == 0 and num_seen > 1:  # a raw stream: the rate is FFmpeg's guess
         pace = pace._replace(guessed=True)
-    gaps = _gap_notes([start - 1, *(one.position for one in seen[len(seen) - len(kept) :])])
-    return kept, num_declared, pace, notes + gaps
+    gaps = _gap_notes([start - 1, *positions[num_seen - num_kept :]])
+    return (told.num_total if stop is None else stop) - start, pace, told.notes + gaps
 
 
 def _shown_of(path: Path, declared: int, seconds: np.ndarray, fps: float, reached: int) -> int:
@@ -267,7 +312,7 @@ def _gap_notes(positions: list[int]) -> tuple[str, ...]:
     return (f"{which} cannot be decoded, and are left out; what follows may be blemished, {sound}.",)
 
 
-def _pace_notes(pace: Pace) -> tuple[str, ...]:
+def pace_notes(pace: Pace) -> tuple[str, ...]:
     if pace.guessed:
         return (f"no rate is told that can be used; taken as {pace.fps:g} frames a second, unless fps says otherwise.",)
     if pace.times is None:
@@ -279,37 +324,37 @@ def _pace_notes(pace: Pace) -> tuple[str, ...]:
     )
 
 
-def _read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
+def read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
     """The images of a folder."""
     images = image_paths(folder)
     if not images:
-        raise _error(
+        raise video_error(
             "path",
             expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
             got=f"{str(folder)!r} without any",
             cure="Give the folder that holds the frames, or a video file.",
         )
     _check_within(start, stop, len(images), folder)
-    return _read_images(images[start:stop], prepare)
+    return read_pictures(images[start:stop], prepare)
 
 
 def _is_image(path: Path) -> bool:
     """Whether a file is one image, whatever it is called."""
     if path.suffix.lower() not in IMAGE_SUFFIXES and not is_image(_head(path)):
         return False
-    with _quiet():
+    with quiet():
         num_images = cv2.imcount(str(path))
     if num_images > 1 and _head(path).startswith(
         (b"II*\0", b"MM\0*")
     ):  # a TIFF, of which that decoder sees the first alone
         got = f"{num_images} in {str(path)!r}"
-        raise _error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
+        raise video_error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
     if path.suffix.lower() not in IMAGE_SUFFIXES and _is_followed(path):
         got, cure = (
             f"a bare sequence of JPEGs, {str(path)!r}",
             "Put it into a container: ffmpeg -i VIDEO -c copy NEW.avi.",
         )
-        raise _error("path", expected="a video in a container", got=got, cure=cure)
+        raise video_error("path", expected="a video in a container", got=got, cure=cure)
     return num_images == 1
 
 
@@ -326,9 +371,9 @@ def _is_followed(path: Path) -> bool:
 
 
 def _read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> _Read:
-    """As `_read_folder`, of a file with one image."""
+    """As `read_folder`, of a file with one image."""
     _check_within(start, stop, 1, path)
-    return _read_images([path], prepare)
+    return read_pictures([path], prepare)
 
 
 #: What Pillow raises of damaged files.
@@ -376,13 +421,13 @@ def _read_animation(path: Path, start: int, stop: int | None, prepare: Callable)
     num_total = max(num_promised, len(delays) + fault)
     _check_within(start, stop, num_total, path)
     if not kept:
-        raise _none_decodes(start, stop, len(delays), num_total, path)
+        raise none_decodes(start, stop, len(delays), num_total, path)
     shown = np.array(delays[start:])
     pace = pace_of(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
     if pace.times is not None:
         pace = Pace(pace.fps, pace.times[:-1])
     pace = _usable(pace)
-    return _alike(kept), (num_total if stop is None else stop) - start, pace, ()
+    return kept, (num_total if stop is None else stop) - start, pace, ()
 
 
 def _promised_pictures(animation: Image.Image) -> int:
@@ -393,24 +438,24 @@ def _promised_pictures(animation: Image.Image) -> int:
         return 0
 
 
-def _read_images(chosen: list[Path], prepare: Callable) -> _Read:
+def read_pictures(chosen: list[Path], prepare: Callable) -> _Read:
     """Images of one size."""
     first_shape, kept = None, []
     for entry in chosen:
-        image = _read_image(entry)
+        image = read_picture(entry)
         first_shape = first_shape or image.shape[:2]
         if image.shape[:2] != first_shape:
-            raise _error(
+            raise video_error(
                 "path",
                 expected=f"images of one size, {_shape_text(first_shape)} as in {chosen[0].name!r}",
                 got=f"{_shape_text(image.shape)} in {entry.name!r}",
                 cure="Resize the images, or choose others with frames=(A, B).",
             )
         kept.append(prepare(image))
-    return _alike(kept), len(chosen), Pace(DEFAULT_FPS), ()
+    return kept, len(chosen), Pace(DEFAULT_FPS), ()
 
 
-def _alike(frames: list[np.ndarray]) -> list[np.ndarray]:
+def alike_frames(frames: list[np.ndarray]) -> list[np.ndarray]:
     """All with alpha where one is transparent anywhere, else all without."""
     with_alpha = [frame.shape[2] == 4 for frame in frames]
     if not any(with_alpha):
@@ -433,16 +478,16 @@ def image_paths(folder: Path) -> list[Path]:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(height, width) of an image, in pixels."""
-    return _read_image(path).shape[:2]
+    return read_picture(path).shape[:2]
 
 
-def _read_image(path: Path) -> np.ndarray:
+def read_picture(path: Path) -> np.ndarray:
     """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
     head = _head(path)
     _refuse_huge_image(path, head)
     # UNCHANGED shows a fourth channel; JPEG has none, and COLOR also applies its orientation.
     flags = cv2.IMREAD_COLOR if head.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
-    with _quiet():
+    with quiet():
         try:
             image = cv2.imread(str(path), flags)
         except cv2.error:  # an absurd size in the header
@@ -452,7 +497,7 @@ def _read_image(path: Path) -> np.ndarray:
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
     if image.dtype != np.uint8:
-        raise _error(
+        raise video_error(
             "path",
             expected="images of 8 or 16 bits",
             got=f"{image.dtype} in {str(path)!r}",
@@ -463,15 +508,15 @@ def _read_image(path: Path) -> np.ndarray:
     return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
 
 
-def _none_decodes(start: int, stop: int | None, num_decoded: int, num_total: int, path: Path) -> VideoError:
+def none_decodes(start: int, stop: int | None, num_decoded: int, num_total: int, path: Path) -> VideoError:
     """Of the frames asked for."""
     got = f"{_text(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}"
-    return _error("frames", expected="a range with frames that decode", got=got, cure="Ask for earlier frames.")
+    return video_error("frames", expected="a range with frames that decode", got=got, cure="Ask for earlier frames.")
 
 
 def _undecoded(path: Path) -> VideoError:
     got = f"{str(path)!r} ({_bytes_text(path)}), which does not"
-    return _error("path", expected="images that decode", got=got, cure="Replace or remove it.")
+    return video_error("path", expected="images that decode", got=got, cure="Replace or remove it.")
 
 
 def _refuse_huge_image(path: Path, head: bytes) -> None:
@@ -485,7 +530,7 @@ def _refuse_huge_image(path: Path, head: bytes) -> None:
 def _refuse_huge(path: Path, size: tuple[float, float] | None) -> None:
     """Raise for a picture that a header says is larger than any, before memory is taken for it."""
     if size is not None and size[0] * size[1] > MAX_PIXELS:
-        raise _error(
+        raise video_error(
             "path",
             expected=f"pictures of at most {MAX_PIXELS:,} pixels",
             got=f"{size[0]:.0f}x{size[1]:.0f} (height x width) in the header of {str(path)!r}",
@@ -523,31 +568,42 @@ def _restricted() -> Iterator[None]:
                 os.environ[_OPTIONS] = before
 
 
-@contextmanager
-def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
-    """An opened decoder, silent and released at the end."""
+def open_video(path: Path) -> cv2.VideoCapture:
+    """An opened decoder. Raises `VideoError` for what does not open, has alpha, or is huge."""
     kind = kind_of(_head(path))
     if kind == LIST:
-        raise _error(
+        raise video_error(
             "path",
             expected="a video file or a folder of images",
             got=f"{kind}, {str(path)!r}",
             cure="What it names is never opened: give the video itself.",
         )
-    with _quiet():
-        # FFmpeg only, and an absolute path: other backends take 'img01.png' for the first of a sequence,
-        # and FFmpeg takes 'name:rest' for a protocol.
-        with _restricted():
-            capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+    # FFmpeg only, and an absolute path: other backends take 'img01.png' for the first of a sequence,
+    # and FFmpeg takes 'name:rest' for a protocol.
+    with quiet(), _restricted():
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise video_error(
+                "path",
+                expected="a video file or a folder of images",
+                got=f"{str(path)!r} ({_bytes_text(path)}{f', {kind}' if kind else ''}), which does not open as a video",
+                cure="Check that it is a video and that its copy or download is complete.",
+            )
+        _refuse_alpha(capture, path)
+        _refuse_huge(path, (capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
+    except VideoError:
+        capture.release()
+        raise
+    return capture
+
+
+@contextmanager
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    """An opened decoder, silent and released at the end."""
+    with quiet():
+        capture = open_video(path)
         try:
-            if not capture.isOpened():
-                raise _error(
-                    "path",
-                    expected="a video file or a folder of images",
-                    got=f"{str(path)!r} ({_bytes_text(path)}{f', {kind}' if kind else ''}), "
-                    "which does not open as a video",
-                    cure="Check that it is a video and that its copy or download is complete.",
-                )
             yield capture
         finally:
             capture.release()
@@ -563,7 +619,7 @@ def _refuse_alpha(capture: cv2.VideoCapture, path: Path) -> None:
     kind = (int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) & 0xFFFFFFFF).to_bytes(4, "little")
     packed = kind in _PACKED_ALPHA and int(capture.get(cv2.CAP_PROP_FOURCC)) != 0  # raw video's fourth byte is idle
     if packed or (kind[:2] in _PLANAR_ALPHA and kind[2] < ord(" ")) or has_alpha_beside(_head(path)):
-        raise _error(
+        raise video_error(
             "path",
             expected="a video without alpha",
             got=f"one with alpha, {str(path)!r}, which would be lost",
@@ -579,14 +635,14 @@ def _shape_notes(capture: cv2.VideoCapture) -> tuple[str, ...]:
     return (f"pixels are {across / down:.3g} times as wide as high; frames are kept as stored, not stretched.",)
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
     """A frame that decodes: which one of the file it is, and its time."""
 
     position: int
     milliseconds: float
 
 
-def _grabbed(capture: cv2.VideoCapture, fps: float) -> Iterator[_Seen]:
+def frames_grabbed(capture: cv2.VideoCapture, fps: float) -> Iterator[Seen]:
     """The frames that decode, one by one. Those lost before one, in damage, are counted by its time."""
     position, before, misses = -1, -1000 / fps, 0
     while misses < MISSES:
@@ -597,17 +653,17 @@ def _grabbed(capture: cv2.VideoCapture, fps: float) -> Iterator[_Seen]:
         lost = (now - before) * fps / 1000 - 1 if misses else 0.0
         position += 1 + (round(lost) if 0 < lost < MOST_LOST else 0)
         before, misses = now, 0
-        yield _Seen(position, now)
+        yield Seen(position, now)
 
 
-def _decoded(
-    capture: cv2.VideoCapture, fps: float, start: int, stop: int | None, seen: list[_Seen]
+def frames_decoded(
+    capture: cv2.VideoCapture, fps: float, start: int, stop: int | None, seen: list[Seen]
 ) -> Iterator[np.ndarray]:
     """The frames from `start` up to `stop`, BGR, that decode; all that are passed are added to `seen`.
 
     Those before `start` are decoded and dropped: seeking lands on key frames in some containers.
     """
-    for one in _grabbed(capture, fps):
+    for one in frames_grabbed(capture, fps):
         if stop is not None and one.position >= stop:
             return
         if one.position >= start:
@@ -628,7 +684,7 @@ class _Stays:
     it equals the one before; so do frames of clips in which nothing moves.
     """
 
-    def __init__(self, seen: list[_Seen]):
+    def __init__(self, seen: list[Seen]):
         self.last, self._seen, self._before = 0, seen, None
 
     def watched(self, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
@@ -673,7 +729,7 @@ def _same_size(frames: Iterable[np.ndarray], path: Path) -> Iterator[np.ndarray]
     for number, frame in enumerate(frames):
         shape = shape or frame.shape
         if frame.shape != shape:
-            raise _error(
+            raise video_error(
                 "path",
                 expected=f"frames of one size, {_shape_text(shape)}",
                 got=f"{_shape_text(frame.shape)} from frame {number} on in {str(path)!r}",
@@ -696,7 +752,7 @@ def memory_limit() -> int:
         return 8 << 30
 
 
-def _fit_to(size: tuple[int, int] | None, crop: tuple[int, int] | None = None) -> Callable[[np.ndarray], np.ndarray]:
+def fit_to(size: tuple[int, int] | None, crop: tuple[int, int] | None = None) -> Callable[[np.ndarray], np.ndarray]:
     """BGR of any size -> RGB: the window `crop` around the centre, the aspect of `size`, then resize to that."""
     limit, taken, num_frames = memory_limit(), 0, 0
 
@@ -708,7 +764,7 @@ def _fit_to(size: tuple[int, int] | None, crop: tuple[int, int] | None = None) -
         channels = image.shape[2]
         taken, num_frames = taken + channels * height * width, num_frames + 1
         if taken > limit:
-            raise _error(
+            raise video_error(
                 "size",
                 expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
                 got=f"more, at frame {num_frames} of {height}x{width}",
@@ -734,7 +790,7 @@ def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, 
 def centre_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice, slice]:
     """Rows and columns of the `window` of (height, width) around the centre; `VideoError` where it does not fit."""
     if window[0] > have[0] or window[1] > have[1]:
-        raise _error(
+        raise video_error(
             "center_crop",
             expected=f"at most the frame's {_shape_text(have)}",
             got=f"{window[0]}x{window[1]}",
@@ -767,13 +823,13 @@ def _in_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
     return kept
 
 
-def _stacked(frames: list[np.ndarray]) -> np.ndarray:
+def stacked(frames: list[np.ndarray]) -> np.ndarray:
     """np.stack that frees each frame as it goes, so the peak is one copy of the clip and not two."""
-    stacked = np.empty((len(frames), *frames[0].shape), np.uint8)
+    clip = np.empty((len(frames), *frames[0].shape), np.uint8)
     for number in range(len(frames)):
-        stacked[number] = frames[number]
+        clip[number] = frames[number]
         frames[number] = None
-    return stacked
+    return clip
 
 
 def natural_order(name: str) -> tuple:
@@ -812,10 +868,10 @@ def write_video(
     path cannot be written.
     """
     path = checked_path(path, "path, frames, fps")
-    _check_fps(fps)
+    check_fps(fps)
     if not isinstance(frames, Iterable):
         cure = "Of a model: model.frames()."
-        raise _error("frames", expected="pictures, one by one", got=type(frames).__name__, cure=cure)
+        raise video_error("frames", expected="pictures, one by one", got=type(frames).__name__, cure=cure)
     one_of("image_format", image_format, IMAGE_FORMATS)
     if path.is_dir() or not path.suffix:
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
@@ -823,7 +879,7 @@ def write_video(
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps))
     if suffix not in VIDEO_SUFFIXES:
-        raise _error(
+        raise video_error(
             "path",
             expected="a name ending in .mp4, .webm, .gif or .webp, or a folder (no extension) for images",
             got=repr(path.name),
@@ -868,7 +924,7 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
-        raise _error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
+        raise video_error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
     data = _png(_checked_frame(image, None, "image"))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
@@ -878,7 +934,7 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
 def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float) -> Path:
     """Write an animated GIF or WebP that repeats without end."""
     if suffix == ".gif" and fps > MAX_GIF_FPS:
-        raise _error(
+        raise video_error(
             "fps",
             expected=f"at most {MAX_GIF_FPS:g} for a GIF",
             got=f"{fps:g}",
@@ -898,7 +954,7 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
         except (OverflowError, RuntimeError, ValueError) as error:
             height, width = first.height, first.width
             expected, got = f"a size and a rate that {suffix} can hold", f"{height}x{width} at {fps:g} a second"
-            raise _error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
+            raise video_error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
     return path
 
 
@@ -917,7 +973,7 @@ def _encode(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
     """Encode in VP9 and return the number of frames; the container goes by the extension of `path`."""
     code = cv2.VideoWriter.fourcc(*("vp09" if path.suffix.lower() == ".mp4" else "VP90"))
     writer, num_frames = None, 0
-    with _quiet():
+    with quiet():
         try:
             for frame in frames:
                 image = _for_encoder(frame)
@@ -961,7 +1017,7 @@ def _check_written(path: Path, num_frames: int, target: Path) -> None:
     The container's own count will not do, it can be right in a file that breaks off. Decoding takes a few
     hundredths of the time of encoding.
     """
-    with _quiet():
+    with quiet():
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         num_decoded = sum(1 for _ in iter(capture.grab, False))
         capture.release()
@@ -984,7 +1040,7 @@ def _webp(frame: np.ndarray) -> bytes:
     quality = [cv2.IMWRITE_WEBP_QUALITY, 101]  # above 100: lossless
     if max(frame.shape[:2]) > MAX_WEBP_SIDE:
         got = _shape_text(frame.shape)
-        raise _error("frames", expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP", got=got, cure="Take PNG.")
+        raise video_error("frames", expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP", got=got, cure="Take PNG.")
     return cv2.imencode(".webp", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
 
 
@@ -1002,14 +1058,14 @@ def _checked_frames(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         shape = frame.shape
         yield frame
     if shape is None:
-        raise _error("frames", expected="at least 1 frame", got="none")
+        raise video_error("frames", expected="at least 1 frame", got="none")
 
 
 def _checked_frame(frame: np.ndarray, shape: tuple | None, parameter: str) -> np.ndarray:
     frame = np.asarray(frame)
     fits = frame.ndim == 3 and frame.shape[2] == 3 and min(frame.shape) > 0 and frame.dtype == np.uint8
     if not fits or (shape is not None and frame.shape != shape):
-        raise _error(
+        raise video_error(
             parameter,
             expected=f"uint8 RGB of shape {shape or '(height, width, 3)'}",
             got=f"{frame.dtype} of shape {frame.shape}",
@@ -1018,19 +1074,21 @@ def _checked_frame(frame: np.ndarray, shape: tuple | None, parameter: str) -> np
     return np.ascontiguousarray(frame)
 
 
-def _checked_range(frames: Range | None) -> tuple[int, int | None]:
+def checked_range(frames: Range | None) -> tuple[int, int | None]:
     start, stop = (None, None) if frames is None else frames
     start = 0 if start is None else start
     if start < 0 or (stop is not None and stop < 0):
-        raise _error("frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more.")
+        raise video_error(
+            "frames", expected="A:B counted from the start", got=_text(start, stop), cure="Use 0 or more."
+        )
     if stop is not None and stop <= start:
-        raise _error("frames", expected="A:B with at least 1 frame", got=_text(start, stop), cure="Choose B > A.")
+        raise video_error("frames", expected="A:B with at least 1 frame", got=_text(start, stop), cure="Choose B > A.")
     return start, stop
 
 
 def _check_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
     if start >= num_total or (stop is not None and stop > num_total):
-        raise _error(
+        raise video_error(
             "frames",
             expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
             got=_text(start, stop),
@@ -1038,12 +1096,12 @@ def _check_within(start: int, stop: int | None, num_total: int, path: Path) -> N
         )
 
 
-def _checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
+def checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
     if size is None:
         return None
     height, width = size
     if height != int(height) or width != int(width) or min(height, width) < 1:
-        raise _error(
+        raise video_error(
             parameter,
             expected="height and width of whole pixels, at least 1",
             got=f"{height}x{width}",
@@ -1052,12 +1110,12 @@ def _checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tupl
     return int(height), int(width)
 
 
-def _check_fps(fps: float) -> None:
+def check_fps(fps: float) -> None:
     if not within(fps, f"(0, {MAX_FPS}]"):
-        raise _error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+        raise video_error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
 
 
-def _error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:
+def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:
     return VideoError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
 
 
@@ -1079,7 +1137,7 @@ _LOG_LEVEL_SILENT = 0
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Silence OpenCV's own log (FFmpeg's is set above); the level is the whole process's, so restore it."""
     logging = getattr(cv2.utils, "logging", cv2)  # cv2 itself: up to OpenCV 4
     level = logging.getLogLevel()

@@ -33,6 +33,23 @@ FEW = 16
 CUT_SHARE = 0.15
 
 
+class CutFinder:
+    """`Motion.cuts` of a clip that comes frame by frame, of which two are held.
+
+    Each pair is judged as a clip of its own, on maps as large as those of a short clip.
+    """
+
+    def __init__(self):
+        self.found: list[int] = []  # the frames, in order, that begin another shot
+        self._num, self._before = 0, None
+
+    def add(self, frame: UInt8[np.ndarray, "height width 3"]) -> None:
+        """The next frame, which may be used again afterwards only if it does not change."""
+        if self._before is not None and Motion.of(np.stack([self._before, frame])).cuts():
+            self.found.append(self._num)
+        self._before, self._num = frame, self._num + 1
+
+
 @dataclasses.dataclass(frozen=True)
 class Tracks:
     """Tracks of points, relative to where they start.

@@ -130,11 +130,12 @@ def _read_picture(path: Path) -> None:
 
 #: The part of `foldgauss.io.video_file` that reads.
 _READ = (
-    ONLY, "read_video", "_reader", "_head", "_read_file", "_usable", "_gap_notes", "_pace_notes", "_read_folder",
-    "_is_image", "_read_image_file", "_read_animation", "_promised_pictures", "_read_images", "_alike",
-    "image_paths", "_read_image", "_undecoded", "_refuse_huge_image", "_refuse_huge", "_premultiplied", "_capture",
-    "_refuse_alpha", "_shape_notes", "_grabbed", "_decoded", "_Stays", "_same_size", "_declared_frames", "_fit_to",
-    "aspect_window", "_in_blocks", "_stacked", "_check_within",
+    ONLY, "read_video", "readable_path", "reader_of", "_head", "read_file", "pass_through", "told_of_span", "_usable",
+    "_gap_notes", "pace_notes", "read_folder", "_is_image", "_read_image_file", "_read_animation",
+    "_promised_pictures", "read_pictures", "alike_frames", "image_paths", "read_picture", "_undecoded",
+    "_refuse_huge_image", "_refuse_huge", "_premultiplied", "_capture", "open_video", "_refuse_alpha", "_shape_notes",
+    "frames_grabbed", "frames_decoded", "_Stays", "_same_size", "_declared_frames", "fit_to", "aspect_window",
+    "_in_blocks", "stacked", "_check_within",
 )  # fmt: skip
 
 PICTURES = Target(

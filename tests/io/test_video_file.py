@@ -670,5 +670,5 @@ def test_frames_of_many_blocks(tmp_path, monkeypatch):
     frames = np.random.default_rng(0).integers(0, 256, (8, 20, 24, 3), np.uint8)
     kept = video_file._in_blocks(frames)
     assert len({id(frame.base) for frame in kept}) == 3
-    np.testing.assert_array_equal(video_file._stacked(kept), frames)
+    np.testing.assert_array_equal(video_file.stacked(kept), frames)
     assert video_file._in_blocks(iter(())) == []

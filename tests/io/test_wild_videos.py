@@ -731,7 +731,7 @@ def test_the_second_door_is_needed(tmp_path):
     """Without it FFmpeg reads the file that a list names."""
     (tmp_path / "list.txt").write_text(LISTS["ffconcat"])
     _exact_avi(tmp_path / "clip.avi", _noise())
-    with video_file._quiet():
+    with video_file.quiet():
         capture = cv2.VideoCapture(str(tmp_path / "list.txt"), cv2.CAP_FFMPEG)
         assert capture.read()[0]
         capture.release()
@@ -805,7 +805,7 @@ def test_images_of_one_colour_are_not_taken_for_them(tmp_path, suffix):
 def test_huge_videos_are_refused_before_a_frame_is_decoded(tmp_path, mp4, monkeypatch):
     (tmp_path / "a.mp4").write_bytes(mp4)
     monkeypatch.setattr(video_file, "MAX_PIXELS", 48 * 64 - 1)
-    monkeypatch.setattr(video_file, "_grabbed", None)
+    monkeypatch.setattr(video_file, "frames_grabbed", None)
     _refused(tmp_path / "a.mp4", "at most 3,071 pixels", "48x64", "a.mp4")
 
 
