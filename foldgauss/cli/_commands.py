@@ -16,6 +16,7 @@ class Command(NamedTuple):
 COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "fit": Command("fitting", "Fit a model to a clip; the first of its budgets ends it."),
+        "fit-many": Command("many", "Fit a model to each clip of a folder; those that cannot be fitted are listed."),
         "view": Command("viewing", "Play a model in the browser; Ctrl-C ends it."),
         "render": Command("drawing", "Draw a model as a video, in between its frames too."),
         "evaluate": Command("drawing", "Compare a model with its clip: PSNR and SSIM of every frame."),

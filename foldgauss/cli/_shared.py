@@ -1,7 +1,6 @@
 """What the commands share: consoles, options, arguments and how results are shown."""
 
 import dataclasses
-import hashlib
 import json
 import os
 import re
@@ -21,6 +20,8 @@ from foldgauss.cli._app import WrongUse, as_option, err, out
 from foldgauss.cli._app import app as app
 from foldgauss.cli._completion import clip_files, model_files
 from foldgauss.io._atomic import atomic_path
+from foldgauss.io.provenance import fingerprint as fingerprint
+from foldgauss.io.provenance import provenance as provenance
 from foldgauss.io.video_file import (
     ANIMATION_SUFFIXES,
     MAX_FPS,
@@ -214,17 +215,6 @@ def tell_of(clip: Clip) -> None:
         err.print(f"warning: {clip.source}: {note}", soft_wrap=True)
 
 
-def fingerprint(clip: Clip) -> dict[str, Any]:
-    """What a resumed fit must find again: the frames themselves, whatever they are called now."""
-    digest = hashlib.blake2b(clip.frames, digest_size=16).hexdigest()
-    return {"num_frames": clip.num_frames, "size": list(clip.size), "frames_digest": digest}
-
-
-def provenance(clip: Clip, seed: int) -> dict[str, Any]:
-    """What is noted in a model's file of where it comes from."""
-    return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
-
-
 def clip_of_model(
     model: VideoModel | EditedVideo, model_path: Path, video: Path, frames: str | None, *, as_many: bool = True
 ) -> Clip:
@@ -288,6 +278,9 @@ _LABELS = {
     "num_gaussians": ("Gaussians", "{:,}"),
     "degree": ("degree of the folds", "{}"),
     "fit_seconds": ("time spent fitting", "{:.1f} s"),
+    "wall_seconds": ("time in all", "{:.1f} s"),
+    "num_segments": ("segments", "{:,}"),
+    "seam_drop": ("PSNR lost where segments meet", "{:.2f} dB"),
     "steps": ("steps", "{:,}"),
     "stopped_by": ("stopped by", "{}"),
     "loss_db": ("loss", "{:.3f} dB"),

@@ -1,11 +1,9 @@
 """The commands that fit: `demo` and `fit`."""
 
-import dataclasses
 import json
-import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +13,39 @@ import typer
 from foldgauss._checks import invalid
 from foldgauss._progress import Manner, Observer, previewing, print_json, watching
 from foldgauss._threads import num_threads
-from foldgauss.cli._completion import among
+from foldgauss.cli._fit_options import (
+    WATCHED,
+    BatchSize,
+    BetweenShare,
+    CheckpointSeconds,
+    Compositing,
+    Degree,
+    Engine,
+    Gaussians,
+    HalfShare,
+    LogJson,
+    MaxGaussians,
+    MaxSizeMb,
+    Minutes,
+    OnDivergence,
+    Power,
+    Preset,
+    QuarterShare,
+    Quiet,
+    Scheduler,
+    Seed,
+    SegmentSeconds,
+    SmallestAtPsnr,
+    SsimShare,
+    Steps,
+    TargetPsnr,
+    Threads,
+    UseEconomy,
+    Workers,
+    config_of,
+    manner_of,
+)
+from foldgauss.cli._jobs_view import check_crew
 from foldgauss.cli._shared import (
     AlphaCutoff,
     Frames,
@@ -43,9 +73,10 @@ from foldgauss.cli._shared import (
     refuse_input,
     scores_of,
     tell_of,
-    with_constants,
     write_json,
 )
+from foldgauss.cli._signals import noted_signals
+from foldgauss.cli.long import fit_in_segments
 from foldgauss.datasets import sample_clip
 from foldgauss.io._atomic import OutputError, check_writable
 from foldgauss.io._lock import only_writer
@@ -53,29 +84,20 @@ from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import Clip, read_video, write_image, write_video
 from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_checkpoint, save_checkpoint, save_video_model
-from foldgauss.render import COMPOSITINGS
+from foldgauss.jobs.fitting import CHECKPOINT_SECONDS
 from foldgauss.video.config import (
-    FIT_ENGINES,
-    ON_DIVERGENCE,
-    PRESETS,
     FitConfig,
     chosen_num_gaussians,
     planned_steps,
 )
 from foldgauss.video.device import chosen_engine, device_name
-from foldgauss.video.economy import Economy
 from foldgauss.video.fit import FitInfo, FitState, fit_steps, running_psnr, to_model
 from foldgauss.video.guard import FitDiverged
 
-#: A running fit is kept on disk this often, in seconds.
-CHECKPOINT_SECONDS = 30.0
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_RECORD = "metrics.json"
 DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", DEMO_RECORD}
 DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
-#: Panels of `fit --help`.
-MODEL, BUDGET, COURSE = "What is fitted", "When it ends: the first of these", "How it is fitted"
-WATCHED = "Watching a fit, going on with it"
 
 
 @app.command()
@@ -91,7 +113,7 @@ def demo(
     clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
     make_folder(out_dir)
     out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
-    with watching(_manner(), err) as observe:
+    with watching(manner_of(), err) as observe:
         state, info = _run_fit(clip.frames, DEMO_CONFIG, observe)
     model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
     pictures: list[np.ndarray] = []
@@ -136,131 +158,32 @@ def fit(
         Path | None,
         typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name, in this folder]."),
     ] = None,
-    preset: Annotated[
-        str,
-        typer.Option(
-            help=f"Recipe that other options change: {', '.join(PRESETS)} (slow: the published one).",
-            autocompletion=among(PRESETS),
-        ),
-    ] = "standard",
+    preset: Preset = "standard",
     size: Size = None,
     frames: Frames = None,
     overwrite: Overwrite = False,
-    gaussians: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of Gaussians at the start [default: by the preset, or the clip's size and length].",
-            rich_help_panel=MODEL,
-        ),
-    ] = None,
-    max_gaussians: Annotated[
-        int | None, typer.Option(help="Largest number of Gaussians, grown or not.", rich_help_panel=MODEL)
-    ] = None,
-    economy: Annotated[
-        bool,
-        typer.Option(
-            "--economy",
-            help="Keep only what saves more bits than it takes: Gaussians, powers, colours.",
-            rich_help_panel=MODEL,
-        ),
-    ] = False,
-    smallest_at_psnr: Annotated[
-        float | None,
-        typer.Option(
-            "--smallest-at-psnr",
-            help="The smallest model whose mean PSNR is this, in dB; takes its time.",
-            rich_help_panel=MODEL,
-        ),
-    ] = None,
-    max_size_mb: Annotated[
-        float | None,
-        typer.Option(
-            "--max-size-mb",
-            help="Largest model file, in 10^6 bytes; limits the Gaussians.",
-            rich_help_panel=MODEL,
-        ),
-    ] = None,
-    degree: Annotated[
-        int | None,
-        typer.Option(help="Degree of the fold polynomial [default: 3; draft: 2; paper: 7].", rich_help_panel=MODEL),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            help="Optimiser steps [default: 3000, more for long clips; draft: 800; paper: 30000].",
-            rich_help_panel=BUDGET,
-        ),
-    ] = None,
-    minutes: Annotated[float | None, typer.Option(help="Time to fit for.", rich_help_panel=BUDGET)] = None,
-    target_psnr: Annotated[
-        float | None,
-        typer.Option(
-            "--target-psnr", help="Stop once the mean PSNR of the frames is this, in dB.", rich_help_panel=BUDGET
-        ),
-    ] = None,
-    batch_size: Annotated[
-        int | None, typer.Option(help="Frames per step [default: 1; paper: 3].", rich_help_panel=COURSE)
-    ] = None,
-    power: Annotated[
-        float | None,
-        typer.Option(
-            help="Power of the envelope a(t): 1 as in the paper's text, 2 as in its code [default: 1; paper: 2].",
-            rich_help_panel=MODEL,
-        ),
-    ] = None,
-    compositing: Annotated[
-        str | None,
-        typer.Option(
-            help="Blend of the Gaussians: over (front to back) or sum [default: over].",
-            rich_help_panel=MODEL,
-            autocompletion=among(COMPOSITINGS),
-        ),
-    ] = None,
-    between_share: Annotated[
-        float | None,
-        typer.Option(
-            help="Share of the steps that learn what lies between frames, for slow motion, as 0.5 [default: 0].",
-            rich_help_panel=COURSE,
-        ),
-    ] = None,
-    ssim_share: Annotated[
-        float | None,
-        typer.Option(help="Share of D-SSIM in the loss, the rest being L1 [default: 0.2].", rich_help_panel=COURSE),
-    ] = None,
-    quarter_share: Annotated[
-        float | None,
-        typer.Option(
-            help="Share of the steps with frames at a quarter of their size [default: 0.2].", rich_help_panel=COURSE
-        ),
-    ] = None,
-    half_share: Annotated[
-        float | None,
-        typer.Option(
-            help="Share of the steps with frames at half of their size [default: 0.4].", rich_help_panel=COURSE
-        ),
-    ] = None,
-    engine: Annotated[
-        str,
-        typer.Option(
-            help="What computes the steps: cpu, or on a GPU xla or pallas; auto: cpu unless there is a GPU.",
-            rich_help_panel=COURSE,
-            autocompletion=among(FIT_ENGINES),
-        ),
-    ] = "auto",
-    seed: Annotated[
-        int, typer.Option(help="Seed of the random starts and of the order of frames.", rich_help_panel=COURSE)
-    ] = 0,
+    gaussians: Gaussians = None,
+    max_gaussians: MaxGaussians = None,
+    economy: UseEconomy = False,
+    smallest_at_psnr: SmallestAtPsnr = None,
+    max_size_mb: MaxSizeMb = None,
+    degree: Degree = None,
+    steps: Steps = None,
+    minutes: Minutes = None,
+    target_psnr: TargetPsnr = None,
+    batch_size: BatchSize = None,
+    power: Power = None,
+    compositing: Compositing = None,
+    between_share: BetweenShare = None,
+    ssim_share: SsimShare = None,
+    quarter_share: QuarterShare = None,
+    half_share: HalfShare = None,
+    engine: Engine = "auto",
+    seed: Seed = 0,
     alpha_cutoff: AlphaCutoff = None,
     support_radius: SupportRadius = None,
     transmittance_stop: TransmittanceStop = None,
-    on_divergence: Annotated[
-        str,
-        typer.Option(
-            help="If the fit comes apart: back-off (to sound numbers, at lower rates) or stop.",
-            rich_help_panel=COURSE,
-            autocompletion=among(ON_DIVERGENCE),
-        ),
-    ] = "back-off",
+    on_divergence: OnDivergence = "back-off",
     resume: Annotated[
         bool,
         typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=WATCHED),
@@ -281,53 +204,42 @@ def fit(
             rich_help_panel=WATCHED,
         ),
     ] = None,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", help="Say nothing but warnings and errors.", rich_help_panel=WATCHED)
-    ] = False,
-    log_json: Annotated[
-        bool,
-        typer.Option("--log-json", help="Tell progress and figures as lines of JSON.", rich_help_panel=WATCHED),
-    ] = False,
+    checkpoint_seconds: CheckpointSeconds = None,
+    segment_seconds: SegmentSeconds = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    log_json: LogJson = False,
 ) -> None:
     """Fit a model to a clip; the first of its budgets ends it.
 
-    A stopped fit is kept and goes on with --resume.
+    A stopped fit is kept and goes on with --resume. A long clip is fitted in segments, by several workers if asked.
     """
-    changes = {
-        "num_gaussians": gaussians,
-        "max_gaussians": max_gaussians,
-        "degree": degree,
-        "steps": steps,
-        "minutes": minutes,
-        "target_psnr": target_psnr,
-        "max_size_mb": max_size_mb,
-        "batch_size": batch_size,
-        "power": power,
-        "compositing": compositing,
-        "between_share": between_share,
-        "ssim_share": ssim_share,
-        "quarter_share": quarter_share,
-        "half_share": half_share,
-        "on_divergence": on_divergence,
-        "engine": engine,
-        "seed": seed,
-    }
     target = named_after(video, MODEL_SUFFIX) if out_path is None else out_path
     refuse_input(target, "clip", video)
     try:
         check_model_name(target, "out")
-        if economy or smallest_at_psnr is not None:
-            changes["economy"] = Economy(psnr=smallest_at_psnr)
-        config = FitConfig.preset(preset, **{name: value for name, value in changes.items() if value is not None})
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
-    constants = {"support_radius": support_radius, "transmittance_stop": transmittance_stop}
-    options = with_constants(config.options, alpha_cutoff=alpha_cutoff, **constants)
-    config = dataclasses.replace(config, options=options)
+    config = config_of(context.params)
     kept = target.with_name(f"{target.name}.checkpoint")
-    manner = _manner(quiet, log_json)
+    manner = manner_of(quiet, log_json)
+    check_crew(workers, scheduler, threads)
     context.with_resource(only_writer(target, own=(kept,)))
     refuse_existing(target, overwrite)
+    if not (segment_seconds is None and workers is None and scheduler is None):
+        for option, path in (("--history", history), ("--preview", preview)):
+            if path is not None:
+                raise WrongUse(f"{option}: expected a fit in one piece, got one in segments. Leave it out.")
+        parsed = {"size": parse_size(size), "frames": parse_frames(frames)}
+        how = {
+            "segment_seconds": segment_seconds,
+            "crew": (workers, scheduler, threads),
+            "checkpoint_seconds": checkpoint_seconds,
+        }
+        fit_in_segments(video, target, config, manner, resume=resume, overwrite=overwrite, **parsed, **how)
+        return
     curves = _check_records(target, video, history, preview, overwrite or resume)
     if kept.exists() and not (resume or overwrite):
         raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
@@ -354,7 +266,7 @@ def fit(
         recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
     previews = None if preview is None else previewing(preview, clip, config)
     with watching(manner, err, history=recorded, preview=previews) as observe:
-        state, info = _run_fit(clip.frames, config, observe, state, keep, begin)
+        state, info = _run_fit(clip.frames, config, observe, state, keep, begin, seconds=checkpoint_seconds)
     model = to_model(state, config, clip.size, clip.fps)
     about = noted(clip, seed, frames)
     try:
@@ -397,15 +309,6 @@ def noted(clip: Clip, seed: int, frames: str | None) -> dict[str, Any]:
     return provenance(clip, seed) | {"frames": parse_frames(frames)}
 
 
-def _manner(quiet: bool = False, log_json: bool = False) -> Manner:
-    """How a fit is shown: as asked, else a bar on a terminal and lines in a log."""
-    if quiet and log_json:
-        raise WrongUse("--quiet: expected one of --quiet and --log-json, got both. Leave one out.")
-    if quiet or log_json:
-        return "quiet" if quiet else "json"
-    return "bar" if err.is_terminal else "lines"
-
-
 def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
     """Refuse places for the history, its curves and the preview that cannot be right; returns that of the curves."""
     curves = Path() if history is None else history.with_suffix(".png")
@@ -445,13 +348,15 @@ def _run_fit(
     resumed: FitState | None = None,
     keep: Callable[[FitState], object] | None = None,
     begin: Callable[[], object] = lambda: None,
+    *,
+    seconds: float | None = None,
 ) -> tuple[FitState, FitInfo]:
     """Run the fit; `observe` sees each step, `keep` is called now and then, and before leaving on a signal.
 
     `begin` is called once there is a first step, and so something in place of what was there before.
     """
     try:
-        return _watched_steps(fit_steps(frames, config, resumed), observe, keep, begin)
+        return _watched_steps(fit_steps(frames, config, resumed), observe, keep, begin, seconds)
     except FitDiverged as error:
         raise _diverged(error, keep) from error
 
@@ -461,16 +366,17 @@ def _watched_steps(
     observe: Observer,
     keep: Callable[[FitState], object] | None,
     begin: Callable[[], object],
+    seconds: float | None,
 ) -> tuple[FitState, FitInfo]:
     """The last of the steps; a signal ends them, once what is done is kept."""
-    with _signals() as asked:
+    with noted_signals() as asked:
         kept_at = time.monotonic()
         for state, info in steps:
             if not asked.stepping:
                 asked.stepping = True
                 begin()
             observe(state, info)  # first: what is kept at a step is in the history
-            if keep is not None and time.monotonic() - kept_at > CHECKPOINT_SECONDS:
+            if keep is not None and time.monotonic() - kept_at > (CHECKPOINT_SECONDS if seconds is None else seconds):
                 _keep_if_possible(keep, state)
                 kept_at = time.monotonic()
             if asked.name and info.progress < 1:
@@ -508,38 +414,6 @@ def _stopped(name: str, state: FitState, info: FitInfo, keep: Callable[[FitState
         return Stopped(f"stopped by {name} after step {info.step}; nothing was kept.")
     keep(state)
     return Stopped(f"stopped by {name} after step {info.step}; add --resume to go on from there.")
-
-
-@dataclasses.dataclass
-class _Asked:
-    """The signal that asked a fit to stop; and whether it had taken a step by then, which must not be cut in half."""
-
-    name: str = ""
-    stepping: bool = False
-
-
-@contextmanager
-def _signals() -> Iterator[_Asked]:
-    """Note SIGINT and SIGTERM, for the end of a step; before the first step they stop at once, as a second SIGINT."""
-    asked, before = _Asked(), {}
-
-    def note(number, frame) -> None:
-        asked.name = asked.name or signal.Signals(number).name
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if not asked.stepping:
-            raise KeyboardInterrupt
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, note)
-    try:
-        yield asked
-    except KeyboardInterrupt as error:
-        if asked.stepping:
-            raise
-        raise Stopped(f"stopped by {asked.name} before the first step.") from error
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _draw_curves(path: Path, history: Path) -> None:

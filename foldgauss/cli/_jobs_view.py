@@ -1,0 +1,186 @@
+"""How many jobs at once are shown: one bar for all and one for each that runs, lines in a log, or JSON."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from foldgauss._progress import Manner, print_json
+from foldgauss.cli._app import Stopped, WrongUse, err
+from foldgauss.cli._signals import noted_signals
+from foldgauss.jobs import FitJob, Outcome, local_workers, run_here, run_on, running_cluster
+from foldgauss.jobs import Progress as Share
+from foldgauss.jobs import Stopped as JobsStopped
+
+#: Seconds between two lines of a log; the first comes sooner, since something may be misspelt.
+FIRST_LINE, LINE = 10.0, 30.0
+
+
+def run_jobs(
+    jobs: Sequence[FitJob],
+    what: str,
+    manner: Manner,
+    *,
+    workers: int | None,
+    scheduler: str | None,
+    threads: int | None,
+    on_end: Callable[[Outcome], None] = lambda outcome: None,
+    cure: str,
+) -> list[Outcome]:
+    """Do the jobs, by workers where any are asked for, and show how far they are; outcomes in the order of the jobs.
+
+    Ctrl-C and SIGTERM end them, once what is done is kept: raises `Stopped`, which says how to go on, by `cure`.
+    """
+    ended: dict[str, Outcome] = {}
+    with noted_signals() as asked, _shown(what, len(jobs), manner) as view:
+        asked.stepping = True  # what comes is kept at any moment
+        with _crew(workers, scheduler, threads) as client:
+            how = {"asked_to_stop": lambda: bool(asked.name)}
+            outcomes = run_here(jobs, view.watch, **how) if client is None else run_on(client, jobs, view.watch, **how)
+            try:
+                for outcome in outcomes:
+                    ended[outcome.job.target] = outcome
+                    view.ended(outcome)
+                    on_end(outcome)
+            except JobsStopped as error:
+                done = sum(outcome.failure is None for outcome in ended.values())
+                told = (
+                    f"stopped by {asked.name or 'the worker'}; {done} of {len(jobs)} {what} are done, the others kept"
+                )
+                raise Stopped(f"{told}. {cure}") from error
+    return [ended[job.target] for job in jobs]
+
+
+def check_crew(workers: int | None, scheduler: str | None, threads: int | None) -> None:
+    """Raise WrongUse for options that do not go together."""
+    if scheduler is not None and (workers is not None or threads is not None):
+        other = "--workers" if workers is not None else "--threads"
+        raise WrongUse(f"{other}: expected no --scheduler beside it, which has workers of its own. Leave one out.")
+    if threads is not None and workers is None:
+        raise WrongUse("--threads: expected --workers beside it. Of this process: FOLDGAUSS_NUM_THREADS.")
+
+
+def crew_of(workers: int | None, scheduler: str | None, threads: int | None) -> str:
+    if scheduler is not None:
+        return f"the workers of {scheduler}"
+    if workers is None:
+        return "this process"
+    each = "" if threads is None else f" of {threads} thread{'' if threads == 1 else 's'}"
+    return f"{workers} worker{'' if workers == 1 else 's'}{each}"
+
+
+def _crew(workers: int | None, scheduler: str | None, threads: int | None) -> AbstractContextManager:
+    if scheduler is not None:
+        return running_cluster(scheduler)
+    return nullcontext() if workers is None else local_workers(workers, threads=threads)
+
+
+class _View:
+    """What is told of jobs; by itself nothing."""
+
+    def __init__(self, what: str, total: int):
+        self.what, self.total, self.done, self.failed = what, total, 0, 0
+        self.shares: dict[str, Share] = {}
+
+    def watch(self, share: Share) -> None:
+        self.shares[share.name] = share
+
+    def ended(self, outcome: Outcome) -> None:
+        self.shares.pop(outcome.job.name, None)
+        self.done += outcome.failure is None
+        self.failed += outcome.failure is not None
+
+    @property
+    def completed(self) -> float:
+        return self.done + self.failed + sum(share.share for share in self.shares.values())
+
+    @property
+    def counts(self) -> str:
+        failed = f", {self.failed} failed" if self.failed else ""
+        return f"{self.done} of {self.total} {self.what} done{failed}"
+
+
+def _told(share: Share) -> str:
+    psnr = f"{share.psnr:.2f} dB" if math.isfinite(share.psnr) else ""
+    return f"{share.step} steps  {psnr}  {share.num_gaussians:,} Gaussians"
+
+
+class _Bars(_View):
+    def __init__(self, what: str, total: int, progress: Progress):
+        super().__init__(what, total)
+        self.progress, self.begun = progress, time.monotonic()
+        self.all = progress.add_task(self.counts, total=total, told="starting")
+        self.tasks: dict[str, TaskID] = {}
+
+    def watch(self, share: Share) -> None:
+        super().watch(share)
+        if share.name not in self.tasks:
+            self.tasks[share.name] = self.progress.add_task(f"  {share.name}", total=1.0, told="")
+        self.progress.update(self.tasks[share.name], completed=share.share, told=_told(share))
+        self._whole()
+
+    def ended(self, outcome: Outcome) -> None:
+        super().ended(outcome)
+        if outcome.job.name in self.tasks:
+            self.progress.remove_task(self.tasks.pop(outcome.job.name))
+        if outcome.failure is not None:
+            self.progress.console.print(f"failed: {outcome.job.name}: {outcome.failure}", soft_wrap=True)
+        self._whole()
+
+    def _whole(self) -> None:
+        passed, share = time.monotonic() - self.begun, self.completed / self.total
+        left = f"{passed * (1 - share) / share:.0f} s left" if 0.02 < share < 1 else ""
+        self.progress.update(self.all, description=self.counts, completed=self.completed, told=left)
+
+
+class _Lines(_View):
+    def __init__(self, what: str, total: int):
+        super().__init__(what, total)
+        self.next = time.monotonic() + FIRST_LINE
+
+    def watch(self, share: Share) -> None:
+        super().watch(share)
+        if time.monotonic() >= self.next:
+            self.next = time.monotonic() + LINE
+            running = (f"{one.name} {one.share:.0%} ({one.psnr:.1f} dB)" for one in self.shares.values())
+            err.print(f"{self.counts}; {', '.join(running)}", soft_wrap=True)
+
+    def ended(self, outcome: Outcome) -> None:
+        super().ended(outcome)
+        if outcome.failure is not None:
+            err.print(f"failed: {outcome.job.name}: {outcome.failure}", soft_wrap=True)
+        elif self.done < self.total:
+            err.print(f"{self.counts}: {outcome.job.name}, {outcome.record['mean_psnr']:.2f} dB", soft_wrap=True)
+
+
+class _Json(_View):
+    def watch(self, share: Share) -> None:
+        super().watch(share)
+        finite = {name: value for name, value in share._asdict().items() if value == value and value != math.inf}
+        print_json("progress", finite)
+
+    def ended(self, outcome: Outcome) -> None:
+        super().ended(outcome)
+        if outcome.failure is not None:
+            print_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
+        else:
+            figures = {name: outcome.record[name] for name in ("mean_psnr", "mean_ssim", "seconds", "steps")}
+            print_json("ended", {"name": outcome.job.name} | figures)
+
+
+@contextmanager
+def _shown(what: str, total: int, manner: Manner) -> Iterator[_View]:
+    if manner != "bar":
+        kinds = {"lines": _Lines, "json": _Json, "quiet": _View}
+        yield kinds[manner](what, total)
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[told]}"),
+    )
+    with Progress(*columns, console=err) as progress:
+        yield _Bars(what, total, progress)

@@ -1,0 +1,145 @@
+"""`fit` of a long clip: in segments, by workers if asked."""
+
+import shutil
+import time
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from foldgauss._progress import Manner, print_json
+from foldgauss._threads import available_cores
+from foldgauss.cli._app import Stopped, WrongUse, as_option, err, out
+from foldgauss.cli._jobs_view import crew_of, run_jobs
+from foldgauss.cli._shared import print_figures, progress_bar
+from foldgauss.jobs import LongFit, Outcome, plan_long_fit, segments_folder
+from foldgauss.jobs.long import SEGMENT_SECONDS
+from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
+
+Crew = tuple[int | None, str | None, int | None]  # workers, scheduler, threads of each worker
+
+
+def fit_in_segments(
+    video: Path,
+    target: Path,
+    config: FitConfig,
+    manner: Manner,
+    *,
+    size: tuple[int, int] | None,
+    frames: tuple[int | None, int | None] | None,
+    segment_seconds: float | None,
+    crew: Crew,
+    checkpoint_seconds: float | None,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Plan, fit, join, tell. What is done is taken up where the same is asked again."""
+    begun, folder = time.monotonic(), segments_folder(target)
+    workers, scheduler, threads = crew
+    if resume and not folder.is_dir():
+        raise WrongUse(f"--resume: expected a stopped fit in {folder}, got none. Start it without --resume.")
+    if overwrite and not resume and folder.is_dir():
+        _clear(folder)
+    asked = {"size": size, "frames": frames, "checkpoint_seconds": checkpoint_seconds}
+    asked["segment_seconds"] = SEGMENT_SECONDS if segment_seconds is None else segment_seconds
+    fit = _planned(video, target, config, manner, asked)
+    if workers is not None and threads is None:
+        threads = max(1, available_cores() // workers)
+    _say_plan(fit, config, manner, video, crew_of(workers, scheduler, threads))
+    again = "Give the same command again to go on."
+    how = {"workers": workers, "scheduler": scheduler, "threads": threads}
+    outcomes = run_jobs(fit.jobs, "segments", manner, cure=again, **how)
+    _say_warnings(outcomes)
+    failed = [outcome for outcome in outcomes if outcome.failure is not None]
+    if failed:
+        first = f"{failed[0].job.name}: {failed[0].failure}"
+        raise Stopped(
+            f"{len(failed)} of {len(outcomes)} segments failed, the others are kept in {fit.folder}. {first} {again}"
+        )
+    records = {outcome.job.name: outcome.record for outcome in outcomes}
+    shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
+    with progress_bar("Joining", max(shared, 1), shown=manner == "bar" and shared > 0) as advance:
+        joined = fit.join(records, on_frame=advance)
+    fit.tidy()
+    height, width = outcomes[0].record["size"]
+    figures = {
+        "mean_psnr": round(joined.mean_psnr, 3),
+        "mean_ssim": round(joined.mean_ssim, 4),
+        "lowest_psnr": round(min(joined.psnr), 3),
+        "num_segments": len(outcomes),
+        "num_frames": fit.index.num_frames,
+        "height": height,
+        "width": width,
+        "num_gaussians": sum(outcome.record["num_gaussians"] for outcome in outcomes),
+        "degree": config.degree,
+        "fit_seconds": round(sum(outcome.record["seconds"] for outcome in outcomes), 2),
+        "wall_seconds": round(time.monotonic() - begun, 2),
+        "file_bytes": target.stat().st_size,
+    }
+    if joined.seam_drop is not None:
+        figures["seam_drop"] = round(joined.seam_drop, 3)
+    if manner == "json":
+        print_json("done", {"model": str(target)} | figures)
+    elif manner != "quiet":
+        print_figures(str(target), figures)
+
+
+def _clear(folder: Path) -> None:
+    """Remove the parts of a fit that is begun anew; a folder with other things in it is refused."""
+    own = ("segment-", ".segment-", "plan.json", ".plan.", "index.npz", ".index.", ".lock")
+    foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(own))
+    if foreign:
+        raise WrongUse(f"--out: expected {folder} to hold parts of a fit, got {foreign[0]!r} in it. Move it away.")
+    shutil.rmtree(folder)
+
+
+def _planned(video: Path, target: Path, config: FitConfig, manner: Manner, asked: dict[str, Any]) -> LongFit:
+    """The plan, for which the whole clip is looked through once: that is shown."""
+    status = err.status("Looking through the clip") if manner == "bar" else None
+    count = 0
+
+    def on_frame() -> None:
+        nonlocal count
+        count += 1
+        if status is not None and count % 25 == 0:
+            status.update(f"Looking through the clip: {count:,} frames")
+
+    try:
+        with nullcontext() if status is None else status:
+            return plan_long_fit(video, target, config, on_frame=on_frame, **asked)
+    except ValueError as error:
+        if str(error).startswith(("segment_seconds", "resume")):
+            raise WrongUse(as_option(str(error))) from error
+        raise
+
+
+def _say_plan(fit: LongFit, config: FitConfig, manner: Manner, video: Path, crew: str) -> None:
+    index = fit.index
+    for note in index.notes:
+        err.print(f"warning: {video}: {note}", soft_wrap=True)
+    lengths = [stop - first for first, stop in fit.spans]
+    pairs = zip(fit.spans[:-1], fit.spans[1:], strict=True)
+    at_cuts = sum(before[1] == after[0] for before, after in pairs)
+    size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
+    num = chosen_num_gaussians(config, max(lengths), *size)
+    steps = planned_steps(config, max(lengths))
+    if manner == "json":
+        about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
+        print_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
+    if manner in ("json", "quiet"):
+        return
+    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
+    plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
+    span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
+    where = f" ({at_cuts} end at cuts)" if at_cuts else ""
+    segments = "1 segment" if len(lengths) == 1 else f"{len(lengths)} segments"
+    out.print(
+        f"{video}: {index.num_frames:,} frames of {size[0]}x{size[1]} in {segments} of {span} frames{where}, "
+        f"each with {num:,} Gaussians of degree {config.degree} and {plan}, by {crew}",
+        soft_wrap=True,
+    )
+
+
+def _say_warnings(outcomes: list[Outcome]) -> None:
+    for outcome in outcomes:
+        for text in (outcome.record or {}).get("warnings", ()):
+            err.print(f"warning: {outcome.job.name}: {text}", soft_wrap=True)

@@ -1,0 +1,296 @@
+"""Who does the jobs: this process, or the workers of dask.distributed, here or on a cluster.
+
+Nothing of a job is lost with who does it: see `fitting`. dask replaces workers that die and gives their jobs to others;
+what is here gives a job up that kills whoever takes it.
+"""
+
+import dataclasses
+import os
+import queue
+import secrets
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any
+
+from foldgauss._checks import invalid, whole
+from foldgauss._threads import available_cores
+from foldgauss.jobs.fitting import FitJob, Progress, Stopped, fit_job
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+#: A job whose worker dies so often without a new checkpoint is given up; dask counts the deaths between.
+FRUITLESS = 3
+#: Seconds that workers have to keep what they do, once they are asked to stop.
+GRACE = 60.0
+#: Seconds that a cluster may be without workers.
+NO_WORKERS = 120.0
+_POLL = 0.2
+
+
+class SchedulerLost(OSError):
+    """The scheduler is gone; what is done is kept."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of a job: its record, or why there is none, in one line."""
+
+    job: FitJob
+    record: dict[str, Any] | None = None
+    failure: str | None = None
+
+
+Watch = Callable[[Progress], None]
+
+
+def run_here(jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False):
+    """Outcomes of the jobs, one after another, done by this process.
+
+    Raises `Stopped` at a job that stops, since `asked_to_stop` says so; it is kept.
+    """
+    for job in jobs:
+
+        def tell(progress: Progress) -> bool:
+            watch(progress)
+            return not asked_to_stop()
+
+        if asked_to_stop():
+            raise Stopped("stopped between two jobs")
+        yield _tried(job, tell)
+
+
+def _tried(job: FitJob, tell: Callable[[Progress], bool]) -> Outcome:
+    """The outcome of a job done here; what is wrong with its clip or its disk is one."""
+    try:
+        return Outcome(job, fit_job(job, tell))
+    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+        return Outcome(job, failure=one_line(error))
+
+
+def one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    plain = isinstance(error, ValueError | OSError) and text
+    return text if plain else f"{type(error).__name__}: {text}"[:300]
+
+
+@contextmanager
+def local_workers(count: int, *, threads: int | None = None) -> Iterator["Client"]:
+    """A client of `count` processes of this machine, each with `threads` of its cores (default: an equal share).
+
+    Workers end with this process, however it ends, and are replaced when they die. Raises ValueError for counts that
+    are none, ImportError where dask.distributed is not installed.
+    """
+    for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
+        if not whole(value, 1):
+            raise invalid(name, expected="a whole number >= 1", got=repr(value))
+    distributed = _distributed("workers")
+    import dask
+
+    threads = max(1, available_cores() // count) if threads is None else threads
+    environment = {"FOLDGAUSS_NUM_THREADS": str(threads)}
+    if threads == 1:
+        flags = os.environ.get("XLA_FLAGS", "")
+        environment["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+    settings = {
+        "distributed.worker.profile.enabled": False,
+        "distributed.scheduler.allowed-failures": FRUITLESS - 1,
+        "distributed.admin.system-monitor.gil.enabled": False,
+    }
+    with ExitStack() as stack:
+        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="foldgauss-", ignore_cleanup_errors=True))
+        stack.enter_context(dask.config.set(settings))
+        cluster = distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,  # a worker that is stopped for its memory would be stopped again
+            dashboard_address=None,
+            local_directory=scratch,
+            silence_logs=50,
+            env=environment,
+        )
+        stack.enter_context(cluster)
+        yield stack.enter_context(distributed.Client(cluster, set_as_default=False))
+
+
+@contextmanager
+def running_cluster(address: str) -> Iterator["Client"]:
+    """A client of the scheduler at `address`, as tcp://host:8786. Its workers must find clips and outputs by the same
+    paths, and are best started with one thread each, `dask worker --nthreads 1`, as a job has threads of its own.
+
+    Raises `SchedulerLost` where none answers, ImportError where dask.distributed is not installed.
+    """
+    distributed = _distributed("scheduler")
+    try:
+        client = distributed.Client(address, set_as_default=False, timeout="10s")
+    except (OSError, TimeoutError, ValueError) as error:
+        got = f"{address!r}, where none answers ({one_line(error)})"
+        cure = "Start one: dask scheduler; dask worker ADDRESS --nthreads 1."
+        raise SchedulerLost(
+            str(invalid("scheduler", expected="the address of a running one", got=got, cure=cure))
+        ) from error
+    with client:
+        yield client
+
+
+def _distributed(what: str):
+    try:
+        import distributed
+    except ImportError as error:
+        raise ImportError(f"{what}: needs dask.distributed: pip install 'foldgauss[distributed]'.") from error
+    return distributed
+
+
+def run_on(
+    client: "Client", jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
+) -> Iterator[Outcome]:
+    """Outcomes of the jobs in the order in which they end, done by the workers of `client`.
+
+    Raises `Stopped` once `asked_to_stop` says so and the workers have kept what they do, `SchedulerLost`.
+    """
+    yield from _Run(client, jobs, watch, asked_to_stop).outcomes()
+
+
+class _Run:
+    """Jobs on their way."""
+
+    def __init__(self, client: "Client", jobs: Sequence[FitJob], watch: Watch, asked_to_stop: Callable[[], bool]):
+        from distributed import Event
+
+        self.client, self.watch, self.asked_to_stop = client, watch, asked_to_stop
+        self.topic = f"foldgauss-{secrets.token_hex(6)}"
+        self.stop = Event(self.topic, client=client)
+        self.told: queue.SimpleQueue = queue.SimpleQueue()
+        self.waiting, self.ended = deque(jobs), queue.SimpleQueue()
+        self.open: dict[str, tuple[Any, FitJob]] = {}
+        self.deaths: dict[str, tuple[int, Any]] = {}
+        self.seen = time.monotonic()  # workers
+
+    def outcomes(self) -> Iterator[Outcome]:
+        # Events come on the client's own thread, and go to `watch` on this one.
+        self.client.subscribe_topic(self.topic, lambda event: self.told.put(event[1]))
+        try:
+            while self.waiting or self.open:
+                self._fill()
+                yield from self._some()
+        finally:
+            self._leave()
+
+    def _fill(self) -> None:
+        """Give out as many jobs as there are threads, and no more: dask blames each that a worker had when it died."""
+        if not self._lives():
+            raise SchedulerLost(_LOST)
+        threads = sum(self.client.nthreads().values())
+        if threads:
+            self.seen = time.monotonic()
+        elif time.monotonic() - self.seen > NO_WORKERS:
+            raise SchedulerLost(
+                f"scheduler: expected workers, got none for {NO_WORKERS:g} s. What is finished is kept."
+            )
+        while self.waiting and len(self.open) < threads:
+            self._submit(self.waiting.popleft())
+
+    def _submit(self, job: FitJob) -> None:
+        key = f"{self.topic}-{secrets.token_hex(6)}"
+        future = self.client.submit(_work, job, self.topic, key=key, pure=False)
+        self.open[key] = (future, job)
+        future.add_done_callback(lambda done: self.ended.put(done.key))
+
+    def _lives(self) -> bool:
+        return self.client.status in ("running", "connecting")
+
+    def _some(self) -> Iterator[Outcome]:
+        """What has come within a moment."""
+        try:
+            key = self.ended.get(timeout=_POLL)
+        except queue.Empty:
+            key = None
+        while not self.told.empty():
+            self.watch(Progress(*self.told.get()))
+        if key in self.open:
+            outcome = self._outcome(*self.open.pop(key))
+            if outcome is not None:
+                yield outcome
+        if self.asked_to_stop():
+            self._stop()
+
+    def _outcome(self, future: Any, job: FitJob) -> Outcome | None:
+        """Of a job that has ended; None of one that is given to another worker."""
+        from distributed import CancelledError, KilledWorker
+
+        if future.status == "cancelled":
+            raise SchedulerLost(_LOST)
+        try:
+            record, failure = future.result()
+        except KilledWorker:
+            return self._again(job)
+        except CancelledError as error:
+            raise SchedulerLost(_LOST) from error
+        except Stopped:
+            raise
+        except Exception as error:  # of the worker's own, as of a foldgauss that is none or another there
+            return Outcome(job, failure=one_line(error))
+        return Outcome(job, record, failure)
+
+    def _again(self, job: FitJob) -> Outcome | None:
+        """A job whose workers died: once more while it gets on."""
+        count, before = self.deaths.get(job.target, (0, None))
+        now = _when(job)
+        if now == before:
+            return Outcome(
+                job,
+                failure=f"{job.name}: its worker died {FRUITLESS * (count + 1)} times without getting on. "
+                "Most likely memory is short: take fewer workers, shorter segments or smaller frames.",
+            )
+        self.deaths[job.target] = (count + 1, now)
+        self.waiting.appendleft(job)
+        return None
+
+    def _stop(self) -> None:
+        """Ask the workers to keep what they do, and wait for that."""
+        self.stop.set()
+        until = time.monotonic() + GRACE
+        while time.monotonic() < until and not all(future.done() for future, _ in self.open.values()):
+            time.sleep(_POLL)
+        raise Stopped("stopped")
+
+    def _leave(self) -> None:
+        try:
+            self.client.unsubscribe_topic(self.topic)
+            self.client.cancel([future for future, _ in self.open.values()])
+        except Exception:  # the scheduler is gone, and all this with it
+            return
+
+
+_LOST = (
+    "scheduler: expected one that lives, got one that is gone. What is finished is kept: give the command again, "
+    "with a scheduler that runs."
+)
+
+
+def _when(job: FitJob) -> tuple[int, int] | None:
+    """What tells one checkpoint of a job from the next."""
+    try:
+        stat = os.stat(job.kept)
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_size
+
+
+def _work(job: FitJob, topic: str) -> tuple[dict[str, Any] | None, str | None]:
+    """A worker's part: the record of a job, or its failure."""
+    from distributed import Event, get_worker
+
+    worker = get_worker()
+    stop = Event(topic)
+
+    def tell(progress: Progress) -> bool:
+        worker.log_event(topic, tuple(progress))
+        return not stop.is_set()
+
+    outcome = _tried(job, tell)
+    return outcome.record, outcome.failure
