@@ -36,9 +36,9 @@ def run_jobs(
     ended: dict[str, Outcome] = {}
     with noted_signals() as asked, _shown(what, len(jobs), manner) as view:
         asked.stepping = True  # what comes is kept at any moment
-        with _crew(workers, scheduler, threads) as client:
+        with _crew(workers, scheduler, threads) as crew:
             how = {"asked_to_stop": lambda: bool(asked.name)}
-            outcomes = run_here(jobs, view.watch, **how) if client is None else run_on(client, jobs, view.watch, **how)
+            outcomes = run_here(jobs, view.watch, **how) if crew is None else run_on(crew, jobs, view.watch, **how)
             try:
                 for outcome in outcomes:
                     ended[outcome.job.target] = outcome

@@ -5,6 +5,7 @@ what is here gives a job up that kills whoever takes it.
 """
 
 import dataclasses
+import logging
 import os
 import queue
 import secrets
@@ -28,6 +29,8 @@ FRUITLESS = 3
 GRACE = 60.0
 #: Seconds that a cluster may be without workers.
 NO_WORKERS = 120.0
+#: Seconds that workers of this machine may be missing before others are started; twice as long each time.
+MEND_SECONDS = 20.0
 _POLL = 0.2
 
 
@@ -77,9 +80,54 @@ def one_line(error: BaseException) -> str:
     return text if plain else f"{type(error).__name__}: {text}"[:300]
 
 
+class Crew:
+    """Workers of dask.distributed, as `local_workers` and `running_cluster` give them."""
+
+    def __init__(self, client: "Client", cluster: Any = None, count: int = 0):
+        self.client, self._cluster, self._count = client, cluster, count
+        self._since, self._patience = time.monotonic(), MEND_SECONDS
+
+    @property
+    def threads(self) -> int:
+        """Jobs that can be done at once, now. Raises `SchedulerLost`."""
+        try:
+            if self.client.status not in ("running", "connecting"):
+                raise SchedulerLost(_LOST)
+            return sum(self.client.nthreads().values())
+        except (OSError, TimeoutError) as error:
+            raise SchedulerLost(_LOST) from error
+
+    def mend(self, alive: int) -> None:
+        """Bring workers of this machine in place of those that stay away.
+
+        Who dies at work is replaced by dask; who dies while it starts, is not.
+        """
+        now = time.monotonic()
+        if alive >= self._count:
+            self._since, self._patience = now, MEND_SECONDS
+        elif now - self._since > self._patience:
+            self._since, self._patience = now, 2 * self._patience  # starting takes long on a busy machine
+            self._cluster.scale(alive)  # those that are not there are the first to be given up
+            self._cluster.scale(self._count)
+
+
 @contextmanager
-def local_workers(count: int, *, threads: int | None = None) -> Iterator["Client"]:
-    """A client of `count` processes of this machine, each with `threads` of its cores (default: an equal share).
+def _silenced() -> Iterator[None]:
+    """dask tells of each worker that dies, with its traceback; who does the jobs is told by their outcomes."""
+    names = ("distributed", "tornado.application", "asyncio")
+    before = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)
+
+
+@contextmanager
+def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]:
+    """A crew of `count` processes of this machine, each with `threads` of its cores (default: an equal share).
 
     Workers end with this process, however it ends, and are replaced when they die. Raises ValueError for counts that
     are none, ImportError where dask.distributed is not installed.
@@ -100,11 +148,11 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Client
         "distributed.scheduler.allowed-failures": FRUITLESS - 1,
         "distributed.admin.system-monitor.gil.enabled": False,
     }
-    with ExitStack() as stack:
+    with ExitStack() as stack, _silenced():
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="foldgauss-", ignore_cleanup_errors=True))
         stack.enter_context(dask.config.set(settings))
         cluster = distributed.LocalCluster(
-            n_workers=count,
+            n_workers=0,  # for `Crew.mend` to bring: one that dies while it starts is no reason to fail
             threads_per_worker=1,
             processes=True,
             memory_limit=None,  # a worker that is stopped for its memory would be stopped again
@@ -114,12 +162,14 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Client
             env=environment,
         )
         stack.enter_context(cluster)
-        yield stack.enter_context(distributed.Client(cluster, set_as_default=False))
+        crew = Crew(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
+        cluster.scale(count)
+        yield crew
 
 
 @contextmanager
-def running_cluster(address: str) -> Iterator["Client"]:
-    """A client of the scheduler at `address`, as tcp://host:8786. Its workers must find clips and outputs by the same
+def running_cluster(address: str) -> Iterator["Crew"]:
+    """The crew of the scheduler at `address`, as tcp://host:8786. Its workers must find clips and outputs by the same
     paths, and are best started with one thread each, `dask worker --nthreads 1`, as a job has threads of its own.
 
     Raises `SchedulerLost` where none answers, ImportError where dask.distributed is not installed.
@@ -134,7 +184,7 @@ def running_cluster(address: str) -> Iterator["Client"]:
             str(invalid("scheduler", expected="the address of a running one", got=got, cure=cure))
         ) from error
     with client:
-        yield client
+        yield Crew(client)
 
 
 def _distributed(what: str):
@@ -146,24 +196,24 @@ def _distributed(what: str):
 
 
 def run_on(
-    client: "Client", jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
+    crew: Crew, jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
 ) -> Iterator[Outcome]:
-    """Outcomes of the jobs in the order in which they end, done by the workers of `client`.
+    """Outcomes of the jobs in the order in which they end, done by the workers of `crew`.
 
     Raises `Stopped` once `asked_to_stop` says so and the workers have kept what they do, `SchedulerLost`.
     """
-    yield from _Run(client, jobs, watch, asked_to_stop).outcomes()
+    yield from _Run(crew, jobs, watch, asked_to_stop).outcomes()
 
 
 class _Run:
     """Jobs on their way."""
 
-    def __init__(self, client: "Client", jobs: Sequence[FitJob], watch: Watch, asked_to_stop: Callable[[], bool]):
+    def __init__(self, crew: Crew, jobs: Sequence[FitJob], watch: Watch, asked_to_stop: Callable[[], bool]):
         from distributed import Event
 
-        self.client, self.watch, self.asked_to_stop = client, watch, asked_to_stop
+        self.crew, self.client, self.watch, self.asked_to_stop = crew, crew.client, watch, asked_to_stop
         self.topic = f"foldgauss-{secrets.token_hex(6)}"
-        self.stop = Event(self.topic, client=client)
+        self.stop = Event(self.topic, client=crew.client)
         self.told: queue.SimpleQueue = queue.SimpleQueue()
         self.waiting, self.ended = deque(jobs), queue.SimpleQueue()
         self.open: dict[str, tuple[Any, FitJob]] = {}
@@ -182,9 +232,8 @@ class _Run:
 
     def _fill(self) -> None:
         """Give out as many jobs as there are threads, and no more: dask blames each that a worker had when it died."""
-        if not self._lives():
-            raise SchedulerLost(_LOST)
-        threads = sum(self.client.nthreads().values())
+        threads = self.crew.threads
+        self.crew.mend(threads)
         if threads:
             self.seen = time.monotonic()
         elif time.monotonic() - self.seen > NO_WORKERS:
@@ -199,9 +248,6 @@ class _Run:
         future = self.client.submit(_work, job, self.topic, key=key, pure=False)
         self.open[key] = (future, job)
         future.add_done_callback(lambda done: self.ended.put(done.key))
-
-    def _lives(self) -> bool:
-        return self.client.status in ("running", "connecting")
 
     def _some(self) -> Iterator[Outcome]:
         """What has come within a moment."""
