@@ -279,6 +279,7 @@ _LABELS = {
     "degree": ("degree of the folds", "{}"),
     "fit_seconds": ("time spent fitting", "{:.1f} s"),
     "wall_seconds": ("time in all", "{:.1f} s"),
+    "peak_mib": ("most memory of a process that fits", "{:,} MiB"),
     "num_segments": ("segments", "{:,}"),
     "seam_drop": ("PSNR lost where segments meet", "{:.2f} dB"),
     "steps": ("steps", "{:,}"),

@@ -68,6 +68,9 @@ def fit_in_segments(
         "wall_seconds": round(time.monotonic() - begun, 2),
         "file_bytes": target.stat().st_size,
     }
+    peaks = [outcome.record["peak_bytes"] for outcome in outcomes]
+    if None not in peaks:
+        figures["peak_mib"] = round(max(peaks) / 2**20)
     if joined.seam_drop is not None:
         figures["seam_drop"] = round(joined.seam_drop, 3)
     if manner == "json":
