@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 FRUITLESS = 3
 #: Seconds that workers have to keep what they do, once they are asked to stop.
 GRACE = 60.0
+#: Seconds that a scheduler has to answer.
+CONNECT_SECONDS = 10.0
 #: Seconds that a cluster may be without workers.
 NO_WORKERS = 120.0
 #: Seconds that workers of this machine may be missing before others are started; twice as long each time.
@@ -182,7 +184,7 @@ def running_cluster(address: str) -> Iterator["Crew"]:
 
 def _client(distributed: Any, address: str) -> "Client":
     try:
-        return distributed.Client(address, set_as_default=False, timeout="10s")
+        return distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
     except (OSError, TimeoutError, ValueError) as error:
         got = f"{address!r}, where none answers ({one_line(error)})"
         cure = "Start one: dask scheduler; dask worker ADDRESS --nthreads 1."
