@@ -116,6 +116,12 @@ def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
 # ---------------------------------------------------------------------------------------------- loading
 
 
+def is_segmented(path: str | os.PathLike) -> bool:
+    """Whether a file holds a video in segments; no tensor is read. Raises as `load_video_model`."""
+    path = checked_path(path)
+    return not is_compact(path) and read_header(path)["kind"] == SEGMENTED
+
+
 def load_segmented(path: Path, about: dict) -> SegmentedVideo:
     """The video in a file whose `read_header` is `about`: no tensor is read until a segment's model is asked for.
 
