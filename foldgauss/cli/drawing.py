@@ -49,6 +49,7 @@ from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
 from foldgauss.io.video_model import load_video_model, read_metadata, read_origin
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
+from foldgauss.video.metrics import Evaluation
 from foldgauss.video.model import VideoModel
 from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.stored import stored_counts, to_stored
@@ -217,6 +218,8 @@ def evaluate_command(
 ) -> None:
     """Compare a model with its clip: PSNR and SSIM of every frame.
 
+    Of a model in segments those of each segment are shown; --json has the frames'.
+
     Tells the size of the file, its bits per pixel and how fast it is drawn, too.
     """
     if json_path is not None:
@@ -237,8 +240,19 @@ def evaluate_command(
     figures["frames_per_second"] = round(frames_per_second(model), 1)
     if json_path is not None:
         write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
-    print_frames(scores)
+    _print_segments(model, scores) if isinstance(model, SegmentedVideo) else print_frames(scores)
     print_figures(str(model_path), figures)
+
+
+def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:
+    """A row for each segment, by the frames that it begins: those of a clip of hours are too many for a screen."""
+    table = Table("segment", "frames", "PSNR (dB)", "lowest", "SSIM")
+    stops = [segment.first for segment in model.segments[1:]] + [model.num_frames]
+    for number, (segment, stop) in enumerate(zip(model.segments, stops, strict=True)):
+        psnr, ssim = scores.psnr[segment.first : stop], scores.ssim[segment.first : stop]
+        quality = (f"{np.mean(psnr):.2f}", f"{min(psnr):.2f}", f"{np.mean(ssim):.4f}")
+        table.add_row(str(number), f"{segment.first:,}:{stop:,}", *quality)
+    out.print(table)
 
 
 @app.command()
@@ -269,7 +283,9 @@ def info(model_path: ModelFile) -> None:
 
 def _print_facts(model_path: Path, figures: dict[str, str], about: dict) -> None:
     table = Table(title=str(model_path), show_header=False)
-    for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
+    # What was noted of the frames fitted to stands beside what the model's own frames are.
+    noted = {f"{k} of the clip" if k in figures else k: short(v) for k, v in about.items() if v is not None}
+    for name, value in (figures | noted).items():
         table.add_row(name, value)
     out.print(table)
 
@@ -277,7 +293,7 @@ def _print_facts(model_path: Path, figures: dict[str, str], about: dict) -> None
 def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> None:
     """What the header says: no model is loaded."""
     cuts, fades = len(model.cuts), len(model.segments) - 1 - len(model.cuts)
-    joints = f", {cuts:,} meet at a cut, {fades:,} fade into the next" if len(model.segments) > 1 else ""
+    joints = f"; joined by {cuts:,} cuts and {fades:,} fades" if len(model.segments) > 1 else ""
     figures = {
         "frames": _frames_told(model),
         "segments": f"{len(model.segments):,}{joints}",
