@@ -5,6 +5,7 @@ import gc
 import weakref
 from itertools import pairwise
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -35,7 +36,7 @@ from foldgauss.video import (
 from foldgauss.video.flat import flattened
 from foldgauss.video.playback import Playback
 from foldgauss.video.segments import READY
-from foldgauss.video.shots import time_logits
+from foldgauss.video.shots import is_cut, time_logits
 from foldgauss.video.tradeoff import frames_per_second
 
 #: Spans 0:7, 4:13 (three frames shared), 13:18 (a cut), 17:23 (one shared).
@@ -221,6 +222,7 @@ def test_other_constants_go_to_all_segments():
     assert clip.options == options
     np.testing.assert_array_equal(list(clip.frames()), list(expected.frames()))
     assert np.abs(at(clip, 3) - at(video(), 3)).max() > 0.01
+    assert [segment.model.options for segment in clip.segments] == [options] * 4
     assert video().with_options(video().options).num_frames == NUM_FRAMES
 
 
@@ -251,10 +253,16 @@ def test_positions_are_exact_in_a_clip_of_ten_million_frames():
         assert segment.first - 1 < k <= segment.stop
 
 
+def test_cuts_are_told_from_float64_times():
+    """In float32 all of these are one."""
+    times = 0.5 + 1e-9 * np.array([0, 1, 2, 3, 23, 24])
+    assert list(is_cut(times)) == [False, False, False, True, False]
+    np.testing.assert_array_equal(is_cut(jnp.float32([0, 1, 2, 3, 23, 24])), is_cut(times))
+
+
 def test_even_times_of_a_long_clip_have_no_cuts():
-    """float32 has no such times: their steps come out as 0, 6e-8 or 1.2e-7."""
-    times = long_clip(3_000_000).frame_times.times()
-    positions = np.array([0.5, 1234567.25, 2_999_998.75])
+    times = long_clip(300_000).frame_times.times()
+    positions = np.array([0.5, 123456.25, 299_998.75])
     np.testing.assert_allclose(times_at(times, positions) * (len(times) - 1), positions, atol=1e-6)
 
 
@@ -449,6 +457,8 @@ def test_plans_of_known_clips():
     assert plan_segments(100, [50], length=100, overlap=5) == [(0, 100)]
     assert plan_segments(130, [], length=100, overlap=10) == [(0, 70), (60, 130)]  # evened out
     assert plan_segments(130, [100], length=100, overlap=10) == [(0, 70), (60, 130)]  # 30 frames are too few
+    # Evened out, the last two share less, so that the last does not reach the first.
+    assert plan_segments(33, [9], length=20, overlap=8) == [(0, 20), (12, 25), (20, 33)]
     assert plan_segments(1, [], length=2, overlap=1) == [(0, 1)]
 
 
