@@ -112,7 +112,7 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
     assert run("info", here) == 0
     said = told(capsys)
     for text in (
-        "18 of 40x64 (height x width), 25 a second", "3; joined by 1 cuts and 1 fades", f"{3 * NUM} in all",
+        "18 of 40x64 (height x width), 25 a second", "3; begin at a cut: 1; fade in: 1", f"{3 * NUM} in all",
         "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
         "frames of the clip │ [2, 20]",
     ):  # fmt: skip

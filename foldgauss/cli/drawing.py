@@ -293,7 +293,7 @@ def _print_facts(model_path: Path, figures: dict[str, str], about: dict) -> None
 def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> None:
     """What the header says: no model is loaded."""
     cuts, fades = len(model.cuts), len(model.segments) - 1 - len(model.cuts)
-    joints = f"; joined by {cuts:,} cuts and {fades:,} fades" if len(model.segments) > 1 else ""
+    joints = f"; begin at a cut: {cuts:,}; fade in: {fades:,}" if len(model.segments) > 1 else ""
     figures = {
         "frames": _frames_told(model),
         "segments": f"{len(model.segments):,}{joints}",

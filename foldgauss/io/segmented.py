@@ -1,4 +1,4 @@
-"""Models of a clip's segments in one file, each loaded when it is asked for. The layout is in docs/format.md."""
+"""Models of a clip's segments in one file, each loaded when it is asked for. The layout is in docs/formats.md."""
 
 import math
 import os
