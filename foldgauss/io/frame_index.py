@@ -5,7 +5,8 @@ import hashlib
 import json
 import operator
 import os
-import pickle
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -58,6 +59,18 @@ SAME_TIME = 1e-3
 RUN = 32
 _START, _STEPS = "from the start", "from the start, every frame looked at"
 _FORMAT = 1
+#: What NumPy raises of other files, and we of other arrays.
+_NO_INDEX = (
+    OSError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class FrameIndex:
@@ -97,8 +110,7 @@ class FrameIndex:
         self.has_alpha = bool(transparent.any())
         self.positions = places[len(places) - len(digests) :] - about["start"]
         self._alpha_at: dict[tuple[int, int], bool] = {}
-        #: The margin that was last needed, an index of MARGINS, and whether seeking finds anything at all.
-        self._margin, self._seeks = 0, True
+        self._margin = 0  # that was last needed, a place in MARGINS
 
     def __repr__(self) -> str:
         height, width = self.size
@@ -142,7 +154,7 @@ class FrameIndex:
                 return cls(about, times=arrays.pop("times", None), **arrays)
         except FileNotFoundError:
             raise
-        except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, pickle.UnpicklingError) as error:
+        except _NO_INDEX as error:
             raise video_error(
                 "path",
                 expected="an index of a clip, as FrameIndex.save writes it",
@@ -337,9 +349,8 @@ class _Reel:
         """Frames `first` up to `stop`, of those that decode, as `Clip.frames`; and what else `read_video` tells."""
         with_alpha, prepare, kept = self.has_alpha(size), fit_to(size), _Sheets(stop - first)
 
-        def take(image: np.ndarray) -> int:
+        def take(image: np.ndarray) -> None:
             kept.add(_with_channels(prepare(image), 4 if with_alpha else 3))
-            return 0
 
         told = self._pass(first, stop, take)
         return kept.frames, *told
@@ -350,30 +361,35 @@ class _Reel:
         if size is None or not index.has_alpha:
             return index.has_alpha
         if size not in index._alpha_at:
-            index._alpha_at[size] = any(map(partial_alpha(self, size), np.flatnonzero(index._transparent).tolist()))
+            suspects = np.flatnonzero(index._transparent).tolist()
+            index._alpha_at[size] = any(self._is_transparent(number, size) for number in suspects)
         return index._alpha_at[size]
 
-    def _pass(self, first: int, stop: int, take: Callable[[np.ndarray], int]) -> tuple[int, Pace, tuple[str, ...]]:
+    def _is_transparent(self, number: int, size: tuple[int, int]) -> bool:
+        found, prepare = [], fit_to(size)
+        self._pass(number, number + 1, lambda image: found.append(prepare(image)[..., 3].min() < 255))
+        return bool(found[0])
+
+    def _pass(self, first: int, stop: int, take: Callable[[np.ndarray], object]) -> tuple[int, Pace, tuple[str, ...]]:
         """Hand the frames to `take`, as they are in the file."""
         index = self.index
         if index.kind == "video":
             for image in self._frames(first, stop):
                 take(image)
             return stop - first, Pace(index.fps), ()
-        number = first
+        numbers = iter(range(first, stop))
 
-        def checked(image: np.ndarray) -> int:
-            nonlocal number
+        def checked(image: np.ndarray) -> object:
+            number = next(numbers)
             if _digest(image) != index._digests[number].tobytes():
                 raise _changed(index, number)
-            number += 1
             return take(image)
 
         if index.kind == "folder":
             paths = [index._path / name for name in index._about["names"][first:stop]]
-            for path in paths:
+            for number, path in enumerate(paths, first):
                 if not path.is_file():
-                    raise _changed(index, first)
+                    raise _changed(index, number)
             return read_pictures(paths, checked)[1:]
         start = index._about["start"]
         return reader_of(index._path)(index._path, start + first, start + stop, checked)[1:]
@@ -398,7 +414,7 @@ class _Reel:
             yield None
         if self.seeks:
             for number in range(index._margin, len(MARGINS)):
-                if index._before + self._done - MARGINS[number] <= 0 or not self.seeks:
+                if index._before + self._done - MARGINS[number] <= 0:
                     break
                 yield number
         yield _START
@@ -406,8 +422,8 @@ class _Reel:
 
     @property
     def seeks(self) -> bool:
-        """Whether it is worth while: a raw stream has no times, and others may have no index."""
-        return self.index._seeks and np.ptp(self.index._milliseconds) > 0
+        """Whether it is worth while: a raw stream has no times."""
+        return np.ptp(self.index._milliseconds) > 0
 
     def _by(self, way: int | str | None, stop: int) -> Iterator[np.ndarray]:
         """Frames from the next wanted one on, as far as they come that way."""
@@ -427,17 +443,17 @@ class _Reel:
             return
         grabbed = frames_grabbed(self._capture, index._about["rate"])
         while self._done < stop:
-            image = self._next(grabbed, way)
+            image = self._next(grabbed)
             if image is None:
                 self._at = None
                 return
             self._done += 1
             yield image
 
-    def _next(self, grabbed: Iterator[Seen], way: int | str | None) -> np.ndarray | None:
+    def _next(self, grabbed: Iterator[Seen]) -> np.ndarray | None:
         """The next wanted frame; None where it does not come."""
         index = self.index
-        target, located = index._before + self._done, self._at is not None
+        target = index._before + self._done
         with quiet():
             for one in grabbed:
                 number = self._number(one.milliseconds)
@@ -445,7 +461,7 @@ class _Reel:
                     if one.milliseconds > index._milliseconds[target] + SAME_TIME:
                         break
                     continue
-                self._at, located = number, True
+                self._at = number
                 if number < target:
                     continue
                 if number > target:
@@ -453,8 +469,6 @@ class _Reel:
                 found, image = self._capture.retrieve()
                 same = found and _digest(image) == index._digests[self._done].tobytes()
                 return image if same else None
-        if isinstance(way, int) and not located:
-            index._seeks = False
         return None
 
     def _by_steps(self, stop: int) -> Iterator[np.ndarray]:
@@ -486,18 +500,6 @@ class _Reel:
             return after
         near = np.flatnonzero(np.abs(known[after:] - milliseconds) <= SAME_TIME)
         return after + int(near[0]) if len(near) else None
-
-
-def partial_alpha(reel: _Reel, size: tuple[int, int]) -> Callable[[int], bool]:
-    """Whether a frame is transparent anywhere at that size."""
-
-    def transparent(number: int) -> bool:
-        found = []
-        prepare = fit_to(size)
-        reel._pass(number, number + 1, lambda image: found.append(prepare(image)[..., 3].min() < 255) or 0)
-        return bool(found[0])
-
-    return transparent
 
 
 def _with_channels(frame: np.ndarray, channels: int) -> np.ndarray:
