@@ -73,6 +73,15 @@ _NO_INDEX = (
 )
 
 
+def _checked(**arrays: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of an index; raises ValueError where they do not belong together."""
+    num, seen = len(arrays["transparent"]), len(arrays["places"])
+    shapes = arrays["digests"].shape, arrays["milliseconds"].shape
+    if not 0 < num <= seen or shapes != ((num, DIGEST_BYTES), (seen,)):
+        raise ValueError("shapes")
+    return arrays
+
+
 class FrameIndex:
     """What one pass through a clip leaves; made by `index_video`.
 
@@ -146,12 +155,13 @@ class FrameIndex:
         """What `save` wrote. Raises `FileNotFoundError`, and `VideoError` for another file."""
         path = checked_path(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # The file is opened here, for NumPy leaves that of a broken one open.
+            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
                 about = json.loads(arrays.pop("about").tobytes())
                 if about.pop("format") != _FORMAT:
                     raise ValueError("format")
-                return cls(about, times=arrays.pop("times", None), **arrays)
+                return cls(about, times=arrays.pop("times", None), **_checked(**arrays))
         except FileNotFoundError:
             raise
         except _NO_INDEX as error:
@@ -200,7 +210,7 @@ class _Recorder:
     def __call__(self, image: np.ndarray) -> int:
         self.size = image.shape[:2]
         self.digests += _digest(image)
-        self.transparent.append(image.shape[2] == 4 and image[..., 3].min() < 255)
+        self.transparent.append(int(image.shape[2] == 4 and image[..., 3].min() < 255))
         if self._cuts is not None:
             self._cuts.add(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
         self._on_frame()
