@@ -185,7 +185,7 @@ class FrameIndex:
     def _told(self) -> Told:
         about = self._about
         seconds = risen(self._milliseconds.tolist(), about["rate"])
-        return Told(about["rate"], about["num_total"], tuple(about["shape_notes"]), seconds)
+        return Told(about["rate"], about["num_total"], tuple(about["shape_notes"]), seconds, about["threads"])
 
     @property
     def _path(self) -> Path:
@@ -275,6 +275,7 @@ def index_video(
         "names": names,
         "rate": float(told.fps if told else pace.fps),
         "num_total": int(told.num_total) if told else 0,
+        "threads": max(told.threads, 0) if told else 0,
         "shape_notes": list(told.notes) if told else [],
     }
     digests = np.frombuffer(bytes(record.digests), np.uint8).reshape(-1, DIGEST_BYTES)
@@ -442,10 +443,10 @@ class _Reel:
         with quiet():
             if way in (_START, _STEPS):
                 self.close()
-                self._capture, self._at = open_video(index._path), -1
+                self._capture, self._at = open_video(index._path, index._about["threads"]), -1
             elif way is not None:
                 if self._capture is None:
-                    self._capture = open_video(index._path)
+                    self._capture = open_video(index._path, index._about["threads"])
                 self._capture.set(cv2.CAP_PROP_POS_MSEC, index._milliseconds[target - MARGINS[way]])
                 self._at = None
         if way == _STEPS:
@@ -536,7 +537,7 @@ def _changed(index: FrameIndex, number: int) -> VideoError:
         "path",
         expected=f"the file that was indexed, {index.num_frames} frames with the digest {index.digest}",
         got=f"{str(index._path)!r}, in which frame {number} is another",
-        cure="Index it again with index_video, or bring back the file.",
+        cure="It has changed, or another OpenCV decodes it: index it again with index_video, or bring back the file.",
     )
 
 
