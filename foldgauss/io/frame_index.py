@@ -5,6 +5,7 @@ import hashlib
 import json
 import operator
 import os
+import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -138,7 +139,8 @@ class FrameIndex:
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers but
-        in a damaged clip."""
+        in a damaged clip. Raises `VideoError` for frames that there are not."""
+        first, stop = _checked_numbers(self, first, stop)
         return int(self.positions[first]), int(self.positions[stop - 1]) + 1
 
     def save(self, path: PathLike) -> Path:
@@ -336,6 +338,19 @@ def _checked_span(index: FrameIndex, first: int, stop: int | None) -> tuple[int,
     return first, stop
 
 
+def _checked_numbers(index: FrameIndex, first: int, stop: int | None) -> tuple[int, int]:
+    """Of frames that decode."""
+    first, stop = operator.index(first), index.num_frames if stop is None else operator.index(stop)
+    if not 0 <= first < stop <= index.num_frames:
+        raise video_error(
+            "first, stop",
+            expected=f"a range within 0:{index.num_frames}, the frames of {index.source!r}",
+            got=f"{first}:{stop}",
+            cure="Choose first < stop.",
+        )
+    return first, stop
+
+
 def _readable(index: FrameIndex) -> Path:
     return readable_path(index._path)
 
@@ -401,9 +416,14 @@ class _Reel:
             for number, path in enumerate(paths, first):
                 if not path.is_file():
                     raise _changed(index, number)
-            return read_pictures(paths, checked)[1:]
-        start = index._about["start"]
-        return reader_of(index._path)(index._path, start + first, start + stop, checked)[1:]
+            told = read_pictures(paths, checked)[1:]
+        else:
+            start = index._about["start"]
+            told = reader_of(index._path)(index._path, start + first, start + stop, checked)[1:]
+        missing = next(numbers, None)
+        if missing is not None:
+            raise _changed(index, missing)
+        return told
 
     def _frames(self, first: int, stop: int) -> Iterator[np.ndarray]:
         """Frames of a video file, BGR, each as it was when it was indexed."""
@@ -548,8 +568,8 @@ class LazyFrames:
     `read_video(path, size=size).frames`, from `first` up to `stop`, which count frames that decode.
 
     `frames[k]` and `frames[a:b]` give C-contiguous arrays of their own. Going forward decodes each frame about once;
-    `run` frames are held for single ones. It can be pickled. The file stays open until `close()`, or until the object
-    goes. Reading raises what `read_indexed` does.
+    `run` frames are held for single ones. It can be pickled, and read by several
+    threads. The file stays open until `close()`, or until the object goes. Reading raises what `read_indexed` does.
     """
 
     dtype, ndim = np.dtype(np.uint8), 4
@@ -562,21 +582,15 @@ class LazyFrames:
         stop: int | None = None,
         run: int = RUN,
     ):
-        stop = index.num_frames if stop is None else operator.index(stop)
-        first, run = operator.index(first), operator.index(run)
-        if not 0 <= first < stop <= index.num_frames:
-            raise video_error(
-                "first, stop",
-                expected=f"a range within 0:{index.num_frames}, the frames of {index.source!r}",
-                got=f"{first}:{stop}",
-                cure="Choose first < stop.",
-            )
+        first, stop = _checked_numbers(index, first, stop)
+        run = operator.index(run)
         if run < 1:
             raise video_error("run", expected="a whole number >= 1", got=str(run), cure=f"Try {RUN}.")
         self.index, self._size = index, checked_size(size)
         self._first, self._stop, self._run = first, stop, run
         self._reel = _Reel(index)
         self._held, self._held_from = None, 0
+        self._one_at_a_time = threading.RLock()  # one decoder, one place in the file
 
     def __getstate__(self) -> dict:
         return {"index": self.index, "size": self._size, "first": self._first, "stop": self._stop, "run": self._run}
@@ -589,8 +603,9 @@ class LazyFrames:
 
     def close(self) -> None:
         """Let the file go, and the frames held; reading opens it again."""
-        self._reel.close()
-        self._held = None
+        with self._one_at_a_time:
+            self._reel.close()
+            self._held = None
 
     @cached_property
     def shape(self) -> tuple[int, int, int, int]:
@@ -626,20 +641,22 @@ class LazyFrames:
             ) from error
         if not -len(self) <= number < len(self):
             raise IndexError(f"frames[{number}]: expected a number within {len(self)} frames.")
-        return self._one(number % len(self)).copy()
+        return self._one(number % len(self))
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.asarray(self[:], dtype)
 
     def _one(self, number: int) -> np.ndarray:
-        if self._held is None or not 0 <= number - self._held_from < len(self._held):
-            first = number - number % self._run
-            self._held = None  # before others are read
-            self._held, self._held_from = self._read(first, min(first + self._run, len(self))), first
-        return self._held[number - self._held_from]
+        """A frame of its own memory."""
+        with self._one_at_a_time:
+            if self._held is None or not 0 <= number - self._held_from < len(self._held):
+                first = number - number % self._run
+                self._held = None  # before others are read
+                self._held, self._held_from = self._read(first, min(first + self._run, len(self))), first
+            return self._held[number - self._held_from].copy()
 
     def _read(self, first: int, stop: int) -> np.ndarray:
-        with unreadable_told(self.index._path):
+        with self._one_at_a_time, unreadable_told(self.index._path):
             _readable(self.index)
             return self._reel.read(self._first + first, self._first + stop, self._size)[0]
 

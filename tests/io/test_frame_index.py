@@ -9,6 +9,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -373,7 +374,31 @@ def test_animations(tmp_path, name):
         assert (found.fps, found.notes, found.num_declared) == (span.fps, span.notes, span.num_declared)
     np.testing.assert_array_equal(LazyFrames(index, run=5)[:], clip.frames)
     part = index_video(tmp_path / name, frames=(2, 10))
+    size = (HEIGHT, WIDTH - 16)  # the left edge is cut off
+    np.testing.assert_array_equal(LazyFrames(index, size)[:], read_video(tmp_path / name, size=size).frames)
     np.testing.assert_array_equal(read_indexed(part, 5, 7).frames, clip.frames[7:9, ..., :3])  # all opaque
+
+
+@pytest.mark.parametrize(("name", "says"), [("a.gif", "expected A:B within 0:"), ("a.png", "is another")])
+def test_an_animation_that_lost_frames_is_refused(tmp_path, name, says):
+    """A GIF does not promise a number of frames, a PNG does."""
+    path = tmp_path / name
+    first, *rest = map(Image.fromarray, _moving(12))
+    first.save(path, save_all=True, append_images=rest)
+    index = index_video(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: 3 * len(data) // 4])
+    np.testing.assert_array_equal(LazyFrames(index)[1:3], read_video(path).frames[1:3])
+    with pytest.raises(VideoError, match=says):
+        read_indexed(index, 3, 12)
+
+
+def test_threads_share_a_decoder(long, long_index):
+    lazy, whole = LazyFrames(long_index, run=4), read_video(long).frames
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lazy.__getitem__, [3 * k % 7 * 80 + k for k in range(40)]))
+    for k, frame in enumerate(found):
+        np.testing.assert_array_equal(frame, whole[3 * k % 7 * 80 + k])
 
 
 def test_one_image_is_a_clip(tmp_path):
@@ -547,6 +572,9 @@ def test_what_arrays_refuse_is_refused(long_index):
     for which in ("a", 1.5, (1, 2), [1, 2]):
         with pytest.raises(ValueError, match="expected the number of a frame, or a slice"):
             lazy[which]
+    for span in ((5, 5), (0, 0), (0, 621), (-2, 3)):
+        with pytest.raises(VideoError, match="expected a range within 0:620"):
+            long_index.span(*span)
     for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"run": 0}, {"size": (0, 5)}):
         with pytest.raises(VideoError, match="expected"):
             LazyFrames(long_index, **options)
