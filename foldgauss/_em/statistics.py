@@ -26,6 +26,7 @@ from foldgauss._batch import cast
 from foldgauss._chunks import Chunks, Piece
 from foldgauss._em.components import Pairs, Parameters, log_likelihoods, pairs_of
 from foldgauss._regression import hermite_columns
+from foldgauss._threads import check_process
 from foldgauss.envelope import AbstractEnvelope, Constant
 
 __all__ = [
@@ -137,6 +138,7 @@ def summed(function: Callable, points: Points | Blocks, *arguments):
 
 
 def _sums_of_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
+    check_process()
     total, last = None, None
     with precision(dtype):
         for block in blocks_of(map(prepare, pieces), size, num_components, devices):
