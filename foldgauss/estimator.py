@@ -319,9 +319,12 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         if warm:
             return jax.tree.map(lambda z: jnp.asarray(z, data.dtype)[None], self._params)
         rng = check_random_state(self.random_state)
-        made = []
+        made, whole = [], None
         for _ in range(self.n_init):
-            one = start(self.init_params, *data.seen_by_start(rng), model, degree, rng)
+            some = drawn(data.size, rng)
+            if some is None and whole is None:
+                whole = data.rows()
+            one = start(self.init_params, *(whole if some is None else data.rows(some)), model, degree, rng)
             made.append(_of_kind(self._with_given(one, scaling, degree), self.covariance_type))
         return jax.tree.map(lambda *z: jnp.stack(z), *made)
 
@@ -597,8 +600,7 @@ class _Rows(NamedTuple):
     def scaled(self, scaling: Scaling) -> "_Rows":
         return self._replace(x=scaling.apply(self.x))
 
-    def seen_by_start(self, rng) -> tuple[np.ndarray, np.ndarray]:
-        some = drawn(self.size, rng)
+    def rows(self, some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         return (self.x, self.weights) if some is None else (self.x[some], self.weights[some])
 
     def points(self, num_components: int, devices: int) -> Points:
@@ -637,8 +639,8 @@ class _ChunkedRows(NamedTuple):
     def scaled(self, scaling: Scaling) -> "_ChunkedRows":
         return self._replace(scaling=scaling)
 
-    def seen_by_start(self, rng) -> tuple[np.ndarray, np.ndarray]:
-        return picked(self.chunks, self.sizes, drawn(self.size, rng), self.prepare)
+    def rows(self, some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        return picked(self.chunks, self.sizes, some, self.prepare)
 
     def points(self, num_components: int, devices: int) -> Blocks:
         return Blocks(self.chunks, self.prepare, self.dtype, num_components, self.sizes, devices)

@@ -20,11 +20,30 @@ from foldgauss.estimator import FoldedGaussianMixture
 from foldgauss.selection import select_mixture
 
 N, CUTS = 600, (1, 1, 90, 91, 350, 595)  # a chunk of one row, one of none
-OPTIONS = {"n_components": 3, "degree": 2, "init_params": "trajectories", "random_state": 0, "tol": 1e-5}
-FITTED = (
-    "weights_ means_ covariances_ locs_ space_covariances_ time_means_ time_scales_ fold_coefficients_ degrees_ "
-    "lower_bound_ lower_bounds_ n_iter_"
-).split()
+#: One set for nearly all tests: they share its programs.
+OPTIONS = {
+    "n_components": 3,
+    "degree": 2,
+    "covariance_type": "tied",
+    "init_params": "trajectories",
+    "n_init": 2,
+    "random_state": 0,
+    "tol": 1e-5,
+}
+FITTED = [
+    "weights_",
+    "means_",
+    "covariances_",
+    "locs_",
+    "space_covariances_",
+    "time_means_",
+    "time_scales_",
+    "fold_coefficients_",
+    "degrees_",
+    "lower_bound_",
+    "lower_bounds_",
+    "n_iter_",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -77,8 +96,9 @@ class _Files:
 @pytest.mark.parametrize(
     "options",
     [
-        {"n_init": 2, "covariance_type": "tied"},
-        {"envelope": "time_likelihood", "max_iter": 30},
+        {},
+        {"envelope": "time_likelihood", "covariance_type": "full", "degree": 1, "n_init": 1, "max_iter": 30},
+        pytest.param({"covariance_type": "full", "n_init": 1}, marks=pytest.mark.slow),
         pytest.param(
             {"n_components": "auto", "degree": "auto", "max_components": 4, "annealing": 0.5}, marks=pytest.mark.slow
         ),
@@ -97,7 +117,7 @@ def test_chunks_are_fitted_as_one_array(options):
     parted = _fit(np.split(x, CUTS), np.split(weights, CUTS), **options)
     _assert_same(whole, parted)
     assert whole.n_iter_ > 2
-    if not options.get("annealing"):  # the likelihood never falls
+    if "annealing" not in options and "auto" not in options.values():  # the likelihood never falls
         assert (np.diff(parted.lower_bounds_) > -1e-9).all()
 
 
@@ -143,13 +163,25 @@ def test_starts_look_at_the_same_rows(monkeypatch, ordered):
         return starts.start(kind, y, weights, *rest)
 
     monkeypatch.setattr("foldgauss.estimator.start", start)
-    options = {"n_init": 2, "covariance_type": "tied"}
-    _assert_same(_fit(x, weights, **options), _fit(np.split(x, CUTS), np.split(weights, CUTS), **options))
+    _assert_same(_fit(x, weights), _fit(np.split(x, CUTS), np.split(weights, CUTS)))
     for (y, w), (again, mass) in zip(seen[:2], seen[2:], strict=True):
         assert len(y) == len(again) == 100
         np.testing.assert_allclose(np.sort(y, axis=0), np.sort(again, axis=0), atol=1e-12)
         np.testing.assert_array_equal(np.sort(w), np.sort(mass))
     assert not np.allclose(np.sort(seen[2][0], axis=0), np.sort(seen[3][0], axis=0))
+
+
+def test_of_equal_ends_the_first_is_kept():
+    """Up to rounding, which hangs on how points are chunked."""
+    params = _fit(X, max_iter=1)._params
+    run = loop.Run(params, 2.0, [2.0], 1, loop.EMStatus.CONVERGED, 0)
+    broken = run._replace(status=loop.EMStatus.NOT_FINITE, log_likelihood=9.0)
+    lost = broken._replace(log_likelihood=-np.inf)
+    for ends, expected in [((2, 2 + 1e-14), 0), ((2, 2 + 1e-12), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
+        runs = [run._replace(log_likelihood=end) for end in ends]
+        assert loop.best([broken, *runs]) is runs[expected]
+    assert loop.best([lost, broken]) is broken
+    assert loop.best([lost, lost]).log_likelihood == -np.inf
 
 
 def test_a_draw_of_many_is_fair_and_without_repetition():
@@ -162,7 +194,7 @@ def test_a_draw_of_many_is_fair_and_without_repetition():
 
 def test_a_warm_start_goes_on_with_chunks():
     x = _tracks()
-    begun = _fit(x, max_iter=2, warm_start=True, covariance_type="tied", n_init=2)
+    begun = _fit(x, max_iter=2, warm_start=True)
     reached = begun.lower_bound_
     begun.set_params(max_iter=100).fit(np.split(x, CUTS))
     assert begun.converged_
@@ -171,7 +203,7 @@ def test_a_warm_start_goes_on_with_chunks():
 
 def test_what_pruning_asks_of_points_is_the_same_of_blocks():
     x, weights = _tracks(), _weights()
-    fitted, there = _fit(x, weights, covariance_type="tied", max_iter=1), weights > 0
+    fitted, there = _fit(x, weights, max_iter=1), weights > 0
     chunks = chunks_of(np.split(x, CUTS), np.split(weights, CUTS))
     prepare = Prepare(np.arange(2), fitted._scaling, 1.0, np.dtype(np.float64))
     with statistics.precision(np.float64):
@@ -201,7 +233,7 @@ def test_variances_are_of_centred_numbers():
 
 def test_scores_and_labels_of_chunks():
     x = _tracks()
-    fitted, parts = _fit(x, covariance_type="tied"), np.split(x, CUTS)
+    fitted, parts = _fit(x), np.split(x, CUTS)
     for name in ("score", "bic", "aic"):
         np.testing.assert_allclose(getattr(fitted, name)(parts), getattr(fitted, name)(x), rtol=1e-12)
     for name in ("score_samples", "predict", "predict_proba"):
@@ -210,14 +242,14 @@ def test_scores_and_labels_of_chunks():
         expected = getattr(fitted, name)(x)
         assert {part.ndim for part in found} == {expected.ndim}
         np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-12)
-    labels = FoldedGaussianMixture(**OPTIONS | {"covariance_type": "tied"}).fit_predict(parts)
+    labels = FoldedGaussianMixture(**OPTIONS).fit_predict(parts)
     np.testing.assert_array_equal(np.concatenate(list(labels)), fitted.predict(x))
 
 
 def test_chunks_are_chosen_among_by_information():
     x = _tracks()
     options = {"n_components": [3], "degrees": [2]}
-    estimator = FoldedGaussianMixture(**OPTIONS | {"covariance_type": "tied", "n_init": 2})
+    estimator = FoldedGaussianMixture(**OPTIONS)
     chosen = select_mixture(estimator, np.split(x, CUTS), **options)
     np.testing.assert_allclose(chosen.scores, select_mixture(estimator, x, **options).scores, rtol=1e-9)
     with pytest.raises(ValueError, match=r'criterion: expected "bic" or "aic" for chunks'):
@@ -278,8 +310,9 @@ def _same_with(client, rows, alone):
     client.compute = lambda *args, **more: tasks.append(1) or submit(*args, **more)
     parted = _fit(rows, _weights())
     num_parts = chunks_of(rows).num_parts
-    # A survey, the start's rows, and one pass for each step.
-    assert len(tasks) == num_parts * (2 + parted.n_iter_)
+    # A survey, the starts' rows, and a pass for each step, of which the other start may have taken more.
+    assert len(tasks) % num_parts == 0
+    assert len(tasks) >= num_parts * (2 + parted.n_iter_)
     for name in FITTED:
         np.testing.assert_array_equal(getattr(parted, name), getattr(alone, name))
 
@@ -370,7 +403,7 @@ def test_dask_arrays_that_cannot_be_fitted_are_told():
         (rows.rechunk((20, 2)), array.ones(49), "sample_weight: expected shape"),
         (rows.rechunk((20, 2)), [np.ones(50)], "sample_weight: expected a dask or NumPy array"),
         (
-            array.from_array(np.where(X == X[45], np.nan, X), chunks=(20, 2)),
+            array.from_array(np.where(X[45] == X, np.nan, X), chunks=(20, 2)),
             None,
             "X, chunk 2: expected finite .* row 5",
         ),
@@ -380,13 +413,13 @@ def test_dask_arrays_that_cannot_be_fitted_are_told():
 
 
 def test_chunks_unlike_those_fitted_are_told():
-    fitted = _fit(X, covariance_type="tied", max_iter=1)
+    fitted = _fit(X, max_iter=1)
     with pytest.raises(ValueError, match="X, chunk 1: expected 2 columns, got 1"):
         fitted.score([X, X[:, :1]])
     with pytest.raises(ValueError, match="X, chunk 0: expected finite numbers"):
         next(fitted.predict([_NAN]))
     with pytest.raises(ValueError, match="X: expected at least one chunk with rows"):
-        fitted.bic(lambda: [])
+        fitted.bic(list)
     with pytest.raises(ValueError, match="X: expected 2 columns, got 1"):
         fitted.predict(_dask().from_array(X[:, :1]))
     with pytest.raises(ValueError, match=r"X: expected one batch of rows, got chunks. fit takes chunks"):

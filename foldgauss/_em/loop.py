@@ -23,6 +23,8 @@ __all__ = ["EMStatus", "Run", "State", "best", "expectation_maximisation", "log_
 _ARMIJO = 1e-4
 #: Steps from the first inverse temperature to 1.
 ANNEALING_STEPS = 50
+#: Mean log-likelihoods that differ by less than so many times their dtype's eps are equal.
+_ROUNDING = 64
 #: On the way, centres are moved by this share of their own spread: components that heat has made one can part again.
 _JITTER = 0.05
 
@@ -246,8 +248,18 @@ def expectation_maximisation(
 
 
 def best(runs: list[Run]) -> Run:
-    """The run of the largest likelihood; a broken one only if all are."""
-    return max(runs, key=lambda run: (run.status != EMStatus.NOT_FINITE, run.log_likelihood))
+    """The run of the largest likelihood, the first of those equal up to rounding; a broken one only if all are.
+
+    Otherwise the order in which points are summed would choose among starts that lead to one end.
+    """
+    top = max(runs, key=_goodness)
+    rounding = _ROUNDING * float(jnp.finfo(top.params.curve.dtype).eps) * max(1.0, abs(top.log_likelihood))
+    sound, least = top.status != EMStatus.NOT_FINITE, top.log_likelihood - rounding
+    return next((run for run in runs if _goodness(run) >= (sound, least)), top)
+
+
+def _goodness(run: Run) -> tuple[bool, float]:
+    return run.status != EMStatus.NOT_FINITE, run.log_likelihood
 
 
 def _last_finite(history: list[float]) -> float:
