@@ -5,8 +5,8 @@
 Each way runs in a process of its own, which makes its rows, d = 3 in float32, from the same seeds: all at once, or
 one chunk after another in each pass. The time of a pass is the difference of two fits, of few and of more iterations,
 divided by the iterations more: starts and compiling are in neither. What reading costs is in it: "making the chunks" is
-the same chunks made and not fitted. Peak memory is above what the process held before the fit, but for "in memory", where
-the rows are there before: their bytes are added. Parameters are compared after the longer fit, relative to the
+the same chunks made and not fitted. Peak memory is above what the process held before the fit; for "in memory", where
+the rows are there before, their bytes are added. Parameters are compared after the longer fit, relative to the
 largest number of each kind.
 """
 
@@ -17,7 +17,6 @@ import subprocess
 import sys
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 
