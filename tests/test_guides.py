@@ -112,6 +112,7 @@ def _editing(names, folder):
 def _estimator(names, folder):
     assert names["mixture"].converged_
     assert names["mixture"].score(names["x"]) > 0.5
+    np.testing.assert_array_equal(np.concatenate(names["labels"]), names["mixture"].predict(names["x"]))
 
 
 def _extending(names, folder):
