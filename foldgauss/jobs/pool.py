@@ -23,8 +23,9 @@ from foldgauss.jobs.fitting import FitJob, Progress, Stopped, fit_job
 if TYPE_CHECKING:
     from distributed import Client
 
-#: A job whose worker dies so often without a new checkpoint is given up; dask counts the deaths between.
-FRUITLESS = 3
+#: dask gives a job back once so many of its workers have died, and it is given up after so many such rounds without a
+#: new checkpoint.
+DEATHS, ROUNDS = 3, 3
 #: Seconds that workers have to keep what they do, once they are asked to stop.
 GRACE = 60.0
 #: Seconds that a scheduler has to answer.
@@ -147,7 +148,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
         environment["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
     settings = {
         "distributed.worker.profile.enabled": False,
-        "distributed.scheduler.allowed-failures": FRUITLESS - 1,
+        "distributed.scheduler.allowed-failures": DEATHS - 1,
         "distributed.admin.system-monitor.gil.enabled": False,
     }
     with ExitStack() as stack, _silenced():
@@ -223,7 +224,7 @@ class _Run:
         self.told: queue.SimpleQueue = queue.SimpleQueue()
         self.waiting, self.ended = deque(jobs), queue.SimpleQueue()
         self.open: dict[str, tuple[Any, FitJob]] = {}
-        self.deaths: dict[str, tuple[int, Any]] = {}
+        self.rounds: dict[str, tuple[int, Any]] = {}  # in which a job's workers died
         self.seen = time.monotonic()  # workers
 
     def outcomes(self) -> Iterator[Outcome]:
@@ -289,15 +290,16 @@ class _Run:
 
     def _again(self, job: FitJob) -> Outcome | None:
         """A job whose workers died: once more while it gets on."""
-        count, before = self.deaths.get(job.target, (0, None))
+        fruitless, before = self.rounds.get(job.target, (0, None))
         now = _when(job)
-        if now == before:
+        fruitless = fruitless + 1 if now == before else 0
+        if fruitless >= ROUNDS:
             return Outcome(
                 job,
-                failure=f"{job.name}: its worker died {FRUITLESS * (count + 1)} times without getting on. "
+                failure=f"{job.name}: its workers died again and again without getting on. "
                 "Most likely memory is short: take fewer workers, shorter segments or smaller frames.",
             )
-        self.deaths[job.target] = (count + 1, now)
+        self.rounds[job.target] = (fruitless, now)
         self.waiting.appendleft(job)
         return None
 
