@@ -12,13 +12,13 @@ import secrets
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from foldgauss._checks import invalid, whole
 from foldgauss._threads import available_cores
-from foldgauss.jobs.fitting import FitJob, Progress, Stopped, fit_job
+from foldgauss.jobs.fitting import FitJob, Progress, Stopped, finished, fit_job
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -53,12 +53,15 @@ class Outcome:
 Watch = Callable[[Progress], None]
 
 
-def run_here(jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False):
+def run_here(
+    jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
+) -> Iterator[Outcome]:
     """Outcomes of the jobs, one after another, done by this process.
 
     Raises `Stopped` at a job that stops, since `asked_to_stop` says so; it is kept.
     """
-    for job in jobs:
+    waiting = yield from _done_before(jobs)
+    for job in waiting:
 
         def tell(progress: Progress) -> bool:
             watch(progress)
@@ -67,6 +70,18 @@ def run_here(jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[]
         if asked_to_stop():
             raise Stopped("stopped between two jobs")
         yield _tried(job, tell)
+
+
+def _done_before(jobs: Sequence[FitJob]) -> Generator[Outcome, None, list[FitJob]]:
+    """Outcomes of jobs that somebody has done; returns the others."""
+    waiting = []
+    for job in jobs:
+        record = finished(job)
+        if record is None:
+            waiting.append(job)
+        else:
+            yield Outcome(job, record)
+    return waiting
 
 
 def _tried(job: FitJob, tell: Callable[[Progress], bool]) -> Outcome:
@@ -209,7 +224,8 @@ def run_on(
 
     Raises `Stopped` once `asked_to_stop` says so and the workers have kept what they do, `SchedulerLost`.
     """
-    yield from _Run(crew, jobs, watch, asked_to_stop).outcomes()
+    waiting = yield from _done_before(jobs)
+    yield from _Run(crew, waiting, watch, asked_to_stop).outcomes()
 
 
 class _Run:
