@@ -218,6 +218,25 @@ def test_what_is_no_ordinary_model_is_refused(work, tmp_path):
     assert not (tmp_path / "out.safetensors").exists()
 
 
+def test_a_source_that_does_not_fit_its_header_is_refused(work, tmp_path):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes((work / "a.safetensors").read_bytes())
+    rewritten(path, lambda header, outer: outer.update({"splats.more": outer.pop("splats.angle_logit")}))
+    with pytest.raises(ModelFileError, match="angle_logit"):
+        join_segments(tmp_path / "out.safetensors", [(0, path)])
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_source_that_changes_meanwhile_is_refused(work, tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes((work / "a.safetensors").read_bytes())
+    longer = soft_model(num_frames=8)
+    monkeypatch.setattr(segmented, "check_writable", lambda _: save_video_model(path, longer))
+    with pytest.raises(ModelFileError, match=r"got one that has changed meanwhile.*Join them again"):
+        join_segments(tmp_path / "out.safetensors", [(0, path)])
+    assert not (tmp_path / "out.safetensors").exists()
+
+
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
