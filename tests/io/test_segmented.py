@@ -224,6 +224,10 @@ def test_a_source_that_does_not_fit_its_header_is_refused(work, tmp_path):
     rewritten(path, lambda header, outer: outer.update({"splats.more": outer.pop("splats.angle_logit")}))
     with pytest.raises(ModelFileError, match="angle_logit"):
         join_segments(tmp_path / "out.safetensors", [(0, path)])
+    path.write_bytes((work / "a.safetensors").read_bytes())
+    rewritten(path, lambda header, outer: header.update({"fps": float("inf")}))
+    with pytest.raises(ModelFileError, match="got one with a size or a rate out of range"):
+        join_segments(tmp_path / "out.safetensors", [(0, path)])
     assert not (tmp_path / "out.safetensors").exists()
 
 
@@ -299,6 +303,7 @@ def setting(*keys, to):
         setting("segments", 1, "kind", to="fit-checkpoint"),
         setting("segments", 1, "metadata", to=[1]),
         setting("segments", 0, "header", "num_frames", to=10**30),
+        setting("segments", 2, "header", "num_frames", to=10**30),
         setting("segments", 0, "header", "num_gaussians", to=10**30),
         setting("segments", 0, "header", "degree", to=10**400),
         setting("segments", 0, "header", "degree", to=-1),
