@@ -332,6 +332,19 @@ def test_headers_that_make_no_sense_are_refused(change, work, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "value"),
+    [("fps", float("inf")), ("fps", -1.0), ("compositing", "none"), ("size", [0, 5]), ("options", {"low_pass": -1.0})],
+)
+def test_facts_that_make_no_sense_are_refused_of_one_segment_too(name, value, work, tmp_path):
+    """With others it would not go together."""
+    path = tmp_path / "one.safetensors"
+    join_segments(path, [(0, work / "a.safetensors")])
+    rewritten(path, setting("segments", 0, "header", name, to=value))
+    with pytest.raises(ModelFileError, match="does not describe it"):
+        load_video_model(path)
+
+
+@pytest.mark.parametrize(
     "change",
     [
         setting("segments", 2, "header", "envelope", to="Other"),
