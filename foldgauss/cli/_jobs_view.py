@@ -4,7 +4,8 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -21,6 +22,12 @@ from foldgauss.jobs import Stopped as JobsStopped
 FIRST_LINE, LINE = 10.0, 30.0
 #: Jobs of which each has a line in a log.
 FEW = 20
+
+
+def tell_json(event: str, figures: dict[str, Any]) -> None:
+    """A line of JSON; that nobody listens any more is no reason to lose a fit."""
+    with suppress(OSError):
+        print_json(event, figures)
 
 
 def run_jobs(
@@ -166,15 +173,15 @@ class _Json(_View):
     def watch(self, share: Share) -> None:
         super().watch(share)
         finite = {name: value for name, value in share._asdict().items() if value == value and value != math.inf}
-        print_json("progress", finite)
+        tell_json("progress", finite)
 
     def ended(self, outcome: Outcome) -> None:
         super().ended(outcome)
         if outcome.failure is not None:
-            print_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
+            tell_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
         else:
             figures = {name: outcome.record[name] for name in ("mean_psnr", "mean_ssim", "seconds", "steps")}
-            print_json("ended", {"name": outcome.job.name} | figures)
+            tell_json("ended", {"name": outcome.job.name} | figures)
 
 
 @contextmanager
@@ -184,7 +191,7 @@ def _shown(what: str, total: int, manner: Manner) -> Iterator[_View]:
         yield kinds[manner](what, total)
         return
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # names of files
         BarColumn(bar_width=20),
         TimeElapsedColumn(),
         *TIME_LEFT,

@@ -48,6 +48,10 @@ class Progress(NamedTuple):
     seconds_left: float
 
 
+#: What a record says besides `asked` and the scores of each frame.
+_TOLD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}
+_TOLD |= {"file_bytes", "peak_bytes", "warnings"}
+
 #: Is told how far a job is, and answers whether to go on.
 Tell = Callable[[Progress], bool]
 
@@ -121,9 +125,25 @@ def finished(job: FitJob) -> dict[str, Any] | None:
     try:
         record = json.loads(job.record.read_text())
         same = record["asked"] == job.asked and os.path.getsize(job.target) == record["file_bytes"]
+        same = same and len(record["psnr"]) == len(record["ssim"]) == record["num_frames"] and record.keys() >= _TOLD
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return record if same else None
+
+
+def begin(job: FitJob) -> None:
+    """Note, where its record is to be, what a job asks."""
+    with atomic_path(job.record) as temporary:
+        temporary.write_text(json.dumps({"asked": job.asked}) + "\n")
+
+
+def begun(job: FitJob) -> dict[str, Any] | None:
+    """What was asked when a job of its target was begun, or done; None where nothing says so."""
+    try:
+        asked = json.loads(job.record.read_text())["asked"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return asked if isinstance(asked, dict) else None
 
 
 @contextmanager

@@ -88,7 +88,9 @@ def _tried(job: FitJob, tell: Callable[[Progress], bool]) -> Outcome:
     """The outcome of a job done here; what is wrong with its clip or its disk is one."""
     try:
         return Outcome(job, fit_job(job, tell))
-    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+    except Stopped:
+        raise
+    except Exception as error:  # any: the others go on
         return Outcome(job, failure=one_line(error))
 
 

@@ -65,7 +65,7 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
     assert reads.count == 0
 
 
-@pytest.mark.parametrize("change", ["config", "source", "size", "model"])
+@pytest.mark.parametrize("change", ["config", "source", "size", "model", "record"])
 def test_a_record_of_something_else_is_none(done, clip, tmp_path, change):
     job, _record = done
     changed = {
@@ -73,12 +73,17 @@ def test_a_record_of_something_else_is_none(done, clip, tmp_path, change):
         "source": {"source": {"digest": "another"}},
         "size": {"size": (12, 16)},
         "model": {},
+        "record": {},
     }[change]
     other = job_of(clip, tmp_path, **changed)
     for made, wanted in ((job.target, other.target), (job.record, other.record)):
         Path(wanted).write_bytes(Path(made).read_bytes())
     if change == "model":
         Path(other.target).write_bytes(Path(job.target).read_bytes()[:-1])
+    if change == "record":
+        told = json.loads(job.record.read_text())
+        del told["mean_psnr"]
+        other.record.write_text(json.dumps(told))
     assert finished(other) is None
 
 
