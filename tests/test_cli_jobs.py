@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -295,6 +296,14 @@ def test_a_checkpoint_of_other_settings_is_not_thrown_away(clips, tmp_path, caps
     assert run("fit-many", clips, "--out", out, *QUICK[:-1], "2") == 2
     assert f"{kept} exists, of other settings" in " ".join(capsys.readouterr().err.split())
     assert kept.read_bytes() == before
+
+
+@pytest.mark.parametrize("options", [("--workers", "2"), ("--scheduler", "tcp://127.0.0.1:1")])
+def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, options):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
+    assert f"{options[0]}: needs dask.distributed: pip install" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_names_are_shown_as_they_are(monkeypatch):

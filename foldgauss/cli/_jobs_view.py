@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from importlib.util import find_spec
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -77,6 +78,9 @@ class Hands:
             raise WrongUse(f"{other}: expected no --scheduler beside it, which has workers of its own. Leave one out.")
         if self.threads is not None and self.workers is None:
             raise WrongUse("--threads: expected --workers beside it. Of this process: FOLDGAUSS_NUM_THREADS.")
+        if (self.workers is not None or self.scheduler is not None) and find_spec("distributed") is None:
+            option = "--workers" if self.scheduler is None else "--scheduler"
+            raise WrongUse(f"{option}: needs dask.distributed: pip install 'foldgauss[distributed]'.")
         if self.workers is not None and self.threads is None:
             object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
 

@@ -8,10 +8,12 @@ import dataclasses
 import json
 import os
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -168,8 +170,7 @@ def _only_one(job: FitJob) -> Iterator[None]:
 def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
     clip = _read(job)
     source = fingerprint(clip)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with _EARS.heard() as caught:
         state, info = _steps(job, clip, source, tell)
     model = to_model(state, job.config, clip.size, clip.fps)
     scores = evaluate(model, clip.frames)
@@ -192,13 +193,56 @@ def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
         "peak_bytes": peak_bytes(),
         "warnings": [
             *(_of_clip(clip) if job.index is None else ()),
-            *dict.fromkeys(" ".join(str(one.message).split()) for one in caught),
+            *dict.fromkeys(caught),
+            *_missed(job.config, scores.mean_psnr, info),
         ],
     }
     with atomic_path(job.record) as temporary:
         temporary.write_text(json.dumps(record) + "\n")
     job.kept.unlink(missing_ok=True)
     return record
+
+
+def _missed(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]:
+    """What was asked for and not reached."""
+    if config.economy is None or config.economy.psnr is None or info.stopped_by == "smallest_at_psnr":
+        return []
+    return [f"{config.economy.psnr:g} dB were not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
+
+
+class _Ears:
+    """Warnings by the thread that gives them: a worker may do two jobs at once, and `warnings` has one ear for all."""
+
+    def __init__(self):
+        self._lock, self._open, self._heard = threading.Lock(), ExitStack(), {}
+
+    @contextmanager
+    def heard(self) -> Iterator[list[str]]:
+        """The texts of those that this thread gives in the block; others' are shown as ever."""
+        number, texts = threading.get_ident(), []
+        with self._lock:
+            if not self._heard:
+                self._open.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("always")
+                warnings.showwarning = partial(self._take, warnings.showwarning)
+            self._heard[number] = texts
+        try:
+            yield texts
+        finally:
+            with self._lock:
+                del self._heard[number]
+                if not self._heard:
+                    self._open.close()
+
+    def _take(self, show: Callable[..., Any], message: Warning | str, *where: Any, **more: Any) -> None:
+        texts = self._heard.get(threading.get_ident())
+        if texts is None:
+            show(message, *where, **more)
+        else:
+            texts.append(" ".join(str(message).split()))
+
+
+_EARS = _Ears()
 
 
 def _read(job: FitJob) -> Clip:

@@ -9,11 +9,13 @@ import logging
 import os
 import queue
 import secrets
+import signal
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from foldgauss._checks import invalid, whole
@@ -149,8 +151,10 @@ def _silenced() -> Iterator[None]:
 def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]:
     """A crew of `count` processes of this machine, each with `threads` of its cores (default: an equal share).
 
-    Workers end with this process, however it ends, and are replaced when they die. Raises ValueError for counts that
-    are none, ImportError where dask.distributed is not installed.
+    Workers end with this process, however it ends, and are replaced when they die. They import the program that starts
+    them: in a file of your own, do so under `if __name__ == "__main__":`, or none comes to work.
+
+    Raises ValueError for counts that are none, ImportError where dask.distributed is not installed.
     """
     for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
         if not whole(value, 1):
@@ -177,15 +181,24 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
             processes=True,
             memory_limit=None,  # a worker that is stopped for its memory would be stopped again
             dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # a port of its own: two commands may run at once
             local_directory=scratch,
             silence_logs=50,
             env=environment,
             preload=["foldgauss._worker"],
         )
         stack.enter_context(cluster)
+        cluster.loop.add_callback(_block_ctrl_c)
         crew = Crew(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
         cluster.scale(count)
         yield crew
+
+
+def _block_ctrl_c() -> None:
+    """On the thread that starts workers, and so in these from the first moment: a terminal sends it to them, too."""
+    if hasattr(signal, "pthread_sigmask"):  # not Windows
+        resource_tracker.ensure_running()  # or starting it, with the first worker, would take the block away
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 @contextmanager

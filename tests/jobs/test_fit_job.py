@@ -3,6 +3,9 @@
 import dataclasses
 import json
 import os
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import only_writer
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.fitting import finished
+from foldgauss.video.economy import Economy
 
 NUM_FRAMES = 10
 
@@ -170,6 +174,38 @@ def test_a_full_disk_at_a_checkpoint_costs_no_fit(done, clip, tmp_path, monkeypa
     job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
     fit_job(job)
     assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+
+
+def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch):
+    """Two at once in one process, the second of which begins later and ends first."""
+    real, begun, over = fitting._steps, threading.Event(), threading.Event()
+
+    def steps(job, *given):
+        if job.name == "first":
+            begun.set()
+            assert over.wait(60)
+        warnings.warn(f"of {job.name}", stacklevel=1)
+        return real(job, *given)
+
+    monkeypatch.setattr(fitting, "_steps", steps)
+    jobs = [
+        dataclasses.replace(job_of(clip, tmp_path, f"{name}.safetensors"), name=name) for name in ("first", "second")
+    ]
+    before, shown = warnings.filters.copy(), warnings.showwarning
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(fit_job, jobs[0])
+        assert begun.wait(60)
+        second = fit_job(jobs[1])
+        over.set()
+        records = first.result(), second
+    assert [record["warnings"] for record in records] == [["of first"], ["of second"]]
+    assert (warnings.filters, warnings.showwarning) == (before, shown)
+
+
+def test_a_psnr_that_was_not_reached_is_told(clip, tmp_path):
+    config = dataclasses.replace(CONFIG, economy=Economy(psnr=60.0))
+    (told,) = fit_job(job_of(clip, tmp_path, config=config))["warnings"]
+    assert told.startswith("60 dB were not reached, got ")
 
 
 def test_files_go_where_they_are_asked_to(clip, tmp_path):
