@@ -14,8 +14,9 @@ from commands import run
 from rich.console import Console
 
 import foldgauss.jobs.fitting as fitting
-from foldgauss.cli import _jobs_view
+from foldgauss.cli import _jobs_view, many
 from foldgauss.io import load_video_model, read_video, write_image, write_video
+from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -304,6 +305,22 @@ def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, opt
     assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
     assert f"{options[0]}: needs dask.distributed: pip install" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys, monkeypatch):
+    def full(*given):
+        raise OutputError("path: expected room for 'summary.json', got none.")
+
+    monkeypatch.setattr(many, "write_json", full)
+    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK) == 1
+    assert "3 models in" in (told := capsys.readouterr()).out
+    assert "warning: path: expected room" in told.err
+    assert len(list((tmp_path / "models").glob("*.safetensors"))) == 3
+
+
+def test_names_hold_no_pictures(capsys):
+    assert run("fit-many", "no:smile:folder") == 2
+    assert "no:smile:folder" in "".join(capsys.readouterr().err.split())
 
 
 def test_names_are_shown_as_they_are(monkeypatch):

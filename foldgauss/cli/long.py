@@ -47,7 +47,8 @@ def fit_in_segments(
     if failed:
         for outcome in failed:
             err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
-        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed; the others are kept in {fit.folder}. {again}")
+        others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
+        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
     records = {outcome.job.name: outcome.record for outcome in outcomes}
     shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
     with progress_bar("Joining", max(shared, 1), shown=manner == "bar" and shared > 0) as advance:

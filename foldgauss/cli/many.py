@@ -147,7 +147,10 @@ def fit_many(
         nonlocal written
         ended[outcome.job.target] = outcome
         if len(ended) == len(jobs) or time.monotonic() - written > SUMMARY_SECONDS:
-            _summarise(out_dir, jobs, ended)
+            try:
+                _summarise(out_dir, jobs, ended)
+            except OSError as error:  # a full disk now is no reason to lose the fits
+                err.print(f"warning: {error}", soft_wrap=True)
             written = time.monotonic()
 
     again = "Give the command again without --overwrite" if overwrite else "Give the same command again"

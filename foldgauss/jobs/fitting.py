@@ -5,6 +5,7 @@ how it went. Whoever does it again takes up what is there.
 """
 
 import dataclasses
+import hashlib
 import json
 import os
 import sys
@@ -52,7 +53,7 @@ class Progress(NamedTuple):
 
 #: What a record says besides `asked` and the scores of each frame.
 _TOLD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}
-_TOLD |= {"file_bytes", "peak_bytes", "warnings"}
+_TOLD |= {"file_bytes", "file_digest", "peak_bytes", "warnings"}
 
 #: Is told how far a job is, and answers whether to go on.
 Tell = Callable[[Progress], bool]
@@ -108,8 +109,8 @@ def fit_job(job: FitJob, tell: Tell | None = None) -> dict[str, Any]:
     """Do the job, or what is left of it; returns its record.
 
     The record: `asked`, `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame, `mean_psnr`,
-    `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `peak_bytes` (of the process, so far)
-    and `warnings`.
+    `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `file_digest`, `peak_bytes` (of the
+    process, so far) and `warnings`.
 
     Raises `Stopped` where `tell` answers False; ValueError and OSError for a clip that cannot be read or fitted, and
     outputs that cannot be written, `FitDiverged` as `fit_steps` does.
@@ -123,14 +124,24 @@ def fit_job(job: FitJob, tell: Tell | None = None) -> dict[str, Any]:
 
 
 def finished(job: FitJob) -> dict[str, Any] | None:
-    """The record of a job that is done: its model is there, of what it asks."""
+    """The record of a job that is done: its model is there, of what it asks.
+
+    Of a segment's it is looked at whether they are the same bytes: segments of one length are of one size.
+    """
     try:
         record = json.loads(job.record.read_text())
         same = record["asked"] == job.asked and os.path.getsize(job.target) == record["file_bytes"]
         same = same and len(record["psnr"]) == len(record["ssim"]) == record["num_frames"] and record.keys() >= _TOLD
+        same = same and (job.index is None or record["file_digest"] == file_digest(job.target))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return record if same else None
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """blake2b of 16 bytes over a file, as a hexadecimal text."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, partial(hashlib.blake2b, digest_size=16)).hexdigest()
 
 
 def begin(job: FitJob) -> None:
@@ -190,6 +201,7 @@ def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
         "seconds": round(info.seconds, 2),
         "stopped_by": info.stopped_by,
         "file_bytes": os.path.getsize(job.target),
+        "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
         "warnings": [
             *(_of_clip(clip) if job.index is None else ()),

@@ -18,7 +18,7 @@ from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.frame_index import FrameIndex, index_video, read_indexed
 from foldgauss.io.segmented import join_segments
 from foldgauss.io.video_model import load_video_model
-from foldgauss.jobs.fitting import FitJob
+from foldgauss.jobs.fitting import FitJob, file_digest
 from foldgauss.video.config import FitConfig
 from foldgauss.video.metrics import psnr, ssim
 from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
@@ -53,8 +53,14 @@ class LongFit:
         """Write the segments as one model, once all jobs are done; `records` by name of the job.
 
         The frames that two segments share are scored as they are played. The same segments give the same bytes. The
-        folder stays: see `tidy`. Raises as `join_segments`.
+        folder stays: see `tidy`. Raises as `join_segments`, and `OutputError` where a segment's file is not what its
+        record tells of.
         """
+        for job in self.jobs:
+            if file_digest(job.target) != records[job.name]["file_digest"]:
+                got = f"a changed {job.target!r}"
+                cure = "Give the same command again, and it is fitted again."
+                raise OutputError(str(invalid("path", expected=f"{job.name} as it was written", got=got, cure=cure)))
         sources = [(first, job.target) for (first, _), job in zip(self.spans, self.jobs, strict=True)]
         scores = [(records[job.name]["psnr"], records[job.name]["ssim"]) for job in self.jobs]
         psnr_of, ssim_of = (_joined(self.spans, kind) for kind in zip(*scores, strict=True))

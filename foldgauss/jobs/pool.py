@@ -110,6 +110,11 @@ class Crew:
         self._since, self._patience = time.monotonic(), MEND_SECONDS
 
     @property
+    def is_remote(self) -> bool:
+        """Whether others start its workers."""
+        return self._cluster is None
+
+    @property
     def threads(self) -> int:
         """Jobs that can be done at once, now. Raises `SchedulerLost`."""
         try:
@@ -275,7 +280,7 @@ class _Run:
         if threads:
             self.seen = time.monotonic()
         elif time.monotonic() - self.seen > NO_WORKERS:
-            told = "start some, and give the command again"
+            told = "start some, and give the command again" if self.crew.is_remote else _NONE_HERE
             raise SchedulerLost(f"No worker came for {NO_WORKERS:g} s. What is finished is kept: {told}.")
         while self.waiting and len(self.open) < threads:
             self._submit(self.waiting.popleft())
@@ -350,6 +355,10 @@ class _Run:
             return
 
 
+_NONE_HERE = (
+    "they die while they start, of what is told above; a program of your own must start them under "
+    '`if __name__ == "__main__":`'
+)
 _LOST = "The scheduler is gone. What is finished is kept: start one, and give the command again."
 
 

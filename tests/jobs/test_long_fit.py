@@ -13,6 +13,7 @@ from drifting import CONFIG, SIZE, drifting, write_drifting
 import foldgauss.jobs.fitting as fitting
 import foldgauss.jobs.long as long
 from foldgauss.io import VideoError, index_video, load_video_model, read_video
+from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -215,6 +216,19 @@ def test_a_plan_that_somebody_has_edited_is_made_again(clip, tmp_path, edit):
     again = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
     assert again.spans == fit.spans
     assert again.jobs == fit.jobs
+
+
+def test_models_in_the_place_of_others_are_not_taken_for_them(whole, clip, tmp_path):
+    """Segments of one length have files of one size."""
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    records = {outcome.job.name: outcome.record for outcome in done_here(fit)}
+    one, other = (Path(job.target) for job in fit.jobs[:2])
+    assert one.stat().st_size == other.stat().st_size
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(OutputError, match="expected segment 0 as it was written"):
+        fit.join(records)
+    assert not fit.target.exists()
+    assert joined(fit).path.read_bytes() == whole[1].path.read_bytes()
 
 
 def test_an_index_of_another_clip_is_made_again(clip, tmp_path):

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import distributed
 import pytest
 from drifting import CONFIG, write_drifting
 
@@ -72,6 +73,22 @@ def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_he
     assert failed.job.name == "broken.mp4"
     assert "does not open as a video" in failed.failure
     assert {progress.name for progress in told if progress.share == 1} == {f"clip{k}.mp4" for k in range(3)}
+
+
+@pytest.mark.parametrize(("is_remote", "says"), [(True, "start some"), (False, "if __name__")])
+def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, says):
+    class NoCrew:
+        client, threads = None, 0
+
+        def mend(self, alive):
+            assert alive == 0
+
+    monkeypatch.setattr(pool, "NO_WORKERS", -1.0)
+    monkeypatch.setattr(distributed, "Event", lambda *given, **named: None)
+    crew = NoCrew()
+    crew.is_remote = is_remote
+    with pytest.raises(SchedulerLost, match=says):
+        pool._Run(crew, [], ignored, lambda: False)._fill()
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):
