@@ -178,13 +178,19 @@ def test_a_full_disk_at_a_checkpoint_costs_no_fit(done, clip, tmp_path, monkeypa
 
 def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch):
     """Two at once in one process, the second of which begins later and ends first."""
-    real, begun, over = fitting._steps, threading.Event(), threading.Event()
+    real, begun, joined, warned, over = fitting._steps, *(threading.Event() for _ in range(4))
 
     def steps(job, *given):
-        if job.name == "first":
+        if job.name == "second":
+            joined.set()
+            assert warned.wait(60)
+        else:
             begun.set()
-            assert over.wait(60)
+            assert joined.wait(60)
         warnings.warn(f"of {job.name}", stacklevel=1)
+        if job.name == "first":
+            warned.set()
+            assert over.wait(60)
         return real(job, *given)
 
     monkeypatch.setattr(fitting, "_steps", steps)
