@@ -145,6 +145,12 @@ def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, who
     assert "--preview: expected a fit in one piece" in capsys.readouterr().err
     assert run("fit", long_clip, "--out", target, *QUICK, "--log-json") == 0
     assert json.loads(capsys.readouterr().out.splitlines()[0])["spans"] == [[0, 15], [12, 27], [24, 39]]
+    checkpoint = tmp_path / "m.safetensors.checkpoint"
+    (tmp_path / "m.safetensors.segments").mkdir()
+    (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
+    checkpoint.write_bytes(b"of a fit in one piece")
+    assert run("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume") == 1
+    assert checkpoint.name in capsys.readouterr().err
     assert target.read_bytes() == whole.read_bytes()
 
 

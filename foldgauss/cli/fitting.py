@@ -229,7 +229,7 @@ def fit(
     hands = Hands(workers, scheduler, threads)
     context.with_resource(only_writer(target, own=(kept,)))
     refuse_existing(target, overwrite)
-    begun = kept_seconds(target) is not None and (resume or not overwrite)
+    begun = kept_seconds(target) is not None and not kept.exists() and (resume or not overwrite)
     if begun or not (segment_seconds is None and workers is None and scheduler is None):
         for option, path in (("--history", history), ("--preview", preview)):
             if path is not None:

@@ -191,7 +191,8 @@ def _make_room(jobs: list[FitJob], overwrite: bool) -> None:
     for job in waiting:
         if overwrite:
             job.kept.unlink(missing_ok=True)
-        begin(job)
+        if overwrite or begun(job) != job.asked:
+            begin(job)
 
 
 def _summarise(out_dir: Path, jobs: list[FitJob], ended: dict[str, Outcome]) -> None:

@@ -145,9 +145,8 @@ def file_digest(path: str | os.PathLike) -> str:
 
 
 def begin(job: FitJob) -> None:
-    """Note, where its record is to be, what a job asks."""
-    with atomic_path(job.record) as temporary:
-        temporary.write_text(json.dumps({"asked": job.asked}) + "\n")
+    """Note what a job asks where its record is to be. Not atomic: there may be thousands, and half of it says nothing."""
+    job.record.write_text(json.dumps({"asked": job.asked}) + "\n")
 
 
 def begun(job: FitJob) -> dict[str, Any] | None:
