@@ -145,7 +145,7 @@ def file_digest(path: str | os.PathLike) -> str:
 
 
 def begin(job: FitJob) -> None:
-    """Note what a job asks where its record is to be. Not atomic: there may be thousands, and half of it says nothing."""
+    """Note what a job asks where its record is to be. Not atomic: there may be thousands, and half of one is none."""
     job.record.write_text(json.dumps({"asked": job.asked}) + "\n")
 
 
