@@ -35,6 +35,7 @@ from foldgauss.io.mesh import read_pseudomesh
 from foldgauss.io.video_file import VIDEO_SUFFIXES, write_video
 from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, read_origin, save_video_model
 from foldgauss.video.model import VideoModel
+from foldgauss.video.segments import SegmentedVideo
 
 _CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles", "html": "player"}
 #: Options of a page, also of `view`.
@@ -100,6 +101,8 @@ def edit_command(
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
         save_video_model(out_path, edited, metadata=about)
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
+        if isinstance(edited, SegmentedVideo):
+            kind = f"a model in {len(edited.segments)} segments"
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     draw(edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=picture_size, overwrite=overwrite)

@@ -14,6 +14,7 @@ from foldgauss.video.independent import IndependentFrames, independent_frames
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.overlays import SelectedGaussians
+from foldgauss.video.segment_edits import SegmentedEdit, SegmentedSelection
 from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
 from foldgauss.video.select import (
     Selection,
@@ -50,6 +51,8 @@ __all__ = [
     "Layer",
     "LearningRates",
     "Segment",
+    "SegmentedEdit",
+    "SegmentedSelection",
     "SegmentedVideo",
     "SelectedGaussians",
     "Selection",
