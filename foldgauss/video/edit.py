@@ -391,7 +391,9 @@ class Edit:
         if hue is not None and not within(hue, "[0, 1]"):
             raise invalid("hue", expected="turns in [0, 1]", got=repr(hue), cure="Degrees over 360.")
         if color is not None:
-            matrix, gain = np.outer(checked_color(color), LIGHTNESS), 1 / mean_lightness([self._light()])
+            target = checked_color(color)
+            self._check_selected()
+            matrix, gain = np.outer(target, LIGHTNESS), 1 / mean_lightness([self._light()])
         make = _recolor(gain, offset, matrix, None if hue is None else checked_number("hue", hue))
         identity = make(np.zeros(0, bool), None) == _recolor(None, None, None, None)(np.zeros(0, bool), None)
         bake = lambda splats, mask: baking.recolored(splats, mask, make(mask, None))  # noqa: E731

@@ -38,12 +38,12 @@ class Part:
     @property
     def frame_times(self) -> Float64[np.ndarray, " num_frames"]:
         """Of the clip."""
-        return np.arange(self.num_frames) / self._steps
+        return self.times if self.is_whole else np.arange(self.num_frames) / self._steps
 
     @property
     def is_whole(self) -> bool:
         """Whether there is nothing but this part, and its times are the clip's."""
-        return len(self.times) == self.num_frames and self.is_even
+        return len(self.times) == self.num_frames and (self.num_frames == 1 or self.is_even)
 
     @property
     def is_even(self) -> bool:

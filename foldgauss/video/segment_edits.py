@@ -415,11 +415,11 @@ class _Carried:
             for other in self._next_to(number):
                 if other in found or other in asked or not self._named.get("follow", True):
                     continue
-                if len(found[number]):
+                if len(found[number]) or number in asked:  # that it is not there is known there, too
                     self._show(one, found[number], number, other)
-                    if other not in reached:
-                        reached.add(other)
-                        waiting.append(other)
+                if len(found[number]) and other not in reached:
+                    reached.add(other)
+                    waiting.append(other)
         parts = (found[k] if k in found else _none(self._edits._replayed(k)) for k in self._edits._numbers)
         return SegmentedSelection(tuple(parts))
 
