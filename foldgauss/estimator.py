@@ -4,9 +4,10 @@ Where scikit-learn's GaussianMixture has ellipsoids, this has tubes that bend ov
 model. Needs scikit-learn: `pip install "foldgauss[sklearn]"`.
 """
 
-import contextlib
 import warnings
+from collections.abc import Iterable
 from numbers import Integral
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,13 +21,14 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._checks import invalid, one_of, whole, within
+from foldgauss._chunks import Chunks, Piece, Survey, chunks_of, is_chunked, picked, survey, variances_of
 from foldgauss._em.components import Parameters, log_likelihoods, pairs_of
 from foldgauss._em.loop import EMStatus, Run, best, expectation_maximisation, used_degrees
 from foldgauss._em.online import FORGETTING, batch_sums, online_step
 from foldgauss._em.prune import compressed, num_parameters, pruned
-from foldgauss._em.scaling import Scaling, scaling_of, to_mixture, variances_of
-from foldgauss._em.starts import STARTS, from_joint, start
-from foldgauss._em.statistics import Points, points_of, scores
+from foldgauss._em.scaling import Prepare, Scaling, scaling_of, to_mixture
+from foldgauss._em.starts import STARTS, drawn, from_joint, start
+from foldgauss._em.statistics import Blocks, Points, blocks_of, points_of, precision, scores
 from foldgauss._em.updates import Model
 from foldgauss._threads import check_process
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
@@ -60,6 +62,12 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     Parameters and fitted attributes are those of scikit-learn's GaussianMixture where they mean the same. With the
     default envelope a = 1, `degree=1` *is* its model with `covariance_type="full"` and `degree=0` with
     `covariance_type="diag"` its "diag".
+
+    **Data larger than memory:** wherever X are rows (n, d), they may be chunks of rows: an iterable of arrays (n_i, d)
+    that can be gone through again, a function that returns a fresh iterator of them, or a dask array chunked along its
+    rows. `sample_weight` is then chunked likewise, or one array of n weights. Every iteration reads all chunks once
+    (twice with an envelope other than "constant"), one after another; a dask array's by the workers where a
+    `dask.distributed` client is active. The result is that of the rows in one array, up to rounding.
 
     **Parameters:**
 
@@ -150,26 +158,34 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     def fit(self, X, y=None, sample_weight=None):
         """Fit to rows of X (n, d); `sample_weight` (n,) counts repetitions: 2 is the point twice, 0 is not there.
 
-        **Raises:** ValueError on bad parameters, NaN or infinity, fewer points than components; warns
-        (ConvergenceWarning) where it did not converge, see `status_`.
+        **Raises:** ValueError on bad parameters, NaN or infinity, fewer points than components, and naming the chunk
+        where chunks have other columns than the first, can be read but once, or differ from one pass to the next;
+        warns (ConvergenceWarning) where it did not converge, see `status_`.
         """
         self._fit(X, sample_weight)
         return self
 
     def fit_predict(self, X, y=None, sample_weight=None) -> Int[np.ndarray, " n"]:
-        """Fit, and the likeliest component of each row."""
+        """Fit, and the likeliest component of each row, as `predict`."""
         scaled = self._fit(X, sample_weight)
-        with _precision(scaled.dtype):
+        if scaled is None:
+            return self.predict(X)
+        with precision(scaled.dtype):
             return self._posteriors(scaled).argmax(1)
 
     def _fit(self, X, sample_weight):
         _check_parameters(self)
-        x, weights = self._checked(X, sample_weight)
-        if (self.max_degree if self.degree == "auto" else self.degree) > _SINGLE_DEGREE:
-            x, weights = x.astype(np.float64), weights.astype(np.float64)
-        present = weights > 0  # rows without weight may hold anything
-        with _precision(x.dtype):
-            run, model = self._runs(x[present], weights[present])
+        double = (self.max_degree if self.degree == "auto" else self.degree) > _SINGLE_DEGREE
+        if is_chunked(X):
+            x, data = None, self._checked_chunks(X, sample_weight, double)
+        else:
+            x, weights = self._checked(X, sample_weight)
+            if double:
+                x, weights = x.astype(np.float64), weights.astype(np.float64)
+            present = weights > 0  # rows without weight may hold any number
+            data = _Rows(x[present], weights[present])
+        with precision(data.dtype):
+            run, model = self._runs(data)
         self._keep(run, model)
         if run.status != EMStatus.CONVERGED:
             warnings.warn(
@@ -177,27 +193,45 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 ConvergenceWarning,
                 stacklevel=3,
             )
-        return self._scaling.apply(x)
+        return None if x is None else self._scaling.apply(x)
 
     def _checked(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, both of the dtype that is fitted in."""
         check_process()
         X = validate_data(self, X, dtype=[np.float64, np.float32], ensure_min_samples=2 if reset else 1, reset=reset)
-        if X.shape[1] < 2:
-            cure = "One column is time; give at least one of space."
-            raise invalid("X", expected="at least 2 columns", got=f"n_features = {X.shape[1]}", cure=cure)
         weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
-        if not weights.sum() > 0:
+        self._check_sizes(X.shape[1], int((weights > 0).sum()), weights.sum(), reset)
+        return _time_last(X, self._column(X.shape[1])), weights
+
+    def _checked_chunks(self, X, sample_weight, double: bool) -> "_ChunkedRows":
+        """Chunks of rows, after a first pass through them."""
+        check_process()
+        chunks = chunks_of(X, sample_weight)
+        found, sizes = survey(chunks)
+        if found.num_rows < 2:
+            raise invalid("X", expected="at least 2 rows", got=found.num_rows)
+        width = chunks.width
+        self._check_sizes(width, found.size, found.total)
+        order = _order(self._column(width), width)
+        vars(self).pop("feature_names_in_", None)
+        self.n_features_in_ = width
+        dtype = np.dtype(np.float32 if found.single and not double else np.float64)
+        return _ChunkedRows(chunks, found, sizes, order, dtype)
+
+    def _check_sizes(self, num_columns: int, num_points: int, total: float, reset: bool = True) -> None:
+        if num_columns < 2:
+            cure = "One column is time; give at least one of space."
+            raise invalid("X", expected="at least 2 columns", got=f"n_features = {num_columns}", cure=cure)
+        if not total > 0:
             raise invalid("sample_weight", expected="a positive sum", got="0", cure="0 takes a row out.")
         least = 1 if self.n_components == "auto" or not reset else self.n_components
-        if (weights > 0).sum() < least:
+        if num_points < least:
             raise invalid(
                 "n_components",
-                expected=f"at most the number of points (n_samples = {int((weights > 0).sum())})",
+                expected=f"at most the number of points (n_samples = {num_points})",
                 got=self.n_components,
                 cure='Fewer components, or n_components="auto".',
             )
-        return _time_last(X, self._column(X.shape[1])), weights
 
     def _column(self, num_columns: int) -> int:
         column = self.time_column
@@ -207,25 +241,25 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             )
         return int(column) % num_columns
 
-    def _runs(self, x, weights) -> tuple[Run, Model]:
+    def _runs(self, data: "_Rows | _ChunkedRows") -> tuple[Run, Model]:
         auto = "auto" in (self.n_components, self.degree)
-        if auto and weights.sum(dtype=np.float64) < len(weights):  # shares: what pays is decided by numbers of points
-            weights = weights * x.dtype.type(len(weights) / weights.sum(dtype=np.float64))
-        mean, variance = variances_of(x, weights)
+        if auto and data.total < data.size:  # shares: what pays is decided by numbers of points
+            data = data.weighted(data.size / data.total)
+        mean, variance = data.variances()
+        num_columns, total = len(mean), data.total
         envelope = _envelope(self.envelope)
-        total = float(weights.sum(dtype=np.float64))
-        warm = self._warm_start(x.shape[1])
+        warm = self._warm_start(num_columns)
         if warm is None:
             scaling = scaling_of(mean, variance, envelope, self.covariance_type)
-            num, degree = self._sizes(len(weights))
+            num, degree = self._sizes(data.size)
         else:
             scaling, (num, degree) = self._scaling, warm
-        scaled = scaling.apply(x)
+        data = data.scaled(scaling)
         floor = (self.reg_covar + self.reg_relative * variance) / scaling.scale**2
         degrees = used_degrees(degree if warm is None else self.degrees_, num)
-        model = Model(degrees, jnp.asarray(floor, x.dtype), self.covariance_type)
-        starts = self._starts(scaled, weights, scaling, model, degree, warm is not None)
-        points = points_of(scaled, weights, num * len(starts.time_loc), self.devices)
+        model = Model(degrees, jnp.asarray(floor, data.dtype), self.covariance_type)
+        starts = self._starts(data, scaling, model, degree, warm is not None)
+        points = data.points(num * len(starts.time_loc), self.devices)
         run = best(
             expectation_maximisation(
                 starts,
@@ -233,7 +267,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 envelope,
                 model,
                 total=total,
-                least_mass=0.5 * total / len(weights),
+                least_mass=0.5 * total / data.size,
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,
@@ -244,10 +278,10 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             run, model = self._pruned(run, points, envelope, model, total)
         self._scaling, self._envelope, self._floor = scaling, envelope, floor
         vars(self).pop("_online", None)  # a new fit begins anew
-        self._fitted_with = self.covariance_type, self._column(x.shape[1])
+        self._fitted_with = self.covariance_type, self._column(num_columns)
         return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model
 
-    def _pruned(self, run: Run, points: Points, envelope, model: Model, total: float) -> tuple[Run, Model]:
+    def _pruned(self, run: Run, points: Points | Blocks, envelope, model: Model, total: float) -> tuple[Run, Model]:
         params, model = pruned(
             run.params,
             points,
@@ -280,14 +314,17 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         same &= self.n_components in ("auto", len(self.weights_)) and self.degree in ("auto", self._params.degree)
         return (len(self.weights_), self._params.degree) if same else None
 
-    def _starts(self, scaled, weights, scaling: Scaling, model: Model, degree: int, warm: bool) -> Parameters:
+    def _starts(self, data, scaling: Scaling, model: Model, degree: int, warm: bool) -> Parameters:
         """Starts, a leading axis of `n_init`."""
         if warm:
-            return jax.tree.map(lambda z: jnp.asarray(z, scaled.dtype)[None], self._params)
+            return jax.tree.map(lambda z: jnp.asarray(z, data.dtype)[None], self._params)
         rng = check_random_state(self.random_state)
-        made = []
+        made, whole = [], None
         for _ in range(self.n_init):
-            one = start(self.init_params, scaled, weights, model, degree, rng)
+            some = drawn(data.size, rng)
+            if some is None and whole is None:
+                whole = data.rows()
+            one = start(self.init_params, *(whole if some is None else data.rows(some)), model, degree, rng)
             made.append(_of_kind(self._with_given(one, scaling, degree), self.covariance_type))
         return jax.tree.map(lambda *z: jnp.stack(z), *made)
 
@@ -321,7 +358,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         """The fitted attributes, in NumPy."""
         params = Parameters(*(np.asarray(z) for z in run.params))
         self._params = params
-        with _precision(params.curve.dtype):
+        with precision(params.curve.dtype):
             mixture = to_mixture(params, self._scaling, self._envelope)
             means, covariances = mixture.components.moments()
             back = np.argsort(_order(self._column(means.shape[-1]), means.shape[-1]))
@@ -349,6 +386,9 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         **Source:** Cappé and Moulines 2009. **Raises:** as `fit`; ValueError for an envelope other than "constant",
         whose sums do not outlive a step of time.
         """
+        if is_chunked(X):
+            cure = "fit takes chunks; or call partial_fit with one after another."
+            raise invalid("X", expected="one batch of rows", got="chunks", cure=cure)
         if not hasattr(self, "_online"):
             if not isinstance(_envelope(self.envelope), Constant):
                 cure = "Use fit, or gradient_fit.fit_gradient with batch_size."
@@ -357,7 +397,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         _check_parameters(self)
         x, weights = self._checked(X, sample_weight, reset=False)
         sums, seen, batches, model = self._online
-        with _precision(self._params.curve.dtype):
+        with precision(self._params.curve.dtype):
             scaled = self._scaling.apply(x.astype(self._params.curve.dtype))
             points = points_of(scaled, weights.astype(scaled.dtype), len(self.weights_), self.devices)
             total, batches = float(weights.sum(dtype=np.float64)), batches + 1
@@ -384,7 +424,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
                 ConvergenceWarning,
                 stacklevel=3,
             )
-        with _precision(scaled.dtype):
+        with precision(scaled.dtype):
             weights = _check_sample_weight(sample_weight, scaled, dtype=scaled.dtype)
             points = points_of(scaled, weights, len(self.weights_), self.devices)
             sums = batch_sums(self._arrays(scaled.dtype), points)
@@ -395,40 +435,70 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return self
 
     # --- what is known of points ------------------------------------------------------------------------------
+    # Of chunks: an iterator of one array for each, or of a dask array another one, computed when it is asked for.
 
     def score_samples(self, X) -> Float[np.ndarray, " n"]:
-        """log p(x) of each row, in the units of X."""
+        """log p(x) of each row, in the units of X. Of chunks, an iterator of arrays; of a dask array, a dask array."""
+        if is_chunked(X):
+            return self._chunks(X).mapped(_log_prob, self._known())
         y = self._scaled(X)
-        with _precision(y.dtype):
+        with precision(y.dtype):
             points = points_of(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
             value = np.asarray(_scores(self._arrays(y.dtype), self._envelope, points))[: len(y)]
         return value - y.dtype.type(self._scaling.log_volume)
 
     def score(self, X, y=None) -> float:
-        """The mean of `score_samples`."""
-        return float(self.score_samples(X).mean(dtype=np.float64))
+        """The mean of `score_samples`; of chunks, one number for all of them."""
+        return self._mean_score(X)[0]
 
     def predict(self, X) -> Int[np.ndarray, " n"]:
-        """The likeliest component of each row."""
+        """The likeliest component of each row. Of chunks, an iterator of arrays; of a dask array, a dask array."""
+        if is_chunked(X):
+            return self._chunks(X).mapped(_likeliest, self._known(), dtype=np.int64)
         return self.predict_proba(X).argmax(1)
 
     def predict_proba(self, X) -> Float[np.ndarray, "n k"]:
-        """P(component | x) of each row."""
+        """P(component | x) of each row. Of chunks, an iterator of arrays; of a dask array, a dask array."""
+        if is_chunked(X):
+            return self._chunks(X).mapped(_shares, self._known(), num_columns=len(self.weights_))
         y = self._scaled(X)
-        with _precision(y.dtype):
+        with precision(y.dtype):
             return self._posteriors(y)
 
     def _posteriors(self, y):
         points = points_of(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
         return np.asarray(_responsibilities(self._arrays(y.dtype), self._envelope, points))[: len(y)]
 
+    def _mean_score(self, X) -> tuple[float, int]:
+        """The mean log p(x), and the number of rows."""
+        if not is_chunked(X):
+            value = self.score_samples(X)
+            return float(value.mean(dtype=np.float64)), len(value)
+        parts = list(self._chunks(X).run(_total_log_prob, self._known()))
+        num = sum(size for _, size in parts)
+        if not num:
+            raise invalid("X", expected="at least one chunk with rows", got="none")
+        return sum(total for total, _ in parts) / num, num
+
+    def _chunks(self, X) -> Chunks:
+        check_process()
+        check_is_fitted(self)
+        return chunks_of(X, width=self.n_features_in_)
+
+    def _known(self) -> "_Known":
+        order = _order(self._column(self.n_features_in_), self.n_features_in_)
+        envelope = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, self._envelope)
+        return _Known(self._params, envelope, self._scaling, order)
+
     def bic(self, X) -> float:
         """-2 log-likelihood + parameters log n: smaller is better."""
-        return -2 * self.score(X) * len(X) + self._n_parameters() * float(np.log(len(X)))
+        mean, num = self._mean_score(X)
+        return -2 * mean * num + self._n_parameters() * float(np.log(num))
 
     def aic(self, X) -> float:
         """-2 log-likelihood + 2 parameters: smaller is better."""
-        return -2 * self.score(X) * len(X) + 2 * self._n_parameters()
+        mean, num = self._mean_score(X)
+        return -2 * mean * num + 2 * self._n_parameters()
 
     def _n_parameters(self) -> int:
         check_is_fitted(self)
@@ -467,7 +537,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         check_process()
-        with _precision(self._params.curve.dtype):
+        with precision(self._params.curve.dtype):
             x, component = self.to_mixture().sample(jax.random.key(seed), (n_samples,), return_component=True)
             x, component = np.asarray(x), np.asarray(component)
         return x[:, np.argsort(_order(self._column(x.shape[1]), x.shape[1]))], component
@@ -486,7 +556,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         values = np.atleast_1d(np.asarray(values, np.float64))
         if not np.isfinite(values).all():
             raise invalid("values", expected="finite numbers", got=values.tolist())
-        with _precision(self._params.curve.dtype):  # the times of data far from zero do not fit into float32
+        with precision(self._params.curve.dtype):  # the times of data far from zero do not fit into float32
             made = self.to_mixture().condition([order.index(int(c) % num) for c in columns], values)
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), made)
 
@@ -498,6 +568,122 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def _arrays(self, dtype) -> Parameters:
         return Parameters(*(jnp.asarray(z, dtype) for z in self._params))
+
+
+# --- rows in memory and in chunks: what a fit asks of them --------------------------------------------------------
+
+
+class _Rows(NamedTuple):
+    """Rows with weight, time last."""
+
+    x: Float[np.ndarray, "n d"]
+    weights: Float[np.ndarray, " n"]
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self.x.dtype
+
+    @property
+    def size(self) -> int:
+        return len(self.weights)
+
+    @property
+    def total(self) -> float:
+        return float(self.weights.sum(dtype=np.float64))
+
+    def variances(self) -> tuple[np.ndarray, np.ndarray]:
+        return variances_of(self.x, self.weights)
+
+    def weighted(self, factor: float) -> "_Rows":
+        return self._replace(weights=self.weights * self.dtype.type(factor))
+
+    def scaled(self, scaling: Scaling) -> "_Rows":
+        return self._replace(x=scaling.apply(self.x))
+
+    def rows(self, some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        return (self.x, self.weights) if some is None else (self.x[some], self.weights[some])
+
+    def points(self, num_components: int, devices: int) -> Points:
+        return points_of(self.x, self.weights, num_components, devices)
+
+
+class _ChunkedRows(NamedTuple):
+    """Chunks, and what a first pass told of them."""
+
+    chunks: Chunks
+    found: Survey
+    sizes: list[int]
+    order: Int[np.ndarray, " d"]
+    dtype: np.dtype
+    factor: float = 1.0
+    scaling: Scaling | None = None
+
+    @property
+    def size(self) -> int:
+        return self.found.size
+
+    @property
+    def total(self) -> float:
+        return self.found.total * self.factor
+
+    @property
+    def prepare(self) -> Prepare:
+        return Prepare(self.order, self.scaling, self.factor, self.dtype)
+
+    def variances(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.found.mean[self.order], self.found.scatter[self.order] / self.found.total
+
+    def weighted(self, factor: float) -> "_ChunkedRows":
+        return self._replace(factor=factor)
+
+    def scaled(self, scaling: Scaling) -> "_ChunkedRows":
+        return self._replace(scaling=scaling)
+
+    def rows(self, some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        return picked(self.chunks, self.sizes, some, self.prepare)
+
+    def points(self, num_components: int, devices: int) -> Blocks:
+        return Blocks(self.chunks, self.prepare, self.dtype, num_components, self.sizes, devices)
+
+
+class _Known(NamedTuple):
+    """A fitted mixture in NumPy's arrays, for workers."""
+
+    params: Parameters
+    envelope: AbstractEnvelope
+    scaling: Scaling
+    order: Int[np.ndarray, " d"]
+
+
+def _by_rows(function, known: _Known, x: np.ndarray) -> np.ndarray:
+    """A compiled function of points for rows of X, in blocks of few shapes: chunks of any lengths share programs."""
+    y = known.scaling.apply(x[:, known.order])
+    num = len(known.params.time_loc)
+    with precision(y.dtype):
+        params = Parameters(*(jnp.asarray(z, y.dtype) for z in known.params))
+        blocks = blocks_of([(y, np.ones(len(y), y.dtype))], len(y), num)
+        made = [np.asarray(function(params, known.envelope, block)) for block in blocks]
+    return np.concatenate(made)[: len(y)] if made else np.zeros((0, num), y.dtype)
+
+
+def _log_prob(known: _Known, x: np.ndarray) -> np.ndarray:
+    value = _by_rows(_scores, known, x)
+    return (value if len(x) else value[:, 0]) - value.dtype.type(known.scaling.log_volume)
+
+
+def _shares(known: _Known, x: np.ndarray) -> np.ndarray:
+    return _by_rows(_responsibilities, known, x)
+
+
+def _likeliest(known: _Known, x: np.ndarray) -> np.ndarray:
+    return _shares(known, x).argmax(1)
+
+
+def _total_log_prob(pieces: Iterable[Piece], known: _Known) -> tuple[float, int]:
+    total, num = 0.0, 0
+    for x, _ in pieces:
+        total, num = total + float(_log_prob(known, x).sum(dtype=np.float64)), num + len(x)
+    return total, num
 
 
 # --- compiled -------------------------------------------------------------------------------------------------
@@ -519,11 +705,6 @@ def _responsibilities(params: Parameters, envelope: AbstractEnvelope, points: Po
 
 
 # --- columns, checks --------------------------------------------------------------------------------------------
-
-
-def _precision(dtype):
-    """Where float64 data are computed, float64 is enabled; the user's own setting is left as it is."""
-    return jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext()
 
 
 def _order(column: int, num_columns: int) -> Int[np.ndarray, " d"]:

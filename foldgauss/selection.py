@@ -10,6 +10,7 @@ from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
 from foldgauss._checks import invalid, one_of, whole
+from foldgauss._chunks import is_chunked
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture
 
 __all__ = ["MixtureChoice", "select_mixture"]
@@ -43,7 +44,7 @@ def select_mixture(
 
     A degree of "auto" takes away, in each component by itself, the powers that do not pay (from `max_degree`).
 
-    **Shapes:** X (n, d), as in `fit`; all other settings are the estimator's.
+    **Shapes:** X (n, d), as in `fit`, or chunks of rows for "bic" and "aic"; all other settings are the estimator's.
 
     **Example:** `select_mixture(FoldedGaussianMixture(n_init=3), x, n_components=range(1, 6), degrees=[0, 1, 3])`
 
@@ -56,9 +57,13 @@ def select_mixture(
         raise invalid("n_components", expected="whole numbers >= 1", got=sizes, cure="range(1, 6), say.")
     if not degrees or not all(q == "auto" or whole(q, 0) for q in degrees):
         raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
-    X = np.asarray(X)
-    parts = _parts(len(X), folds, groups) if criterion == "cv" else None
-    least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
+    parts, least = None, np.inf
+    if not is_chunked(X):
+        X = np.asarray(X)
+        parts = _parts(len(X), folds, groups) if criterion == "cv" else None
+        least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
+    elif criterion == "cv":
+        raise invalid("criterion", expected='"bic" or "aic" for chunks of rows', got='"cv"', cure="Or give one array.")
     if max(sizes) > least:
         got, cure = max(sizes), "Fewer components."
         raise invalid("n_components", expected=f"at most {least}, the points of a fit", got=got, cure=cure)

@@ -112,6 +112,7 @@ def _editing(names, folder):
 def _estimator(names, folder):
     assert names["mixture"].converged_
     assert names["mixture"].score(names["x"]) > 0.5
+    np.testing.assert_array_equal(np.concatenate(names["labels"]), names["mixture"].predict(names["x"]))
 
 
 def _extending(names, folder):
@@ -192,6 +193,14 @@ def _results(names, folder):
     assert names["gain"] > 0
 
 
+def _segments(names, folder):
+    assert names["spans"] == [(0, 12), (9, 20)]
+    assert names["score"] > 20
+    assert names["part"].num_frames == 11
+    made = {"slow.mp4", "scores.json", "waves-ply", "second.safetensors", "second.fgz", "waves.interpolation.png"}
+    assert made <= {path.name for path in folder.iterdir()}
+
+
 def _slow_motion(names, folder):
     assert len(names["slow"]) == 4 * (guides.NUM_FRAMES - 1) + 1
     assert len(names["large"]) == 2 * guides.NUM_FRAMES - 1
@@ -237,6 +246,7 @@ CHECKS = {
     "docs/quickstart.md": _quickstart,
     "docs/rendering.md": _rendering,
     "docs/results.md": _results,
+    "docs/segments.md": _segments,
     "docs/slow-motion.md": _slow_motion,
     "docs/tradeoff.md": _tradeoff,
     "docs/uncertainty.md": _uncertainty,

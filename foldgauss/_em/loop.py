@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._em.components import Parameters
-from foldgauss._em.statistics import Points, Times, accumulate, time_steps
+from foldgauss._em.statistics import Blocks, Points, Statistics, Times, accumulate, summed, time_steps
 from foldgauss._em.updates import Model, newton_step, profile, updated
 from foldgauss.envelope import AbstractEnvelope, Constant
 
@@ -23,6 +23,8 @@ __all__ = ["EMStatus", "Run", "State", "best", "expectation_maximisation", "log_
 _ARMIJO = 1e-4
 #: Steps from the first inverse temperature to 1.
 ANNEALING_STEPS = 50
+#: Mean log-likelihoods that differ by less than so many times their dtype's eps are equal.
+_ROUNDING = 64
 #: On the way, centres are moved by this share of their own spread: components that heat has made one can part again.
 _JITTER = 0.05
 
@@ -67,14 +69,36 @@ def step(
     """One iteration: exact EM for a constant envelope, else generalised EM with a step of time that goes up."""
     params = state.params
     if isinstance(envelope, Constant):
-        sums = accumulate(params, envelope, points, inverse_temperature=inverse_temperature)
-        new, stuck = updated(params, sums, model)
-        return State(new, state.share), Info(sums.log_likelihood, sums.mass, stuck, jnp.zeros((), sums.mass.dtype))
+        return _stepped(state, accumulate(params, envelope, points, inverse_temperature=inverse_temperature), model)
     here = accumulate(params, envelope, points, order=2, inverse_temperature=inverse_temperature)
-    direction, promise = newton_step(here, model, params.degree)
+    trial = _trial(state, here, model)
+    there = accumulate(params, envelope, points, times=trial.times, inverse_temperature=inverse_temperature)
+    return _stepped_in_time(state, here, trial, there, model)
+
+
+class _Trial(NamedTuple):
+    """A step of time that is to be tried."""
+
+    steps: Float[Array, "2 k"]
+    promise: Float[Array, " k"]
+    times: Times
+
+
+def _stepped(state: State, sums: Statistics, model: Model) -> tuple[State, Info]:
+    new, stuck = updated(state.params, sums, model)
+    return State(new, state.share), Info(sums.log_likelihood, sums.mass, stuck, jnp.zeros((), sums.mass.dtype))
+
+
+def _trial(state: State, here: Statistics, model: Model) -> _Trial:
+    direction, promise = newton_step(here, model, state.params.degree)
     steps = state.share[None] * direction
-    times = time_steps(Times(params.time_loc, params.time_scale), steps)
-    there = accumulate(params, envelope, points, times=times, inverse_temperature=inverse_temperature)
+    return _Trial(steps, promise, time_steps(Times(state.params.time_loc, state.params.time_scale), steps))
+
+
+def _stepped_in_time(
+    state: State, here: Statistics, trial: _Trial, there: Statistics, model: Model
+) -> tuple[State, Info]:
+    (steps, promise, _), params = trial, state.params
     before = profile(here, model, params.degree, jnp.zeros_like(steps), here.gram[0], here.log_a[0])
     after = profile(here, model, params.degree, steps, there.gram[0], there.log_a[0])
     rises = after >= before + _ARMIJO * state.share * promise  # so written, a NaN does not rise
@@ -90,24 +114,73 @@ def _steps(states: State, frozen, points, envelope, model, inverse_temperature):
     """A step of every restart; frozen ones stay."""
 
     def one(state, stays):
-        new, info = step(state, points, envelope, model, inverse_temperature)
-        return jax.tree.map(lambda a, b: jnp.where(stays, a, b), state, new), info
+        return _held(stays, state, *step(state, points, envelope, model, inverse_temperature))
 
-    if frozen.shape[0] == 1:  # without an axis of size one in every array
-        alone = jax.tree.map(lambda z: z[0], (states, frozen))
-        return jax.tree.map(lambda z: z[None], one(*alone))
-    return jax.vmap(one)(states, frozen)
+    return _of_each(one, states, frozen)
+
+
+def _held(stays, state: State, new: State, info: Info) -> tuple[State, Info]:
+    return jax.tree.map(lambda a, b: jnp.where(stays, a, b), state, new), info
+
+
+def _of_each(function, *arguments):
+    """The function of each restart (leading axis)."""
+    if len(jax.tree.leaves(arguments)[0]) == 1:  # without an axis of size one in every array
+        return jax.tree.map(lambda z: z[None], function(*jax.tree.map(lambda z: z[0], arguments)))
+    return jax.vmap(function)(*arguments)
+
+
+# --- the same step over blocks: the sums are one program, called for each block, what is made of them another ------
+
+
+def _steps_of_blocks(states: State, frozen, blocks: Blocks, envelope, model, inverse_temperature):
+    """As `_steps`."""
+    if isinstance(envelope, Constant):
+        sums = summed(_sums, blocks, states.params, envelope, None, 0, inverse_temperature)
+        return _stepped_each(states, frozen, sums, model)
+    here = summed(_sums, blocks, states.params, envelope, None, 2, inverse_temperature)
+    trial = _trial_each(states, here, model)
+    there = summed(_sums, blocks, states.params, envelope, trial.times, 0, inverse_temperature)
+    return _stepped_in_time_each(states, frozen, here, trial, there, model)
+
+
+def _sums(params: Parameters, envelope, times: Times | None, order: int, inverse_temperature, points: Points):
+    def one(params, times):
+        return accumulate(params, envelope, points, times=times, order=order, inverse_temperature=inverse_temperature)
+
+    return _of_each(one, params, times)
 
 
 @eqx.filter_jit
-def log_likelihood(params: Parameters, points: Points, envelope: AbstractEnvelope) -> Float[Array, ""]:
+def _stepped_each(states, frozen, sums, model):
+    return _of_each(lambda stays, state, sums: _held(stays, state, *_stepped(state, sums, model)), frozen, states, sums)
+
+
+@eqx.filter_jit
+def _trial_each(states, here, model):
+    return _of_each(lambda state, here: _trial(state, here, model), states, here)
+
+
+@eqx.filter_jit
+def _stepped_in_time_each(states, frozen, here, trial, there, model):
+    def one(stays, state, *sums):
+        return _held(stays, state, *_stepped_in_time(state, *sums, model))
+
+    return _of_each(one, frozen, states, here, trial, there)
+
+
+def log_likelihood(params: Parameters, points: Points | Blocks, envelope: AbstractEnvelope) -> Float[Array, ""]:
     """sum_i w_i log p(x_i)."""
+    return summed(_log_likelihood, points, params, envelope)
+
+
+def _log_likelihood(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, ""]:
     return accumulate(params, envelope, points).log_likelihood
 
 
 def expectation_maximisation(
     starts: Parameters,
-    points: Points,
+    points: Points | Blocks,
     envelope: AbstractEnvelope,
     model: Model,
     *,
@@ -118,13 +191,14 @@ def expectation_maximisation(
     annealing: float = 1.0,
     observe=None,
 ) -> list[Run]:
-    """EM from every start (leading axis), all in one program; `total` is the sum of the weights.
+    """EM from every start (leading axis), all in one program, or in one for each block; `total` is the weights' sum.
 
     A component with less mass than `least_mass` is given half of the heaviest one instead, so many times as there are
     components. A run converges where the mean log-likelihood moves by less than `tol`, at temperature 1, without a
     reset, and with no larger promise refused to its times.
     """
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
+    take_steps = _steps_of_blocks if isinstance(points, Blocks) else _steps
     before, lasts = states, np.full(restarts, -np.inf)
     statuses = np.full(restarts, EMStatus.NOT_CONVERGED)
     done, num_steps = np.zeros(restarts, bool), np.zeros(restarts, int)
@@ -133,7 +207,7 @@ def expectation_maximisation(
         heat = annealing ** max(1 - (number - 1) / ANNEALING_STEPS, 0)
         cold = heat == 1.0
         temperature = None if cold else jnp.asarray(heat, starts.time_loc.dtype)
-        new, info = _steps(states, jnp.asarray(done), points, envelope, model, temperature)
+        new, info = take_steps(states, jnp.asarray(done), points, envelope, model, temperature)
         values, refused = np.asarray(info.log_likelihood) / total, np.asarray(info.refused) / total
         broken = ~done & ~np.isfinite(values)
         small = (np.abs(values - lasts) < tol) & (refused < max(tol, 1e-12)) & cold & (number > 1)
@@ -174,8 +248,18 @@ def expectation_maximisation(
 
 
 def best(runs: list[Run]) -> Run:
-    """The run of the largest likelihood; a broken one only if all are."""
-    return max(runs, key=lambda run: (run.status != EMStatus.NOT_FINITE, run.log_likelihood))
+    """The run of the largest likelihood, the first of those equal up to rounding; a broken one only if all are.
+
+    Otherwise the order in which points are summed would choose among starts that lead to one end.
+    """
+    top = max(runs, key=_goodness)
+    rounding = _ROUNDING * float(jnp.finfo(top.params.curve.dtype).eps) * max(1.0, abs(top.log_likelihood))
+    sound, least = top.status != EMStatus.NOT_FINITE, top.log_likelihood - rounding
+    return next((run for run in runs if _goodness(run) >= (sound, least)), top)
+
+
+def _goodness(run: Run) -> tuple[bool, float]:
+    return run.status != EMStatus.NOT_FINITE, run.log_likelihood
 
 
 def _last_finite(history: list[float]) -> float:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from foldgauss._em.cholesky import cholesky, inverse_lower, log_det
 from foldgauss._em.components import Parameters, log_likelihoods, pairs_of, to_powers
 from foldgauss._em.loop import best, expectation_maximisation, log_likelihood
-from foldgauss._em.statistics import Points, accumulate
+from foldgauss._em.statistics import Blocks, Points, Statistics, accumulate, summed
 from foldgauss._em.updates import Model, residual_scatter
 from foldgauss._regression import hermite_to_powers
 from foldgauss.envelope import AbstractEnvelope
@@ -43,7 +43,7 @@ def num_parameters(weights: np.ndarray, degrees: np.ndarray, dim: int, covarianc
 
 def pruned(
     params: Parameters,
-    points: Points,
+    points: Points | Blocks,
     envelope: AbstractEnvelope,
     model: Model,
     *,
@@ -74,7 +74,7 @@ def pruned(
         # Powers first: a component is worth more beside others than its share of powers that nobody needs.
         while powers and (less := _lower(found, points, envelope, fitted, penalty)) is not None:
             found, moves = less, True
-        while components and (less := _fewer(found, points, envelope, fitted)) is not None:
+        while components and (less := _fewer(found, points, envelope, fitted, total)) is not None:
             found, moves = less, True
     return found.params, found.model
 
@@ -88,15 +88,15 @@ def compressed(params: Parameters, model: Model) -> tuple[Parameters, Model]:
     return params, Model(jnp.asarray(used), model.floor, model.covariance)
 
 
-def _fewer(found: _Found, points, envelope, fitted) -> _Found | None:
+def _fewer(found: _Found, points, envelope, fitted, total: float) -> _Found | None:
     """One component less, if that pays: those are tried first whose points the others explain best."""
     log_weights = np.asarray(found.params.log_weights, np.float64)
     alive = np.flatnonzero(log_weights > -np.inf)
     if len(alive) < 2:
         return None
-    without = np.asarray(_without(found.params, points, envelope), np.float64)
+    without = np.asarray(summed(_without, points, found.params, envelope), np.float64)
     share = np.exp(log_weights[alive])
-    value = without[alive] - np.asarray(points.weights, np.float64).sum() * np.log1p(-np.minimum(share, 1 - 1e-12))
+    value = without[alive] - total * np.log1p(-np.minimum(share, 1 - 1e-12))
     for k in alive[np.argsort(-value)[:_TRIALS]]:
         rest = log_weights.copy()
         rest[k] = -np.inf
@@ -110,7 +110,8 @@ def _fewer(found: _Found, points, envelope, fitted) -> _Found | None:
 
 def _lower(found: _Found, points, envelope, fitted, penalty: float) -> _Found | None:
     """A power less in every component where it does not pay; if that was too much at once, in the first of them."""
-    losses = np.asarray(_losses(found.params, points, envelope, found.model), np.float64)
+    sums = summed(_sums, points, found.params, envelope)
+    losses = np.asarray(_losses(sums, found.params, found.model), np.float64)
     used, dim = np.asarray(found.model.used), found.params.tril.shape[-1]
     idle = (2 * losses < penalty * dim) & (used > 0) & (np.asarray(found.params.log_weights) > -np.inf)
     first = np.arange(len(used)) == np.argmin(np.where(idle, losses, np.inf))
@@ -130,8 +131,11 @@ def _with_degrees(found: _Found, used: np.ndarray, fitted) -> _Found:
     return fitted(found.params._replace(curve=curve), model)
 
 
-@eqx.filter_jit
-def _without(params: Parameters, points: Points, envelope) -> Float[Array, " k"]:
+def _sums(params: Parameters, envelope, points: Points) -> Statistics:
+    return accumulate(params, envelope, points)
+
+
+def _without(params: Parameters, envelope, points: Points) -> Float[Array, " k"]:
     """The log-likelihood without each component, the others as they are, but for the weights' sum."""
 
     def of_chunk(chunk):
@@ -147,9 +151,8 @@ def _without(params: Parameters, points: Points, envelope) -> Float[Array, " k"]
 
 
 @eqx.filter_jit
-def _losses(params: Parameters, points: Points, envelope, model: Model) -> Float[Array, " k"]:
+def _losses(sums: Statistics, params: Parameters, model: Model) -> Float[Array, " k"]:
     """What each component's highest power is worth in expected log-likelihood, its responsibilities held."""
-    sums = accumulate(params, envelope, points)
     mass = jnp.where(sums.mass > 0, sums.mass, 1)
 
     whitening = inverse_lower(params.tril)

@@ -4,15 +4,16 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from foldgauss._chunks import Piece
 from foldgauss._em.components import Parameters
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["Scaling", "from_mixture", "scaling_of", "to_mixture", "variances_of"]
+__all__ = ["Prepare", "Scaling", "from_mixture", "scaling_of", "to_mixture"]
 
 
 class Scaling(NamedTuple):
@@ -31,13 +32,18 @@ class Scaling(NamedTuple):
         return float(np.log(self.scale).sum())
 
 
-def variances_of(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean and variance per coordinate, in float64."""
-    share = (weights / weights.sum(dtype=np.float64)).astype(np.float64)
-    mean = share @ x
-    centred = x - mean
-    correction = share @ centred
-    return mean + correction, share @ (centred - correction) ** 2
+class Prepare(NamedTuple):
+    """Pieces of chunks made ready for fitting: rows with weight, their columns in `order`, scaled."""
+
+    order: Int[np.ndarray, " d"]
+    scaling: Scaling
+    factor: float  # of the weights
+    dtype: np.dtype
+
+    def __call__(self, piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+        there = piece.weights > 0
+        x, weights = (z.astype(self.dtype, copy=False) for z in (piece.x[there][:, self.order], piece.weights[there]))
+        return self.scaling.apply(x), weights if self.factor == 1 else weights * self.dtype.type(self.factor)
 
 
 def scaling_of(mean, variance, envelope: AbstractEnvelope, covariance: str) -> Scaling:

@@ -10,10 +10,12 @@ from foldgauss._em.statistics import Points, accumulate, points_of
 from foldgauss._em.updates import Model, updated
 from foldgauss.envelope import Constant
 
-__all__ = ["STARTS", "from_joint", "from_responsibilities", "start"]
+__all__ = ["STARTS", "drawn", "from_joint", "from_responsibilities", "start"]
 
 #: Points that a start looks at; EM itself sees all of them.
 _MOST_POINTS = 20_000
+#: Of more points than this, NumPy's draw without replacement, an order of all of them, would take memory of its own.
+_MOST_ORDERED = 2**20
 _LLOYD_STEPS = 10
 #: Curves tried for each component, points that they are tried on, and steps in which each grows along the points.
 _CURVES, _CURVE_POINTS, _GROWTH_STEPS = 12, 2_000, 8
@@ -24,13 +26,23 @@ def start(
 ) -> Parameters:
     """Parameters for scaled points from one of `STARTS`; `rng` is NumPy's."""
     keep = np.flatnonzero(weights > 0)
-    if len(keep) > _MOST_POINTS:
-        keep = rng.choice(keep, _MOST_POINTS, replace=False)
+    if (some := drawn(len(keep), rng)) is not None:
+        keep = keep[some]
     # Points in order and none twice: the same start for a weight of 2 and a point that is there twice.
     y, which = np.unique(y[keep], axis=0, return_inverse=True)
     weights = np.bincount(which.ravel(), weights[keep]).astype(y.dtype)
     responsibilities = STARTS[kind](y.astype(np.float64), weights, len(model.used), degree, rng)
     return from_responsibilities(y, weights, responsibilities, model, degree)
+
+
+def drawn(num: int, rng) -> Int[np.ndarray, " m"] | None:
+    """The numbers, out of `num`, of the points that a start looks at; None where it looks at all."""
+    if num <= _MOST_POINTS:
+        return None
+    if num <= _MOST_ORDERED:
+        return rng.choice(num, _MOST_POINTS, replace=False)
+    # Twice as many as needed, hardly any of them twice; which of them are kept is fair again.
+    return rng.choice(np.unique(rng.choice(num, 2 * _MOST_POINTS)), _MOST_POINTS, replace=False)
 
 
 def from_responsibilities(y, weights, responsibilities, model: Model, degree: int) -> Parameters:

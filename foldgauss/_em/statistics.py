@@ -9,7 +9,10 @@ holds the whole weighted regression of space on time. It is centred before it is
 residuals are those from the component's present curve, whitened.
 """
 
+import contextlib
+import functools
 import math
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,16 +23,33 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._batch import cast
+from foldgauss._chunks import Chunks, Piece
 from foldgauss._em.components import Pairs, Parameters, log_likelihoods, pairs_of
 from foldgauss._regression import hermite_columns
+from foldgauss._threads import check_process
 from foldgauss.envelope import AbstractEnvelope, Constant
 
-__all__ = ["PAIRS_PER_CHUNK", "Points", "Statistics", "Times", "accumulate", "points_of", "scores", "time_steps"]
+__all__ = [
+    "PAIRS_PER_CHUNK",
+    "Blocks",
+    "Points",
+    "Statistics",
+    "Times",
+    "accumulate",
+    "blocks_of",
+    "points_of",
+    "precision",
+    "scores",
+    "summed",
+    "time_steps",
+]
 
 #: Pairs of point and component held at once. Arrays of this many numbers stay in a core's cache.
 PAIRS_PER_CHUNK = 2**17
 #: The least number of rows that a program is compiled for: small batches of any size share one.
 _LEAST_ROWS = 256
+#: Of points that are read chunk by chunk, so many times the rows held at once go into one call of a program.
+_ROUNDS_PER_BLOCK = 8
 
 
 class Points(eqx.Module):
@@ -65,9 +85,8 @@ class Statistics(NamedTuple):
 def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1) -> Points:
     """Points (n, d) and weights (n,), chunked and padded; few distinct shapes, so that few programs are compiled."""
     n, d = x.shape
-    most = max(2 ** int(math.log2(max(PAIRS_PER_CHUNK // num_components, 16))), 16)
     per_device = -(-n // devices)
-    rows = min(most, max(2 ** math.ceil(math.log2(max(per_device, 1))), _LEAST_ROWS))
+    rows = min(_most_rows(num_components), _power_of_two(per_device))
     chunks = -(-per_device // rows)
     missing = devices * chunks * rows - n
     x = np.concatenate([x, np.zeros((missing, d), x.dtype)]) if missing else x
@@ -79,6 +98,100 @@ def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: 
     mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:devices]), ("points",))
     where = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("points"))
     return Points(jax.device_put(x, where), jax.device_put(weights, where), n)
+
+
+def _most_rows(num_components: int) -> int:
+    return max(2 ** int(math.log2(max(PAIRS_PER_CHUNK // num_components, 16))), 16)
+
+
+def _power_of_two(num_rows: int) -> int:
+    return max(2 ** math.ceil(math.log2(max(num_rows, 1))), _LEAST_ROWS)
+
+
+# --- points that are read chunk by chunk ----------------------------------------------------------------------
+
+
+class Blocks(NamedTuple):
+    """Points that are read anew in every pass; `prepare` makes scaled points and weights of a piece."""
+
+    chunks: Chunks
+    prepare: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
+    dtype: np.dtype
+    num_components: int
+    sizes: list[int]  # points in each part of the chunks
+    devices: int = 1
+
+
+def summed(function: Callable, points: Points | Blocks, *arguments):
+    """`function(*arguments, points)`, compiled, of a function that is a sum over points; of blocks, in float64.
+
+    Blocks are added up in the order of their rows, so that who computed them makes no difference.
+    """
+    if isinstance(points, Points):
+        return _compiled(function)(*arguments, points)
+    # Workers get NumPy's arrays: JAX's belong to a process.
+    arguments = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, arguments)
+    devices = 1 if points.chunks.on_workers else points.devices
+    settings = (points.prepare, points.dtype, points.num_components, devices, function, arguments)
+    total = functools.reduce(_added, points.chunks.run(_sums_of_part, *settings, each=points.sizes))
+    return jax.tree.map(lambda z: jnp.asarray(z, points.dtype), total)
+
+
+def _sums_of_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
+    check_process()
+    total, last = None, None
+    with precision(dtype):
+        for block in blocks_of(map(prepare, pieces), size, num_components, devices):
+            # JAX returns before the sums are there: meanwhile the next block is read.
+            last, before = _compiled(function)(*arguments, block), last
+            total = _added(total, before)
+        return _added(total, last)
+
+
+def _added(total, more):
+    """Pytrees of sums in NumPy's float64; None is nothing yet."""
+    if more is None:
+        return total
+    more = jax.tree.map(lambda z: np.asarray(z, np.float64), more)
+    return more if total is None else jax.tree.map(np.add, total, more)
+
+
+def blocks_of(rows: Iterable[tuple], size: int, num_components: int, devices: int = 1) -> Iterator[Points]:
+    """All of `rows`, (points, weights) of any lengths, `size` in all, in blocks of one shape: compiled once."""
+    most = devices * _ROUNDS_PER_BLOCK * _most_rows(num_components)
+    size, held, count = min(devices * _power_of_two(-(-size // devices)), most), [], 0
+    for y, weights in rows:
+        while len(y):
+            taken = min(len(y), size - count)
+            held.append((y[:taken], weights[:taken]))
+            count, y, weights = count + taken, y[taken:], weights[taken:]
+            if count == size:
+                yield _block(held, size, num_components, devices)
+                held, count = [], 0
+    if held:
+        yield _block(held, size, num_components, devices)
+
+
+def _block(held: list[tuple], size: int, num_components: int, devices: int) -> Points:
+    y = np.zeros((size, held[0][0].shape[1]), held[0][0].dtype)
+    weights, row = np.zeros(size, y.dtype), 0
+    for part, mass in held:
+        y[row : row + len(part)], weights[row : row + len(part)] = part, mass
+        row += len(part)
+    return points_of(y, weights, num_components, devices)
+
+
+@functools.cache
+def _compiled(function: Callable) -> Callable:
+    return eqx.filter_jit(function)
+
+
+def precision(dtype) -> contextlib.AbstractContextManager:
+    """Where float64 data are computed, float64 is enabled; the user's own setting is left as it is."""
+    return jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext()
+
+
+# --- sums -----------------------------------------------------------------------------------------------------
 
 
 def accumulate(

@@ -23,6 +23,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "info": Command("drawing", "Say what a model file holds."),
         "figure": Command("figures", "Make a labelled picture of pictures from a model: PNG."),
         "uncertainty": Command("uncertainty", "Say how sure the frame times are, given the splats."),
+        "segment": Command("editing", "Take one segment out of a model in segments, as a model of its own."),
         "edit": Command("editing", "Edit objects or single frames of a model by a script."),
         "compress": Command("compressing", "Write a model as a compact file: a fraction of its size."),
         "tradeoff": Command("tradeoff", "Measure what speed and size cost, one setting at a time."),

@@ -65,6 +65,10 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("For other programs", "foldgauss evaluate holiday.safetensors holiday.mp4 --json holiday.json"),
         ),
         "info": (Example("What is in the file", "foldgauss info holiday.safetensors"),),
+        "segment": (
+            Example("The fourth, into holiday.3.safetensors", "foldgauss segment holiday.safetensors 3"),
+            Example("With another name", "foldgauss segment holiday.safetensors 0 --out beginning.safetensors"),
+        ),
         "edit": (
             Example(
                 "Into holiday.night.safetensors, by the script night.toml",

@@ -1,5 +1,6 @@
 """How many jobs at once are shown: one bar for all and one for each that runs, lines in a log, or JSON."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -8,73 +9,81 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from foldgauss._progress import Manner, print_json
+from foldgauss._threads import available_cores
 from foldgauss.cli._app import Stopped, WrongUse, err
 from foldgauss.cli._signals import noted_signals
-from foldgauss.jobs import FitJob, Outcome, local_workers, run_here, run_on, running_cluster
+from foldgauss.jobs import Crew, FitJob, Outcome, local_workers, run_here, run_on, running_cluster
 from foldgauss.jobs import Progress as Share
 from foldgauss.jobs import Stopped as JobsStopped
 
 #: Seconds between two lines of a log; the first comes sooner, since something may be misspelt.
 FIRST_LINE, LINE = 10.0, 30.0
+#: Jobs of which each has a line in a log.
+FEW = 20
 
 
 def run_jobs(
     jobs: Sequence[FitJob],
     what: str,
     manner: Manner,
+    crew: Crew | None,
     *,
-    workers: int | None,
-    scheduler: str | None,
-    threads: int | None,
     on_end: Callable[[Outcome], None] = lambda outcome: None,
     cure: str,
 ) -> list[Outcome]:
-    """Do the jobs, by workers where any are asked for, and show how far they are; outcomes in the order of the jobs.
+    """Have the jobs done, by `crew` or here, and show how far they are; outcomes in the order of the jobs.
 
     Ctrl-C and SIGTERM end them, once what is done is kept: raises `Stopped`, which says how to go on, by `cure`.
     """
     ended: dict[str, Outcome] = {}
     with noted_signals() as asked, _shown(what, len(jobs), manner) as view:
         asked.stepping = True  # what comes is kept at any moment
-        with _crew(workers, scheduler, threads) as crew:
-            how = {"asked_to_stop": lambda: bool(asked.name)}
-            outcomes = run_here(jobs, view.watch, **how) if crew is None else run_on(crew, jobs, view.watch, **how)
-            try:
-                for outcome in outcomes:
-                    ended[outcome.job.target] = outcome
-                    view.ended(outcome)
-                    on_end(outcome)
-            except JobsStopped as error:
-                done = sum(outcome.failure is None for outcome in ended.values())
-                told = (
-                    f"stopped by {asked.name or 'the worker'}; {done} of {len(jobs)} {what} are done, the others kept"
-                )
-                raise Stopped(f"{told}. {cure}") from error
+        how = {"asked_to_stop": lambda: bool(asked.name)}
+        outcomes = run_here(jobs, view.watch, **how) if crew is None else run_on(crew, jobs, view.watch, **how)
+        try:
+            for outcome in outcomes:
+                ended[outcome.job.target] = outcome
+                view.ended(outcome)
+                on_end(outcome)
+        except JobsStopped as error:
+            done = sum(outcome.failure is None for outcome in ended.values())
+            told = f"stopped by {asked.name or 'the worker'}; {done} of {len(jobs)} {what} are done, the others kept"
+            raise Stopped(f"{told}. {cure}") from error
     return [ended[job.target] for job in jobs]
 
 
-def check_crew(workers: int | None, scheduler: str | None, threads: int | None) -> None:
-    """Raise WrongUse for options that do not go together."""
-    if scheduler is not None and (workers is not None or threads is not None):
-        other = "--workers" if workers is not None else "--threads"
-        raise WrongUse(f"{other}: expected no --scheduler beside it, which has workers of its own. Leave one out.")
-    if threads is not None and workers is None:
-        raise WrongUse("--threads: expected --workers beside it. Of this process: FOLDGAUSS_NUM_THREADS.")
+@dataclasses.dataclass(frozen=True)
+class Hands:
+    """Who is asked to do jobs: `workers` of this machine, each of so many `threads`, those of a `scheduler`, or nobody.
 
+    Raises WrongUse for options that do not go together.
+    """
 
-def crew_of(workers: int | None, scheduler: str | None, threads: int | None) -> str:
-    if scheduler is not None:
-        return f"the workers of {scheduler}"
-    if workers is None:
-        return "this process"
-    each = "" if threads is None else f" of {threads} thread{'' if threads == 1 else 's'}"
-    return f"{workers} worker{'' if workers == 1 else 's'}{each}"
+    workers: int | None
+    scheduler: str | None
+    threads: int | None
 
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and (self.workers is not None or self.threads is not None):
+            other = "--workers" if self.workers is not None else "--threads"
+            raise WrongUse(f"{other}: expected no --scheduler beside it, which has workers of its own. Leave one out.")
+        if self.threads is not None and self.workers is None:
+            raise WrongUse("--threads: expected --workers beside it. Of this process: FOLDGAUSS_NUM_THREADS.")
+        if self.workers is not None and self.threads is None:
+            object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
 
-def _crew(workers: int | None, scheduler: str | None, threads: int | None) -> AbstractContextManager:
-    if scheduler is not None:
-        return running_cluster(scheduler)
-    return nullcontext() if workers is None else local_workers(workers, threads=threads)
+    def __str__(self) -> str:
+        if self.scheduler is not None:
+            return f"the workers of {self.scheduler}"
+        if self.workers is None:
+            return "this process"
+        each = f"{self.threads} thread{'' if self.threads == 1 else 's'}"
+        return f"{self.workers} worker{'' if self.workers == 1 else 's'} of {each}"
+
+    def crew(self) -> AbstractContextManager[Crew | None]:
+        if self.scheduler is not None:
+            return running_cluster(self.scheduler)
+        return nullcontext() if self.workers is None else local_workers(self.workers, threads=self.threads)
 
 
 class _View:
@@ -125,8 +134,6 @@ class _Bars(_View):
         super().ended(outcome)
         if outcome.job.name in self.tasks:
             self.progress.remove_task(self.tasks.pop(outcome.job.name))
-        if outcome.failure is not None:
-            self.progress.console.print(f"failed: {outcome.job.name}: {outcome.failure}", soft_wrap=True)
         self._whole()
 
     def _whole(self) -> None:
@@ -136,6 +143,8 @@ class _Bars(_View):
 
 
 class _Lines(_View):
+    """A line for each that ends, where these are few; else, and between, one now and then."""
+
     def __init__(self, what: str, total: int):
         super().__init__(what, total)
         self.next = time.monotonic() + FIRST_LINE
@@ -149,10 +158,9 @@ class _Lines(_View):
 
     def ended(self, outcome: Outcome) -> None:
         super().ended(outcome)
-        if outcome.failure is not None:
-            err.print(f"failed: {outcome.job.name}: {outcome.failure}", soft_wrap=True)
-        elif self.done < self.total:
-            err.print(f"{self.counts}: {outcome.job.name}, {outcome.record['mean_psnr']:.2f} dB", soft_wrap=True)
+        if self.total <= FEW and self.done + self.failed < self.total:
+            what = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
+            err.print(f"{self.counts}: {outcome.job.name}, {what}", soft_wrap=True)
 
 
 class _Json(_View):

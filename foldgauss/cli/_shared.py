@@ -20,8 +20,11 @@ from foldgauss.cli._app import WrongUse, as_option, err, out
 from foldgauss.cli._app import app as app
 from foldgauss.cli._completion import clip_files, model_files
 from foldgauss.io._atomic import atomic_path
+from foldgauss.io.frame_index import LazyFrames, index_video
+from foldgauss.io.provenance import are_others
 from foldgauss.io.provenance import fingerprint as fingerprint
 from foldgauss.io.provenance import provenance as provenance
+from foldgauss.io.segmented import is_segmented
 from foldgauss.io.video_file import (
     ANIMATION_SUFFIXES,
     MAX_FPS,
@@ -33,12 +36,16 @@ from foldgauss.io.video_file import (
     write_image,
     write_video,
 )
-from foldgauss.io.video_model import read_origin
+from foldgauss.io.video_model import load_video_model, read_origin
 from foldgauss.render import RenderOptions
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.metrics import Evaluation, evaluate
 from foldgauss.video.model import VideoModel
+from foldgauss.video.segments import SegmentedVideo
+
+#: What a model file holds.
+Video = VideoModel | EditedVideo | SegmentedVideo
 
 #: Of a bar, after the time that has gone.
 TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
@@ -117,12 +124,17 @@ def with_constants(options: RenderOptions, **constants: float | None) -> RenderO
         raise WrongUse(as_option(str(error).removeprefix("RenderOptions."))) from error
 
 
-def drawn_with(model: VideoModel | EditedVideo, **constants: float | None) -> VideoModel | EditedVideo:
+def drawn_with(model: Video, **constants: float | None) -> Video:
     """The model, drawn with those constants that were given instead of its own. Raises as `with_constants`."""
-    if isinstance(model, EditedVideo):
-        own = (dataclasses.replace(layer, model=drawn_with(layer.model, **constants)) for layer in model.layers)
-        return dataclasses.replace(model, layers=tuple(own))
-    return dataclasses.replace(model, options=with_constants(model.options, **constants))
+    return model.with_options(with_constants(model.options, **constants))
+
+
+def refuse_segments(model_path: Path) -> None:
+    """For commands that take a model of one piece alone. Raises WrongUse, and as `load_video_model`."""
+    if is_segmented(model_path):
+        got = f"one of {len(load_video_model(model_path).segments):,} segments"
+        cure = f"Take one out: foldgauss segment {model_path} 0."
+        raise WrongUse(str(invalid("MODEL", expected="a model of one piece", got=got, cure=cure)))
 
 
 def refuse_huge(size: tuple[int, int] | None) -> None:
@@ -170,8 +182,8 @@ def counted(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
 
 
 def evaluate_with_progress(
-    model: VideoModel | EditedVideo,
-    frames: np.ndarray,
+    model: Video,
+    frames: np.ndarray | LazyFrames,
     keep: Callable[[np.ndarray], None] = lambda picture: None,
     *,
     shown: bool = True,
@@ -187,7 +199,7 @@ def evaluate_with_progress(
         return evaluate(model, frames, on_frame, background=background)
 
 
-def figures_of(model: VideoModel | EditedVideo, scores: Evaluation) -> dict[str, Any]:
+def figures_of(model: Video, scores: Evaluation) -> dict[str, Any]:
     return {
         "mean_psnr": round(scores.mean_psnr, 3),
         "mean_ssim": round(scores.mean_ssim, 4),
@@ -215,10 +227,10 @@ def tell_of(clip: Clip) -> None:
         err.print(f"warning: {clip.source}: {note}", soft_wrap=True)
 
 
-def clip_of_model(
-    model: VideoModel | EditedVideo, model_path: Path, video: Path, frames: str | None, *, as_many: bool = True
-) -> Clip:
+def clip_of_model(model: Video, model_path: Path, video: Path, frames: str | None, *, as_many: bool = True) -> Clip:
     """The frames that a model was fitted to, at its size, or those named; says so where they are others.
+
+    Those of a model in segments are `LazyFrames`: the clip may be larger than memory.
 
     Raises WrongUse, with `as_many`, for another number of frames than the model's.
     """
@@ -226,7 +238,8 @@ def clip_of_model(
     kept = about.get("frames")
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     try:
-        clip = read_video(video, frames=wanted, size=model.size)
+        read = _lazy_clip if isinstance(model, SegmentedVideo) else read_video
+        clip = read(video, frames=wanted, size=model.size)
     except ValueError as error:
         if frames is not None or not str(error).startswith("frames:"):
             raise
@@ -241,15 +254,22 @@ def clip_of_model(
     return clip
 
 
+def _lazy_clip(video: Path, *, frames: tuple[int | None, int | None] | None, size: tuple[int, int]) -> Clip:
+    """As `read_video`; no more than some frames are in memory."""
+    with err.status(f"Looking through {video.name}"):
+        index = index_video(video, frames=frames, find_cuts=False)
+    lazy = LazyFrames(index, size)
+    return Clip(lazy, index.fps, index.source, index.num_declared, index.times, index.notes)
+
+
 def is_other_clip(model_path: Path, clip: Clip, got: Callable[[], float]) -> bool:
     """Whether `clip` is not what the model was fitted to: other frames, which it shows worse by `OTHER` dB.
 
     `got` gives the mean PSNR, and is asked only where the frames differ in some bit.
     """
     about = read_origin(model_path)
-    digest, had = about.get("frames_digest"), about.get("mean_psnr")
-    differs = digest is not None and digest != fingerprint(clip)["frames_digest"]
-    return differs and had is not None and got() < had - OTHER
+    had = about.get("mean_psnr")
+    return had is not None and are_others(about, clip) and got() < had - OTHER
 
 
 #: dB: decoders differ by less.
@@ -258,8 +278,7 @@ OTHER = 3.0
 
 def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
     """Any clip of the right size may be compared with a model, but not unawares."""
-    digest = about.get("frames_digest")  # files from before it was kept have none
-    if digest is not None and digest != fingerprint(clip)["frames_digest"]:
+    if are_others(about, clip):
         err.print(
             f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
             "another clip or range, or the same one decoded by another version of OpenCV.",
@@ -279,6 +298,7 @@ _LABELS = {
     "degree": ("degree of the folds", "{}"),
     "fit_seconds": ("time spent fitting", "{:.1f} s"),
     "wall_seconds": ("time in all", "{:.1f} s"),
+    "peak_mib": ("most memory of a process that fits", "{:,} MiB"),
     "num_segments": ("segments", "{:,}"),
     "seam_drop": ("PSNR lost where segments meet", "{:.2f} dB"),
     "steps": ("steps", "{:,}"),
@@ -348,7 +368,7 @@ def check_picture_path(path: Path, *, others: str = "", single: bool = False) ->
 
 
 def draw(
-    model: VideoModel | EditedVideo,
+    model: Video,
     path: Path,
     times: np.ndarray,
     rate: float,

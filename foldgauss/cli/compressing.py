@@ -22,6 +22,7 @@ from foldgauss.cli._shared import (
     print_figures,
     refuse_existing,
     refuse_input,
+    refuse_segments,
     scores_of,
 )
 from foldgauss.io._atomic import check_writable
@@ -82,6 +83,7 @@ def compress_command(
     refuse_input(target, "model", model_path)
     refuse_existing(target, overwrite)
     check_writable(target)
+    refuse_segments(model_path)
     model, about = load_video_model(model_path), read_origin(model_path)
     if not isinstance(model, VideoModel):
         cure = "Compress the model before it is edited, and edit that."

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, within
 from foldgauss.cli._completion import among
 from foldgauss.cli._shared import (
     MAX_SHOWN,
@@ -20,6 +20,7 @@ from foldgauss.cli._shared import (
     Size,
     SupportRadius,
     TransmittanceStop,
+    Video,
     WrongUse,
     app,
     check_picture_path,
@@ -48,12 +49,16 @@ from foldgauss.io.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
 from foldgauss.io.video_model import load_video_model, read_metadata, read_origin
 from foldgauss.video.edited import EditedVideo, as_edited
 from foldgauss.video.frame_times import interpolated_times, played_positions, remapped_positions, times_at
+from foldgauss.video.metrics import Evaluation
 from foldgauss.video.model import VideoModel
+from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.stored import stored_counts, to_stored
 from foldgauss.video.tradeoff import frames_per_second
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
+#: That `info` lists one by one.
+MOST_SEGMENTS = 100
 
 
 @app.command()
@@ -171,7 +176,8 @@ class _Course:
             self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
             return times_at(frame_times, remapped_positions(self.remap, fps, rate))
         speed = self.speed or 1.0
-        self._refuse_long("--speed", (len(frame_times) - 1) * rate / abs(speed))
+        if self.speed is not None or self.fps is not None:  # a clip's own frames are as many as there are
+            self._refuse_long("--speed", (len(frame_times) - 1) * rate / abs(speed))
         return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
 
     def warn_of_end(self, num_frames: int, fps: float) -> None:
@@ -212,6 +218,8 @@ def evaluate_command(
 ) -> None:
     """Compare a model with its clip: PSNR and SSIM of every frame.
 
+    Of a model in segments those of each segment are shown; --json has the frames'.
+
     Tells the size of the file, its bits per pixel and how fast it is drawn, too.
     """
     if json_path is not None:
@@ -232,8 +240,19 @@ def evaluate_command(
     figures["frames_per_second"] = round(frames_per_second(model), 1)
     if json_path is not None:
         write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
-    print_frames(scores)
+    _print_segments(model, scores) if isinstance(model, SegmentedVideo) else print_frames(scores)
     print_figures(str(model_path), figures)
+
+
+def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:
+    """A row for each segment, by the frames that it begins: those of a clip of hours are too many for a screen."""
+    table = Table("segment", "frames", "PSNR (dB)", "lowest", "SSIM")
+    stops = [segment.first for segment in model.segments[1:]] + [model.num_frames]
+    for number, (segment, stop) in enumerate(zip(model.segments, stops, strict=True)):
+        psnr, ssim = scores.psnr[segment.first : stop], scores.ssim[segment.first : stop]
+        quality = (f"{np.mean(psnr):.2f}", f"{min(psnr):.2f}", f"{np.mean(ssim):.4f}")
+        table.add_row(str(number), f"{segment.first:,}:{stop:,}", *quality)
+    out.print(table)
 
 
 @app.command()
@@ -241,9 +260,12 @@ def info(model_path: ModelFile) -> None:
     """Say what a model file holds."""
     model = load_video_model(model_path)
     about = read_metadata(model_path)
+    if isinstance(model, SegmentedVideo):
+        _tell_of_segments(model_path, model, about)
+        return
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
     figures = {
-        "frames": f"{model.num_frames} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second",
+        "frames": _frames_told(model),
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
         **_economies(model),
@@ -256,10 +278,47 @@ def info(model_path: ModelFile) -> None:
         figures["edits"] = ", ".join(
             f"{len(one.overlays) + len(one.clocks)} on {one.num_gaussians:,} Gaussians" for one in model.layers
         )
+    _print_facts(model_path, figures, about)
+
+
+def _print_facts(model_path: Path, figures: dict[str, str], about: dict) -> None:
     table = Table(title=str(model_path), show_header=False)
-    for name, value in (figures | {k: short(v) for k, v in about.items() if v is not None}).items():
+    # What was noted of the frames fitted to stands beside what the model's own frames are.
+    noted = {f"{k} of the clip" if k in figures else k: short(v) for k, v in about.items() if v is not None}
+    for name, value in (figures | noted).items():
         table.add_row(name, value)
     out.print(table)
+
+
+def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> None:
+    """What the header says: no model is loaded."""
+    cuts, fades = len(model.cuts), len(model.segments) - 1 - len(model.cuts)
+    joints = f"; begin at a cut: {cuts:,}; fade in: {fades:,}" if len(model.segments) > 1 else ""
+    figures = {
+        "frames": _frames_told(model),
+        "segments": f"{len(model.segments):,}{joints}",
+        "Gaussians": f"{model.num_gaussians:,} in all",
+        "fold": f"polynomial of degree {model.degree}",
+        "numbers stored": f"{model.num_floats:,}",
+        "file": _size_of(model_path, model),
+    }
+    _print_facts(model_path, figures, about)
+    table = Table("segment", "frames", "begins", "Gaussians", "PSNR (dB)")
+    before = None
+    for number, segment in enumerate(model.segments[:MOST_SEGMENTS]):
+        shared = 0 if before is None else before.stop - segment.first
+        begins = "" if before is None else f"fading in over {shared:,}" if shared else "at a cut"
+        quality = segment.metadata.get("mean_psnr")
+        row = (f"{segment.first:,}:{segment.stop:,}", begins, f"{segment.num_gaussians:,}")
+        table.add_row(str(number), *row, f"{quality:.2f}" if within(quality, "(0, 100]") else "")
+        before = segment
+    out.print(table)
+    if len(model.segments) > MOST_SEGMENTS:
+        out.print(f"and {len(model.segments) - MOST_SEGMENTS:,} more segments")
+
+
+def _frames_told(model: Video) -> str:
+    return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second"
 
 
 def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
@@ -290,7 +349,7 @@ def _about_times(times: np.ndarray) -> str:
     return f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}"
 
 
-def _size_of(path: Path, model: VideoModel | EditedVideo) -> str:
+def _size_of(path: Path, model: Video) -> str:
     num_bytes, num_pixels = path.stat().st_size, model.num_frames * model.size[0] * model.size[1]
     kind = "compact, " if is_compact(path) else ""
     return f"{kind}{num_bytes:,} bytes, {8 * num_bytes / num_pixels:.3f} bits per pixel of the frames"

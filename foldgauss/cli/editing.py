@@ -1,4 +1,4 @@
-"""The commands that change a model, and take it to other programs and back: `edit`, `export` and `import`."""
+"""The commands that change a model, and take it to other programs and back: `edit`, `segment`, `export`, `import`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,14 +26,17 @@ from foldgauss.cli._shared import (
     refuse_existing,
     refuse_huge,
     refuse_input,
+    refuse_segments,
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
 from foldgauss.io.exchange import FORMATS, export, import_model
 from foldgauss.io.html import HTML_SUFFIX, QUALITY, write_html
 from foldgauss.io.mesh import read_pseudomesh
+from foldgauss.io.segmented import is_segmented
 from foldgauss.io.video_file import VIDEO_SUFFIXES, write_video
-from foldgauss.io.video_model import MODEL_SUFFIX, load_video_model, read_origin, save_video_model
+from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_video_model, read_origin, save_video_model
+from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 from foldgauss.video.segments import SegmentedVideo
 
@@ -92,6 +95,7 @@ def edit_command(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
+    refuse_segments(model_path)
     model = load_video_model(model_path)
     if not as_model:
         refuse_huge(picture_size or model.size)
@@ -123,8 +127,8 @@ def export_command(
         Path | None,
         typer.Option(
             "--out",
-            help="FILE.ply for ply, and for ply3dgs of one time; FILE.html for html; else a folder "
-            "[default: by the model's name].",
+            help="FILE.ply for ply, and for ply3dgs of one time; FILE.html for html; else a folder, also for ply of a "
+            "model in segments [default: by the model's name].",
         ),
     ] = None,
     times: Annotated[
@@ -144,12 +148,22 @@ def export_command(
     if file_format not in FORMATS:
         raise WrongUse(str(invalid("--format", expected="one of " + ", ".join(FORMATS), got=file_format)))
     chosen = parse_times(times)
+    segmented = file_format == "ply" and is_segmented(model_path)
     if out_path is None:
         single = file_format == "ply3dgs" and chosen is not None and len(chosen) == 1
-        endings = {"ply": ".ply", "ply3dgs": ".3dgs.ply" if single else "-3dgs", "html": ".html"}
+        endings = {
+            "ply": "-ply" if segmented else ".ply",
+            "ply3dgs": ".3dgs.ply" if single else "-3dgs",
+            "html": ".html",
+        }
         out_path = named_after(model_path, endings.get(file_format, f"-{file_format}"))
     refuse_input(out_path, "model", model_path)
-    if file_format == "ply" and out_path.suffix.lower() != ".ply":
+    if file_format == "html":
+        refuse_segments(model_path)
+    if segmented and out_path.suffix and not out_path.is_dir():
+        cure = "Each segment becomes a file in it."
+        raise WrongUse(str(invalid("--out", expected="a folder without extension", got=out_path, cure=cure)))
+    if file_format == "ply" and not segmented and out_path.suffix.lower() != ".ply":
         raise WrongUse(str(invalid("--out", expected="a name ending in .ply", got=out_path)))
     if file_format == "obj" and out_path.suffix:
         raise WrongUse(str(invalid("--out", expected="a folder without extension", got=out_path)))
@@ -169,7 +183,7 @@ def export_command(
         size = out_path.stat().st_size / 1e6
         out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
         return
-    if file_format == "ply" and not isinstance(model, VideoModel):
+    if file_format == "ply" and isinstance(model, EditedVideo):
         cure = "Frames of it go out as ply3dgs or obj."
         raise WrongUse(str(invalid("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)))
     num_frames = model.num_frames if chosen is None else len(chosen)
@@ -179,6 +193,44 @@ def export_command(
     most = "" if file_format == "ply" else "up to "  # of frames, those alive
     told = f"{_CALLED[file_format]} ({file_format}), {frames}, {most}{model.num_gaussians:,} Gaussians"
     out.print(f"{path}: {told}{' each' if most and num_frames > 1 else ''}", soft_wrap=True)
+
+
+@app.command(name="segment")
+def segment_command(
+    model_path: ModelFile,
+    number: Annotated[int, typer.Argument(metavar="NUMBER", help="Which, from 0; see foldgauss info.")],
+    out_path: Annotated[
+        Path | None,
+        typer.Option("--out", help=f"FILE{MODEL_SUFFIX} [default: MODEL.NUMBER{MODEL_SUFFIX} in this folder]."),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Take one segment out of a model in segments, as a model of its own.
+
+    It is compressed, edited, viewed as any other; its frames are those of its span, told by foldgauss info.
+    """
+    if out_path is None:
+        out_path = named_after(model_path, f".{number}{MODEL_SUFFIX}")
+    try:
+        check_model_name(out_path, "--out")
+    except ValueError as error:
+        raise WrongUse(str(error)) from error
+    refuse_input(out_path, "model", model_path)
+    refuse_existing(out_path, overwrite)
+    check_writable(out_path)
+    video, about = load_video_model(model_path), read_origin(model_path)
+    if not isinstance(video, SegmentedVideo):
+        raise WrongUse(str(invalid("MODEL", expected="a model in segments", got="one of one piece")))
+    if not 0 <= number < len(video.segments):
+        expected = f"a whole number from 0 to {len(video.segments) - 1}"
+        raise WrongUse(str(invalid("NUMBER", expected=expected, got=number)))
+    segment = video.segments[number]
+    begins = (about.get("frames") or [0])[0] or 0
+    whole = {"clip": about["clip"]} if "clip" in about else {}
+    known = whole | {"frames": [begins + segment.first, begins + segment.stop]} | dict(segment.metadata)
+    save_video_model(out_path, segment.model, metadata=known)
+    told = f"segment {number}, frames {segment.first:,}:{segment.stop:,}, {segment.num_gaussians:,} Gaussians"
+    out.print(f"{out_path}: {told}", soft_wrap=True)
 
 
 @app.command(name="import")

@@ -14,6 +14,7 @@ from foldgauss.cli._shared import (
     FittedClip,
     ModelFile,
     Overwrite,
+    Video,
     WrongUse,
     app,
     clip_of_model,
@@ -27,11 +28,8 @@ from foldgauss.io._atomic import check_writable
 from foldgauss.io.pictures import comparison, sheet
 from foldgauss.io.video_file import write_image
 from foldgauss.io.video_model import load_video_model
-from foldgauss.video.edited import EditedVideo
 from foldgauss.video.frame_times import times_at
 from foldgauss.video.metrics import psnr
-from foldgauss.video.model import VideoModel
-from foldgauss.video.shots import is_cut
 
 #: As in the paper: t, t + 1/4, t + 2/4, t + 3/4, t + 1.
 PARTS, MAX_PARTS = 4, 32
@@ -69,10 +67,9 @@ def interpolation(
         cure = "Between the frames of one picture lies nothing."
         raise WrongUse(str(invalid("MODEL", expected="at least 2 frames", got=model.num_frames, cure=cure)))
     size, times = _size(model, width), np.asarray(model.frame_times.times())
-    cuts = np.asarray(is_cut(times))
-    chosen = [_near_the_middle(cuts)] if at is None else _parse_at(at, model.num_frames - 1)
-    for k in np.flatnonzero(cuts):
-        if k in chosen:
+    chosen = [_near_the_middle(model)] if at is None else _parse_at(at, model.num_frames - 1)
+    for k in sorted(set(chosen)):
+        if model.frame_times.cut_after(k):
             text = f"warning: --at: between frames {k} and {k + 1} is a cut: each half is the nearer frame."
             err.print(text, soft_wrap=True)
     shares = np.arange(parts + 1) / parts
@@ -110,7 +107,7 @@ def reconstruction(
     spread = sorted({int((k + 0.5) * num / SHOWN) for k in range(SHOWN)})
     chosen = spread if at is None else _parse_at(at, num)
     clip = clip_of_model(model, model_path, video, frames)
-    originals = [clip.over_black[k] for k in chosen]
+    originals = [np.ascontiguousarray(clip.frames[k][..., :3]) for k in chosen]  # over black
     pictures = list(model.frames(np.asarray(model.frame_times.times())[chosen]))
     quality = [psnr(*pair) for pair in zip(originals, pictures, strict=True)]
     captions = [f"frame {k}, {each:.1f} dB" for k, each in zip(chosen, quality, strict=True)]
@@ -129,7 +126,7 @@ def _checked_out(path: Path | None, model_path: Path, kind: str, overwrite: bool
     return path
 
 
-def _size(model: VideoModel | EditedVideo, width: int | None) -> tuple[int, int]:
+def _size(model: Video, width: int | None) -> tuple[int, int]:
     """Height and width of each picture: the model's, or in proportion."""
     if width is None:
         return model.size
@@ -153,10 +150,11 @@ def _parse_at(text: str, count: int) -> list[int]:
     return [int(part) for part in parts]
 
 
-def _near_the_middle(cuts: np.ndarray) -> int:
+def _near_the_middle(model: Video) -> int:
     """The first frame of the interval nearest the middle that is no cut."""
-    within = np.flatnonzero(~cuts)
-    return int(within[np.argmin(np.abs(within - (len(cuts) - 1) / 2))]) if len(within) else 0
+    num = model.num_frames - 1
+    nearest_first = sorted(range(num), key=lambda k: abs(k - (num - 1) / 2))
+    return next((k for k in nearest_first if not model.frame_times.cut_after(k)), 0)
 
 
 def _write(path: Path, picture: np.ndarray, what: str) -> None:

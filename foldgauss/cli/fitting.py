@@ -45,7 +45,7 @@ from foldgauss.cli._fit_options import (
     config_of,
     manner_of,
 )
-from foldgauss.cli._jobs_view import check_crew
+from foldgauss.cli._jobs_view import Hands
 from foldgauss.cli._shared import (
     AlphaCutoff,
     Frames,
@@ -225,7 +225,7 @@ def fit(
     config = config_of(context.params)
     kept = target.with_name(f"{target.name}.checkpoint")
     manner = manner_of(quiet, log_json)
-    check_crew(workers, scheduler, threads)
+    hands = Hands(workers, scheduler, threads)
     context.with_resource(only_writer(target, own=(kept,)))
     refuse_existing(target, overwrite)
     if not (segment_seconds is None and workers is None and scheduler is None):
@@ -235,7 +235,7 @@ def fit(
         parsed = {"size": parse_size(size), "frames": parse_frames(frames)}
         how = {
             "segment_seconds": segment_seconds,
-            "crew": (workers, scheduler, threads),
+            "hands": hands,
             "checkpoint_seconds": checkpoint_seconds,
         }
         fit_in_segments(video, target, config, manner, resume=resume, overwrite=overwrite, **parsed, **how)

@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from foldgauss._progress import Manner, print_json
-from foldgauss._threads import available_cores
 from foldgauss.cli._app import Stopped, WrongUse, as_option, err, out
-from foldgauss.cli._jobs_view import crew_of, run_jobs
+from foldgauss.cli._jobs_view import Hands, run_jobs
 from foldgauss.cli._shared import print_figures, progress_bar
 from foldgauss.jobs import LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.long import SEGMENT_SECONDS
 from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
-
-Crew = tuple[int | None, str | None, int | None]  # workers, scheduler, threads of each worker
 
 
 def fit_in_segments(
@@ -27,34 +24,30 @@ def fit_in_segments(
     size: tuple[int, int] | None,
     frames: tuple[int | None, int | None] | None,
     segment_seconds: float | None,
-    crew: Crew,
+    hands: Hands,
     checkpoint_seconds: float | None,
     resume: bool,
     overwrite: bool,
 ) -> None:
     """Plan, fit, join, tell. What is done is taken up where the same is asked again."""
     begun, folder = time.monotonic(), segments_folder(target)
-    workers, scheduler, threads = crew
     if resume and not folder.is_dir():
         raise WrongUse(f"--resume: expected a stopped fit in {folder}, got none. Start it without --resume.")
     if overwrite and not resume and folder.is_dir():
         _clear(folder)
     asked = {"size": size, "frames": frames, "checkpoint_seconds": checkpoint_seconds}
     asked["segment_seconds"] = SEGMENT_SECONDS if segment_seconds is None else segment_seconds
-    fit = _planned(video, target, config, manner, asked)
-    if workers is not None and threads is None:
-        threads = max(1, available_cores() // workers)
-    _say_plan(fit, config, manner, video, crew_of(workers, scheduler, threads))
-    again = "Give the same command again to go on."
-    how = {"workers": workers, "scheduler": scheduler, "threads": threads}
-    outcomes = run_jobs(fit.jobs, "segments", manner, cure=again, **how)
+    with hands.crew() as crew:  # first: they get ready while the clip is looked through
+        fit = _planned(video, target, config, manner, asked)
+        _say_plan(fit, config, manner, video, str(hands))
+        again = "Give the same command again to go on."
+        outcomes = run_jobs(fit.jobs, "segments", manner, crew, cure=again)
     _say_warnings(outcomes)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if failed:
-        first = f"{failed[0].job.name}: {failed[0].failure}"
-        raise Stopped(
-            f"{len(failed)} of {len(outcomes)} segments failed, the others are kept in {fit.folder}. {first} {again}"
-        )
+        for outcome in failed:
+            err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
+        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed; the others are kept in {fit.folder}. {again}")
     records = {outcome.job.name: outcome.record for outcome in outcomes}
     shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
     with progress_bar("Joining", max(shared, 1), shown=manner == "bar" and shared > 0) as advance:
@@ -75,6 +68,9 @@ def fit_in_segments(
         "wall_seconds": round(time.monotonic() - begun, 2),
         "file_bytes": target.stat().st_size,
     }
+    peaks = [outcome.record["peak_bytes"] for outcome in outcomes]
+    if None not in peaks:
+        figures["peak_mib"] = round(max(peaks) / 2**20)
     if joined.seam_drop is not None:
         figures["seam_drop"] = round(joined.seam_drop, 3)
     if manner == "json":

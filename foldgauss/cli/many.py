@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
+from rich.table import Column, Table
 
 from foldgauss._progress import print_json
-from foldgauss._threads import available_cores
 from foldgauss.cli._app import WrongUse, as_option, err, out
 from foldgauss.cli._completion import files
 from foldgauss.cli._fit_options import (
@@ -41,7 +40,7 @@ from foldgauss.cli._fit_options import (
     config_of,
     manner_of,
 )
-from foldgauss.cli._jobs_view import check_crew, crew_of, run_jobs
+from foldgauss.cli._jobs_view import Hands, run_jobs
 from foldgauss.cli._shared import (
     AlphaCutoff,
     Frames,
@@ -58,6 +57,7 @@ from foldgauss.cli.fitting import make_folder
 from foldgauss.io._lock import only_writer
 from foldgauss.jobs import FitJob, Outcome, find_clips, jobs_of
 from foldgauss.jobs.fitting import finished
+from foldgauss.jobs.many import RECORDS
 
 SUMMARY = "summary.json"
 #: Above, the table shows failures alone; the summary has all.
@@ -116,12 +116,13 @@ def fit_many(
     is left, from where stopped fits were kept. It exits with 1 where a clip failed.
     """
     config, manner = config_of(context.params), manner_of(quiet, log_json)
-    check_crew(workers, scheduler, threads)
+    hands = Hands(workers, scheduler, threads)
     found = find_clips(folder)
     out_dir = Path(f"{folder.resolve().name}-models") if out_dir is None else out_dir
     if out_dir.exists() and out_dir.resolve() == folder.resolve():
         raise WrongUse(f"--out: expected another folder than the clips', got {out_dir}.")
     make_folder(out_dir)
+    make_folder(out_dir / RECORDS)
     context.with_resource(only_writer(out_dir / SUMMARY, what="fit-many"))
     try:
         how = {"size": parse_size(size), "frames": parse_frames(frames), "checkpoint_seconds": checkpoint_seconds}
@@ -130,13 +131,9 @@ def fit_many(
         raise WrongUse(as_option(str(error))) from error
     _make_room(jobs, overwrite)
     before = sum(finished(job) is not None for job in jobs)
-    if workers is not None and threads is None:
-        threads = max(1, available_cores() // workers)
     if manner in ("bar", "lines"):
         done = f", {before} of them done before" if before else ""
-        out.print(
-            f"{folder}: {_number(len(jobs), 'clip')}{done}, by {crew_of(workers, scheduler, threads)}", soft_wrap=True
-        )
+        out.print(f"{folder}: {_number(len(jobs), 'clip')}{done}, by {hands}", soft_wrap=True)
         if found.others:
             names = ", ".join(entry.name for entry in found.others[:3]) + (", ..." if len(found.others) > 3 else "")
             out.print(f"left alone, no clips: {names}", soft_wrap=True)
@@ -146,9 +143,8 @@ def fit_many(
         ended[outcome.job.target] = outcome
         _summarise(out_dir, jobs, ended)
 
-    how = {"workers": workers, "scheduler": scheduler, "threads": threads}
-    again = "Give the same command again to go on."
-    outcomes = run_jobs(jobs, "clips", manner, cure=again, on_end=on_end, **how)
+    with hands.crew() as crew:
+        outcomes = run_jobs(jobs, "clips", manner, crew, cure="Give the same command again to go on.", on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if manner == "json":
         print_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
@@ -206,17 +202,19 @@ def _row(outcome: Outcome) -> dict[str, Any]:
 
 def _print_table(title: str, outcomes: list[Outcome]) -> None:
     failed = sum(outcome.failure is not None for outcome in outcomes)
-    table = Table("clip", "frames", "size", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds", title=title)
+    table = Table(Column("clip", overflow="fold"), title=title)
+    for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds"):
+        table.add_column(name, justify="right", no_wrap=True)
     if len(outcomes) <= MOST_ROWS:
         for outcome in outcomes:
             if outcome.failure is not None:
                 table.add_row(outcome.job.name, "failed")
                 continue
             one = outcome.record
-            height, width = one["size"]
+            frames = f"{one['num_frames']} of {one['size'][0]}x{one['size'][1]}"
             figures = f"{one['mean_psnr']:.2f}", f"{one['mean_ssim']:.4f}", f"{one['num_gaussians']:,}"
             rest = f"{one['file_bytes']:,}", f"{one['seconds']:.1f}"
-            table.add_row(outcome.job.name, str(one["num_frames"]), f"{height}x{width}", *figures, *rest)
+            table.add_row(outcome.job.name, frames, *figures, *rest)
         out.print(table)
     done = [outcome.record for outcome in outcomes if outcome.failure is None]
     told = f"{_number(len(done), 'model')} in {title}"

@@ -30,6 +30,7 @@ from foldgauss.cli._shared import (
     fingerprint,
     named_after,
     out,
+    refuse_segments,
 )
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
 from foldgauss.io._lock import only_writer
@@ -121,6 +122,7 @@ def uncertainty_command(
     out_dir = named_after(model_path, "-uncertainty") if out_dir is None else out_dir
     _check_folder(out_dir, video, overwrite)
     wanted = _parse_only(only)
+    refuse_segments(model_path)
     model = load_video_model(model_path)
     if not isinstance(model, VideoModel):
         cure = "Take the model that was edited, and the clip that it was fitted to."

@@ -2,12 +2,13 @@
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from foldgauss._checks import invalid, one_of
-from foldgauss.io._atomic import OutputError, check_writable, checked_path
+from foldgauss.io._atomic import OutputError, atomic_folder, check_replaceable, check_writable, checked_path
 from foldgauss.io._ply import format_error
 from foldgauss.io.html import HTML_SUFFIX, QUALITY, Frames, write_html
 from foldgauss.io.mesh import write_pseudomesh
@@ -22,6 +23,7 @@ from foldgauss.io.ply import (
 from foldgauss.video.edit import Edit
 from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
+from foldgauss.video.segments import SegmentedVideo
 
 #: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame;
 #: a page that plays.
@@ -29,7 +31,7 @@ FORMATS = ("ply", "ply3dgs", "obj", "html")
 
 
 def export(
-    model: VideoModel | EditedVideo,
+    model: VideoModel | EditedVideo | SegmentedVideo,
     format: str,
     out: str | os.PathLike,
     *,
@@ -45,7 +47,8 @@ def export(
 ) -> Path:
     """Write a model for other programs; returns the path of the file or the folder.
 
-    - `ply`: one file, the published VeGaS video (`write_vegas_ply`)
+    - `ply`: one file, the published VeGaS video (`write_vegas_ply`); of a video in segments a folder with one of each,
+      segment-000.ply and so on
     - `ply3dgs`: a folder with a 3DGS scene of each frame (`write_3dgs_frames`); or one file, where `out` ends in .ply
       and `times` is one (`write_3dgs_ply`)
     - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
@@ -60,7 +63,7 @@ def export(
 
     **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
     """
-    if not isinstance(model, VideoModel | EditedVideo):
+    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
         cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     one_of("format", format, FORMATS)
@@ -74,6 +77,8 @@ def export(
     if unknown:
         got = f"it for {format!r}"
         raise invalid(unknown[0], expected="an option of this format", got=got, cure="Leave it out.")
+    if format == "ply" and isinstance(model, SegmentedVideo):
+        return _write_vegas_segments(out, model, overwrite)
     if format == "ply":
         _check_new(out, overwrite)
         return write_vegas_ply(out, model)
@@ -95,6 +100,18 @@ def export(
         raise invalid("times", expected="one for a single file", got=got, cure=cure)
     _check_new(out, overwrite)
     return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **given)
+
+
+def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
+    if folder.suffix.lower() == ".ply" and not folder.is_dir():
+        cure = "Each segment becomes a file in it: leave the extension out."
+        raise invalid("out", expected="a folder", got=repr(str(folder)), cure=cure)
+    check = partial(check_replaceable, folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments")
+    check()
+    with atomic_folder(folder, check=check) as temporary:
+        for number, segment in enumerate(video.segments):
+            write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)
+    return folder
 
 
 def _check_new(path: Path, overwrite: bool) -> None:

@@ -5,7 +5,9 @@ import hashlib
 import json
 import operator
 import os
-import pickle
+import threading
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -58,6 +60,27 @@ SAME_TIME = 1e-3
 RUN = 32
 _START, _STEPS = "from the start", "from the start, every frame looked at"
 _FORMAT = 1
+#: What NumPy raises of other files, and we of other arrays.
+_NO_INDEX = (
+    OSError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def _checked(**arrays: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of an index; raises ValueError where they do not belong together."""
+    num, seen = len(arrays["transparent"]), len(arrays["places"])
+    shapes = arrays["digests"].shape, arrays["milliseconds"].shape
+    if not 0 < num <= seen or shapes != ((num, DIGEST_BYTES), (seen,)):
+        raise ValueError("shapes")
+    return arrays
 
 
 class FrameIndex:
@@ -97,8 +120,7 @@ class FrameIndex:
         self.has_alpha = bool(transparent.any())
         self.positions = places[len(places) - len(digests) :] - about["start"]
         self._alpha_at: dict[tuple[int, int], bool] = {}
-        #: The margin that was last needed, an index of MARGINS, and whether seeking finds anything at all.
-        self._margin, self._seeks = 0, True
+        self._margin = 0  # that was last needed, a place in MARGINS
 
     def __repr__(self) -> str:
         height, width = self.size
@@ -117,7 +139,8 @@ class FrameIndex:
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers but
-        in a damaged clip."""
+        in a damaged clip. Raises `VideoError` for frames that there are not."""
+        first, stop = _checked_numbers(self, first, stop)
         return int(self.positions[first]), int(self.positions[stop - 1]) + 1
 
     def save(self, path: PathLike) -> Path:
@@ -134,15 +157,16 @@ class FrameIndex:
         """What `save` wrote. Raises `FileNotFoundError`, and `VideoError` for another file."""
         path = checked_path(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # The file is opened here, for NumPy leaves that of a broken one open.
+            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
                 about = json.loads(arrays.pop("about").tobytes())
                 if about.pop("format") != _FORMAT:
                     raise ValueError("format")
-                return cls(about, times=arrays.pop("times", None), **arrays)
+                return cls(about, times=arrays.pop("times", None), **_checked(**arrays))
         except FileNotFoundError:
             raise
-        except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, pickle.UnpicklingError) as error:
+        except _NO_INDEX as error:
             raise video_error(
                 "path",
                 expected="an index of a clip, as FrameIndex.save writes it",
@@ -163,7 +187,7 @@ class FrameIndex:
     def _told(self) -> Told:
         about = self._about
         seconds = risen(self._milliseconds.tolist(), about["rate"])
-        return Told(about["rate"], about["num_total"], tuple(about["shape_notes"]), seconds)
+        return Told(about["rate"], about["num_total"], tuple(about["shape_notes"]), seconds, about["threads"])
 
     @property
     def _path(self) -> Path:
@@ -188,7 +212,7 @@ class _Recorder:
     def __call__(self, image: np.ndarray) -> int:
         self.size = image.shape[:2]
         self.digests += _digest(image)
-        self.transparent.append(image.shape[2] == 4 and image[..., 3].min() < 255)
+        self.transparent.append(int(image.shape[2] == 4 and image[..., 3].min() < 255))
         if self._cuts is not None:
             self._cuts.add(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
         self._on_frame()
@@ -253,6 +277,7 @@ def index_video(
         "names": names,
         "rate": float(told.fps if told else pace.fps),
         "num_total": int(told.num_total) if told else 0,
+        "threads": max(told.threads, 0) if told else 0,
         "shape_notes": list(told.notes) if told else [],
     }
     digests = np.frombuffer(bytes(record.digests), np.uint8).reshape(-1, DIGEST_BYTES)
@@ -313,6 +338,19 @@ def _checked_span(index: FrameIndex, first: int, stop: int | None) -> tuple[int,
     return first, stop
 
 
+def _checked_numbers(index: FrameIndex, first: int, stop: int | None) -> tuple[int, int]:
+    """Of frames that decode."""
+    first, stop = operator.index(first), index.num_frames if stop is None else operator.index(stop)
+    if not 0 <= first < stop <= index.num_frames:
+        raise video_error(
+            "first, stop",
+            expected=f"a range within 0:{index.num_frames}, the frames of {index.source!r}",
+            got=f"{first}:{stop}",
+            cure="Choose first < stop.",
+        )
+    return first, stop
+
+
 def _readable(index: FrameIndex) -> Path:
     return readable_path(index._path)
 
@@ -337,9 +375,8 @@ class _Reel:
         """Frames `first` up to `stop`, of those that decode, as `Clip.frames`; and what else `read_video` tells."""
         with_alpha, prepare, kept = self.has_alpha(size), fit_to(size), _Sheets(stop - first)
 
-        def take(image: np.ndarray) -> int:
+        def take(image: np.ndarray) -> None:
             kept.add(_with_channels(prepare(image), 4 if with_alpha else 3))
-            return 0
 
         told = self._pass(first, stop, take)
         return kept.frames, *told
@@ -350,33 +387,43 @@ class _Reel:
         if size is None or not index.has_alpha:
             return index.has_alpha
         if size not in index._alpha_at:
-            index._alpha_at[size] = any(map(partial_alpha(self, size), np.flatnonzero(index._transparent).tolist()))
+            suspects = np.flatnonzero(index._transparent).tolist()
+            index._alpha_at[size] = any(self._is_transparent(number, size) for number in suspects)
         return index._alpha_at[size]
 
-    def _pass(self, first: int, stop: int, take: Callable[[np.ndarray], int]) -> tuple[int, Pace, tuple[str, ...]]:
+    def _is_transparent(self, number: int, size: tuple[int, int]) -> bool:
+        found, prepare = [], fit_to(size)
+        self._pass(number, number + 1, lambda image: found.append(prepare(image)[..., 3].min() < 255))
+        return bool(found[0])
+
+    def _pass(self, first: int, stop: int, take: Callable[[np.ndarray], object]) -> tuple[int, Pace, tuple[str, ...]]:
         """Hand the frames to `take`, as they are in the file."""
         index = self.index
         if index.kind == "video":
             for image in self._frames(first, stop):
                 take(image)
             return stop - first, Pace(index.fps), ()
-        number = first
+        numbers = iter(range(first, stop))
 
-        def checked(image: np.ndarray) -> int:
-            nonlocal number
+        def checked(image: np.ndarray) -> object:
+            number = next(numbers)
             if _digest(image) != index._digests[number].tobytes():
                 raise _changed(index, number)
-            number += 1
             return take(image)
 
         if index.kind == "folder":
             paths = [index._path / name for name in index._about["names"][first:stop]]
-            for path in paths:
+            for number, path in enumerate(paths, first):
                 if not path.is_file():
-                    raise _changed(index, first)
-            return read_pictures(paths, checked)[1:]
-        start = index._about["start"]
-        return reader_of(index._path)(index._path, start + first, start + stop, checked)[1:]
+                    raise _changed(index, number)
+            told = read_pictures(paths, checked)[1:]
+        else:
+            start = index._about["start"]
+            told = reader_of(index._path)(index._path, start + first, start + stop, checked)[1:]
+        missing = next(numbers, None)
+        if missing is not None:
+            raise _changed(index, missing)
+        return told
 
     def _frames(self, first: int, stop: int) -> Iterator[np.ndarray]:
         """Frames of a video file, BGR, each as it was when it was indexed."""
@@ -398,7 +445,7 @@ class _Reel:
             yield None
         if self.seeks:
             for number in range(index._margin, len(MARGINS)):
-                if index._before + self._done - MARGINS[number] <= 0 or not self.seeks:
+                if index._before + self._done - MARGINS[number] <= 0:
                     break
                 yield number
         yield _START
@@ -406,8 +453,8 @@ class _Reel:
 
     @property
     def seeks(self) -> bool:
-        """Whether it is worth while: a raw stream has no times, and others may have no index."""
-        return self.index._seeks and np.ptp(self.index._milliseconds) > 0
+        """Whether it is worth while: a raw stream has no times."""
+        return np.ptp(self.index._milliseconds) > 0
 
     def _by(self, way: int | str | None, stop: int) -> Iterator[np.ndarray]:
         """Frames from the next wanted one on, as far as they come that way."""
@@ -416,10 +463,10 @@ class _Reel:
         with quiet():
             if way in (_START, _STEPS):
                 self.close()
-                self._capture, self._at = open_video(index._path), -1
+                self._capture, self._at = open_video(index._path, index._about["threads"]), -1
             elif way is not None:
                 if self._capture is None:
-                    self._capture = open_video(index._path)
+                    self._capture = open_video(index._path, index._about["threads"])
                 self._capture.set(cv2.CAP_PROP_POS_MSEC, index._milliseconds[target - MARGINS[way]])
                 self._at = None
         if way == _STEPS:
@@ -427,17 +474,17 @@ class _Reel:
             return
         grabbed = frames_grabbed(self._capture, index._about["rate"])
         while self._done < stop:
-            image = self._next(grabbed, way)
+            image = self._next(grabbed)
             if image is None:
                 self._at = None
                 return
             self._done += 1
             yield image
 
-    def _next(self, grabbed: Iterator[Seen], way: int | str | None) -> np.ndarray | None:
+    def _next(self, grabbed: Iterator[Seen]) -> np.ndarray | None:
         """The next wanted frame; None where it does not come."""
         index = self.index
-        target, located = index._before + self._done, self._at is not None
+        target = index._before + self._done
         with quiet():
             for one in grabbed:
                 number = self._number(one.milliseconds)
@@ -445,7 +492,7 @@ class _Reel:
                     if one.milliseconds > index._milliseconds[target] + SAME_TIME:
                         break
                     continue
-                self._at, located = number, True
+                self._at = number
                 if number < target:
                     continue
                 if number > target:
@@ -453,8 +500,6 @@ class _Reel:
                 found, image = self._capture.retrieve()
                 same = found and _digest(image) == index._digests[self._done].tobytes()
                 return image if same else None
-        if isinstance(way, int) and not located:
-            index._seeks = False
         return None
 
     def _by_steps(self, stop: int) -> Iterator[np.ndarray]:
@@ -488,18 +533,6 @@ class _Reel:
         return after + int(near[0]) if len(near) else None
 
 
-def partial_alpha(reel: _Reel, size: tuple[int, int]) -> Callable[[int], bool]:
-    """Whether a frame is transparent anywhere at that size."""
-
-    def transparent(number: int) -> bool:
-        found = []
-        prepare = fit_to(size)
-        reel._pass(number, number + 1, lambda image: found.append(prepare(image)[..., 3].min() < 255) or 0)
-        return bool(found[0])
-
-    return transparent
-
-
 def _with_channels(frame: np.ndarray, channels: int) -> np.ndarray:
     if frame.shape[2] == channels:
         return frame
@@ -524,7 +557,7 @@ def _changed(index: FrameIndex, number: int) -> VideoError:
         "path",
         expected=f"the file that was indexed, {index.num_frames} frames with the digest {index.digest}",
         got=f"{str(index._path)!r}, in which frame {number} is another",
-        cure="Index it again with index_video, or bring back the file.",
+        cure="It has changed, or another OpenCV decodes it: index it again with index_video, or bring back the file.",
     )
 
 
@@ -535,8 +568,8 @@ class LazyFrames:
     `read_video(path, size=size).frames`, from `first` up to `stop`, which count frames that decode.
 
     `frames[k]` and `frames[a:b]` give C-contiguous arrays of their own. Going forward decodes each frame about once;
-    `run` frames are held for single ones. It can be pickled. The file stays open until `close()`, or until the object
-    goes. Reading raises what `read_indexed` does.
+    `run` frames are held for single ones. It can be pickled, and read by several
+    threads. The file stays open until `close()`, or until the object goes. Reading raises what `read_indexed` does.
     """
 
     dtype, ndim = np.dtype(np.uint8), 4
@@ -549,21 +582,15 @@ class LazyFrames:
         stop: int | None = None,
         run: int = RUN,
     ):
-        stop = index.num_frames if stop is None else operator.index(stop)
-        first, run = operator.index(first), operator.index(run)
-        if not 0 <= first < stop <= index.num_frames:
-            raise video_error(
-                "first, stop",
-                expected=f"a range within 0:{index.num_frames}, the frames of {index.source!r}",
-                got=f"{first}:{stop}",
-                cure="Choose first < stop.",
-            )
+        first, stop = _checked_numbers(index, first, stop)
+        run = operator.index(run)
         if run < 1:
             raise video_error("run", expected="a whole number >= 1", got=str(run), cure=f"Try {RUN}.")
         self.index, self._size = index, checked_size(size)
         self._first, self._stop, self._run = first, stop, run
         self._reel = _Reel(index)
         self._held, self._held_from = None, 0
+        self._one_at_a_time = threading.RLock()  # one decoder, one place in the file
 
     def __getstate__(self) -> dict:
         return {"index": self.index, "size": self._size, "first": self._first, "stop": self._stop, "run": self._run}
@@ -576,8 +603,9 @@ class LazyFrames:
 
     def close(self) -> None:
         """Let the file go, and the frames held; reading opens it again."""
-        self._reel.close()
-        self._held = None
+        with self._one_at_a_time:
+            self._reel.close()
+            self._held = None
 
     @cached_property
     def shape(self) -> tuple[int, int, int, int]:
@@ -613,20 +641,22 @@ class LazyFrames:
             ) from error
         if not -len(self) <= number < len(self):
             raise IndexError(f"frames[{number}]: expected a number within {len(self)} frames.")
-        return self._one(number % len(self)).copy()
+        return self._one(number % len(self))
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.asarray(self[:], dtype)
 
     def _one(self, number: int) -> np.ndarray:
-        if self._held is None or not 0 <= number - self._held_from < len(self._held):
-            first = number - number % self._run
-            self._held = None  # before others are read
-            self._held, self._held_from = self._read(first, min(first + self._run, len(self))), first
-        return self._held[number - self._held_from]
+        """A frame of its own memory."""
+        with self._one_at_a_time:
+            if self._held is None or not 0 <= number - self._held_from < len(self._held):
+                first = number - number % self._run
+                self._held = None  # before others are read
+                self._held, self._held_from = self._read(first, min(first + self._run, len(self))), first
+            return self._held[number - self._held_from].copy()
 
     def _read(self, first: int, stop: int) -> np.ndarray:
-        with unreadable_told(self.index._path):
+        with self._one_at_a_time, unreadable_told(self.index._path):
             _readable(self.index)
             return self._reel.read(self._first + first, self._first + stop, self._size)[0]
 

@@ -28,6 +28,7 @@ from foldgauss.video.edited import EditedVideo
 from foldgauss.video.flat import flattened
 from foldgauss.video.model import VideoModel
 from foldgauss.video.quantise import Quantised, Rule, column_names, describe, is_whole, quantise
+from foldgauss.video.segments import SegmentedVideo
 
 HTML_SUFFIX = ".html"
 #: Quality of the original's pictures, as WebP counts it.
@@ -83,8 +84,8 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
     finely: see docs/player.md for how near the picture comes. `original`: the clip's frames, of the model's number and
     size, shown beside it; as WebP of `quality`, 1 to 100.
 
-    Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, and for frames that
-    do not fit; errors of reading as `load_video_model`.
+    Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, for a video in
+    segments, and for frames that do not fit; errors of reading as `load_video_model`.
 
     Example: `html_page(model, title="holiday")`.
     """
@@ -123,7 +124,7 @@ def _compact(model: Model) -> tuple[bytes, VideoModel | EditedVideo | Quantised,
             return path.read_bytes(), load_compact_model(path), name
         loaded = load_video_model(path)
         return packed(_fine(flattened(loaded))), loaded, name
-    if not isinstance(model, VideoModel | EditedVideo):
+    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
         cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)
     return packed(_fine(flattened(model))), model, "foldgauss"

@@ -25,8 +25,7 @@ from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, S
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
 from foldgauss.video.alpha import BLACK, checked_background
-from foldgauss.video.model import VideoModel
-from foldgauss.video.playback import Playback, to_bytes
+from foldgauss.video.playback import Drawable, Playback, to_bytes
 
 #: What is not in an `.obj`: times of the frames, size and rate of the video, how it is drawn.
 NOTES = "pseudomesh.json"
@@ -116,7 +115,7 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 def write_pseudomesh(
     folder: str | os.PathLike,
-    model: VideoModel,
+    model: Drawable,
     times: Sequence[float] | None = None,
     *,
     overwrite: bool = False,

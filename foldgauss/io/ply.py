@@ -27,7 +27,8 @@ from foldgauss.render.camera import FIELD_OF_VIEW, THICKNESS
 from foldgauss.render.splats import check_size
 from foldgauss.video.frame_times import FrameTimes
 from foldgauss.video.model import LASTING, SH_C0, FoldedSplats, VideoModel
-from foldgauss.video.playback import Playback
+from foldgauss.video.playback import Drawable, Playback
+from foldgauss.video.segments import SegmentedVideo
 
 #: The envelope's power of the published code, which scales standard deviations by exp(-tau^2 / 2).
 VEGAS_POWER = 2.0
@@ -252,6 +253,8 @@ def _note(ply: Ply) -> dict:
 def _check_writable_as_vegas(model: VideoModel) -> None:
     if not isinstance(model, VideoModel):
         cure = "An edited video goes out frame by frame, as ply3dgs or obj."
+        if isinstance(model, SegmentedVideo):
+            cure = "export(model, 'ply', FOLDER) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     envelope = model.splats.envelope
     facts = {
@@ -288,10 +291,11 @@ def _float64(leaf: object) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- 3DGS
 
 
-def frame_gaussians(model: VideoModel | Playback, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
+def frame_gaussians(model: Drawable | Playback, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
     """The Gaussians that a model draws at time t, flat in space, front first, for programs that sort by depth.
 
-    A `Playback` in place of the model saves the making of one for each of many times.
+    A `Playback` in place of the model saves the making of one for each of many times. Where segments of a video fade
+    one into the other, they are those of the one that is seen more of.
 
     **Shapes:** leaves of `Gaussians3D` of the Gaussians alive at t, NumPy. **Units:** model space (see
     `foldgauss.render.camera`); `depth_step` in its units too.
@@ -374,7 +378,7 @@ def write_gaussians_ply(
 
 def write_3dgs_ply(
     path: str | os.PathLike,
-    model: VideoModel,
+    model: Drawable,
     t: float,
     *,
     depth_step: float = DEPTH_STEP,
@@ -397,7 +401,7 @@ def write_3dgs_ply(
 
 def write_3dgs_frames(
     folder: str | os.PathLike,
-    model: VideoModel,
+    model: Drawable,
     times: Sequence[float] | None = None,
     *,
     depth_step: float = DEPTH_STEP,
@@ -428,13 +432,13 @@ def write_3dgs_frames(
     return folder
 
 
-def _check_covers(model: VideoModel) -> None:
+def _check_covers(model: Drawable) -> None:
     if model.compositing != "over":
         cure = "Fit it with --compositing over."
         raise invalid("model's compositing", expected="over, as viewers blend", got=model.compositing, cure=cure)
 
 
-def checked_times(model: VideoModel, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
+def checked_times(model: Drawable, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)

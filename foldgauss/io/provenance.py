@@ -1,9 +1,11 @@
 """Where a model comes from: what its file and its checkpoint say of the frames it was fitted to."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from foldgauss.io.frame_index import LazyFrames
 from foldgauss.io.video_file import Clip
 
 
@@ -16,3 +18,15 @@ def fingerprint(clip: Clip) -> dict[str, Any]:
 def provenance(clip: Clip, seed: int) -> dict[str, Any]:
     """What is noted in a model's file of where it comes from."""
     return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
+
+
+def are_others(about: Mapping[str, Any], clip: Clip) -> bool:
+    """Whether `clip` has other frames than a model's file says `about` its own; False where it says nothing.
+
+    Of a clip that is read lazily, as of a model in segments, frames are compared as they are before they are scaled.
+    """
+    lazy = isinstance(clip.frames, LazyFrames)
+    had = about.get("clip_digest" if lazy else "frames_digest")
+    if had is None:
+        return False
+    return had != (clip.frames.index.digest if lazy else fingerprint(clip)["frames_digest"])

@@ -1,4 +1,4 @@
-"""Models of a clip's segments in one file, each loaded when it is asked for. The layout is in docs/format.md."""
+"""Models of a clip's segments in one file, each loaded when it is asked for. The layout is in docs/formats.md."""
 
 import math
 import os
@@ -114,6 +114,12 @@ def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
 
 
 # ---------------------------------------------------------------------------------------------- loading
+
+
+def is_segmented(path: str | os.PathLike) -> bool:
+    """Whether a file holds a video in segments; no tensor is read. Raises as `load_video_model`."""
+    path = checked_path(path)
+    return not is_compact(path) and read_header(path)["kind"] == SEGMENTED
 
 
 def load_segmented(path: Path, about: dict) -> SegmentedVideo:

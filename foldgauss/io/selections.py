@@ -11,7 +11,8 @@ import numpy as np
 from foldgauss._checks import invalid
 from foldgauss.io._atomic import checked_path
 from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
-from foldgauss.video.model import VideoModel
+from foldgauss.video.model import ONE_SEGMENT, VideoModel
+from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.select import Selection
 
 SELECTION = "selection"
@@ -39,6 +40,7 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
         raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
     if not isinstance(model, VideoModel):
         cure = "Save the selection with the model that it was made in."
+        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     num = model.splats.num_gaussians
     if selection.num_gaussians != num:
@@ -55,7 +57,7 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     """
     checked_path(path, "path, model")
     if not isinstance(model, VideoModel):
-        cure = "The order is (path, model)."
+        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else "The order is (path, model)."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     kind = read_header(path)["kind"]
     if kind != SELECTION:

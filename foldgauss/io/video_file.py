@@ -217,13 +217,14 @@ class Told(NamedTuple):
     """What a pass through a video file tells beside its frames.
 
     `fps`: the container's rate, or what stands for it. `num_total`: frames in all, with those that are missing.
-    `notes`: of the shape of its pixels. `seconds`: of each frame seen, rising.
+    `notes`: of the shape of its pixels. `seconds`: of each frame seen, rising. `threads`: of its decoder.
     """
 
     fps: float
     num_total: int
     notes: tuple[str, ...]
     seconds: np.ndarray
+    threads: int
 
 
 def pass_through(
@@ -234,7 +235,7 @@ def pass_through(
     seen: list[Seen] = []
     with _capture(path) as capture:
         declared, rate = _declared_frames(capture), capture.get(cv2.CAP_PROP_FPS)
-        notes = _shape_notes(capture)
+        notes, threads = _shape_notes(capture), round(capture.get(cv2.CAP_PROP_N_THREADS))
         fps = rate if 0 < rate <= MAX_FPS else DEFAULT_FPS
         stays = _Stays(seen)
         watched = stays.watched(frames_decoded(capture, fps, start, stop, seen))
@@ -270,7 +271,7 @@ def pass_through(
     _check_within(start, stop, num_total, path)
     if not kept:
         raise none_decodes(start, stop, num_decoded, num_total, path)
-    return kept, seen, Told(fps, num_total, notes, seconds)
+    return kept, seen, Told(fps, num_total, notes, seconds, threads)
 
 
 def told_of_span(
@@ -568,8 +569,11 @@ def _restricted() -> Iterator[None]:
                 os.environ[_OPTIONS] = before
 
 
-def open_video(path: Path) -> cv2.VideoCapture:
-    """An opened decoder. Raises `VideoError` for what does not open, has alpha, or is huge."""
+def open_video(path: Path, threads: int = 0) -> cv2.VideoCapture:
+    """An opened decoder. Raises `VideoError` for what does not open, has alpha, or is huge.
+
+    `threads`: of FFmpeg's decoder, 0 for its own choice. What it makes of damaged frames depends on their number.
+    """
     kind = kind_of(_head(path))
     if kind == LIST:
         raise video_error(
@@ -580,8 +584,9 @@ def open_video(path: Path) -> cv2.VideoCapture:
         )
     # FFmpeg only, and an absolute path: other backends take 'img01.png' for the first of a sequence,
     # and FFmpeg takes 'name:rest' for a protocol.
+    options = [cv2.CAP_PROP_N_THREADS, threads] if threads else []
     with quiet(), _restricted():
-        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG, options)
     try:
         if not capture.isOpened():
             raise video_error(

@@ -120,6 +120,7 @@ def _is_range(value: object) -> bool:
 _NOTES: dict[str, Callable[[object], bool]] = {
     "clip": _is_text,
     "frames_digest": _is_text,
+    "clip_digest": _is_text,
     "frames": _is_range,
     "seed": lambda value: whole(value, 0),
     "mean_psnr": lambda value: within(value, "(0, 100]"),

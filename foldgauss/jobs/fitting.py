@@ -71,6 +71,7 @@ class FitJob:
     index: str | None = None
     fps: float | None = None
     checkpoint_seconds: float | None = None
+    folder: str | None = None
     source: dict[str, Any] = dataclasses.field(default_factory=dict)
     noted: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -85,17 +86,16 @@ class FitJob:
     @property
     def kept(self) -> Path:
         """The checkpoint."""
-        return _beside(self.target, ".checkpoint")
+        return self._beside(".checkpoint")
 
     @property
     def record(self) -> Path:
         """What `fit_job` returned, as JSON."""
-        return _beside(self.target, ".json")
+        return self._beside(".json")
 
-
-def _beside(target: str, ending: str) -> Path:
-    path = Path(target)
-    return path.with_name(path.name + ending)
+    def _beside(self, ending: str) -> Path:
+        target = Path(self.target)
+        return Path(self.folder or target.parent) / f"{target.name}{ending}"
 
 
 def fit_job(job: FitJob, tell: Tell | None = None) -> dict[str, Any]:

@@ -36,6 +36,10 @@ CLIP_SUFFIXES = (
 )
 
 
+#: Folder, beside the models, for what is kept of each.
+RECORDS = "records"
+
+
 class FoundClips(NamedTuple):
     """Clips of a folder in natural order, and what else is there."""
 
@@ -76,7 +80,10 @@ def jobs_of(
     frames: tuple[int | None, int | None] | None = None,
     checkpoint_seconds: float | None = None,
 ) -> list[FitJob]:
-    """A job for each clip, whose model goes to `out` under the clip's name, with its extension where two are alike."""
+    """A job for each clip, whose model goes to `out` under the clip's name, with its extension where two are alike.
+
+    Checkpoints and records go to `RECORDS`, a folder in `out`, which must be there.
+    """
     out, config = Path(out).absolute(), FitConfig() if config is None else config
     stems = Counter(_stem(clip).casefold() for clip in clips)
     jobs = []
@@ -84,7 +91,7 @@ def jobs_of(
         stem = _stem(clip) if stems[_stem(clip).casefold()] == 1 else clip.name
         target = str(out / f"{stem}{MODEL_SUFFIX}")
         job = FitJob(clip.name, str(clip.absolute()), target, config, size, frames, source=_stamp(clip))
-        jobs.append(dataclasses.replace(job, checkpoint_seconds=checkpoint_seconds))
+        jobs.append(dataclasses.replace(job, checkpoint_seconds=checkpoint_seconds, folder=str(out / RECORDS)))
     return jobs
 
 

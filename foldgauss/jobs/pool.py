@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 FRUITLESS = 3
 #: Seconds that workers have to keep what they do, once they are asked to stop.
 GRACE = 60.0
+#: Seconds that a scheduler has to answer.
+CONNECT_SECONDS = 10.0
 #: Seconds that a cluster may be without workers.
 NO_WORKERS = 120.0
 #: Seconds that workers of this machine may be missing before others are started; twice as long each time.
@@ -114,7 +116,7 @@ class Crew:
 @contextmanager
 def _silenced() -> Iterator[None]:
     """dask tells of each worker that dies, with its traceback; who does the jobs is told by their outcomes."""
-    names = ("distributed", "tornado.application", "asyncio")
+    names = ("distributed", "distributed.client", "tornado.application", "asyncio")
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -160,6 +162,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
             local_directory=scratch,
             silence_logs=50,
             env=environment,
+            preload=["foldgauss._worker"],
         )
         stack.enter_context(cluster)
         crew = Crew(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
@@ -175,16 +178,19 @@ def running_cluster(address: str) -> Iterator["Crew"]:
     Raises `SchedulerLost` where none answers, ImportError where dask.distributed is not installed.
     """
     distributed = _distributed("scheduler")
+    with _silenced(), _client(distributed, address) as client:
+        yield Crew(client)
+
+
+def _client(distributed: Any, address: str) -> "Client":
     try:
-        client = distributed.Client(address, set_as_default=False, timeout="10s")
+        return distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
     except (OSError, TimeoutError, ValueError) as error:
         got = f"{address!r}, where none answers ({one_line(error)})"
         cure = "Start one: dask scheduler; dask worker ADDRESS --nthreads 1."
         raise SchedulerLost(
             str(invalid("scheduler", expected="the address of a running one", got=got, cure=cure))
         ) from error
-    with client:
-        yield Crew(client)
 
 
 def _distributed(what: str):
@@ -237,9 +243,8 @@ class _Run:
         if threads:
             self.seen = time.monotonic()
         elif time.monotonic() - self.seen > NO_WORKERS:
-            raise SchedulerLost(
-                f"scheduler: expected workers, got none for {NO_WORKERS:g} s. What is finished is kept."
-            )
+            told = "start some, and give the command again"
+            raise SchedulerLost(f"No worker came for {NO_WORKERS:g} s. What is finished is kept: {told}.")
         while self.waiting and len(self.open) < threads:
             self._submit(self.waiting.popleft())
 
@@ -312,10 +317,7 @@ class _Run:
             return
 
 
-_LOST = (
-    "scheduler: expected one that lives, got one that is gone. What is finished is kept: give the command again, "
-    "with a scheduler that runs."
-)
+_LOST = "The scheduler is gone. What is finished is kept: start one, and give the command again."
 
 
 def _when(job: FitJob) -> tuple[int, int] | None:

@@ -13,8 +13,9 @@ from foldgauss._threads import run_tasks
 from foldgauss.render import cpu
 from foldgauss.video.alpha import BLACK, composited
 from foldgauss.video.edited import EditedVideo
-from foldgauss.video.model import VideoModel
+from foldgauss.video.model import ONE_SEGMENT, VideoModel
 from foldgauss.video.playback import Playback
+from foldgauss.video.segments import SegmentedVideo
 
 _f, _d = nb.float32, nb.float64
 _level = np.float32(1 / 255)
@@ -37,6 +38,8 @@ def check_model(model: VideoModel) -> None:
     cure = ""
     if isinstance(model, EditedVideo):
         cure = "Take the model that was edited, and the clip that it was fitted to; or fit one to what is now shown."
+    elif isinstance(model, SegmentedVideo):
+        cure = f"{ONE_SEGMENT} Its clip is that segment's frames."
     raise invalid("model", expected="a VideoModel", got=short_repr(model), cure=cure)
 
 

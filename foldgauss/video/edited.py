@@ -1,5 +1,6 @@
 """Edited videos: models in layers, with edits that no folded model holds, drawn as one."""
 
+import dataclasses
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +15,7 @@ from foldgauss._checks import invalid, whole
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.model import VideoModel, check_time
+from foldgauss.video.model import ONE_SEGMENT, VideoModel, check_time
 from foldgauss.video.overlays import AbstractOverlay, Retimed, SelectedGaussians, acts, padded, room_for
 from foldgauss.video.playback import Playback
 from foldgauss.video.shots import is_cut, out_of_cuts
@@ -119,6 +120,11 @@ class EditedVideo(eqx.Module):
         """Numbers stored, masks not counted."""
         return sum(layer.model.num_floats for layer in self.layers)
 
+    def with_options(self, options: RenderOptions) -> "EditedVideo":
+        """The same, drawn with other constants: those of all layers."""
+        own = (dataclasses.replace(layer, model=layer.model.with_options(options)) for layer in self.layers)
+        return dataclasses.replace(self, layers=tuple(own))
+
     def stage(self, size: tuple[int, int]) -> "EditedStage":
         """Made ready to be conditioned many times, for pictures of `size`."""
         return EditedStage(self, size)
@@ -193,6 +199,8 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
             cure = "Put several together by layers(*videos)."
         elif isinstance(video, str | os.PathLike):
             cure = "Read a file with foldgauss.io.load_video_model(path)."
+        elif type(video).__name__ == "SegmentedVideo":
+            cure = ONE_SEGMENT
         raise invalid("video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cure)
     return EditedVideo((Layer(video),), timeline=0)
 

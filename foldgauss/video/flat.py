@@ -6,21 +6,25 @@ import numpy as np
 
 from foldgauss._checks import invalid
 from foldgauss.video.edited import EditedVideo, Layer
-from foldgauss.video.model import FoldedSplats, VideoModel
+from foldgauss.video.model import ONE_SEGMENT, FoldedSplats, VideoModel
+from foldgauss.video.segments import SegmentedVideo
 
 _CURE = "Draw it as a video: foldgauss render, or write_video(path, video.frames(), video.fps)."
 
 
-def flattened(video: VideoModel | EditedVideo) -> VideoModel:
+def flattened(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoModel:
     """The plain model that draws the same pictures at all times: layers become one array, the front one first.
 
     Raises ValueError for what no folded model holds: edits of some times only, clocks, functions, a camera; and for
-    layers of several envelopes or with cuts of their own.
+    layers of several envelopes or with cuts of their own, and for a video in segments.
 
     Example: `flattened(layers(person, street))`.
     """
     if isinstance(video, VideoModel):
         return video
+    if isinstance(video, SegmentedVideo):
+        got = f"one of {len(video.segments)} segments"
+        raise invalid("model", expected="a model of one piece", got=got, cure=ONE_SEGMENT)
     if video.camera is not None or any(layer.overlays or layer.clocks for layer in video.layers):
         got = "one with edits that no folded model holds"
         raise invalid("model", expected="a plain model, or edits that could be baked", got=got, cure=_CURE)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._checks import invalid
+from foldgauss._checks import invalid, short_repr, whole
 from foldgauss._threads import check_process
 from foldgauss.video.shots import is_cut
 
@@ -42,6 +42,17 @@ class FrameTimes(eqx.Module):
         check_process()
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
+
+    def cut_after(self, k: int) -> bool:
+        """Whether between frames k and k + 1 nothing lies. Raises ValueError for a frame that is none, or the last."""
+        check_frame_before(k, self.num_frames)
+        return bool(is_cut(self.times())[k])
+
+
+def check_frame_before(k: object, num_frames: int) -> None:
+    """Raise unless `k` is the number of a frame that another one follows."""
+    if not whole(k, 0) or k > num_frames - 2:
+        raise invalid("k", expected=f"the number of a frame before the last of {num_frames}", got=short_repr(k))
 
 
 def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:

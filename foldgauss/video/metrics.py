@@ -8,7 +8,7 @@ import skimage
 
 from foldgauss._checks import invalid
 from foldgauss.video.alpha import BLACK, checked_background, composited
-from foldgauss.video.model import VideoModel
+from foldgauss.video.playback import Drawable
 
 
 def psnr(target: np.ndarray, picture: np.ndarray) -> float:
@@ -65,7 +65,7 @@ class Evaluation:
 
 
 def evaluate(
-    model: VideoModel,
+    model: Drawable,
     frames: np.ndarray,
     on_frame: Callable[[np.ndarray], None] | None = None,
     *,
@@ -75,6 +75,8 @@ def evaluate(
 
     Both stand over `background`: black says whether what is seen is right, white besides whether nothing else is.
     Pictures are rounded to 8 bits first, as anyone who watches them gets them. `on_frame` is called with each picture.
+    `model` is any video, also one in segments. Frames are asked for one by one, in order, so `frames` may be anything
+    with `shape`, `dtype`, `ndim` and `[k]`, as `foldgauss.io.LazyFrames` of a clip that is larger than memory.
     Raises ValueError if number or size of the frames differ from the model's.
 
     Example: `evaluate(model, clip.frames).mean_psnr`.
@@ -85,7 +87,8 @@ def evaluate(
         raise invalid("frames", expected=wanted, got=f"{frames.dtype} {frames.shape}")
     scores = []
     for k, picture in enumerate(model.frames(background=background)):
-        target = frames[k] if frames.shape[-1] == 3 else composited(frames[k], checked_background(background))
+        target = np.asarray(frames[k])
+        target = target if target.shape[-1] == 3 else composited(target, checked_background(background))
         scores.append((psnr(target, picture), ssim(target, picture)))
         if on_frame is not None:
             on_frame(picture)

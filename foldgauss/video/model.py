@@ -39,6 +39,8 @@ LASTING = np.float32(np.log(1024))
 OPAQUE = np.float32(8)
 #: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
 PEAK_OPACITY = 0.99
+#: The cure where a video in segments is given and one model is wanted.
+ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 
 class FoldedSplats(eqx.Module):
@@ -251,6 +253,7 @@ def check_model(model: object) -> None:
         cures = {
             "EditedVideo": "Take each layer's own model, before layers and edits are put together.",
             "Edit": "End the chain with .video().",
+            "SegmentedVideo": ONE_SEGMENT,
         }
         cure = cures.get(type(model).__name__, "The model comes first.")
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
@@ -295,6 +298,10 @@ class VideoModel(eqx.Module):
 
         leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
         return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
+
+    def with_options(self, options: RenderOptions) -> "VideoModel":
+        """The same, drawn with other constants."""
+        return dataclasses.replace(self, options=options)
 
     def stage(self, size: tuple[int, int]) -> "Stage":
         """Made ready to be conditioned many times, for pictures of `size`."""

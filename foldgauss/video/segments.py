@@ -14,7 +14,7 @@ from foldgauss._checks import invalid, short_repr, whole
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.alpha import BLACK
 from foldgauss.video.edited import EditedVideo
-from foldgauss.video.frame_times import times_at
+from foldgauss.video.frame_times import check_frame_before, times_at
 from foldgauss.video.model import VideoModel, check_time
 from foldgauss.video.playback import Playback, Staged
 
@@ -67,15 +67,29 @@ class Segment:
         return self.load()
 
 
-@dataclasses.dataclass(frozen=True)
-class EvenTimes:
+@dataclasses.dataclass(frozen=True, eq=False)
+class SegmentedTimes:
     """Times of the frames of a clip in segments: evenly spaced in [0, 1]; one frame alone is at 0."""
 
-    num_frames: int
+    segments: tuple[Segment, ...] = dataclasses.field(repr=False)
+
+    @property
+    def num_frames(self) -> int:
+        return self.segments[-1].stop
 
     def times(self) -> Float64[np.ndarray, " num_frames"]:
         """Frame k is at k / (num_frames - 1)."""
         return np.arange(self.num_frames) / max(self.num_frames - 1, 1)
+
+    def cut_after(self, k: int) -> bool:
+        """Whether between frames k and k + 1 nothing lies: segments meet there, or the segment has a cut of its own.
+
+        Its model is loaded for that. Raises ValueError for a frame that is none, or the last.
+        """
+        check_frame_before(k, self.num_frames)
+        number = bisect.bisect_right(self.segments, k, key=lambda segment: segment.first) - 1
+        segment = self.segments[number]
+        return k + 1 == segment.stop or segment.model.frame_times.cut_after(k - segment.first)
 
 
 class SegmentedVideo:
@@ -135,14 +149,24 @@ class SegmentedVideo:
         return sum(segment.num_floats for segment in self.segments)
 
     @property
-    def frame_times(self) -> EvenTimes:
-        return EvenTimes(self.num_frames)
+    def frame_times(self) -> SegmentedTimes:
+        return SegmentedTimes(self.segments)
 
     @property
     def cuts(self) -> list[int]:
         """The frames that begin a segment at a cut; cuts within segments are their models' own."""
         pairs = pairwise(self.segments)
         return [later.first for earlier, later in pairs if later.first == earlier.stop]
+
+    def with_options(self, options: RenderOptions) -> "SegmentedVideo":
+        """The same, drawn with other constants."""
+        if options == self.options:
+            return self
+
+        def changed(segment: Segment) -> Segment:
+            return dataclasses.replace(segment, options=options, load=lambda: segment.model.with_options(options))
+
+        return SegmentedVideo([changed(segment) for segment in self.segments])
 
     def stage(self, size: tuple[int, int]) -> "SegmentedStage":
         """Made ready to be conditioned many times, for pictures of `size`."""
@@ -193,9 +217,9 @@ class SegmentedVideo:
         number = bisect.bisect_left(self.segments, position + 1, key=lambda segment: segment.first) - 1
         position, seen, left = float(position), [], 1.0
         while left > 0:  # the later ones cover the earlier ones
-            share = self._risen(max(number, 0), position)
+            share = self._risen(number, position)
             if share > 0:
-                seen.append((max(number, 0), left * share))
+                seen.append((number, left * share))
             left, number = left * (1 - share), number - 1
         return seen[::-1]
 

@@ -31,7 +31,7 @@ def time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " i
 
 def is_cut(times: Float[ArrayLike, " num_frames"]) -> Bool[Array, " intervals"]:
     """Which intervals between frame times are cuts."""
-    # By NumPy what is NumPy's: JAX would round float64, in which a clip of a million frames has its times.
+    # By NumPy what is NumPy's: JAX would round float64.
     arrays = jnp if isinstance(times, jax.Array) else np
     intervals = arrays.diff(arrays.asarray(times))
     return intervals > CUT_RATIO * arrays.median(intervals) if len(intervals) else arrays.zeros(0, bool)

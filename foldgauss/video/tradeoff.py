@@ -17,6 +17,7 @@ from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 from foldgauss.video.playback import Playback
 from foldgauss.video.pyramid import levels
+from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.stored import to_stored
 
 #: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
@@ -32,6 +33,8 @@ LEAST_STEPS = 200
 LEAST_GAIN = 0.01
 #: Playing is timed on so many frames at most, and each so many times, of which the fastest counts: others share cores.
 _SHOWN, _ROUNDS = 24, 8
+#: Segments that are timed.
+_SEGMENTS_SHOWN = 3
 #: Seconds after which it is not drawn again, but for a second time.
 _LONG = 5.0
 
@@ -293,6 +296,14 @@ def seconds_per_frame(*models: VideoModel | EditedVideo) -> list[float]:
     return best.mean(1).tolist()
 
 
-def frames_per_second(model: VideoModel | EditedVideo) -> float:
-    """How fast a video is drawn, see `seconds_per_frame`."""
-    return 1 / seconds_per_frame(model)[0]
+def frames_per_second(model: VideoModel | EditedVideo | SegmentedVideo) -> float:
+    """How fast a video is drawn, see `seconds_per_frame`.
+
+    Of one in segments some are drawn, each alone: neither loading nor fades count.
+    """
+    if not isinstance(model, SegmentedVideo):
+        return 1 / seconds_per_frame(model)[0]
+    numbers = np.linspace(0, len(model.segments) - 1, _SEGMENTS_SHOWN).round().astype(int)
+    chosen = [model.segments[number] for number in np.unique(numbers)]
+    seconds = [segment.num_frames * seconds_per_frame(segment.model)[0] for segment in chosen]
+    return sum(segment.num_frames for segment in chosen) / sum(seconds)

@@ -24,7 +24,7 @@ from foldgauss.io import (
 from foldgauss.io.model_file import load_model
 from foldgauss.io.video_model import load_checkpoint, read_origin, save_checkpoint
 from foldgauss.render import Camera, RenderOptions
-from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
+from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
 from foldgauss.video.config import FitConfig
 from foldgauss.video.edit import edit
 from foldgauss.video.growth import Statistics
@@ -97,6 +97,7 @@ def tensors_from(data: bytes) -> int:
 
 #: What a header may say of itself that is none of ours, or of another kind.
 _KINDS = (
+    ("kind", "segmented-video"),
     ("kind", "video"), ("kind", "edited-video"), ("kind", "selection"), ("kind", "fit-checkpoint"), ("kind", "x"),
     ("version", "2"),
     ("format", "pt"), ("header", "[]"), ("header", "{"), ("metadata", "1"), ("metadata", "[" * 9999),
@@ -181,7 +182,7 @@ _MODEL_MUTATIONS = (facts_changed, table_changed, resized, halved)
 #: `_array_leaves` refuses models that are saved; what is loaded comes with the shapes of a skeleton.
 _MODEL_FILE = {
     "foldgauss.io.model_file": (
-        "register_model", "save_model", "_write_safetensors", "_to_numpy", "_kind_of", "_check_described", "to_json",
+        "register_model", "save_model", "write_tensors", "_to_numpy", "_kind_of", "_check_described", "to_json",
         "_array_leaves",
         "_scalar", "plain",
     ),
@@ -201,6 +202,12 @@ def _video_seeds() -> list[bytes]:
     models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
     models.append(dataclasses.replace(_edited(), camera=None))
     models.append(tiny_model(16, 1, shared=True))
+    joined = [
+        (0, tiny_model(seed=2)),
+        (2, dataclasses.replace(_edited(), camera=None)),
+        (5, tiny_model(8, 3, plain=False)),
+    ]
+    models += [SegmentedVideo.of(joined), SegmentedVideo.of([(0, tiny_model(degree=0, frames=1))])]
     return [
         written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]}))
         for one in models
@@ -212,6 +219,9 @@ def _read_video(path: Path) -> None:
     if chance(path) % 8 == 0:
         load_model(path)  # the door below, which takes all kinds
     model = load_video_model(path)
+    for segment in getattr(model, "segments", ()):
+        assert segment.model.num_frames == segment.num_frames
+        assert segment.model.num_gaussians == segment.num_gaussians
     assert model.num_frames >= 1
     assert len(model.size) == 2
     str(model)
@@ -231,6 +241,7 @@ VIDEO = Target(
             "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
             "_palette_skeleton", "_checkpoint_skeleton",
         ),
+        "foldgauss.io.segmented": ("join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "_load"),
         "foldgauss.video.stored": (
             "to_stored", "stored_counts", "_is_regular", "_by_kind", "_by_index", "_num_bytes",
         ),

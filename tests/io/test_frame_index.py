@@ -1,0 +1,645 @@
+"""Spans found by seeking: each is, to the bit, what `read_video` gives, and little else is decoded for it.
+
+Clips are made with ffmpeg, and skipped where there is none.
+"""
+
+import hashlib
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from foldgauss.datasets import sample_clip
+from foldgauss.io import (
+    FrameIndex,
+    LazyFrames,
+    OutputError,
+    VideoError,
+    frame_index,
+    index_video,
+    read_indexed,
+    video_file,
+)
+from foldgauss.io.video_file import read_video, write_frames, write_image, write_video
+from foldgauss.video.motion import CutFinder, Motion
+
+HEIGHT, WIDTH = 48, 64
+
+
+def _moving(num_frames, height=HEIGHT, width=WIDTH):
+    """A texture that moves, so that no frame is like another and an encoder makes use of those around."""
+    texture = np.random.default_rng(0).integers(0, 256, (16, 16, 3)).astype(np.uint8)
+    texture = np.asarray(Image.fromarray(texture).resize((4 * width, 4 * height), Image.Resampling.BICUBIC))
+    there_and_back = [(k % (6 * height), 2 * k % (6 * width)) for k in range(num_frames)]
+    shifts = [(min(y, 6 * height - y), min(x, 6 * width - x)) for y, x in there_and_back]
+    return np.stack([texture[top : top + height, left : left + width] for top, left in shifts])
+
+
+def _encoded(path, frames, *options, rate=25):
+    """Encode with ffmpeg; skip where there is none, or none with that encoder."""
+    if shutil.which("ffmpeg") is None:
+        pytest.skip("ffmpeg is not installed, and nothing else here encodes this")
+    shape = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{frames.shape[2]}x{frames.shape[1]}", "-r", str(rate)]
+    command = ["ffmpeg", "-v", "error", "-y", *shape, "-i", "-", *options, str(path)]
+    ran = subprocess.run(command, input=frames.tobytes(), capture_output=True, check=False, timeout=120)
+    if b"Unknown encoder" in ran.stderr:
+        pytest.skip(f"this ffmpeg lacks an encoder: {ran.stderr.decode().splitlines()[0]}")
+    assert ran.returncode == 0, ran.stderr.decode()
+    return path
+
+
+X264 = ["-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p"]
+LONG = [*X264, "-g", "250", "-bf", "3"]
+#: Of 120 frames. Names begin with what is odd about them.
+KINDS = {
+    "long.mp4": LONG,
+    "open.mp4": [*X264, "-bf", "3", "-x264-params", "open-gop=1:keyint=24:min-keyint=24:scenecut=0"],
+    "open.mkv": ["-c:v", "libx265", "-pix_fmt", "yuv420p", "-x265-params", "open-gop=1:keyint=24:log-level=none"],
+    "refreshed.mp4": [*X264, "-x264-params", "intra-refresh=1:keyint=30", "-bf", "0"],
+    "fragments.mp4": [*LONG, "-g", "40", "-movflags", "frag_keyframe+empty_moov"],
+    "vp9.webm": ["-c:v", "libvpx-vp9", "-b:v", "300k", "-deadline", "realtime", "-cpu-used", "8"],
+    "mpeg4.avi": ["-c:v", "mpeg4", "-g", "30", "-bf", "2"],
+    "mjpeg.avi": ["-c:v", "mjpeg", "-pix_fmt", "yuvj420p"],
+    "stream.ts": [*X264, "-g", "40", "-bf", "2"],
+    "stream.mpg": ["-c:v", "mpeg2video", "-g", "15", "-bf", "2"],
+    "raw.h264": [*X264, "-g", "25"],
+    "late.mkv": [*X264, "-g", "30", "-output_ts_offset", "7.3"],
+    "uneven.mp4": ["-vf", "setpts='PTS+30*eq(mod(N,5),4)/25/TB/50+gt(N,60)/TB'", "-vsync", "vfr", *X264, "-g", "30"],
+    "turned.mp4": [*X264, "-g", "30", "-metadata:s:v", "rotate=90"],
+}
+SPANS = [(0, 7), (40, 52), (83, 84), (110, 120), (17, 30)]
+
+
+def _same(got, expected):
+    assert got.frames.flags.c_contiguous
+    np.testing.assert_array_equal(got.frames, expected.frames)
+    assert (got.fps, got.num_declared, got.notes) == (expected.fps, expected.num_declared, expected.notes)
+    assert got.source == expected.source
+    np.testing.assert_array_equal(got.times, expected.times)
+
+
+def _as_read(index, path, spans=SPANS, size=None, start=0, **options):
+    """Each span is what `read_video` reads there, or refuses."""
+    for first, stop in spans:
+        try:
+            expected = read_video(path, frames=(start + first, start + stop), size=size, **options)
+        except VideoError:
+            with pytest.raises(VideoError):
+                read_indexed(index, first, stop, size=size)
+        else:
+            _same(read_indexed(index, first, stop, size=size), expected)
+
+
+def _described(index, clip):
+    assert (index.num_frames, index.size, index.has_alpha) == (clip.num_frames, clip.size, clip.has_alpha)
+    assert (index.fps, index.num_declared, index.notes) == (clip.fps, clip.num_declared, clip.notes)
+    np.testing.assert_array_equal(index.times, clip.times)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_spans_are_what_decoding_from_the_start_gives(tmp_path, name):
+    path = _encoded(tmp_path / name, _moving(120), *KINDS[name])
+    clip, index = read_video(path), index_video(path)
+    assert clip.num_frames == 120
+    assert (clip.times is not None) == (name == "uneven.mp4")
+    _described(index, clip)
+    assert index.cuts == Motion.of(clip.frames).cuts()
+    _as_read(index, path)
+    _as_read(index, path, SPANS[1:3], size=(20, 30))
+    np.testing.assert_array_equal(LazyFrames(index, run=7)[:], clip.frames)
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """620 frames, of which every 250th stands alone; another shot begins at 400."""
+    frames = _moving(620)
+    frames[400:] = 255 - frames[400:, :, ::-1]
+    return _encoded(tmp_path_factory.mktemp("long") / "long.mp4", frames, *LONG, "-sc_threshold", "0")
+
+
+@pytest.fixture(scope="module")
+def long_index(long):
+    return index_video(long)
+
+
+class _Counting:
+    """An opened decoder that counts what is asked of it."""
+
+    grabs = retrieves = opened = 0
+
+    def __init__(self, capture):
+        self._capture = capture
+        _Counting.opened += 1
+
+    def __getattr__(self, name):
+        return getattr(self._capture, name)
+
+    def grab(self):
+        _Counting.grabs += 1
+        return self._capture.grab()
+
+    def retrieve(self):
+        _Counting.retrieves += 1
+        return self._capture.retrieve()
+
+
+@pytest.fixture
+def counting(monkeypatch):
+    _Counting.grabs = _Counting.retrieves = _Counting.opened = 0
+    real = frame_index.open_video
+    monkeypatch.setattr(frame_index, "open_video", lambda *arguments: _Counting(real(*arguments)))
+    return _Counting
+
+
+def test_a_span_late_in_a_clip_takes_few_frames(long, long_index, counting):
+    found = read_indexed(long_index, 500, 520).frames
+    assert counting.grabs <= 25
+    assert counting.retrieves == 20
+    np.testing.assert_array_equal(found, read_video(long, frames=(500, 520)).frames)
+
+
+def test_going_forward_decodes_each_frame_once(long, long_index, counting):
+    frames = LazyFrames(long_index, size=(24, 32), run=32)
+    whole = read_video(long, size=(24, 32)).frames
+    for k, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame, whole[k])
+    assert counting.opened == 1
+    assert counting.grabs == counting.retrieves == 620
+    assert frames.digest() == hashlib.blake2b(whole, digest_size=16).hexdigest()
+
+
+def test_cuts_are_found_in_passing(long, long_index):
+    assert long_index.cuts == [400]
+    assert index_video(long, find_cuts=False).cuts == []
+
+
+@pytest.mark.parametrize("name", ["bunny", "bikes", "carphone"])
+def test_sample_clips(name):
+    path = sample_clip(name)
+    clip, index = read_video(path, frames=(0, 40)), index_video(path, frames=(0, 40))
+    _described(index, clip)
+    assert index.cuts == Motion.of(clip.frames).cuts() == ([30] if name == "bikes" else [])
+    _as_read(index, path, [(30, 33)], size=(60, 100))
+
+
+def test_cuts_of_a_stream_are_those_of_the_clip():
+    """Fast, dark and noisy clips, with a cut at every third frame."""
+    shots = [read_video(sample_clip(name), size=(90, 120)).frames for name in ("bunny", "bikes", "carphone")]
+    mixed = np.stack([shots[k // 3 % 3][5 * k] for k in range(24)])
+    noise = np.random.default_rng(0).normal(0, 15, mixed.shape)
+    for frames in (mixed, mixed // 12, np.clip(mixed + noise, 0, 255).astype(np.uint8), shots[1][::9]):
+        finder = CutFinder()
+        for frame in frames:
+            finder.add(frame)
+        assert finder.found == Motion.of(frames).cuts()
+        assert finder.found
+
+
+def test_a_stream_without_times_is_read_on(tmp_path, counting):
+    path = _encoded(tmp_path / "a.h264", _moving(120), *KINDS["raw.h264"])
+    lazy, whole = LazyFrames(index_video(path)), read_video(path).frames
+    for first in (3, 100):
+        np.testing.assert_array_equal(lazy[first : first + 2], whole[first : first + 2])
+    assert (counting.opened, counting.grabs) == (1, 102)
+
+
+def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
+    """Without frames that stand alone, a picture is whole only after a whole round of refreshing."""
+    options = [*X264, "-x264-params", "intra-refresh=1:keyint=40", "-bf", "0"]
+    path = _encoded(tmp_path / "a.mp4", _moving(300, 120, 160), *options)
+    index = index_video(path)
+    thrown_away = []
+    for _ in range(2):
+        counting.grabs = counting.retrieves = 0
+        _same(read_indexed(index, 277, 279), read_video(path, frames=(277, 279)))
+        assert counting.grabs < 200
+        thrown_away.append(counting.retrieves - 2)
+    assert thrown_away[0] > 0  # they were looked at, and are not as they should be
+    assert thrown_away[1] == 0  # for the margin is kept that was needed
+
+
+@pytest.mark.parametrize("name", ["long.mp4", "open.mp4", "stream.ts", "mpeg4.avi", "late.mkv", "vp9.webm"])
+def test_damaged_clips(tmp_path, name):
+    path = _encoded(tmp_path / name, _moving(120), *KINDS[name], *([] if name == "long.mp4" else ["-g", "20"]))
+    data = bytearray(path.read_bytes())
+    middle = 2 * len(data) // 5
+    data[middle : middle + 600] = np.random.default_rng(0).bytes(600)
+    path.write_bytes(data)
+    clip, index = read_video(path), index_video(path)
+    _described(index, clip)
+    _as_read(index, path, [*SPANS, (50, 70), (0, clip.num_declared), (clip.num_declared - 1, clip.num_declared)])
+    assert index.positions[0] == 0
+    assert index.positions[-1] < clip.num_declared
+    np.testing.assert_array_equal(LazyFrames(index, first=3)[:], clip.frames[3:])
+    first, stop = index.span(10, clip.num_frames - 5)
+    np.testing.assert_array_equal(read_indexed(index, first, stop).frames, clip.frames[10:-5])
+
+
+def test_damage_is_decoded_as_when_it_was_indexed(tmp_path, monkeypatch):
+    """What FFmpeg makes of damaged frames depends on the number of its threads, of which each machine has its own."""
+    path = _encoded(tmp_path / "a.ts", _moving(120), *KINDS["stream.ts"])
+    data = bytearray(path.read_bytes())
+    at = 6 * len(data) // 10
+    data[at : at + 2000] = np.random.default_rng(3).bytes(2000)
+    path.write_bytes(data)
+    made, real = [], video_file.open_video
+    for threads in (1, 3):
+        monkeypatch.setattr(video_file, "open_video", partial(real, threads=threads))
+        made.append((index_video(path), read_video(path)))
+    if made[0][0].digest == made[1][0].digest:
+        pytest.skip("this FFmpeg makes the same of that damage with any number of threads")
+    for index, clip in made:
+        np.testing.assert_array_equal(LazyFrames(index)[50:], clip.frames[50:])
+
+
+def test_frames_that_damage_left_out_keep_their_places(tmp_path):
+    """As `read_video` has it, a range is one of places; `span` gives that of frames counted as they decode."""
+    frames = _moving(40)
+    path = _encoded(tmp_path / "a.avi", frames, "-c:v", "png")
+    data = path.read_bytes()
+    starts = [at for at in range(len(data)) if data.startswith(b"\x89PNG", at)]
+    broken = bytearray(data)
+    for k in (10, 11):
+        broken[starts[k] : starts[k] + 30] = bytes(30)
+    path.write_bytes(broken)
+    clip, index = read_video(path), index_video(path)
+    assert index.positions.tolist() == [*range(10), *range(13, 40)]  # OpenCV passes by the one after a broken one, too
+    _as_read(index, path, [(8, 15), (10, 12), (10, 14), (30, 40)])  # none of the second's decodes
+    assert index.span(9, 12) == (9, 15)
+    np.testing.assert_array_equal(read_indexed(index, *index.span(9, 12)).frames, clip.frames[9:12])
+    np.testing.assert_array_equal(LazyFrames(index)[9:12], clip.frames[9:12])
+
+
+@pytest.mark.parametrize("num", [1, 2, 3])
+def test_shortest_clips(tmp_path, num):
+    path = write_video(tmp_path / "a.mp4", _moving(num), 25)
+    index = index_video(path)
+    _described(index, read_video(path))
+    _as_read(index, path, [(0, num), (num - 1, num)])
+
+
+def test_where_nothing_moves(tmp_path):
+    """Frames are alike to the bit, then move: a seek is not led astray."""
+    frames = np.concatenate([np.repeat(_moving(1), 60, 0), _moving(40)])
+    path = _encoded(tmp_path / "a.mkv", frames, *X264, "-qp", "0", "-g", "20")
+    index = index_video(path)
+    assert len(np.unique(index._digests[:60], axis=0)) == 1
+    _as_read(index, path, [(5, 8), (30, 50), (58, 64), (61, 63), (99, 100)])
+
+
+def test_a_part_of_a_clip_counts_from_its_first_frame(long):
+    index = index_video(long, frames=(100, 460))
+    clip = read_video(long, frames=(100, 460))
+    _described(index, clip)
+    assert index.cuts == [300]
+    _as_read(index, long, [(0, 5), (200, 220), (350, 360)], start=100)
+    np.testing.assert_array_equal(LazyFrames(index, first=350)[:], clip.frames[350:])
+    with pytest.raises(VideoError, match="first, stop: expected a range within 0:360"):
+        read_indexed(index, 350, 361)
+
+
+def test_a_rate_that_is_given_holds_for_spans(tmp_path):
+    path = _encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"])
+    index = index_video(path, fps=10)
+    clip = read_indexed(index, 50, 70)
+    assert (index.fps, index.times, clip.fps, clip.times) == (10, None, 10, None)
+    _same(clip, read_video(path, frames=(50, 70), fps=10))
+
+
+def test_each_frame_is_told(long):
+    told = []
+    index_video(long, frames=(0, 30), find_cuts=False, on_frame=lambda: told.append(1))
+    assert len(told) == 30
+
+
+def _clear(num_frames, which):
+    """RGBA frames, opaque but for the left edge of those named."""
+    frames = np.concatenate([_moving(num_frames), np.full((num_frames, HEIGHT, WIDTH, 1), 255, np.uint8)], -1)
+    for number in which:
+        frames[number, :, :6, 3] = 40
+    return frames
+
+
+def _as_pictures(folder, frames):
+    folder.mkdir()
+    for number, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / f"img{number}.png")
+    return folder
+
+
+@pytest.mark.parametrize("which", [[], [7]])
+def test_the_whole_clip_decides_on_alpha(tmp_path, which):
+    path = _as_pictures(tmp_path / "frames", _clear(12, which))
+    clip, index = read_video(path), index_video(path)
+    _described(index, clip)
+    assert index.has_alpha == bool(which)
+    found = read_indexed(index, 2, 5).frames
+    np.testing.assert_array_equal(found, clip.frames[2:5])
+    lazy = LazyFrames(index)
+    assert lazy.shape == clip.frames.shape
+    np.testing.assert_array_equal(lazy[:], clip.frames)
+    for size in ((20, 20), (24, 32)):  # the first cuts the left edge off
+        clip, lazy = read_video(path, size=size), LazyFrames(index, size)
+        assert lazy.shape == clip.frames.shape
+        np.testing.assert_array_equal(lazy[:], clip.frames)
+
+
+def test_folders_are_read_by_the_names_indexed(tmp_path):
+    path = write_frames(tmp_path / "frames", _moving(12))
+    index = index_video(path, frames=(1, None))
+    _as_read(index, path, [(0, 3), (8, 11)], start=1)
+    write_image(path / "00000a.png", _moving(1)[0])
+    clip = read_indexed(index, 3, 5)
+    np.testing.assert_array_equal(clip.frames, _moving(12)[4:6])
+    shutil.copy(path / "00002.png", path / "00006.png")
+    with pytest.raises(VideoError, match="frame 5 is another"):
+        read_indexed(index, 3, 8)
+    (path / "00005.png").unlink()
+    with pytest.raises(VideoError, match="frame 4 is another"):
+        read_indexed(index, 3, 8)
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.webp", "a.png"])
+def test_animations(tmp_path, name):
+    frames = _clear(12, [0])
+    if name == "a.gif":  # which has no half of it
+        frames[frames[..., 3] < 255] = 0
+    first, *rest = map(Image.fromarray, frames)
+    first.save(tmp_path / name, save_all=True, append_images=rest, duration=[100] * 6 + [300] * 6)
+    clip, index = read_video(tmp_path / name), index_video(tmp_path / name)
+    assert clip.has_alpha
+    _described(index, clip)
+    for first, stop in [(0, 12), (7, 9), (8, 12)]:
+        span = read_video(tmp_path / name, frames=(first, stop))
+        found = read_indexed(index, first, stop)
+        np.testing.assert_array_equal(found.frames, clip.frames[first:stop])
+        np.testing.assert_array_equal(found.times, span.times)
+        assert (found.fps, found.notes, found.num_declared) == (span.fps, span.notes, span.num_declared)
+    np.testing.assert_array_equal(LazyFrames(index, run=5)[:], clip.frames)
+    part = index_video(tmp_path / name, frames=(2, 10))
+    size = (HEIGHT, WIDTH - 16)  # the left edge is cut off
+    np.testing.assert_array_equal(LazyFrames(index, size)[:], read_video(tmp_path / name, size=size).frames)
+    np.testing.assert_array_equal(read_indexed(part, 5, 7).frames, clip.frames[7:9, ..., :3])  # all opaque
+
+
+@pytest.mark.parametrize(("name", "says"), [("a.gif", "expected A:B within 0:"), ("a.png", "is another")])
+def test_an_animation_that_lost_frames_is_refused(tmp_path, name, says):
+    """A GIF does not promise a number of frames, a PNG does."""
+    path = tmp_path / name
+    first, *rest = map(Image.fromarray, _moving(12))
+    first.save(path, save_all=True, append_images=rest)
+    index = index_video(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: 3 * len(data) // 4])
+    np.testing.assert_array_equal(LazyFrames(index)[1:3], read_video(path).frames[1:3])
+    with pytest.raises(VideoError, match=says):
+        read_indexed(index, 3, 12)
+
+
+def test_threads_share_a_decoder(long, long_index):
+    lazy, whole = LazyFrames(long_index, run=4), read_video(long).frames
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lazy.__getitem__, [3 * k % 7 * 80 + k for k in range(40)]))
+    for k, frame in enumerate(found):
+        np.testing.assert_array_equal(frame, whole[3 * k % 7 * 80 + k])
+
+
+def test_one_image_is_a_clip(tmp_path):
+    path = write_image(tmp_path / "a.png", _moving(1)[0])
+    index = index_video(path)
+    _described(index, read_video(path))
+    _same(read_indexed(index, 0, None), read_video(path))
+
+
+# ---------------------------------------------------------------------------------------- refusals
+
+
+def _bad(tmp_path):
+    (tmp_path / "empty.mp4").touch()
+    (tmp_path / "text.mp4").write_text("no video " * 100)
+    (tmp_path / "list.m3u8").write_text("#EXTM3U\nclip.mp4")
+    (tmp_path / "nothing").mkdir()
+    sizes = tmp_path / "sizes"
+    sizes.mkdir()
+    write_image(sizes / "0.png", _moving(1)[0])
+    write_image(sizes / "1.png", _moving(1, 20, 30)[0])
+    return [*(tmp_path / name for name in ("empty.mp4", "text.mp4", "list.m3u8", "nothing", "sizes")), tmp_path / "no"]
+
+
+def test_what_is_refused_is_refused_alike(tmp_path, long):
+    for path in _bad(tmp_path):
+        with pytest.raises((VideoError, FileNotFoundError)) as expected:
+            read_video(path)
+        with pytest.raises(expected.type) as caught:
+            index_video(path)
+        assert str(caught.value) == str(expected.value)
+    for options in ({"frames": (5, 3)}, {"frames": (600, 700)}, {"frames": (-1, 3)}, {"fps": 0}, {"fps": np.nan}):
+        with pytest.raises(VideoError) as expected:
+            read_video(long, **options)
+        with pytest.raises(VideoError) as caught:
+            index_video(long, **options)
+        assert str(caught.value) == str(expected.value)
+
+
+def test_interlaced_fields_that_do_not_convert_are_refused(tmp_path, monkeypatch, long):
+    path = _encoded(tmp_path / "a.mkv", np.repeat(_moving(1), 20, 0), *X264)
+    monkeypatch.setattr("foldgauss.io.video_file._converts", lambda path, num_frames: False)
+    with pytest.raises(VideoError, match="interlaced"):
+        index_video(path)
+
+
+@pytest.mark.parametrize("span", [(-1, 3), (3, 3), (5, 2), (0, 621), (620, 621), (620, None)], ids=str)
+def test_spans_outside_are_refused(long_index, span):
+    with pytest.raises(VideoError, match="expected"):
+        read_indexed(long_index, *span)
+
+
+def _one_line(caught, *words):
+    text = str(caught.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+def test_a_file_that_is_another_is_refused(tmp_path, long):
+    path = tmp_path / "a.mp4"
+    shutil.copy(long, path)
+    index = index_video(path, find_cuts=False)
+    for other in (_moving(700)[::-1], _moving(30)):
+        _encoded(path, other, *LONG)
+        with pytest.raises(VideoError) as caught:
+            read_indexed(index, 500, 503)
+        _one_line(caught, "expected the file that was indexed", "frame 500 is another", "index it again")
+        with pytest.raises(VideoError, match="is another"):
+            LazyFrames(index)[500]
+    path.write_text("no video")
+    with pytest.raises(VideoError, match="does not open as a video"):
+        read_indexed(index, 500, 503)
+    path.unlink()
+    with pytest.raises(FileNotFoundError):
+        read_indexed(index, 500, 503)
+
+
+def test_the_digest_tells_clips_apart(tmp_path, long, long_index):
+    again = tmp_path / "another.mp4"
+    shutil.copy(long, again)
+    assert index_video(again, find_cuts=False).digest == long_index.digest
+    assert index_video(long, frames=(0, 619), find_cuts=False).digest != long_index.digest
+
+
+# ------------------------------------------------------------------------------------ index on the disk
+
+
+def test_an_index_is_saved_and_sent(tmp_path, monkeypatch, long, long_index):
+    monkeypatch.chdir(long.parent)
+    index = index_video(long.name, frames=(30, 400))
+    monkeypatch.chdir(tmp_path)  # where the name as given leads nowhere
+    path = index.save(tmp_path / "clip.index")
+    assert path.stat().st_size < 100 * 400
+    for other in (FrameIndex.load(path), pickle.loads(pickle.dumps(index))):
+        assert vars(other)["_about"] == vars(index)["_about"]
+        assert (other.digest, other.cuts, other.notes) == (index.digest, index.cuts, index.notes)
+        assert (other.source, other.num_frames, other.size) == (long.name, 370, (HEIGHT, WIDTH))
+        np.testing.assert_array_equal(read_indexed(other, 300, 305).frames, read_indexed(index, 300, 305).frames)
+
+
+def test_an_index_with_times_is_saved(tmp_path):
+    path = _encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"])
+    index = index_video(path)
+    again = FrameIndex.load(index.save(tmp_path / "index.npz"))
+    np.testing.assert_array_equal(again.times, index.times)
+    _same(read_indexed(again, 50, 70), read_indexed(index, 50, 70))
+
+
+def test_what_is_no_index_is_refused(tmp_path, long_index):
+    path = long_index.save(tmp_path / "good.npz")
+    data = path.read_bytes()
+    others = {"empty": b"", "text": b"no index", "cut": data[: len(data) // 2], "zip": b"PK\x03\x04" + bytes(50)}
+    for name, content in others.items():
+        (tmp_path / name).write_bytes(content)
+    np.savez(tmp_path / "other.npz", about=np.zeros(3, np.uint8))
+    np.savez(tmp_path / "pickled.npz", about=np.array([None]))
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "short.npz", **arrays | {"digests": arrays["digests"][:, :8]})
+    np.savez(tmp_path / "later.npz", **arrays | {"about": np.frombuffer(b'{"format": 99}', np.uint8)})
+    for name in [*others, "other.npz", "pickled.npz", "array.npy", "short.npz", "later.npz"]:
+        with pytest.raises(VideoError) as caught:
+            FrameIndex.load(tmp_path / name)
+        _one_line(caught, "expected an index of a clip", "index_video")
+    with pytest.raises(FileNotFoundError):
+        FrameIndex.load(tmp_path / "missing")
+    with pytest.raises(OutputError):
+        long_index.save(tmp_path / "missing" / "a.npz")
+
+
+# ------------------------------------------------------------------------------------------ as an array
+
+
+def test_frames_as_an_array(long, long_index):
+    whole = read_video(long, frames=(90, 200), size=(24, 40)).frames
+    lazy = LazyFrames(long_index, (24, 40), 90, 200, run=16)
+    assert (lazy.shape, lazy.dtype, lazy.ndim, len(lazy)) == (whole.shape, whole.dtype, 4, 110)
+    assert lazy.nbytes == whole.nbytes
+    for which in (
+        slice(3, 9),
+        slice(None, None, 40),
+        slice(-5, None),
+        slice(60, 20, -13),
+        slice(7, 7),
+        slice(200, 300),
+    ):
+        found = lazy[which]
+        assert found.flags.c_contiguous
+        np.testing.assert_array_equal(found, whole[which])
+        assert found.dtype == np.uint8
+    for k in (0, 17, 16, -1, np.int64(50)):
+        assert lazy[k].flags.c_contiguous
+        np.testing.assert_array_equal(lazy[k], whole[k])
+    lazy[3][:] = 0  # a copy
+    np.testing.assert_array_equal(lazy[3], whole[3])
+    np.testing.assert_array_equal(np.asarray(lazy), whole)
+    again = pickle.loads(pickle.dumps(lazy))
+    np.testing.assert_array_equal(again[5:8], whole[5:8])
+    assert again.digest() == lazy.digest() == hashlib.blake2b(whole, digest_size=16).hexdigest()
+    lazy.close()
+    np.testing.assert_array_equal(lazy[2], whole[2])
+
+
+def test_what_arrays_refuse_is_refused(long_index):
+    lazy = LazyFrames(long_index, first=600)
+    for which in (20, -21):
+        with pytest.raises(IndexError, match="20 frames"):
+            lazy[which]
+    for which in ("a", 1.5, (1, 2), [1, 2]):
+        with pytest.raises(ValueError, match="expected the number of a frame, or a slice"):
+            lazy[which]
+    for span in ((5, 5), (0, 0), (0, 621), (-2, 3)):
+        with pytest.raises(VideoError, match="expected a range within 0:620"):
+            long_index.span(*span)
+    for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"run": 0}, {"size": (0, 5)}):
+        with pytest.raises(VideoError, match="expected"):
+            LazyFrames(long_index, **options)
+
+
+def test_nothing_is_said_on_stderr(tmp_path, long):
+    """Neither OpenCV nor FFmpeg, in a fresh process."""
+    data = bytearray(long.read_bytes())
+    data[len(data) // 2 :][:2000] = bytes(2000)
+    (tmp_path / "damaged.mp4").write_bytes(data)
+    program = """
+import sys
+from foldgauss.io import LazyFrames, index_video, read_indexed
+index = index_video(sys.argv[1], find_cuts=False)
+read_indexed(index, 300, 305)
+LazyFrames(index)[200:210]
+"""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}
+    command = [sys.executable, "-c", program, tmp_path / "damaged.mp4"]
+    ran = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+
+
+_PEAK = """
+import resource, sys
+from foldgauss.io import LazyFrames, index_video
+index_video(sys.argv[1], frames=(0, 20))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+index = index_video(sys.argv[1], frames=(0, int(sys.argv[2])))
+for frame in LazyFrames(index, run=8):
+    pass
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of the largest memory are Linux's")
+def test_memory_does_not_grow_with_the_clip(tmp_path):
+    """2,000 frames of 360x640 are 1.4 GB; the index and a pass through them take some MB more than a few frames do."""
+    path = _encoded(tmp_path / "a.mp4", np.tile(_moving(100, 360, 640), (20, 1, 1, 1)), *LONG)
+    grown = {}
+    for num in (200, 2000):
+        command = [sys.executable, "-c", _PEAK, path, str(num)]
+        ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
+        grown[num] = int(ran.stdout)
+    assert grown[2000] < grown[200] + 40_000, grown
+
+
+@pytest.mark.slow
+def test_cuts_of_a_long_clip():
+    """Of so long a clip, `Motion` keeps smaller maps; it comes to the same cuts."""
+    frames = np.concatenate([read_video(sample_clip(name), size=(136, 320)).frames for name in ("bikes", "bunny")] * 4)
+    finder = CutFinder()
+    for frame in frames:
+        finder.add(frame)
+    motion = Motion.of(frames)
+    assert motion.small.shape[2] < 320
+    assert finder.found == motion.cuts()

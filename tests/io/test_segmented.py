@@ -1,0 +1,374 @@
+"""Segments in one file: the bits of the files that they came from, read when they are wanted."""
+
+import dataclasses
+import json
+import os
+import tracemalloc
+
+import jax
+import numpy as np
+import pytest
+from soft_models import NUM, soft_model
+
+from foldgauss.io import (
+    ModelFileError,
+    OutputError,
+    export,
+    html_page,
+    join_segments,
+    load_video_model,
+    read_pseudomesh,
+    read_vegas_ply,
+    save_selection,
+    save_video_model,
+    segmented,
+)
+from foldgauss.io.compact import MAGIC
+from foldgauss.io.model_file import read_header
+from foldgauss.io.video_model import read_metadata
+from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
+from foldgauss.video.model import LASTING, OPAQUE
+from foldgauss.video.playback import Playback
+from foldgauss.video.tradeoff import halved
+
+FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
+
+
+def ragged(model):
+    """With kinds, shared colours and shapes: stored in another form than it has in memory."""
+    splats, lasting = model.splats, np.arange(NUM) % 2 == 0
+    leaves = {name: np.array(getattr(splats, name)) for name in ("time_loc_logit", "log_time_scale", "coefficients")}
+    leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, LASTING
+    leaves["coefficients"][:, 1:] = 0
+    leaves["opacity_logit"] = np.where(lasting, OPAQUE, np.asarray(splats.opacity_logit))
+    leaves["color_dc"] = np.asarray(splats.color_dc)[np.arange(NUM) % 3]
+    return dataclasses.replace(model, splats=dataclasses.replace(splats, **leaves))
+
+
+def models():
+    plain, other, last = (soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS))
+    logits = 0.3 * np.random.default_rng(0).standard_normal(8).astype(np.float32)
+    edited = edit(ragged(other)).select(np.arange(NUM) < 12).move((0.1, 0.0), times=(0.2, 0.7)).video()
+    edited = layers(edited, dataclasses.replace(soft_model(seed=9, num_frames=9), frame_times=FrameTimes(logits)))
+    return [plain, edited, ragged(last)]
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """a, b and c.safetensors, joined into long.safetensors."""
+    folder = tmp_path_factory.mktemp("work")
+    for name, first, model in zip("abc", FIRSTS, models(), strict=True):
+        save_video_model(folder / f"{name}.safetensors", model, metadata={"mean_psnr": 30.0 + first, "seed": first})
+    join_segments(folder / "long.safetensors", sources(folder), metadata={"clip": "long.mp4"})
+    return folder
+
+
+def sources(folder):
+    return [(first, folder / f"{name}.safetensors") for name, first in zip("abc", FIRSTS, strict=True)]
+
+
+def same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+def test_each_segment_is_the_model_of_its_file_to_the_bit(work):
+    video = load_video_model(work / "long.safetensors")
+    assert isinstance(video, SegmentedVideo)
+    for (first, file), segment in zip(sources(work), video.segments, strict=True):
+        own = load_video_model(file)
+        same(own, segment.model)
+        for name in ("num_frames", "num_gaussians", "degree", "num_floats", "size", "fps", "options", "compositing"):
+            assert getattr(segment, name) == getattr(own, name), name
+        assert (segment.first, dict(segment.metadata)) == (first, {"mean_psnr": 30.0 + first, "seed": first})
+    assert read_metadata(work / "long.safetensors") == {"clip": "long.mp4"}
+    assert (video.num_frames, video.cuts) == (18, [13])
+
+
+def test_what_is_played_is_what_was_in_memory(work):
+    video, kept = load_video_model(work / "long.safetensors"), [load_video_model(file) for _, file in sources(work)]
+    expected = SegmentedVideo.of(list(zip(FIRSTS, kept, strict=True)))
+    times = np.linspace(0, 1, 41)
+    np.testing.assert_array_equal(list(video.frames(times)), list(expected.frames(times)))
+
+
+def test_a_file_of_one_segment_plays_as_the_model(work, tmp_path):
+    join_segments(tmp_path / "one.safetensors", [(0, work / "c.safetensors")])
+    one, model = load_video_model(tmp_path / "one.safetensors"), load_video_model(work / "c.safetensors")
+    np.testing.assert_array_equal(list(one.frames()), list(model.frames()))
+    np.testing.assert_array_equal(Playback(one).image(0.33), Playback(model).image(np.float32(0.33)))
+
+
+def test_saved_again_it_has_the_same_bytes(work, tmp_path):
+    long = (work / "long.safetensors").read_bytes()
+    video = load_video_model(work / "long.safetensors")
+    save_video_model(tmp_path / "again.safetensors", video, metadata={"clip": "long.mp4"})
+    assert (tmp_path / "again.safetensors").read_bytes() == long
+    join_segments(tmp_path / "joined.safetensors", sources(work), metadata={"clip": "long.mp4"})
+    assert (tmp_path / "joined.safetensors").read_bytes() == long
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again.safetensors", "joined.safetensors"]
+    in_memory = SegmentedVideo.of(list(zip(FIRSTS, models(), strict=True)))
+    save_video_model(tmp_path / "made.safetensors", in_memory)
+    for one, other in zip(load_video_model(tmp_path / "made.safetensors").segments, video.segments, strict=True):
+        same(one.model, other.model)
+
+
+def test_halves_are_kept_as_halves(tmp_path):
+    save_video_model(tmp_path / "half.safetensors", halved(soft_model()))
+    join_segments(tmp_path / "long.safetensors", [(0, tmp_path / "half.safetensors")])
+    kinds = {spec["dtype"] for spec in read_header(tmp_path / "long.safetensors")["tensors"].values()}
+    assert "F16" in kinds
+    half = load_video_model(tmp_path / "half.safetensors")
+    same(load_video_model(tmp_path / "long.safetensors").segments[0].model, half)
+
+
+def test_more_than_ten_segments_keep_their_order(tmp_path):
+    files = []
+    for k in range(12):
+        files.append((6 * k, tmp_path / f"{k}.safetensors"))
+        save_video_model(files[-1][1], soft_model(seed=k), metadata={"k": k})
+    join_segments(tmp_path / "long.safetensors", files)
+    video = load_video_model(tmp_path / "long.safetensors")
+    assert [segment.metadata["k"] for segment in video.segments] == list(range(12))
+    for (_, file), segment in zip(files, video.segments, strict=True):
+        same(segment.model, load_video_model(file))
+
+
+# ------------------------------------------------------------------------------------------------ laziness
+
+
+@pytest.fixture
+def loaded(monkeypatch):
+    """The prefixes of the models as they are read."""
+    found, load = [], segmented.load_part
+
+    def noted(path, kind, header, tensors, prefix=""):
+        found.append(prefix)
+        return load(path, kind, header, tensors, prefix)
+
+    monkeypatch.setattr(segmented, "load_part", noted)
+    return found
+
+
+def test_segments_are_read_when_they_are_wanted(work, loaded):
+    video = load_video_model(work / "long.safetensors")
+    assert (video.num_gaussians, video.num_frames) == (4 * NUM, 18)
+    assert loaded == []
+    next(video.frames())
+    assert loaded == ["segments.0."]
+    list(video.frames(np.linspace(0, 1, 53)))
+    assert loaded == ["segments.0.", "segments.1.", "segments.2."]
+    assert video.segments[2].model is video.segments[2].model  # the last ones are at hand
+    list(video.frames())
+    assert loaded == [f"segments.{number}." for number in (0, 1, 2, 0, 1, 2)]
+
+
+def test_joining_takes_the_memory_of_one_tensor(tmp_path):
+    num, count, soft = 60_000, 6, soft_model(degree=0)
+    rows = np.random.default_rng(0).integers(0, NUM, num)
+    big = jax.tree.map(lambda leaf: np.asarray(leaf)[rows] if np.ndim(leaf) else leaf, soft.splats)
+    own = np.random.default_rng(1).random((num, 3)).astype(np.float32)  # shared they would be small
+    big = dataclasses.replace(big, color_dc=own, log_scale=own[:, :2] - 3)
+    file = tmp_path / "big.safetensors"
+    save_video_model(file, dataclasses.replace(soft, splats=big))
+    largest = max(4 * int(np.prod(spec["shape"])) for spec in read_header(file)["tensors"].values())
+    join_segments(tmp_path / "warm.safetensors", [(0, file)])
+    tracemalloc.start()
+    try:
+        join_segments(tmp_path / "long.safetensors", [(7 * k, file) for k in range(count)])
+        video = load_video_model(tmp_path / "long.safetensors")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert video.num_gaussians == num * count
+    assert (tmp_path / "long.safetensors").stat().st_size > 4 * 3 * largest
+    assert peak < 4 * largest + 200_000  # an array, its bytes, the library's own
+
+
+def test_a_file_that_changed_since_is_told(work, tmp_path):
+    path = tmp_path / "long.safetensors"
+    join_segments(path, sources(work))
+    video = load_video_model(path)
+    join_segments(path, sources(work)[:2])
+    with pytest.raises(
+        ModelFileError, match=r"^path: expected the file as it was opened, got a changed .*Load it again"
+    ):
+        list(video.frames())
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+def test_what_is_no_ordinary_model_is_refused(work, tmp_path):
+    (tmp_path / "small.fgz").write_bytes(MAGIC)
+    save_selection(tmp_path / "some.selection", Selection(np.ones(NUM, bool)), soft_model())
+    (tmp_path / "noise.safetensors").write_bytes(os.urandom(500))
+    for name, message in (
+        (work / "long.safetensors", r"got one of kind 'segmented-video'.*Join the files that it was made of"),
+        (tmp_path / "small.fgz", "got a compact one.*before they are compressed"),
+        (tmp_path / "some.selection", "got one of kind"),
+        (tmp_path / "noise.safetensors", "expected a foldgauss-model file"),
+    ):
+        with pytest.raises(ModelFileError, match=message):
+            join_segments(tmp_path / "out.safetensors", [(0, name)])
+    with pytest.raises(FileNotFoundError):
+        join_segments(tmp_path / "out.safetensors", [(0, work / "missing.safetensors")])
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ([], "^segments: expected at least one"),
+        ([(0, "a"), (8, "b")], "got frame 8. Fit frames 7:8, too"),
+        ([(4, "b"), (0, "a")], "begin at frame 0"),
+        (["a"], r"^sources\[0\]: expected \(number of its first frame, model file\)"),
+        ([("a", 0)], r"^sources\[0\]: expected the number of its first frame first"),
+        ([(0, 7)], "^path: expected a path"),
+    ],
+)
+def test_sources_that_make_no_clip_are_refused(chosen, message, work, tmp_path):
+    given = [(one[0], work / f"{one[1]}.safetensors") if one[1:] in (("a",), ("b",)) else one for one in chosen]
+    with pytest.raises(ValueError, match=message):
+        join_segments(tmp_path / "out.safetensors", given)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_where_it_cannot_be_written_is_known_before(work, tmp_path):
+    with pytest.raises(OutputError, match="expected an existing folder"):
+        join_segments(tmp_path / "missing" / "out.safetensors", sources(work))
+    with pytest.raises(OutputError, match="expected an existing folder"):
+        save_video_model(tmp_path / "missing" / "out.safetensors", load_video_model(work / "long.safetensors"))
+
+
+def rewritten(path, change):
+    """The file with another header, by `change(header of ours)`."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    outer = json.loads(data[8 : 8 + length])
+    header = json.loads(outer["__metadata__"]["header"])
+    change(header, outer)
+    outer["__metadata__"]["header"] = json.dumps(header)
+    text = json.dumps(outer).encode()
+    text += b" " * (-len(text) % 8)
+    path.write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length :])
+
+
+def setting(*keys, to):
+    """A change of one place in the header."""
+
+    def change(header, outer):
+        del outer
+        for key in keys[:-1]:
+            header = header[key]
+        header[keys[-1]] = to
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        setting("segments", to={}),
+        setting("segments", to=[]),
+        setting("segments", 1, to=7),
+        setting("segments", 1, "first", to=9),
+        setting("segments", 1, "first", to=True),
+        setting("segments", 1, "kind", to="segmented-video"),
+        setting("segments", 1, "kind", to="fit-checkpoint"),
+        setting("segments", 1, "metadata", to=[1]),
+        setting("segments", 0, "header", "num_frames", to=10**30),
+        setting("segments", 0, "header", "num_gaussians", to=10**30),
+        setting("segments", 0, "header", "degree", to=10**400),
+        setting("segments", 0, "header", "degree", to=-1),
+        setting("segments", 0, "header", "size", to=[0, 5]),
+        setting("segments", 0, "header", "size", to=5),
+        setting("segments", 0, "header", "fps", to=float("inf")),
+        setting("segments", 0, "header", "fps", to="fast"),
+        setting("segments", 0, "header", "compositing", to="none"),
+        setting("segments", 0, "header", "options", to={"low_pass": -1.0}),
+        setting("segments", 1, "header", "timeline", to=7),
+        setting("segments", 1, "header", "layers", to=[]),
+        lambda header, outer: outer.update({"more": outer.pop("segments.0.splats.loc")}),
+        lambda header, outer: outer.update({"segments.3.splats.loc": outer.pop("segments.0.splats.loc")}),
+        lambda header, outer: outer.update({"segments.00.splats.loc": outer.pop("segments.0.splats.loc")}),
+    ],
+)
+def test_headers_that_make_no_sense_are_refused(change, work, tmp_path):
+    path = tmp_path / "long.safetensors"
+    path.write_bytes((work / "long.safetensors").read_bytes())
+    rewritten(path, lambda header, outer: None)
+    load_video_model(path)  # the writing itself is sound
+    rewritten(path, change)
+    with pytest.raises(ModelFileError, match="path: expected") as caught:
+        load_video_model(path)
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        setting("segments", 2, "header", "envelope", to="Other"),
+        setting("segments", 2, "header", "stored", to={"powers": 3}),
+        lambda header, outer: outer.update({"segments.2.splats.more": outer.pop("segments.2.splats.angle_logit")}),
+    ],
+)
+def test_a_segment_that_does_not_fit_its_header_is_refused_when_it_is_read(change, work, tmp_path):
+    path = tmp_path / "long.safetensors"
+    path.write_bytes((work / "long.safetensors").read_bytes())
+    rewritten(path, change)
+    video = load_video_model(path)
+    same(video.segments[0].model, load_video_model(work / "a.safetensors"))
+    with pytest.raises(ModelFileError, match="expected"):
+        list(video.frames())
+
+
+def test_cut_off_anywhere(work, tmp_path):
+    data, path = (work / "long.safetensors").read_bytes(), tmp_path / "cut.safetensors"
+    for end in np.linspace(0, len(data) - 1, 40).astype(int):
+        path.write_bytes(data[:end])
+        with pytest.raises(ModelFileError):
+            load_video_model(path)
+
+
+# ------------------------------------------------------------------------------------------------- exports
+
+
+def test_vegas_files_are_one_for_each_segment(tmp_path):
+    parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
+    video = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    export(video, "ply", tmp_path / "out")
+    names = [f"segment-{number:03d}.ply" for number in range(3)]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    for name, model in zip(names, parts, strict=True):
+        again = read_vegas_ply(tmp_path / "out" / name)
+        assert again.num_frames == model.num_frames
+        np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=1e-3)
+    with pytest.raises(OutputError, match="3 segments"):
+        export(video, "ply", tmp_path / "out")
+    export(video, "ply", tmp_path / "out", overwrite=True)
+    (tmp_path / "out" / "notes.txt").touch()
+    with pytest.raises(OutputError, match=r"notes\.txt"):
+        export(video, "ply", tmp_path / "out", overwrite=True)
+    with pytest.raises(ValueError, match="out: expected a folder"):
+        export(video, "ply", tmp_path / "one.ply")
+
+
+def test_frames_go_out_as_they_are_played(tmp_path):
+    parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
+    video = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    t = 15 / 17
+    export(video, "obj", tmp_path / "mesh", times=[t])
+    mesh = read_pseudomesh(tmp_path / "mesh")
+    assert np.abs(mesh.frame(0).astype(int) - Playback(video).frame(t)).max() <= 1
+    export(video, "ply3dgs", tmp_path / "scene.ply", times=[t])
+    export(parts[2], "ply3dgs", tmp_path / "own.ply", times=[0.5])
+    assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
+
+
+def test_there_is_no_page_yet(work):
+    for model in (work / "long.safetensors", load_video_model(work / "long.safetensors")):
+        with pytest.raises(ValueError, match="model: expected a model of one piece, got one of 3 segments"):
+            html_page(model)

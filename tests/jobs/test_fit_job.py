@@ -1,0 +1,176 @@
+"""One fit as a job: taken up wherever it was left, with the same bits."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drifting import CONFIG, write_drifting
+
+import foldgauss.jobs.fitting as fitting
+from foldgauss.io import index_video, load_video_model
+from foldgauss.io._atomic import OutputError
+from foldgauss.io._lock import only_writer
+from foldgauss.jobs import FitJob, Stopped, fit_job
+from foldgauss.jobs.fitting import finished
+
+NUM_FRAMES = 10
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return write_drifting(tmp_path_factory.mktemp("clip") / "clip.mp4", NUM_FRAMES)
+
+
+def job_of(clip, place, name="model.safetensors", **changes):
+    return dataclasses.replace(FitJob("clip", str(clip), str(place / name), CONFIG), **changes)
+
+
+@pytest.fixture(scope="module")
+def done(clip, tmp_path_factory):
+    """A job that was done in one go, and its record."""
+    job = job_of(clip, tmp_path_factory.mktemp("done"))
+    return job, fit_job(job)
+
+
+def test_a_job_leaves_its_model_and_its_record_alone(done):
+    job, record = done
+    model = load_video_model(job.target)
+    assert (model.num_frames, record["num_frames"], record["steps"]) == (NUM_FRAMES, NUM_FRAMES, CONFIG.steps)
+    assert len(record["psnr"]) == NUM_FRAMES
+    assert record["mean_psnr"] == pytest.approx(np.mean(record["psnr"]), abs=1e-3)
+    assert record["file_bytes"] == os.path.getsize(job.target)
+    assert json.loads(job.record.read_text()) == json.loads(json.dumps(record)) == finished(job)
+    assert not job.kept.exists()
+
+
+class Counting:
+    """Reads clips, and counts how often."""
+
+    def __init__(self, monkeypatch):
+        self.count, self.read = 0, fitting.read_video
+        monkeypatch.setattr(fitting, "read_video", self)
+
+    def __call__(self, *given, **named):
+        self.count += 1
+        return self.read(*given, **named)
+
+
+def test_what_is_done_is_not_done_again(done, monkeypatch):
+    job, record = done
+    reads = Counting(monkeypatch)
+    assert fit_job(job) == json.loads(json.dumps(record))
+    assert reads.count == 0
+
+
+@pytest.mark.parametrize("change", ["config", "source", "size", "model"])
+def test_a_record_of_something_else_is_none(done, clip, tmp_path, change):
+    job, _record = done
+    changed = {
+        "config": {"config": dataclasses.replace(CONFIG, steps=13)},
+        "source": {"source": {"digest": "another"}},
+        "size": {"size": (12, 16)},
+        "model": {},
+    }[change]
+    other = job_of(clip, tmp_path, **changed)
+    for made, wanted in ((job.target, other.target), (job.record, other.record)):
+        Path(wanted).write_bytes(Path(made).read_bytes())
+    if change == "model":
+        Path(other.target).write_bytes(Path(job.target).read_bytes()[:-1])
+    assert finished(other) is None
+
+
+def stopped_after(job, step):
+    """The job, asked to stop when it tells of a step so far."""
+    with pytest.raises(Stopped):
+        fit_job(job, lambda progress: progress.step < step)
+
+
+def test_a_stopped_job_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "TELL_SECONDS", 0.0)
+    job, record = job_of(clip, tmp_path), done[1]
+    told = []
+    stopped_after(job, 5)
+    assert job.kept.exists()
+    assert not Path(job.target).exists()
+    again = fit_job(job, lambda progress: not told.append(progress.step))
+    assert told[0] == 6
+    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+    assert {name: again[name] for name in ("psnr", "ssim")} == {name: record[name] for name in ("psnr", "ssim")}
+    assert not job.kept.exists()
+
+
+def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatch):
+    """The process ends as each file is about to be written; the next does what is left."""
+    job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
+
+    class Killed(BaseException):
+        pass
+
+    kills = 0
+    for name in ("save_checkpoint", "save_video_model", "atomic_path"):
+        with monkeypatch.context() as patch:
+
+            def dies(*given, **named):
+                raise Killed
+
+            patch.setattr(fitting, name, dies)
+            with pytest.raises(Killed):
+                fit_job(job)
+            kills += 1
+    fit_job(job)
+    assert kills == 3
+    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["cut", "other"])
+def test_a_checkpoint_that_cannot_be_used_is_not(done, clip, tmp_path, monkeypatch, damage):
+    monkeypatch.setattr(fitting, "TELL_SECONDS", 0.0)
+    job = job_of(clip, tmp_path)
+    if damage == "cut":
+        stopped_after(job, 5)
+        job.kept.write_bytes(job.kept.read_bytes()[:-10])
+    else:
+        other = dataclasses.replace(job, config=dataclasses.replace(CONFIG, seed=1))
+        stopped_after(other, 5)
+    told = []
+    fit_job(job, lambda progress: not told.append(progress.step))
+    assert told[0] == 1
+    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+
+
+def test_a_span_is_found_by_its_index(clip, tmp_path):
+    index = index_video(clip)
+    path = index.save(tmp_path / "index.npz")
+    by_index = job_of(clip, tmp_path, "indexed.safetensors", frames=(3, 9), index=str(path), fps=99.0)
+    plain = job_of(clip, tmp_path, "plain.safetensors", frames=(3, 9))
+    assert fit_job(by_index)["psnr"] == fit_job(plain)["psnr"]
+    assert load_video_model(by_index.target).fps == 99.0
+
+
+def test_a_job_waits_for_another_of_its_target_and_no_longer_than_it_may(clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "WAIT_SECONDS", 0.0)
+    job = job_of(clip, tmp_path)
+    with only_writer(Path(job.target)), pytest.raises(OutputError, match="nobody else is writing"):
+        fit_job(job)
+
+
+def test_a_full_disk_at_a_checkpoint_costs_no_fit(done, clip, tmp_path, monkeypatch):
+    def full(*given, **named):
+        raise OutputError("path: expected room, got none.")
+
+    monkeypatch.setattr(fitting, "save_checkpoint", full)
+    job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
+    fit_job(job)
+    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+
+
+def test_files_go_where_they_are_asked_to(clip, tmp_path):
+    (tmp_path / "records").mkdir()
+    job = job_of(clip, tmp_path, folder=str(tmp_path / "records"))
+    fit_job(job)
+    assert job.record.parent == tmp_path / "records"
+    assert job.record.exists()
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["model.safetensors", "records"]

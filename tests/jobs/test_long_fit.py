@@ -1,0 +1,211 @@
+"""A long clip in segments: its plan, and what is made of it."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drifting import CONFIG, write_drifting
+
+import foldgauss.jobs.long as long
+from foldgauss.io import VideoError, load_video_model, read_video
+from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
+from foldgauss.video import SegmentedVideo, VideoModel, evaluate
+
+NUM_FRAMES, ASKED = 34, {"segment_seconds": 1.3, "overlap": 2}
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return write_drifting(tmp_path_factory.mktemp("clip") / "clip.mp4", NUM_FRAMES)
+
+
+def ignored(progress):
+    return None
+
+
+def done_here(fit) -> list[Outcome]:
+    return list(run_here(fit.jobs, ignored))
+
+
+def joined(fit):
+    return fit.join({outcome.job.name: outcome.record for outcome in done_here(fit)})
+
+
+@pytest.fixture(scope="module")
+def whole(clip, tmp_path_factory):
+    """A fit that nothing disturbed, as (its plan, what was joined)."""
+    fit = plan_long_fit(clip, tmp_path_factory.mktemp("whole") / "long.safetensors", CONFIG, **ASKED)
+    return fit, joined(fit)
+
+
+def test_segments_cover_the_clip_and_share_frames(whole):
+    fit, _ = whole
+    assert len(fit.spans) == 3
+    assert fit.spans[0][0] == 0
+    assert fit.spans[-1][1] == NUM_FRAMES
+    assert all(after[0] == before[1] - 2 for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
+
+
+def test_scores_are_those_of_the_joined_video(whole, clip):
+    _, made = whole
+    video = load_video_model(made.path)
+    assert isinstance(video, SegmentedVideo)
+    assert video.num_frames == NUM_FRAMES
+    scores = evaluate(video, read_video(clip).frames)
+    assert scores.psnr == pytest.approx(made.psnr, abs=2e-4)
+    assert scores.ssim == pytest.approx(made.ssim, abs=2e-5)
+    drops = seam_drops(np.array(scores.psnr), made.fades)
+    assert made.seam_drop == pytest.approx(drops.mean(), abs=1e-3)
+    assert len(drops) == 2
+
+
+def test_seam_drops_are_what_lies_around_less_what_is_shared():
+    scores = np.array([30.0] * 10 + [28.0, 29.0] + [31.0] * 10)
+    assert seam_drops(scores, [(10, 12)], beside=4) == pytest.approx([30.5 - 28.5])
+    assert seam_drops(scores, []).shape == (0,)
+
+
+def test_each_segment_says_what_it_is_of(whole, clip):
+    fit, made = whole
+    for (first, stop), job in zip(fit.spans, fit.jobs, strict=True):
+        model = load_video_model(job.target)
+        mean = json.loads(job.record.read_text())["mean_psnr"]
+        clip_of_it = read_video(clip, frames=(first, stop))
+        assert isinstance(model, VideoModel)
+        assert evaluate(model, clip_of_it.frames).mean_psnr == pytest.approx(mean, abs=1e-3)
+    notes = [segment.metadata for segment in load_video_model(made.path).segments]
+    assert [note["frames"] for note in notes] == [list(span) for span in fit.spans]
+
+
+def test_the_folder_goes_and_what_others_put_there_stays(whole, clip, tmp_path):
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    assert fit.folder == segments_folder(tmp_path / "long.safetensors")
+    for job, made in zip(fit.jobs, whole[0].jobs, strict=True):
+        Path(job.target).write_bytes(Path(made.target).read_bytes())
+        job.record.write_text(made.record.read_text())
+        (fit.folder / f".{Path(job.target).stem}.own-01234567.safetensors").write_bytes(b"left by a kill")
+    fit.tidy()
+    assert not fit.folder.exists()
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    (fit.folder / "mine.txt").write_text("kept")
+    fit.tidy()
+    assert [entry.name for entry in fit.folder.iterdir()] == ["mine.txt"]
+
+
+def test_a_plan_is_taken_up_without_looking_through_the_clip_again(whole, clip, tmp_path, monkeypatch):
+    target = tmp_path / "long.safetensors"
+    first = plan_long_fit(clip, target, CONFIG, **ASKED)
+    jobs = iter(run_here(first.jobs, ignored))
+    next(jobs)  # the first segment is done, then the process dies
+
+    def looked_through(*given, **named):
+        raise AssertionError("the clip is looked through again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(long, "index_video", looked_through)
+        second = plan_long_fit(clip, target, CONFIG, **ASKED)
+    assert second.jobs == first.jobs
+    assert second.spans == first.spans
+    stamp = os.stat(first.jobs[0].target).st_mtime_ns
+    made = joined(second)
+    assert os.stat(first.jobs[0].target).st_mtime_ns == stamp
+    assert made.path.read_bytes() == whole[1].path.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["plan", "index"])
+def test_a_plan_that_cannot_be_read_is_made_again(whole, clip, tmp_path, damage):
+    target = tmp_path / "long.safetensors"
+    fit = plan_long_fit(clip, target, CONFIG, **ASKED)
+    file = fit.folder / {"plan": "plan.json", "index": "index.npz"}[damage]
+    file.write_bytes(file.read_bytes()[:20])
+    again = plan_long_fit(clip, target, CONFIG, **ASKED)
+    assert again.jobs == fit.jobs
+
+
+CHANGES = {
+    "segment_seconds": {"segment_seconds": 2.0},
+    "overlap": {"overlap": 3},
+    "size": {"size": (12, 16)},
+    "frames": {"frames": (0, 30)},
+    "degree": {"config": dataclasses.replace(CONFIG, degree=2)},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_other_options_are_refused_by_name(clip, tmp_path, change):
+    target = tmp_path / "long.safetensors"
+    plan_long_fit(clip, target, CONFIG, **ASKED)
+    with pytest.raises(ValueError, match=f"resume: expected {change}=") as refused:
+        plan_long_fit(clip, target, **({"config": CONFIG} | ASKED | CHANGES[change]))
+    assert "--overwrite" in str(refused.value)
+
+
+def test_another_clip_in_its_place_is_refused_and_the_same_one_is_not(tmp_path):
+    target, clip = tmp_path / "long.safetensors", write_drifting(tmp_path / "clip.mp4", 20)
+    plan_long_fit(clip, target, CONFIG, **ASKED)
+    os.utime(clip, (1, 1))
+    plan_long_fit(clip, target, CONFIG, **ASKED)
+    write_drifting(clip, 20, phase=1.0)
+    with pytest.raises(ValueError, match="clip: expected the clip that was begun with"):
+        plan_long_fit(clip, target, CONFIG, **ASKED)
+
+
+def test_a_short_clip_is_an_ordinary_model(tmp_path):
+    clip = write_drifting(tmp_path / "clip.mp4", 10)
+    fit = plan_long_fit(clip, tmp_path / "short.safetensors", CONFIG)
+    made = joined(fit)
+    assert len(fit.spans) == 1
+    assert made.seam_drop is None
+    assert made.path.read_bytes() == Path(fit.jobs[0].target).read_bytes()
+    assert isinstance(load_video_model(made.path), VideoModel)
+
+
+def test_file_sizes_are_shared_out_by_frames(clip, tmp_path):
+    config = dataclasses.replace(CONFIG, max_size_mb=3.4)
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", config, **ASKED)
+    for (first, stop), job in zip(fit.spans, fit.jobs, strict=True):
+        assert job.config.max_size_mb == pytest.approx(0.1 * (stop - first))
+
+
+@pytest.mark.parametrize(
+    ("asked", "name"),
+    [
+        ({"segment_seconds": 0.0}, "segment_seconds"),
+        ({"segment_seconds": np.nan}, "segment_seconds"),
+        ({"overlap": 0}, "overlap"),
+    ],
+)
+def test_settings_out_of_range_are_refused(clip, tmp_path, asked, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **asked)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_clip_leaves_nothing(tmp_path):
+    (tmp_path / "no.mp4").write_text("no video")
+    with pytest.raises(VideoError):
+        plan_long_fit(tmp_path / "no.mp4", tmp_path / "long.safetensors")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["no.mp4"]
+
+
+def test_jobs_stop_between_two_and_within_one(clip, tmp_path):
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    ended = []
+    outcomes = run_here(fit.jobs, ignored, asked_to_stop=lambda: bool(ended))
+    ended.append(next(outcomes))
+    with pytest.raises(Stopped):
+        next(outcomes)
+    assert len(ended) == 1
+    assert ended[0].failure is None
+
+
+def test_a_failure_is_an_outcome_and_others_go_on(clip, tmp_path):
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    broken = dataclasses.replace(fit.jobs[0], index=str(tmp_path / "none.npz"))
+    outcomes = list(run_here([broken, fit.jobs[1]], ignored))
+    assert [outcome.failure is None for outcome in outcomes] == [False, True]
+    assert "none.npz" in outcomes[0].failure
+    assert "\n" not in outcomes[0].failure

@@ -1,0 +1,70 @@
+"""Which clips a folder has, and what their models are called."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foldgauss.io import write_image
+from foldgauss.jobs import find_clips, jobs_of
+from foldgauss.video import FitConfig
+
+
+def made(folder, *names):
+    for name in names:
+        (folder / name).write_bytes(b"")
+    return folder
+
+
+def folder_of_images(path):
+    path.mkdir()
+    write_image(path / "0.png", np.zeros((4, 4, 3), np.uint8))
+
+
+def test_clips_are_videos_by_name_and_folders_of_images(tmp_path):
+    made(tmp_path, "b2.mp4", "b10.MKV", "a.gif", "notes.txt", ".hidden.mp4", "picture.png")
+    folder_of_images(tmp_path / "frames")
+    (tmp_path / "empty").mkdir()
+    found = find_clips(tmp_path)
+    assert [clip.name for clip in found.clips] == ["a.gif", "b2.mp4", "b10.MKV", "frames"]
+    assert [other.name for other in found.others] == ["empty", "notes.txt", "picture.png"]
+
+
+def test_what_has_no_clips_is_refused_in_words(tmp_path):
+    with pytest.raises(FileNotFoundError, match="missing"):
+        find_clips(tmp_path / "none")
+    with pytest.raises(ValueError, match="folder: expected a folder with clips"):
+        find_clips(made(tmp_path, "notes.txt"))
+    with pytest.raises(ValueError, match="One clip alone: foldgauss fit"):
+        find_clips(tmp_path / "notes.txt")
+    folder_of_images(tmp_path / "frames")
+    with pytest.raises(ValueError, match="Its images are one clip"):
+        find_clips(tmp_path / "frames")
+
+
+def test_models_of_clips_of_one_name_are_told_apart(tmp_path):
+    made(tmp_path, "one.mp4", "One.avi", "two.v1.mp4")
+    jobs = jobs_of(find_clips(tmp_path).clips, tmp_path / "out")
+    assert [Path(job.target).name for job in jobs] == [
+        "One.avi.safetensors",
+        "one.mp4.safetensors",
+        "two.v1.safetensors",
+    ]
+    assert {job.record.parent for job in jobs} == {tmp_path / "out" / "records"}
+
+
+def test_a_clip_in_the_place_of_another_is_another(tmp_path):
+    made(tmp_path, "one.mp4")
+    before = jobs_of(find_clips(tmp_path).clips, tmp_path)[0]
+    (tmp_path / "one.mp4").write_bytes(b"other")
+    after = jobs_of(find_clips(tmp_path).clips, tmp_path)[0]
+    assert before.asked != after.asked
+
+
+def test_settings_reach_each_job(tmp_path):
+    made(tmp_path, "one.mp4", "two.mp4")
+    config = FitConfig(steps=7)
+    jobs = jobs_of(find_clips(tmp_path).clips, tmp_path, config, size=(8, 8), frames=(0, 3), checkpoint_seconds=2.0)
+    assert {(job.config.steps, job.size, job.frames, job.checkpoint_seconds) for job in jobs} == {
+        (7, (8, 8), (0, 3), 2.0)
+    }

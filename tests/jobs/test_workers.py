@@ -1,0 +1,140 @@
+"""Jobs done by workers of dask: the same bits as here, whoever is killed."""
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from drifting import CONFIG, write_drifting
+
+from foldgauss.jobs import (
+    SchedulerLost,
+    Stopped,
+    find_clips,
+    jobs_of,
+    local_workers,
+    pool,
+    run_here,
+    run_on,
+    running_cluster,
+)
+
+#: A fit that lasts, since a kill is to come in its midst.
+LASTING = dataclasses.replace(CONFIG, steps=100_000)
+
+
+def ignored(progress):
+    return None
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips")
+    for k in range(3):
+        write_drifting(folder / f"clip{k}.mp4", 10, phase=k)
+    (folder / "broken.mp4").write_text("no video")
+    return find_clips(folder).clips
+
+
+def jobs_into(folder, clips, config=CONFIG):
+    (folder / "records").mkdir()
+    return jobs_of(clips, folder, config, checkpoint_seconds=0.0)
+
+
+@pytest.fixture(scope="module")
+def done_here(clips, tmp_path_factory):
+    """Models of the clips, by name, as this process makes them."""
+    folder = tmp_path_factory.mktemp("here")
+    outcomes = list(run_here(jobs_into(folder, clips), ignored))
+    assert [outcome.failure is None for outcome in outcomes] == [False, True, True, True]
+    return {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
+
+
+@pytest.fixture(scope="module")
+def crew():
+    with local_workers(1) as made:
+        yield made
+
+
+def workers() -> list[multiprocessing.Process]:
+    return [child for child in multiprocessing.active_children() if "Dask" in child.name]
+
+
+def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_here, tmp_path):
+    told = []
+    outcomes = list(run_on(crew, jobs_into(tmp_path, clips), told.append))
+    assert {path.name: path.read_bytes() for path in tmp_path.glob("*.safetensors")} == done_here
+    (failed,) = (outcome for outcome in outcomes if outcome.failure is not None)
+    assert failed.job.name == "broken.mp4"
+    assert "does not open as a video" in failed.failure
+    assert {progress.name for progress in told if progress.share == 1} == {f"clip{k}.mp4" for k in range(3)}
+
+
+def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips, done_here, tmp_path):
+    (job,) = (job for job in jobs_into(tmp_path, clips) if job.name == "clip1.mp4")
+    kills, firsts = [], []
+
+    def watch(progress):
+        """Who tells of the first step is killed, once."""
+        if not firsts or progress.step < firsts[-1]:
+            firsts.append(progress.step)
+        if not kills:
+            kills.extend(child.pid for child in workers())
+            for pid in kills:
+                os.kill(pid, signal.SIGKILL)
+
+    (outcome,) = run_on(crew, [job], watch)
+    assert outcome.failure is None
+    assert len(kills) == 1
+    assert kills[0] not in [child.pid for child in workers()]
+    assert Path(job.target).read_bytes() == done_here["clip1.safetensors"]
+
+
+def test_workers_keep_what_they_do_when_asked_to_stop(crew, clips, tmp_path):
+    jobs, told = jobs_into(tmp_path, clips[1:], LASTING), []
+    with pytest.raises(Stopped):
+        list(run_on(crew, jobs, told.append, asked_to_stop=lambda: bool(told)))
+    assert any(job.kept.exists() for job in jobs)
+    assert not any(os.path.exists(job.target) for job in jobs)
+
+
+@pytest.mark.slow
+def test_a_job_that_kills_whoever_takes_it_is_given_up(crew, clips, tmp_path, monkeypatch):
+    """Each worker dies before it has kept anything."""
+    monkeypatch.setattr(pool, "_when", lambda job: "as before")
+    job = dataclasses.replace(jobs_into(tmp_path, clips[1:2], LASTING)[0], checkpoint_seconds=1e9)
+    killed, begun = set(), time.monotonic()
+
+    def watch(progress):
+        assert time.monotonic() - begun < 240
+        for child in workers():
+            if child.pid not in killed:
+                killed.add(child.pid)
+                os.kill(child.pid, signal.SIGKILL)
+
+    outcomes = list(run_on(crew, [job], watch))
+    assert len(killed) >= pool.FRUITLESS
+    assert "its worker died" in outcomes[0].failure
+    assert "fewer workers" in outcomes[0].failure
+
+
+@pytest.mark.parametrize(("named", "name"), [({"count": 0}, "workers"), ({"count": 1, "threads": 0}, "threads")])
+def test_counts_that_are_none_are_refused(named, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected a whole number"), local_workers(**named):
+        pass
+
+
+def test_an_address_where_nobody_answers_is_refused(monkeypatch):
+    monkeypatch.setattr(pool, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(SchedulerLost, match="scheduler: expected the address"), running_cluster("tcp://127.0.0.1:9"):
+        pass
+
+
+def test_without_dask_it_is_said_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r"foldgauss\[distributed\]"), local_workers(1):
+        pass

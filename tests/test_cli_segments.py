@@ -1,0 +1,192 @@
+"""The commands on a model in segments."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+from soft_models import NUM, soft_model
+
+from foldgauss.io import load_video_model, read_video, save_video_model, write_image
+from foldgauss.io.video_model import read_metadata
+from foldgauss.video import SegmentedVideo, evaluate, psnr, times_at
+
+#: Spans 0:7, 4:13 (three frames shared) and 13:18 (a cut).
+FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 13), (7, 9, 5), 18
+
+
+def video():
+    parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
+    return SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """long.safetensors, and what it was fitted to: frames 2 to 19 of the images in clip."""
+    folder = tmp_path_factory.mktemp("work")
+    (folder / "clip").mkdir()
+    frames = np.stack(list(video().frames()))
+    noisy = np.clip(frames + np.random.default_rng(0).integers(-6, 7, frames.shape), 0, 255).astype(np.uint8)
+    for k, frame in enumerate([noisy[0], noisy[0], *noisy, noisy[-1]]):
+        write_image(folder / "clip" / f"{k:03}.png", frame)
+    save_video_model(folder / "long.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20]})
+    return folder
+
+
+@pytest.fixture
+def here(work, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return work / "long.safetensors"
+
+
+def told(capsys):
+    found = capsys.readouterr()
+    return " ".join((found.out + found.err).split())
+
+
+def pictures(folder):
+    return [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in sorted(folder.iterdir())]
+
+
+@pytest.mark.parametrize(
+    ("options", "positions"),
+    [
+        ([], range(NUM_FRAMES)),
+        (["--upsample", 3], np.arange(52) / 3),
+        (["--speed", "-0.5"], 17 - np.arange(35) / 2),
+        (["--remap", "0=0.48,0.08=0.24"], [12, 9, 6]),
+        (["--times", "0:1:5"], np.linspace(0, 17, 5)),
+    ],
+)
+def test_render_shows_what_the_model_does(options, positions, here, tmp_path):
+    size = {"--size": "20x32", "--background": "00ff00"} if options[:1] == ["--times"] else {}
+    assert (
+        run("render", here, "--out", tmp_path / "frames", *options, *(word for pair in size.items() for word in pair))
+        == 0
+    )
+    clip = video()
+    times = times_at(clip.frame_times.times(), np.asarray(positions))
+    how = {"size": (20, 32), "background": (0.0, 1.0, 0.0)} if size else {}
+    np.testing.assert_array_equal(pictures(tmp_path / "frames"), list(clip.frames(times, **how)))
+
+
+def test_render_takes_constants_of_the_picture(here, tmp_path):
+    out = tmp_path / "one.png"
+    assert run("render", here, "--times", "0.3", "--alpha-cutoff", "0.3", "--out", out) == 0
+    (with_it,), without = pictures_of(out), next(video().frames(np.array([0.3])))
+    assert np.abs(with_it.astype(int) - without).max() > 20
+
+
+def pictures_of(path):
+    return [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)]
+
+
+def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("foldgauss.cli._shared.read_video", lambda *_, **__: pytest.fail("the whole clip was read"))
+    assert run("evaluate", here, work / "clip", "--json", tmp_path / "scores.json") == 0
+    said = told(capsys)
+    clip = read_video(work / "clip", frames=(2, 20))
+    expected = evaluate(video(), clip.frames)
+    kept = json.loads((tmp_path / "scores.json").read_text())
+    assert kept["psnr"] == list(expected.psnr)
+    assert kept["num_gaussians"] == 3 * NUM
+    assert f"│ 1 │ 4:13 │ {np.mean(expected.psnr[4:13]):.2f} │ {min(expected.psnr[4:13]):.2f} │" in said
+    assert "warning" not in said
+    assert run("evaluate", here, work / "clip", "--frames", "0:4") == 2
+    assert "expected 18 frames as in the model, got 4" in told(capsys)
+
+
+def test_evaluate_knows_another_clip(here, work, tmp_path, capsys):
+    digest = "0" * 32
+    save_video_model(
+        "noted.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20], "clip_digest": digest}
+    )
+    assert run("evaluate", "noted.safetensors", work / "clip") == 0
+    assert "are not those that the model was fitted to (clip)" in told(capsys)
+    assert run("evaluate", here, work / "clip", "--frames", "0:18") == 0
+
+
+def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
+    monkeypatch.setattr("foldgauss.io.segmented.load_part", lambda *_: pytest.fail("a model was loaded"))
+    assert run("info", here) == 0
+    said = told(capsys)
+    for text in (
+        "18 of 40x64 (height x width), 25 a second", "3; begin at a cut: 1; fade in: 1", f"{3 * NUM} in all",
+        "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
+        "frames of the clip │ [2, 20]",
+    ):  # fmt: skip
+        assert text in said
+
+
+def test_figures(here, work, tmp_path, capsys):
+    assert run("figure", "interpolation", here, "--at", "5,12") == 0
+    said = told(capsys)
+    assert "warning: --at: between frames 12 and 13 is a cut" in said
+    assert "between frames 5" not in said
+    assert run("figure", "interpolation", here, "--overwrite") == 0
+    assert "from frame 8 to 9" in told(capsys)
+    assert run("figure", "reconstruction", here, work / "clip", "--at", "5,16") == 0
+    clip = read_video(work / "clip", frames=(2, 20))
+    quality = [psnr(clip.frames[k], list(video().frames())[k]) for k in (5, 16)]
+    assert f"frame 5, {quality[0]:.1f} dB; frame 16, {quality[1]:.1f} dB" in told(capsys)
+
+
+def test_the_middle_is_not_taken_at_a_cut(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    parts = [(0, soft_model(num_frames=5)), (5, soft_model(seed=1, num_frames=5))]
+    save_video_model("cut.safetensors", SegmentedVideo.of(parts))
+    assert run("figure", "interpolation", "cut.safetensors") == 0
+    assert "from frame 3 to 4" in told(capsys)
+
+
+def test_exports(here, capsys, tmp_path):
+    assert run("export", here, "--format", "ply") == 0
+    assert len(list((tmp_path / "long-ply").iterdir())) == 3
+    assert run("export", here, "--format", "ply") != 0
+    assert run("export", here, "--format", "ply", "--overwrite") == 0
+    assert run("export", here, "--format", "ply", "--out", "one.ply") == 2
+    assert "expected a folder without extension" in told(capsys)
+    assert run("export", here, "--format", "obj", "--times", "0:1:4") == 0
+    assert len(list((tmp_path / "long-obj").glob("*.obj"))) == 4
+    assert run("export", here, "--format", "ply3dgs", "--times", "0.9") == 0
+    assert (tmp_path / "long.3dgs.ply").exists()
+
+
+def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
+    assert run("segment", here, 1) == 0
+    assert "long.1.safetensors: segment 1, frames 4:13, 40 Gaussians" in told(capsys)
+    assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15]}
+    one = load_video_model("long.1.safetensors")
+    np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))
+    assert run("evaluate", "long.1.safetensors", work / "clip") == 0  # its own frames of the clip
+    told(capsys)
+    for words, message in (
+        ((here, 3), "NUMBER: expected a whole number from 0 to 2, got 3"),
+        (("long.1.safetensors", 0), "MODEL: expected a model in segments, got one of one piece"),
+        ((here, 1), "overwrite"),
+        ((here, 1, "--out", "one.mp4"), "--out: expected a name for the model"),
+        ((here, 0, "--out", here), "--out"),
+    ):
+        assert run("segment", *words) == 2
+        assert message in told(capsys)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("compress", "MODEL"),
+        ("uncertainty", "MODEL", "clip"),
+        ("export", "MODEL", "--format", "html"),
+        ("view", "MODEL"),
+        ("edit", "MODEL", "night.toml"),
+    ],
+)
+def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, capsys):
+    (tmp_path / "night.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    before = sorted(tmp_path.iterdir())
+    given = {"MODEL": here, "clip": work / "clip"}
+    assert run(*(given.get(word, word) for word in words)) == 2
+    said = told(capsys)
+    assert "MODEL: expected a model of one piece, got one of 3 segments. Take one out: foldgauss segment" in said
+    assert sorted(tmp_path.iterdir()) == before

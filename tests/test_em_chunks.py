@@ -1,0 +1,477 @@
+"""EM over chunks: it ends where EM on one array does, whatever the chunks, and holds no more than some of them."""
+
+import subprocess
+import sys
+import warnings
+import weakref
+
+import jax
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn")
+from sklearn.exceptions import ConvergenceWarning
+
+from foldgauss import _chunks
+from foldgauss._chunks import chunks_of, is_chunked, survey, variances_of
+from foldgauss._em import loop, prune, starts, statistics
+from foldgauss._em.scaling import Prepare
+from foldgauss.estimator import FoldedGaussianMixture
+from foldgauss.selection import select_mixture
+
+N, CUTS = 600, (1, 1, 90, 91, 350, 595)  # a chunk of one row, one of none
+#: One set for nearly all tests: they share its programs.
+OPTIONS = {
+    "n_components": 3,
+    "degree": 2,
+    "covariance_type": "tied",
+    "init_params": "trajectories",
+    "n_init": 2,
+    "random_state": 0,
+    "tol": 1e-5,
+}
+FITTED = [
+    "weights_",
+    "means_",
+    "covariances_",
+    "locs_",
+    "space_covariances_",
+    "time_means_",
+    "time_scales_",
+    "fold_coefficients_",
+    "degrees_",
+    "lower_bound_",
+    "lower_bounds_",
+    "n_iter_",
+]
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch):
+    """Pieces, parts and blocks so small that the tests' data make several."""
+    monkeypatch.setattr(_chunks, "_PIECE_ROWS", 100)
+    monkeypatch.setattr(statistics, "PAIRS_PER_CHUNK", 512)
+    monkeypatch.setattr(statistics, "_ROUNDS_PER_BLOCK", 2)
+
+
+def _tracks(num=N, dtype=np.float64, offset=0.0):
+    rng = np.random.default_rng(0)
+    t, which = rng.normal(0.5, 0.25, num), rng.integers(0, 3, num)
+    s = np.choose(which, [t, 1 - t, 0.5 + 3 * t - 5 * t**2]) + 0.03 * rng.normal(size=num)
+    return (np.stack([s, t], 1) + offset).astype(dtype)
+
+
+def _weights(num=N):
+    """Some are 0, and they sum to less than the number of rows."""
+    return np.random.default_rng(1).integers(0, 3, num) / 4
+
+
+def _fit(x, weights=None, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return FoldedGaussianMixture(**OPTIONS | options).fit(x, sample_weight=weights)
+
+
+def _assert_same(one, other, rtol=1e-6):
+    assert one.status_ == other.status_
+    for name in FITTED:
+        expected = np.asarray(getattr(one, name), np.float64)
+        # Relative to the array's largest number: a component of one at 0 has no digits of its own.
+        np.testing.assert_allclose(getattr(other, name), expected, rtol=rtol, atol=rtol * np.abs(expected).max())
+
+
+class _Files:
+    """As a reader of files: each pass begins anew."""
+
+    def __init__(self, parts):
+        self.parts = parts
+
+    def __iter__(self):
+        return (part.copy() for part in self.parts)
+
+
+# --- the same result ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"envelope": "time_likelihood", "covariance_type": "full", "degree": 1, "n_init": 1, "max_iter": 30},
+        pytest.param({"covariance_type": "full", "n_init": 1}, marks=pytest.mark.slow),
+        pytest.param(
+            {"n_components": "auto", "degree": "auto", "max_components": 4, "annealing": 0.5}, marks=pytest.mark.slow
+        ),
+        pytest.param({"degree": 8, "reg_covar": 0.0, "max_iter": 30}, marks=pytest.mark.slow),
+        pytest.param({"criterion": "aic", "degree": "auto", "covariance_type": "diag"}, marks=pytest.mark.slow),
+        pytest.param(
+            {"envelope": "time_likelihood", "n_init": 3, "covariance_type": "spherical"}, marks=pytest.mark.slow
+        ),
+        pytest.param({"init_params": "random", "annealing": 0.1, "time_column": 0}, marks=pytest.mark.slow),
+    ],
+)
+def test_chunks_are_fitted_as_one_array(options):
+    """Weights of zero among them, and 1e6 away from zero."""
+    x, weights = _tracks(offset=1e6), _weights()
+    whole = _fit(x, weights, **options)
+    parted = _fit(np.split(x, CUTS), np.split(weights, CUTS), **options)
+    _assert_same(whole, parted)
+    assert whole.n_iter_ > 2
+    if "annealing" not in options and "auto" not in options.values():  # the likelihood never falls
+        assert (np.diff(parted.lower_bounds_) > -1e-9).all()
+
+
+def test_any_kind_of_chunks_will_do(tmp_path):
+    x, weights = _tracks(), _weights()
+    parts, masses = np.split(x, CUTS), np.split(weights, CUTS)
+    x.tofile(tmp_path / "rows")
+    mapped = np.memmap(tmp_path / "rows", np.float64, mode="r", shape=x.shape)
+    whole = _fit(x, weights)
+    kinds = {
+        "an object": (_Files(parts), _Files(masses)),
+        "a function": (lambda: iter(parts), lambda: iter(masses)),
+        "one chunk from a file": ([mapped], weights),
+        "slices of a file, and a list": ([mapped[:7], mapped[7:]], list(weights)),
+        "rows one by one": ([row[None] for row in x], weights),
+        "lists of lists in an object": (_Files([p for p in parts if len(p)]), weights),
+    }
+    for X, mass in kinds.values():
+        _assert_same(whole, _fit(X, mass), 1e-9)
+    _assert_same(_fit(x), _fit(parts, 1.0), 1e-9)
+
+
+def test_float32_chunks_are_fitted_in_float32():
+    x = _tracks(dtype=np.float32)
+    whole, parted = _fit(x), _fit(np.split(x, CUTS))
+    assert parted._params.curve.dtype == np.float32
+    _assert_same(whole, parted, 1e-4)
+    mixed = _fit([x[:300], x[300:].astype(np.float64)])
+    assert mixed._params.curve.dtype == np.float64
+    _assert_same(_fit(x.astype(np.float64)), mixed)
+
+
+@pytest.mark.parametrize("ordered", [2**20, 300])
+def test_starts_look_at_the_same_rows(monkeypatch, ordered):
+    """Where a start looks at some rows only; by either way of drawing them."""
+    monkeypatch.setattr(starts, "_MOST_POINTS", 100)
+    monkeypatch.setattr(starts, "_MOST_ORDERED", ordered)
+    x, weights = _tracks(), _weights()
+    seen = []
+
+    def start(kind, y, weights, *rest):
+        seen.append((y, weights))
+        return starts.start(kind, y, weights, *rest)
+
+    monkeypatch.setattr("foldgauss.estimator.start", start)
+    _assert_same(_fit(x, weights), _fit(np.split(x, CUTS), np.split(weights, CUTS)))
+    for (y, w), (again, mass) in zip(seen[:2], seen[2:], strict=True):
+        assert len(y) == len(again) == 100
+        np.testing.assert_allclose(np.sort(y, axis=0), np.sort(again, axis=0), atol=1e-12)
+        np.testing.assert_array_equal(np.sort(w), np.sort(mass))
+    assert not np.allclose(np.sort(seen[2][0], axis=0), np.sort(seen[3][0], axis=0))
+
+
+def test_of_equal_ends_the_first_is_kept():
+    """Up to rounding, which hangs on how points are chunked."""
+    params = _fit(X, max_iter=1)._params
+    run = loop.Run(params, 2.0, [2.0], 1, loop.EMStatus.CONVERGED, 0)
+    broken = run._replace(status=loop.EMStatus.NOT_FINITE, log_likelihood=9.0)
+    lost = broken._replace(log_likelihood=-np.inf)
+    for ends, expected in [((2, 2 + 1e-14), 0), ((2, 2 + 1e-12), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
+        runs = [run._replace(log_likelihood=end) for end in ends]
+        assert loop.best([broken, *runs]) is runs[expected]
+    assert loop.best([lost, broken]) is broken
+    assert loop.best([lost, lost]).log_likelihood == -np.inf
+
+
+def test_a_draw_of_many_is_fair_and_without_repetition():
+    rng = np.random.RandomState(0)
+    numbers = starts.drawn(10**12, rng)
+    assert len(np.unique(numbers)) == starts._MOST_POINTS
+    # Uniform: the mean of 20,000 is within 5 standard errors of the middle (false alarm 6e-7).
+    assert abs(numbers.mean() / 1e12 - 0.5) < 5 / np.sqrt(12 * starts._MOST_POINTS)
+
+
+def test_a_warm_start_goes_on_with_chunks():
+    x = _tracks()
+    begun = _fit(x, max_iter=2, warm_start=True)
+    reached = begun.lower_bound_
+    begun.set_params(max_iter=100).fit(np.split(x, CUTS))
+    assert begun.converged_
+    assert begun.lower_bounds_[0] > reached
+
+
+def test_what_pruning_asks_of_points_is_the_same_of_blocks():
+    x, weights = _tracks(), _weights()
+    fitted, there = _fit(x, weights, max_iter=1), weights > 0
+    chunks = chunks_of(np.split(x, CUTS), np.split(weights, CUTS))
+    prepare = Prepare(np.arange(2), fitted._scaling, 1.0, np.dtype(np.float64))
+    with statistics.precision(np.float64):
+        points = statistics.points_of(fitted._scaling.apply(x[there]), weights[there], 3)
+        blocks = statistics.Blocks(chunks, prepare, np.dtype(np.float64), 3, [there.sum()])
+        for function in (prune._without, prune._sums):
+            pairs = [statistics.summed(function, z, fitted._params, fitted._envelope) for z in (points, blocks)]
+            for one, other in zip(*map(jax.tree.leaves, pairs), strict=True):
+                np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * np.abs(one).max())
+        value = prune.log_likelihood(fitted._params, blocks, fitted._envelope)
+        np.testing.assert_allclose(value, prune.log_likelihood(fitted._params, points, fitted._envelope), rtol=1e-12)
+
+
+def test_variances_are_of_centred_numbers():
+    x = 1e8 + np.random.default_rng(0).normal(size=(1000, 2)) * [1.0, 1e-3]
+    weights = _weights(1000)
+    found, sizes = survey(chunks_of(np.array_split(x, 77), weights))
+    mean, variance = variances_of(x[weights > 0], weights[weights > 0])
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-15)
+    np.testing.assert_allclose(found.scatter / found.total, variance, rtol=1e-5)
+    assert (found.num_rows, found.size, sizes) == (1000, (weights > 0).sum(), [(weights > 0).sum()])
+    np.testing.assert_allclose(found.total, weights.sum())
+
+
+# --- what is known of chunks ----------------------------------------------------------------------------------
+
+
+def test_scores_and_labels_of_chunks():
+    x = _tracks()
+    fitted, parts = _fit(x), np.split(x, CUTS)
+    for name in ("score", "bic", "aic"):
+        np.testing.assert_allclose(getattr(fitted, name)(parts), getattr(fitted, name)(x), rtol=1e-12)
+    for name in ("score_samples", "predict", "predict_proba"):
+        found = list(getattr(fitted, name)(parts))
+        assert [len(part) for part in found] == [len(part) for part in parts]
+        expected = getattr(fitted, name)(x)
+        assert {part.ndim for part in found} == {expected.ndim}
+        np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-12)
+    labels = FoldedGaussianMixture(**OPTIONS).fit_predict(parts)
+    np.testing.assert_array_equal(np.concatenate(list(labels)), fitted.predict(x))
+
+
+def test_chunks_are_chosen_among_by_information():
+    x = _tracks()
+    options = {"n_components": [3], "degrees": [2]}
+    estimator = FoldedGaussianMixture(**OPTIONS)
+    chosen = select_mixture(estimator, np.split(x, CUTS), **options)
+    np.testing.assert_allclose(chosen.scores, select_mixture(estimator, x, **options).scores, rtol=1e-9)
+    with pytest.raises(ValueError, match=r'criterion: expected "bic" or "aic" for chunks'):
+        select_mixture(estimator, [x], criterion="cv", **options)
+
+
+# --- dask -----------------------------------------------------------------------------------------------------
+
+
+def _dask():
+    return pytest.importorskip("dask.array", reason="dask is not installed")
+
+
+def test_a_dask_array_is_fitted_as_one_array():
+    array = _dask()
+    x, weights = _tracks(offset=1e6), _weights()
+    rows = array.from_array(x, chunks=((70, 10, 0, 160, 1, 259, 100), 2))
+    whole = _fit(x, weights)
+    assert chunks_of(rows).num_parts == 3  # small chunks are taken together
+    for mass in (weights, array.from_array(weights, chunks=77)):
+        _assert_same(whole, _fit(rows, mass))
+    for name in ("score", "bic"):
+        np.testing.assert_allclose(getattr(whole, name)(rows), getattr(whole, name)(x), rtol=1e-12)
+    for name in ("score_samples", "predict", "predict_proba"):
+        lazy, expected = getattr(whole, name)(rows), getattr(whole, name)(x)
+        assert isinstance(lazy, array.Array)
+        assert (lazy.dtype, lazy.shape, lazy.chunks[0]) == (expected.dtype, expected.shape, rows.chunks[0])
+        np.testing.assert_allclose(lazy.compute(), expected, atol=1e-9)
+
+
+def test_chunks_of_a_dask_array_are_computed_one_at_a_time():
+    array = _dask()
+    alive, most = [0], [0]
+
+    def gone():
+        alive[0] -= 1
+
+    def made(block_info=None):
+        rows = _tracks(60)
+        weakref.finalize(rows, gone)
+        alive[0] += 1
+        most[0] = max(most[0], alive[0])
+        return rows
+
+    rows = array.map_blocks(made, chunks=((60,) * 20, (2,)), dtype=np.float64, meta=np.zeros((0, 0)))
+    _fit(rows, max_iter=2)
+    assert most[0] == 2  # the one that is looked at, and the one being computed
+
+
+def _workers(**options):
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
+    return distributed.Client(n_workers=2, threads_per_worker=1, dashboard_address=":0", **options)
+
+
+def _same_with(client, rows, alone):
+    tasks = []
+    submit = client.compute
+    client.compute = lambda *args, **more: tasks.append(1) or submit(*args, **more)
+    parted = _fit(rows, _weights())
+    num_parts = chunks_of(rows).num_parts
+    # A survey, the starts' rows, and a pass for each step, of which the other start may have taken more.
+    assert len(tasks) % num_parts == 0
+    assert len(tasks) >= num_parts * (2 + parted.n_iter_)
+    for name in FITTED:
+        np.testing.assert_array_equal(getattr(parted, name), getattr(alone, name))
+
+
+def test_workers_sum_to_the_same_bits():
+    rows = _dask().from_array(_tracks(), chunks=(101, 2))
+    alone = _fit(rows, _weights())
+    with _workers(processes=False) as client:
+        _same_with(client, rows, alone)
+        np.testing.assert_allclose(alone.score(rows), alone.score(_tracks()), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_workers_in_processes_sum_to_the_same_bits(monkeypatch):
+    monkeypatch.undo()  # processes have their own constants
+    rows = _dask().from_array(_tracks(200_000, np.float32), chunks=(66_000, 2))
+    options = {"max_iter": 5}
+    alone = _fit(rows, **options)
+    with _workers(processes=True) as client:
+        with_workers = _fit(rows, **options)
+        again = _fit(client.persist(rows), **options)
+        np.testing.assert_array_equal(alone.predict(rows).compute(), alone.predict(_tracks(200_000, np.float32)))
+    for name in FITTED:
+        np.testing.assert_array_equal(getattr(with_workers, name), getattr(alone, name))
+        np.testing.assert_array_equal(getattr(again, name), getattr(alone, name))
+
+
+# --- errors ---------------------------------------------------------------------------------------------------
+
+X = _tracks(50)
+_NAN = np.where(np.arange(20)[:, None] == 17, np.nan, X[:20])
+
+
+@pytest.mark.parametrize(
+    ("data", "weights", "match"),
+    [
+        (lambda: iter([X]).__iter__(), None, None),
+        ("once", None, "X: expected chunks that can be read again in each pass, got generator"),
+        ([X, X[:, :1]], None, "X, chunk 1: expected 2 columns, got 1"),
+        ([X, X[0]], None, r"X, chunk 1: expected an array \(n, d\), got ndarray of shape \(2,\)"),
+        ([X, X, _NAN], None, "X, chunk 2: expected finite numbers, got NaN or infinity in its row 17"),
+        ([X, X.astype(complex)], None, "X, chunk 1: expected real numbers, got dtype complex128"),
+        ([X[:, :1]], None, "X: expected at least 2 columns"),
+        (_Files([]), None, "X: expected at least one chunk with rows, got none"),
+        ([X[:0]], None, "X: expected at least one chunk with rows, got none"),
+        ([X[:1]], None, "X: expected at least 2 rows, got 1"),
+        ([X[:2]], None, "n_components: expected at most the number of points"),
+        (lambda: X, None, "X: expected an iterable of chunks, got ndarray"),
+        (lambda: 3, None, "X: expected an iterable of chunks, got int"),
+        ([X, X], [np.ones(50), np.ones(49)], r"sample_weight, chunk 1: expected shape \(50,\), got shape \(49,\)"),
+        ([X, X], [np.ones(50)], "sample_weight: expected as many chunks as X, at least 2, got 1"),
+        ([X], [np.ones(50), np.ones(50)], "sample_weight: expected as many chunks as X, got more"),
+        ([X], np.ones(51), "sample_weight: expected 50 weights, one for each row, got 51"),
+        ([X], np.ones(49), r"sample_weight, chunk 0: expected shape \(50,\), got shape \(49,\)"),
+        ([X, X], np.arange(100) - 70.0, "sample_weight, chunk 0: expected numbers >= 0, got -70.0 in its row 0"),
+        ([X], 0.0, "sample_weight: expected a positive sum, got 0"),
+        ([X], "heavy", "sample_weight, chunk 0: expected"),
+    ],
+)
+def test_chunks_that_cannot_be_fitted_are_named(data, weights, match):
+    if match is None:
+        assert _fit(data, max_iter=1).n_iter_ == 1
+        return
+    data = (part for part in [X]) if data == "once" else data
+    with pytest.raises(ValueError, match=match):
+        _fit(data, weights)
+
+
+def test_rows_that_change_from_pass_to_pass_are_told():
+    left = iter([[X, X], [X]])
+    with pytest.raises(ValueError, match="X: expected the same rows in each pass, got 100 at first and 50 now"):
+        _fit(lambda: next(left))
+
+
+def test_dask_arrays_that_cannot_be_fitted_are_told():
+    array = _dask()
+    rows = array.from_array(X, chunks=(20, 1))
+    for data, weights, match in [
+        (rows, None, r"X: expected a dask array chunked along rows alone, .* X.rechunk\(\{1: -1\}\)"),
+        (
+            rows.rechunk((20, 2))[rows[:, 0] > 0],
+            None,
+            "X: expected a dask array of known chunks, .*compute_chunk_sizes",
+        ),
+        (rows[:, 0], None, r"X: expected a dask array \(n, d\), got 1 dimensions"),
+        (rows.to_delayed().ravel()[0], None, "X: expected a dask array, got dask's Delayed"),
+        (rows.rechunk((20, 2)), np.ones(49), "sample_weight: expected shape"),
+        (rows.rechunk((20, 2)), array.ones(49), "sample_weight: expected shape"),
+        (rows.rechunk((20, 2)), [np.ones(50)], "sample_weight: expected a dask or NumPy array"),
+        (
+            array.from_array(np.where(X[45] == X, np.nan, X), chunks=(20, 2)),
+            None,
+            "X, chunk 2: expected finite .* row 5",
+        ),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            _fit(data, weights)
+
+
+def test_chunks_unlike_those_fitted_are_told():
+    fitted = _fit(X, max_iter=1)
+    with pytest.raises(ValueError, match="X, chunk 1: expected 2 columns, got 1"):
+        fitted.score([X, X[:, :1]])
+    with pytest.raises(ValueError, match="X, chunk 0: expected finite numbers"):
+        next(fitted.predict([_NAN]))
+    with pytest.raises(ValueError, match="X: expected at least one chunk with rows"):
+        fitted.bic(list)
+    with pytest.raises(ValueError, match="X: expected 2 columns, got 1"):
+        fitted.predict(_dask().from_array(X[:, :1]))
+    with pytest.raises(ValueError, match=r"X: expected one batch of rows, got chunks. fit takes chunks"):
+        fitted.partial_fit([X])
+
+
+def test_rows_are_not_taken_for_chunks():
+    for rows in (X, X.tolist(), list(X), [], "text", {"a": X}, None, [[1, 2], [3, 4]], X[None]):
+        assert not is_chunked(rows)
+    for chunks in ([X], (X, X), _Files([X]), lambda: [X], (part for part in [X])):
+        assert is_chunked(chunks)
+
+
+# --- cost -----------------------------------------------------------------------------------------------------
+
+
+def test_ragged_chunks_share_one_program(monkeypatch):
+    traced = []
+    sums = loop.accumulate
+    monkeypatch.setattr(loop, "accumulate", lambda *args, **options: traced.append(1) or sums(*args, **options))
+    for cuts in (CUTS, range(3, N, 7), (), (599,)):
+        _fit(np.split(_tracks(), cuts), n_components=4, max_iter=3)  # a number that no other test compiles
+    assert len(traced) == 1
+
+
+_PEAK = """
+import resource, sys, warnings
+import numpy as np
+from foldgauss.estimator import FoldedGaussianMixture
+
+warnings.simplefilter("ignore")
+
+def chunks(num):
+    def begin():
+        for seed in range(num):
+            t = np.random.default_rng(seed).normal(size=50_000)
+            yield np.stack([t**2 + 0.1 * np.cos(99 * t), np.sin(t), t], 1)
+    return begin
+
+peaks = []
+for num in (4, 80):
+    fitted = FoldedGaussianMixture(2, degree=1, init_params="random_from_data", max_iter=2, random_state=0)
+    fitted.fit(chunks(num))
+    fitted.score(chunks(num))
+    peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+assert "dask" not in sys.modules
+print(peaks[1] - peaks[0])
+"""
+
+
+def test_memory_does_not_grow_with_the_number_of_chunks():
+    """20 times the rows, 96 MB in all: the peak grows by less than 16 of the chunks' 1.2 MB."""
+    pytest.importorskip("resource", reason="needs resource.getrusage")
+    done = subprocess.run([sys.executable, "-c", _PEAK], capture_output=True, text=True, timeout=300, check=True)
+    assert int(done.stdout) / 1024 < 20

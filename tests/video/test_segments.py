@@ -1,0 +1,481 @@
+"""Models of a clip's segments as one video: which is seen where, and that no seam is."""
+
+import dataclasses
+import gc
+import weakref
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from soft_models import NUM, SIZE, soft_model
+
+from foldgauss.io import save_selection
+from foldgauss.render import RenderOptions
+from foldgauss.uncertainty.screen import Screen
+from foldgauss.video import (
+    FitConfig,
+    FrameTimes,
+    Segment,
+    SegmentedVideo,
+    Selection,
+    by_color,
+    compress,
+    edit,
+    evaluate,
+    fit,
+    interpolated_times,
+    layers,
+    plan_segments,
+    played_positions,
+    psnr,
+    times_at,
+)
+from foldgauss.video.flat import flattened
+from foldgauss.video.playback import Playback
+from foldgauss.video.segments import READY
+from foldgauss.video.shots import is_cut, time_logits
+from foldgauss.video.tradeoff import frames_per_second
+
+#: Spans 0:7, 4:13 (three frames shared), 13:18 (a cut), 17:23 (one shared).
+FIRSTS, LENGTHS = (0, 4, 13, 17), (7, 9, 5, 6)
+NUM_FRAMES = 23
+
+
+def learned(model, seed=0):
+    """The same with frame times of its own."""
+    logits = 0.3 * np.random.default_rng(seed).standard_normal(model.num_frames - 1).astype(np.float32)
+    return dataclasses.replace(model, frame_times=FrameTimes(logits))
+
+
+def models():
+    return [learned(soft_model(seed=k, num_frames=num), k) for k, num in enumerate(LENGTHS)]
+
+
+def video():
+    return SegmentedVideo.of(list(zip(FIRSTS, models(), strict=True)))
+
+
+def image(one, t):
+    return np.array(Playback(one).image(t))
+
+
+def at(clip, position):
+    """The picture at a frame position."""
+    return image(clip, position / (clip.num_frames - 1))
+
+
+# ------------------------------------------------------------------------------------------ what is seen
+
+
+@pytest.mark.parametrize("kind", ["learned", "cut", "edited", "alone"])
+def test_one_segment_is_the_model_to_the_bit(kind):
+    model = learned(soft_model())
+    if kind == "cut":
+        model = dataclasses.replace(model, frame_times=FrameTimes(time_logits(7, [3])))
+    elif kind == "edited":
+        model = edit(model).select(np.arange(NUM) < 12).move((0.1, 0.0), times=(0.2, 0.7)).video()
+    elif kind == "alone":
+        model = soft_model(num_frames=1)
+    clip = SegmentedVideo.of([(0, model)])
+    assert (clip.size, clip.fps, clip.num_frames) == (model.size, model.fps, model.num_frames)
+    assert (clip.num_gaussians, clip.degree, clip.num_floats) == (model.num_gaussians, model.degree, model.num_floats)
+    np.testing.assert_array_equal(list(clip.frames()), list(model.frames()))
+    green = {"size": (30, 48), "background": (0.0, 0.5, 0.0)}
+    np.testing.assert_array_equal(list(clip.frames(**green)), list(model.frames(**green)))
+    own = np.asarray(model.frame_times.times())
+    for position in np.arange(0, model.num_frames - 1 + 1e-9, 0.375):
+        t = position / max(model.num_frames - 1, 1)
+        np.testing.assert_array_equal(image(clip, t), image(model, times_at(own, position)))
+
+
+def test_every_frame_is_that_of_its_segment():
+    clip, parts, shared = video(), models(), 0
+    pictures = [list(model.frames()) for model in parts]
+    times = clip.frame_times.times()
+    assert times.dtype == np.float64
+    for k, picture in enumerate(clip.frames()):
+        here = [n for n, first in enumerate(FIRSTS) if first <= k < first + LENGTHS[n]]
+        assert clip.position(times[k]) == k
+        if len(here) == 1:
+            np.testing.assert_array_equal(picture, pictures[here[0]][k - FIRSTS[here[0]]])
+        else:
+            shared += 1
+            one, other = (np.float32(image(parts[n], parts[n].frame_times.times()[k - FIRSTS[n]])) for n in here)
+            (_, first), (_, second) = clip.weights(k)
+            expected = np.float32(first) * one + np.float32(second) * other
+            np.testing.assert_array_equal(at(clip, k), expected)
+            assert first + second == pytest.approx(1)
+    assert shared == 4
+
+
+def test_between_frames_it_goes_by_the_segments_own_times():
+    clip, model = video(), models()[1]
+    own = np.asarray(model.frame_times.times())
+    between = image(model, own[5] + 0.25 * (own[6] - own[5]))
+    np.testing.assert_allclose(at(clip, 4 + 5.25), between, atol=2e-5)
+    assert np.abs(between - image(model, (5.25) / 8)).max() > 1e-3  # evenly spaced times are others
+
+
+def test_a_cut_within_a_segment_is_kept():
+    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(time_logits(7, [3])))
+    clip = SegmentedVideo.of([(0, soft_model(num_frames=5)), (5, model)])
+    for position, frame in ((7.4, 2), (7.6, 3)):
+        np.testing.assert_array_equal(at(clip, position), image(model, model.frame_times.times()[frame]))
+    assert [clip.frame_times.cut_after(k) for k in range(11)] == [k in (4, 7) for k in range(11)]
+    assert clip.cuts == [5]
+
+
+def test_at_a_cut_between_segments_is_the_nearer_frame():
+    clip = video()
+    np.testing.assert_array_equal(at(clip, 12.49), at(clip, 12))
+    np.testing.assert_array_equal(at(clip, 12.5), at(clip, 13))
+    assert np.abs(at(clip, 12) - at(clip, 13)).max() > 0.1
+
+
+def test_weights_rise_linearly_and_sum_to_one():
+    clip = video()
+    for position, expected in ((3, [(0, 1)]), (3.5, [(0, 0.875), (1, 0.125)]), (4, [(0, 0.75), (1, 0.25)])):
+        assert clip.weights(position) == expected
+    assert clip.weights(6.5) == [(0, 0.125), (1, 0.875)]
+    assert clip.weights(7) == [(1, 1)]
+    assert clip.weights(17) == [(2, 0.5), (3, 0.5)]
+    for position in np.arange(0, 22.001, 0.01):
+        seen = clip.weights(min(position, 22))
+        assert sum(weight for _, weight in seen) == pytest.approx(1, abs=1e-12)
+        assert [n for n, _ in seen] == sorted({n for n, _ in seen})
+    for outside in (-0.01, 22.01):
+        with pytest.raises(ValueError, match=r"^position: expected a frame position in \[0, 22\]"):
+            clip.weights(outside)
+
+
+def test_fades_are_continuous():
+    """From one position to the next, no picture changes by more than the models do and their share does."""
+    step, clip, parts = 1 / 16, video(), models()[:2]
+    positions = np.arange(2, 8.001, step)
+    alone = [[_held(parts[n], position - FIRSTS[n]) for position in positions] for n in (0, 1)]
+    apart = max(np.abs(a - b).max() for a, b in zip(*alone, strict=True))
+    inside = max(_largest_jump(pictures) for pictures in alone)
+    jump = _largest_jump([at(clip, position) for position in positions])
+    assert jump <= inside + step / 4 * apart + 1e-4
+    assert jump < 0.2 * apart
+
+
+def _held(model, position):
+    """Its picture, before its first frame the first one, after its last one the last."""
+    return image(model, times_at(np.asarray(model.frame_times.times()), position))
+
+
+def _largest_jump(pictures):
+    return max(np.abs(b - a).max() for a, b in pairwise(pictures))
+
+
+def test_three_are_seen_where_one_fade_meets_the_next():
+    parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate((5, 6, 5))]
+    clip = SegmentedVideo.of(list(zip((0, 3, 5), parts, strict=True)))
+    seen = clip.weights(4.5)
+    assert [n for n, _ in seen] == [0, 1, 2]
+    assert sum(weight for _, weight in seen) == pytest.approx(1)
+    around = [at(clip, position) for position in (4.4999, 4.5, 4.5001)]
+    assert max(np.abs(a - around[1]).max() for a in around) < 1e-3
+    assert len(list(Playback(clip).frames(np.linspace(0, 1, 57)))) == 57
+
+
+def test_two_segments_of_one_clip_show_no_seam():
+    y, x = np.mgrid[0:24, 0:40]
+    waves = [128 + 90 * np.sin(0.3 * x + 0.25 * k) * np.cos(0.2 * y - 0.1 * k) for k in range(14)]
+    frames = np.repeat(np.stack(waves)[..., None], 3, -1).astype(np.uint8)
+    spans = plan_segments(14, [], length=9, overlap=4)
+    assert spans == [(0, 9), (5, 14)]
+    config = FitConfig(num_gaussians=80, steps=150, seed=0)
+    clip = SegmentedVideo.of([(a, fit(frames[a:b], config).model) for a, b in spans])
+    quality = np.array([psnr(*pair) for pair in zip(frames, clip.frames(), strict=True)])
+    assert quality.min() > 22
+    assert quality[5:9].mean() >= np.delete(quality, range(5, 9)).mean() - 0.2
+    positions = np.arange(4, 10.001, 0.125)
+    pictures = [at(clip, position) for position in positions]
+    jumps = np.array([np.abs(b - a).mean() for a, b in pairwise(pictures)])
+    assert jumps.max() < 2.5 * np.median(jumps)  # the way of the waves, not a step
+
+
+def test_what_is_given_for_one_time():
+    clip, parts = video(), models()
+    for position, number in ((4, 0), (6, 1), (20, 3)):
+        t = position / 22
+        own = parts[number]
+        expected = own.stage(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
+        for found in (clip.at(t), Playback(clip).splats(t), Playback(clip).shown(t)):
+            np.testing.assert_array_equal(found.mean, expected.mean)
+            np.testing.assert_array_equal(found.opacity, expected.opacity)
+    np.testing.assert_array_equal(clip.render(0.3), np.moveaxis(image(clip, 0.3), 0, -1))
+    for wrong in (-0.1, 1.5, "soon"):
+        with pytest.raises(ValueError, match=r"^t: expected a time in \[0, 1\]"):
+            clip.render(wrong)
+
+
+def test_other_constants_go_to_all_segments():
+    options = RenderOptions(alpha_cutoff=0.2, support_radius=1.0)
+    clip, parts = video().with_options(options), [model.with_options(options) for model in models()]
+    expected = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    assert clip.options == options
+    np.testing.assert_array_equal(list(clip.frames()), list(expected.frames()))
+    assert np.abs(at(clip, 3) - at(video(), 3)).max() > 0.01
+    assert [segment.model.options for segment in clip.segments] == [options] * 4
+    assert video().with_options(video().options).num_frames == NUM_FRAMES
+
+
+# -------------------------------------------------------------------------------------------- long clips
+
+
+def long_clip(num_frames=10**7, length=1000):
+    """Of segments that are never loaded."""
+    lead = Segment.of(0, soft_model())
+    spans = plan_segments(num_frames, [], length=length, overlap=10)
+    return SegmentedVideo(
+        [dataclasses.replace(lead, first=a, num_frames=b - a, load=lambda: pytest.fail("loaded")) for a, b in spans]
+    )
+
+
+def test_positions_are_exact_in_a_clip_of_ten_million_frames():
+    clip = long_clip()
+    assert clip.num_frames == 10**7
+    chosen = np.random.default_rng(0).integers(0, 10**7, 500)
+    for k in [0, 1, 10**7 - 1, *chosen.tolist()]:
+        position = clip.position(k / (clip.num_frames - 1))
+        assert position == k
+        half = clip.position(min(k + 0.25, 10**7 - 1) / (clip.num_frames - 1))
+        assert half == pytest.approx(min(k + 0.25, 10**7 - 1), abs=1e-6)
+        (number, weight), *_ = clip.weights(position)
+        segment = clip.segments[number]
+        assert 0 < weight <= 1
+        assert segment.first - 1 < k <= segment.stop
+
+
+def test_cuts_are_told_from_float64_times():
+    """In float32 all of these are one."""
+    times = 0.5 + 1e-9 * np.array([0, 1, 2, 3, 23, 24])
+    assert list(is_cut(times)) == [False, False, False, True, False]
+    np.testing.assert_array_equal(is_cut(jnp.float32([0, 1, 2, 3, 23, 24])), is_cut(times))
+
+
+def test_even_times_of_a_long_clip_have_no_cuts():
+    times = long_clip(300_000).frame_times.times()
+    positions = np.array([0.5, 123456.25, 299_998.75])
+    np.testing.assert_allclose(times_at(times, positions) * (len(times) - 1), positions, atol=1e-6)
+
+
+def test_upsampled_and_played_times_reach_every_frame():
+    clip = video()
+    times = clip.frame_times.times()
+    fine = interpolated_times(times, 4)
+    assert [clip.position(t) for t in fine[::4]] == list(range(NUM_FRAMES))
+    backwards = times_at(times, played_positions(NUM_FRAMES, 1.0, speed=-1.0))
+    assert [clip.position(t) for t in backwards] == list(range(NUM_FRAMES))[::-1]
+
+
+# ------------------------------------------------------------------------------------------------ loading
+
+
+def counted():
+    """The video, the numbers of the segments as they are loaded, and the models that are still there."""
+    loaded, alive = [], []
+
+    def load(number):
+        model = learned(soft_model(seed=number, num_frames=LENGTHS[number]), number)
+        loaded.append(number)
+        alive.append(weakref.ref(model.splats))
+        return model
+
+    segments = [
+        dataclasses.replace(segment, load=lambda number=number: load(number))
+        for number, segment in enumerate(video().segments)
+    ]
+    return SegmentedVideo(segments), loaded, lambda: gc.collect() and sum(one() is not None for one in alive)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_played_through_each_segment_is_loaded_once(way):
+    clip, loaded, alive = counted()
+    assert loaded == []
+    playback = Playback(clip)
+    for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
+        assert len(playback._stage._ready) <= READY
+    assert loaded == [0, 1, 2, 3][::way]
+    assert not alive()  # a stage needs no model
+
+
+def test_what_is_asked_for_once_loads_what_it_shows():
+    clip, loaded, _ = counted()
+    clip.render(0.0)
+    assert loaded == [0]
+    clip.render(5 / 22)
+    assert sorted(loaded) == [0, 0, 1]
+    assert clip.num_gaussians == 4 * NUM
+    assert len(loaded) == 3
+
+
+def test_speed_is_measured_of_some_segments():
+    clip, loaded, _ = counted()
+    assert frames_per_second(clip) > 0
+    assert sorted(set(loaded)) == [0, 2, 3]
+
+
+# --------------------------------------------------------------------------------------------- evaluation
+
+
+class Frames:
+    """Frames that are read when they are asked for."""
+
+    ndim, dtype = 4, np.dtype(np.uint8)
+
+    def __init__(self, frames):
+        self._frames, self.shape, self.asked = frames, frames.shape, []
+
+    def __getitem__(self, k):
+        self.asked.append(k)
+        return self._frames[k]
+
+
+def test_scores_of_lazy_frames_are_those_of_an_array():
+    clip = video()
+    frames = np.stack(list(clip.frames()))
+    noisy = np.clip(frames + np.random.default_rng(0).integers(-9, 10, frames.shape), 0, 255).astype(np.uint8)
+    lazy = Frames(noisy)
+    assert evaluate(clip, lazy) == evaluate(clip, noisy)
+    assert lazy.asked == list(range(NUM_FRAMES))
+    with_alpha = np.concatenate([noisy, np.full_like(noisy[..., :1], 255)], -1)
+    assert evaluate(clip, Frames(with_alpha)).psnr == evaluate(clip, noisy).psnr
+    with pytest.raises(ValueError, match=r"^frames: expected uint8 \(23, 40, 64, 3\)"):
+        evaluate(clip, Frames(noisy[1:]))
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+def spans(*pairs):
+    lead = Segment.of(0, soft_model())
+    return [dataclasses.replace(lead, first=a, num_frames=b - a) for a, b in pairs]
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        ([], "^segments: expected at least one"),
+        ([(1, 9)], "^segments: expected the first one to begin at frame 0, got 1"),
+        ([(0, 9), (10, 20)], r"segment 1 to begin at frame 9 at the latest.*got frame 10\. Fit frames 9:10, too"),
+        ([(0, 9), (9, 18), (0, 20)], r"^segments: expected segment 2 to begin and to end after segment 1, 9:18"),
+        ([(0, 9), (0, 12)], "to begin and to end after segment 0"),
+        ([(0, 9), (2, 9)], "to begin and to end after segment 0"),
+        ([(0, 9), (3, 12), (8, 20)], r"segment 2 to begin at frame 9 or later.*got frame 8.*overlap less"),
+        ([(-1, 9)], "number of a frame of the whole clip"),
+    ],
+)
+def test_segments_that_do_not_cover_a_clip_are_refused(pairs, message):
+    with pytest.raises(ValueError, match=message):
+        SegmentedVideo(spans(*pairs))
+
+
+def test_segments_that_do_not_go_together_are_refused():
+    lead = soft_model()
+    for name, value in (("size", (40, 80)), ("fps", 24.0), ("compositing", "sum"), ("options", RenderOptions())):
+        other = dataclasses.replace(lead, **{name: value})
+        with pytest.raises(ValueError, match=rf"^segments\[1\]\.{name}: expected .*first segment.*fit them alike"):
+            SegmentedVideo.of([(0, lead), (5, other)])
+    for wrong, message in (
+        ([(0, "a")], "^model: expected a VideoModel or an EditedVideo, got str"),
+        ([(0, edit(lead))], r"got Edit\. End a chain"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            SegmentedVideo.of(wrong)
+    with pytest.raises(ValueError, match=r"^segments\[0\]: expected a Segment"):
+        SegmentedVideo([lead])
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        edit,
+        compress,
+        flattened,
+        lambda clip: layers(soft_model(), clip),
+        lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
+        lambda clip: Selection.all(clip),
+        lambda clip: Screen(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
+        lambda clip: save_selection("never", Selection(np.ones(NUM, bool)), clip),
+    ],
+)
+def test_what_takes_one_model_says_how_to_get_one(call):
+    with pytest.raises(ValueError, match=r"video\.segments\[k\]\.model") as caught:
+        call(video())
+    assert "\n" not in str(caught.value)
+
+
+# -------------------------------------------------------------------------------------------------- plans
+
+
+@st.composite
+def clips(draw):
+    num = draw(st.integers(1, 300))
+    length = draw(st.integers(2, 80))
+    cuts = draw(st.lists(st.integers(1, max(num - 1, 1)), max_size=12)) if num > 1 else []
+    return num, cuts, length, draw(st.integers(1, length // 2))
+
+
+@given(clips())
+def test_plans_cover_the_clip(asked):
+    num, cuts, length, overlap = asked
+    plan = plan_segments(num, cuts, length=length, overlap=overlap)
+    SegmentedVideo(spans(*plan))  # what it refuses no plan may have
+    assert (plan[0][0], plan[-1][1]) == (0, num)
+    for (_, stop), (first, _) in pairwise(plan):
+        assert stop - first == 0 or 1 <= stop - first <= overlap
+        if first == stop:
+            assert first in cuts
+    for first, stop in plan:
+        assert stop - first <= 1.5 * length
+        assert len(plan) == 1 or stop - first >= length / 2
+        assert stop - first >= min(2, num) or length < 4
+
+
+@given(clips())
+def test_plans_end_at_the_cut_that_is_nearest(asked):
+    num, cuts, length, overlap = asked
+    plan = plan_segments(num, cuts, length=length, overlap=overlap)
+    for (first, stop), (following, _) in pairwise(plan):
+        near = [cut for cut in cuts if 0.5 * length <= cut - first <= 1.5 * length and num - cut >= length / 2]
+        if near:
+            assert following == stop
+            assert abs(stop - first - length) == min(abs(cut - first - length) for cut in near)
+        else:
+            assert following < stop
+
+
+def test_plans_of_known_clips():
+    assert plan_segments(250, [90], length=100, overlap=5) == [(0, 90), (90, 190), (185, 250)]
+    assert plan_segments(100, [50], length=100, overlap=5) == [(0, 100)]
+    assert plan_segments(130, [], length=100, overlap=10) == [(0, 70), (60, 130)]  # evened out
+    assert plan_segments(130, [100], length=100, overlap=10) == [(0, 70), (60, 130)]  # 30 frames are too few
+    # Evened out, the last two share less, so that the last does not reach the first.
+    assert plan_segments(33, [9], length=20, overlap=8) == [(0, 20), (12, 25), (20, 33)]
+    assert plan_segments(1, [], length=2, overlap=1) == [(0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("given_", "name"),
+    [
+        ({"num_frames": 0}, "num_frames"),
+        ({"num_frames": 2.5}, "num_frames"),
+        ({"length": 1}, "length"),
+        ({"overlap": 0}, "overlap"),
+        ({"overlap": 6}, "overlap"),
+        ({"cuts": [0]}, "cuts"),
+        ({"cuts": [50]}, "cuts"),
+        ({"cuts": [1.5]}, "cuts"),
+    ],
+)
+def test_plans_that_make_no_sense_are_refused(given_, name):
+    asked = {"num_frames": 50, "cuts": [], "length": 10, "overlap": 2} | given_
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        plan_segments(asked.pop("num_frames"), asked.pop("cuts"), **asked)
