@@ -95,7 +95,6 @@ def edit_command(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
-    refuse_segments(model_path)
     model = load_video_model(model_path)
     if not as_model:
         refuse_huge(picture_size or model.size)
