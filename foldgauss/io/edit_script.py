@@ -33,9 +33,10 @@ from foldgauss.io.selections import load_selection
 from foldgauss.io.video_model import load_video_model
 from foldgauss.render import Camera
 from foldgauss.video.edit import Edit, edit
-from foldgauss.video.edited import EditedVideo, layers
+from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
 from foldgauss.video.segment_edits import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segment_layers import layers
 from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.select import Selection
 

@@ -309,7 +309,7 @@ class Edit:
             counts = np.where(mask, num + 1, 1)
             source = np.repeat(np.arange(len(mask)), counts)
             copy = np.arange(len(source)) - np.repeat(np.cumsum(counts) - counts, counts)  # 0: the original
-            made.append(_gathered(layer, source, mask, copy))
+            made.append(gathered(layer, source, mask, copy))
             chosen.append(mask[source])
             copies.append(copy)
             sources.append(source)
@@ -327,7 +327,7 @@ class Edit:
             delete = mask.any() and not mask.all() and _can_lose(layer, mask)
             source = np.flatnonzero(~mask) if delete else np.arange(len(mask))
             if delete:
-                layer = _gathered(layer, source, mask, np.zeros(len(source), int))
+                layer = gathered(layer, source, mask, np.zeros(len(source), int))
             elif mask.any():
                 layer = _with_overlay(layer, Opacity(mask, None, 0.0))
             made.append(layer)
@@ -351,7 +351,7 @@ class Edit:
         parts = self._parts()
         sources = [np.argsort(~mask if front else mask, kind="stable") for mask in parts]
         made = [
-            _gathered(layer, source, mask, np.zeros(len(source), int))
+            gathered(layer, source, mask, np.zeros(len(source), int))
             for layer, source, mask in zip(self._video.layers, sources, parts, strict=True)
         ]
         chosen = [mask[source] for mask, source in zip(parts, sources, strict=True)]
@@ -646,7 +646,7 @@ def _split(mask: Mask, counts: Sequence[int]) -> list[Mask]:
     return np.split(mask, np.cumsum(counts)[:-1])
 
 
-def _gathered(
+def gathered(
     layer: Layer, source: Int[np.ndarray, " num_new"], chosen: Mask, copy: Int[np.ndarray, " num_new"]
 ) -> Layer:
     """A layer of the Gaussians `source`, with all edits that they had; those of `copy` k are its k-th copies.

@@ -32,7 +32,6 @@ from foldgauss.video import (
     layers,
 )
 from foldgauss.video.segments import READY
-from foldgauss.video.timing import span_of
 
 #: Three segments of a dozen frames, three of which are shared with each neighbour.
 FIRSTS, LENGTH, NUM_FRAMES = (0, 9, 18), 12, 30
@@ -333,6 +332,23 @@ def test_copies_are_in_all_segments():
     assert (orange(np.stack(list(doubled.frames()))) > 1.3 * orange(pictures_of_scene())).all()
 
 
+def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, curve="linear"):
+    """How far along an edit over a span is at a frame position, by the words of `span_of`."""
+    if times is not None:
+        begin, end = times[0] * last, times[1] * last
+    else:
+        first, stop = (frame, frame + 1) if frames is None else frames
+        begin = -np.inf if first is None else first - 0.5
+        end = np.inf if stop is None else stop - 0.5
+    rise, fall = ease if isinstance(ease, tuple) else (ease, ease)
+    if not begin <= position < end:
+        return 0.0
+    into = (position - begin) / rise if rise and np.isfinite(begin) else 1.0
+    out_of = (end - position) / fall if fall and np.isfinite(end) else 1.0
+    s = min(1.0, into, out_of)
+    return s if curve == "linear" else s * s * (3 - 2 * s)
+
+
 @pytest.mark.parametrize("evenly", [True, False])
 @pytest.mark.parametrize(
     "when",
@@ -352,8 +368,8 @@ def test_a_span_acts_over_seams_as_if_there_were_none(when, evenly):
     video = soft_video(evenly=evenly)
     edited = edit(video).recolor(gain=0.2, **when).video()
     times = video.frame_times.times()
-    span = span_of(times, **when)
-    progress = np.array([span.progress(t) for t in times])
+    last = len(times) - 1
+    progress = np.array([progress_at(k, last, **when) for k in range(len(times))])
     assert 0 < (progress > 0).sum() < len(times)
     before, after = np.stack(list(video.frames())), np.stack(list(edited.frames()))
     exact = np.stack([video.render(t) for t in times])
@@ -366,7 +382,7 @@ def test_a_span_acts_over_seams_as_if_there_were_none(when, evenly):
         position = t * (len(times) - 1)
         seen = [number for number, _ in video.weights(position)]
         if len(seen) == 1:  # between the frames of a fade's ends one model shows its last frame, edited as that is
-            expected = video.render(t) * (1 - 0.8 * span.progress(t))
+            expected = video.render(t) * (1 - 0.8 * progress_at(position, last, **when))
             np.testing.assert_allclose(edited.render(t), expected, atol=1e-5)
 
 
@@ -420,6 +436,8 @@ def test_clocks_go_by_the_clip(evenly):
     clock = Clock((7 * per_frame, 9 * per_frame), (9 * per_frame, 7 * per_frame))
     turned = drawn(edit(video).retime(clock=clock, frames=(7, 10)).video())
     np.testing.assert_allclose(turned[7:10], before[[9, 8, 7]], atol=1)
+    fast = edit(video).retime(stretch=0.5, about=7 * per_frame, frames=(7, 9)).video()
+    np.testing.assert_allclose(fast.render(7.5 * per_frame), video.render(8 * per_frame), atol=1e-4)
     half = edit(video).retime(stretch=2, about=7 * per_frame, frames=(7, 10)).video()
     wanted = edit(video.segments[1].model)
     own = np.asarray(video.segments[1].model.frame_times.times())
@@ -437,6 +455,12 @@ def test_the_first_segment_goes_on_before_the_clip_and_the_last_behind_it():
     wanted = edit(first).select(OBJECT).retime(shift=2 / 6).video()
     np.testing.assert_allclose(drawn(begin)[:4], drawn(wanted)[:4], atol=1)
     assert begin.segments[1:] == video.segments[1:]
+    uneven = soft_video()
+    model = uneven.segments[0].model
+    early = Clock.frozen(-2 * float(model.frame_times.times()[1]))
+    begin = edit(uneven).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
+    wanted = edit(model).select(OBJECT).retime(clock=early).video()
+    np.testing.assert_allclose(begin.render(0.0), wanted.render(0.0), atol=1e-4)
     end = edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=-2 / steps).video()
     np.testing.assert_allclose(
         drawn(end)[13:], drawn(edit(last).select(OBJECT).retime(shift=-2 / 5).video())[3:], atol=1
@@ -509,6 +533,7 @@ def test_edits_act_in_their_order_and_a_selection_goes_along():
         assert (segment.num_gaussians, segment.num_floats) == (wanted.num_gaussians, wanted.num_floats)
     copied = edit(video).select(parts).multiply([(0.2, 0)])
     assert len(copied.selection) == len(parts)
+    assert len(copied.select_begun(parts).selection) == 2 * len(parts)
     assert copied.selection.num_gaussians == video.num_gaussians + len(parts)
     again = edit(edited).select(color=(0.5, 0.5, 0.5), tolerance=30).vanish().video()
     assert again.num_gaussians < edited.num_gaussians
@@ -543,13 +568,13 @@ def test_models_are_loaded_one_after_another_and_let_go():
 
         return load
 
-    spans = [(k * 4, soft_model(seed=k, num_frames=7)) for k in range(5)]
+    spans = [(k * 2, soft_model(seed=k, num_frames=4)) for k in range(9)]
     segments = [dataclasses.replace(Segment.of(first, model), load=loading(model)) for first, model in spans]
     video = SegmentedVideo(segments)
-    chain = edit(video).select(color=(0.5, 0.5, 0.5), tolerance=40).move((0.1, 0), frames=(0, 12))
+    chain = edit(video).select(color=(0.5, 0.5, 0.5), tolerance=40).move((0.1, 0), frames=(0, 19))
     edited = chain.video()
     list(edited.frames())
-    assert len(alive) > 5
+    assert len(alive) > 9
     assert most <= 2 * READY + 1  # those that are drawn, and those before them
 
 
