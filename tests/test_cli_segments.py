@@ -1,5 +1,6 @@
 """The commands on a model in segments."""
 
+import dataclasses
 import json
 
 import cv2
@@ -10,15 +11,17 @@ from soft_models import NUM, soft_model
 
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.io.video_model import read_metadata
-from foldgauss.video import SegmentedVideo, edit, evaluate, psnr, times_at
+from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, psnr, times_at
 
 #: Spans 0:7, 4:13 (three frames shared) and 13:18 (a cut).
 FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 13), (7, 9, 5), 18
 
 
 def video():
-    parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
-    return SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    """Of its first segment nothing is noted."""
+    parts = [Segment.of(first, soft_model(seed=k, num_frames=LENGTHS[k])) for k, first in enumerate(FIRSTS)]
+    noted = [dataclasses.replace(part, metadata={"mean_psnr": 31.5, "seed": 3}) for part in parts[1:]]
+    return SegmentedVideo([parts[0], *noted])
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +114,7 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
     said = told(capsys)
     for text in (
         "18 of 40x64 (height x width), 25 a second", "3; begin at a cut: 1; fade in: 1", f"{3 * NUM} in all",
-        "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
+        "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │ 31.50 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
         "frames of the clip │ [2, 20]",
     ):  # fmt: skip
         assert text in said
@@ -154,7 +157,7 @@ def test_exports(here, capsys, tmp_path):
 def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     assert run("segment", here, 1) == 0
     assert "long.1.safetensors: segment 1, frames 4:13, 40 Gaussians" in told(capsys)
-    assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15]}
+    assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15], "mean_psnr": 31.5, "seed": 3}
     one = load_video_model("long.1.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))
     assert run("evaluate", "long.1.safetensors", work / "clip") == 0  # its own frames of the clip

@@ -409,6 +409,14 @@ def test_what_takes_one_model_says_how_to_get_one(call):
     assert "\n" not in str(caught.value)
 
 
+def test_a_model_of_other_frames_is_refused_when_it_comes():
+    lead = Segment.of(0, soft_model())
+    for other in (soft_model(num_frames=8), soft_model(size=(20, 32))):
+        clip = SegmentedVideo([dataclasses.replace(lead, load=lambda other=other: other)])
+        with pytest.raises(ValueError, match=r"^segment\.load\(\): expected a model of 7 frames of 40x64"):
+            clip.render(0.5)
+
+
 # -------------------------------------------------------------------------------------------------- plans
 
 
