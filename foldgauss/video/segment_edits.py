@@ -345,13 +345,21 @@ class SegmentedEdit:
         spans = None if function is by_color else self._positions(**named)
         parts = []
         for number, segment in enumerate(self._video.segments):
-            one = self._replayed(number)
-            own = named if spans is None else _own_times(spans, segment, one._part, named)
-            if own is None or (among is not None and not len(among.parts[number])):
-                parts.append(_none(one))
+            if among is not None and not len(among.parts[number]):
+                parts.append(among.parts[number])
+            elif spans is not None and not _reaches(spans, segment):
+                parts.append(self._nothing(number))
             else:
+                one = self._replayed(number)
+                own = named if spans is None else _own_times(spans, segment, one._part, named)
                 parts.append(_ask(one, layer, lambda model, _, own=own: function(model, **own)))
         return SegmentedSelection(tuple(parts))
+
+    def _nothing(self, number: int) -> Selection:
+        """Of a segment; its model is loaded only where it must be to know how many Gaussians there are now."""
+        if self._as_begun:
+            return Selection(np.zeros(self._video.segments[number].num_gaussians, bool))
+        return _none(self._replayed(number))
 
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
         """First and last frame position, of times, or the range of frames."""
@@ -363,19 +371,21 @@ class SegmentedEdit:
         return tuple(float(t) * (self._video.num_frames - 1) for t in pair)
 
 
-def _own_times(spans: Any, segment: Segment, part: Part, named: dict[str, Any]) -> dict[str, Any] | None:
-    """What `by_time` is asked of a segment; None where nothing of it is meant."""
+def _reaches(spans: Any, segment: Segment) -> bool:
+    """Whether a range of frames, or first and last position, has something of a segment."""
+    first, last = (spans.start, spans.stop - 1) if isinstance(spans, range) else spans
+    return first <= segment.stop - 1 and segment.first <= last
+
+
+def _own_times(spans: Any, segment: Segment, part: Part, named: dict[str, Any]) -> dict[str, Any]:
+    """What `by_time` is asked of a segment that is reached."""
     if isinstance(spans, range):
         first, stop = max(spans.start, segment.first), min(spans.stop, segment.stop)
-        if first >= stop:
-            return None
         return {"frames": (first - segment.first, stop - segment.first), "alive": named["alive"]}
-    low, high = max(spans[0], part.first), min(spans[1], part.last)
-    if low > high:
-        return None
     if part.is_whole:
         return named
-    times = np.interp([low - part.first, high - part.first], np.arange(len(part.times)), part.times)
+    ends = np.clip(spans, part.first, part.last) - part.first
+    times = np.interp(ends, np.arange(len(part.times)), part.times)
     return {"times": tuple(np.clip(times, 0.0, 1.0).tolist()), "alive": named["alive"]}
 
 
@@ -420,7 +430,7 @@ class _Carried:
                 if len(found[number]) and other not in reached:
                     reached.add(other)
                     waiting.append(other)
-        parts = (found[k] if k in found else _none(self._edits._replayed(k)) for k in self._edits._numbers)
+        parts = (found[k] if k in found else self._edits._nothing(k) for k in self._edits._numbers)
         return SegmentedSelection(tuple(parts))
 
     def _held(self, number: int) -> list[int]:
