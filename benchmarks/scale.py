@@ -78,7 +78,8 @@ def workers(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     for row in rows:
         row["faster"] = round(rows[0]["seconds"] / row["seconds"], 2)
         figures = row["workers"], row["num_segments"], row["seconds"], row["faster"], f"{row['mean_psnr']:.2f}"
-        table.add_row(*map(str, figures), f"{row['seam_drop']:+.2f} dB", str(row["peak_mib"]))
+        drop = f"{row['seam_drop']:+.2f} dB" if "seam_drop" in row else "no fades"
+        table.add_row(*map(str, figures), drop, str(row["peak_mib"]))
     console.print(table)
     console.print("The files are the same." if len(digests) == 1 else "THE FILES DIFFER.")
     video = load_video_model(out)
