@@ -61,28 +61,41 @@ def done_event(text: str) -> dict[str, Any]:
 def workers(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """The same fit by more and more workers of one thread each, on the cores that there are."""
     clip = made_clip(folder / "long.mp4", options.frames, options.size)
+    short = made_clip(folder / "short.mp4", options.frames // 4, options.size)
+    how = ("--threads", 1, "--steps", options.steps, "--segment-seconds", options.seconds)
     rows, digests = [], set()
-    for count in options.workers:
-        out = folder / f"by{count}.safetensors"
-        how = ("--workers", count, "--threads", 1, "--steps", options.steps, "--segment-seconds", options.seconds)
+    for source, count in [*((clip, count) for count in options.workers), (short, 2)]:
+        out = folder / f"{source.stem}-by-{count}.safetensors"
         begun = time.perf_counter()
-        told = subprocess.run(fit_words(clip, out, *how), check=True, capture_output=True, text=True).stdout
+        words = fit_words(source, out, "--workers", count, *how)
+        told = subprocess.run(words, check=True, capture_output=True, text=True).stdout
         seconds = time.perf_counter() - begun
-        done = done_event(told)
-        digests.add(out.read_bytes())
-        rows.append({"workers": count, "seconds": round(seconds, 1), **done})
-        console.print(f"{count} workers: {seconds:.1f} s")
+        rows.append({"workers": count, "seconds": round(seconds, 1), **done_event(told)})
+        if source == clip:
+            digests.add(out.read_bytes())
+            last = out
+        console.print(f"{rows[-1]['num_frames']} frames, {count} workers: {seconds:.1f} s")
     table = Table(title=f"{options.frames} frames of {options.size[0]}x{options.size[1]}, {options.steps} steps each")
-    for name in ("workers", "segments", "seconds", "faster by", "mean PSNR", "drop at seams", "MiB of a worker"):
+    for name in (
+        "frames",
+        "workers",
+        "segments",
+        "seconds",
+        "faster by",
+        "mean PSNR",
+        "drop at seams",
+        "MiB of a worker",
+    ):
         table.add_column(name, justify="right")
     for row in rows:
-        row["faster"] = round(rows[0]["seconds"] / row["seconds"], 2)
-        figures = row["workers"], row["num_segments"], row["seconds"], row["faster"], f"{row['mean_psnr']:.2f}"
+        alike = row["num_frames"] == options.frames
+        row["faster"] = round(rows[0]["seconds"] / row["seconds"], 2) if alike else None
+        figures = row["num_frames"], row["workers"], row["num_segments"], row["seconds"], row["faster"] or ""
         drop = f"{row['seam_drop']:+.2f} dB" if "seam_drop" in row else "no fades"
-        table.add_row(*map(str, figures), drop, str(row["peak_mib"]))
+        table.add_row(*map(str, figures), f"{row['mean_psnr']:.2f}", drop, str(row["peak_mib"]))
     console.print(table)
     console.print("The files are the same." if len(digests) == 1 else "THE FILES DIFFER.")
-    video = load_video_model(out)
+    video = load_video_model(last)
     return {"rows": rows, "same_bytes": len(digests) == 1, "spans": [[s.first, s.stop] for s in video.segments]}
 
 
