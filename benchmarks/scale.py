@@ -6,8 +6,8 @@
     python -m benchmarks.scale many --json many.json          50 small clips, 3 of them broken
     python -m benchmarks.scale hours --json hours.json        what grows with the length: reading, planning, joining
 
-Clips are made of the sample clips, forwards and backwards in turn: of Bunny, which has no cuts, for `workers`, of Bunny and
-bikes otherwise. `workers` wants a quiet machine.
+Clips are made of the sample clips, forwards and backwards in turn: of Bunny, which has no cuts, for `workers`, of Bunny
+and bikes otherwise. `workers` wants a quiet machine.
 """
 
 import argparse
