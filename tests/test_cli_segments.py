@@ -30,7 +30,8 @@ def work(tmp_path_factory):
     folder = tmp_path_factory.mktemp("work")
     (folder / "clip").mkdir()
     frames = np.stack(list(video().frames()))
-    noisy = np.clip(frames + np.random.default_rng(0).integers(-6, 7, frames.shape), 0, 255).astype(np.uint8)
+    noise = np.random.default_rng(0).standard_normal(frames.shape) * np.linspace(2, 9, NUM_FRAMES)[:, None, None, None]
+    noisy = np.clip(np.rint(frames + noise), 0, 255).astype(np.uint8)
     for k, frame in enumerate([noisy[0], noisy[0], *noisy, noisy[-1]]):
         write_image(folder / "clip" / f"{k:03}.png", frame)
     save_video_model(folder / "long.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20]})
