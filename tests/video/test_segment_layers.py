@@ -107,6 +107,7 @@ def test_one_segment_is_layered_as_the_model_to_the_bit():
     over, model = front("spans"), soft_model()
     wanted = layers(over, model)
     made = layers(over, SegmentedVideo.of([(0, model)]))
+    assert not any(layer.clocks for layer in made.segments[0].model.layers)
     np.testing.assert_array_equal(list(made.frames()), list(wanted.frames()))
 
 
