@@ -28,7 +28,6 @@ from foldgauss.video import (
     evaluate,
     fit,
     interpolated_times,
-    layers,
     plan_segments,
     played_positions,
     psnr,
@@ -406,10 +405,8 @@ def test_segments_that_do_not_go_together_are_refused():
 @pytest.mark.parametrize(
     "call",
     [
-        edit,
         compress,
         flattened,
-        lambda clip: layers(soft_model(), clip),
         lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
         lambda clip: Selection.all(clip),
         lambda clip: Screen(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
