@@ -99,9 +99,7 @@ def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkey
 
 def test_evaluate_knows_another_clip(here, work, tmp_path, capsys):
     digest = "0" * 32
-    save_video_model(
-        "noted.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20], "clip_digest": digest}
-    )
+    save_video_model("noted.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20], "clip_digest": digest})
     assert run("evaluate", "noted.safetensors", work / "clip") == 0
     assert "are not those that the model was fitted to (clip)" in told(capsys)
     assert run("evaluate", here, work / "clip", "--frames", "0:18") == 0
@@ -177,8 +175,6 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     [
         ("compress", "MODEL"),
         ("uncertainty", "MODEL", "clip"),
-        ("export", "MODEL", "--format", "html"),
-        ("view", "MODEL"),
         ("edit", "MODEL", "night.toml"),
     ],
 )

@@ -156,8 +156,6 @@ def export_command(
         }
         out_path = named_after(model_path, endings.get(file_format, f"-{file_format}"))
     refuse_input(out_path, "model", model_path)
-    if file_format == "html":
-        refuse_segments(model_path)
     if segmented and out_path.suffix and not out_path.is_dir():
         cure = "Each segment becomes a file in it."
         raise WrongUse(str(invalid("--out", expected="a folder without extension", got=out_path, cure=cure)))
