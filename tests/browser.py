@@ -56,6 +56,11 @@ class Opened:
         self.page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
         return self
 
+    def until(self, condition):
+        """Wait until an expression holds; asked at each picture, as the page's policy lets no text be run."""
+        self.page.evaluate(f"async () => {{ while (!({condition})) await new Promise(requestAnimationFrame); }}")
+        return self
+
     @property
     def stats(self):
         return self.page.evaluate("foldgauss.stats")

@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 
 from foldgauss._checks import invalid, short_repr, whole
 from foldgauss.io._atomic import atomic_path, checked_path
-from foldgauss.io.compact import is_compact, load_compact_model, packed
+from foldgauss.io.compact import is_compact, packed
 from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model, read_origin
 from foldgauss.video.alpha import BLACK, composited
@@ -84,8 +84,8 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
     """The page as text.
 
     `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantised
-    finely, of a video in segments each segment: see docs/player.md for how near the picture comes. `original`: the clip's frames, of the model's number and
-    size, shown beside it; as WebP of `quality`, 1 to 100.
+    finely, and so is each segment of a video in segments: see docs/player.md for how near the picture comes.
+    `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
     and for frames that do not fit; errors of reading as `load_video_model`.
@@ -121,7 +121,7 @@ def _loaded(model: Model) -> tuple[Loaded, str]:
     if isinstance(model, str | os.PathLike):
         path = checked_path(model, "model")
         name = read_origin(path).get("clip", path.stem)
-        return (load_compact_model if is_compact(path) else load_video_model)(path), name
+        return load_video_model(path), name
     if not isinstance(model, Loaded):
         cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)
@@ -136,8 +136,10 @@ def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
             yield _block(f"model-{number}", packed(_fine(_flattened(number, segment.model))))
-    elif isinstance(loaded, Quantised):
-        yield _block("model", packed(loaded) if loaded is model else Path(model).read_bytes())
+    elif isinstance(model, Quantised):
+        yield _block("model", packed(model))
+    elif loaded is not model and is_compact(model):
+        yield _block("model", Path(model).read_bytes())
     else:
         yield _block("model", packed(_fine(flattened(loaded))))
 

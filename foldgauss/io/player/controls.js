@@ -108,8 +108,8 @@ export class Controls {
   updatePanel(edit, count, number) {
     element("panel").hidden = !this.player.brushing;
     const { segments, lead } = this.player, { length } = segments.spans;
-    const where = length > 1 ? `, segment ${lead.number + 1} of ${length}` : ""; // what is picked is of the segment seen
-    put("picked", `${count ? `${number(count)} picked` : "Paint over something"}${where}`);
+    put("picked", count ? `${number(count)} ${length > 1 ? "in this segment" : "picked"}` : "Paint over something");
+    if (!this.following) put("follow", `Follow through ${length > 1 ? `segment ${lead.number + 1} of ${length}` : "the clip"}`);
     press("pick", !this.erasing);
     press("erase", this.erasing);
     press("vanish", edit.vanish);
@@ -306,7 +306,6 @@ export class Controls {
       });
     } finally {
       this.following = false;
-      put("follow", "Follow through the clip");
     }
     this.toast(`${more.toLocaleString("en")} more Gaussians belong to it`);
     player.changed();

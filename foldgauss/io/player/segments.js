@@ -6,12 +6,14 @@ import { Timeline } from "./timeline.js";
 const MOST_HELD = 2e6;
 const CLOSE = 1e-6; // frames: a position so near to a frame is that frame
 
+const shareOf = (x) => Math.min(Math.max(x, 0), 1);
+
 /** How far a segment has covered the one before: 0 until it is to be seen, then up to 1. */
 function risen(spans, number, position) {
   if (number === 0) return 1;
   const { first } = spans[number], stop = spans[number - 1].first + spans[number - 1].num_frames;
   if (first === stop) return position >= first - 0.5 ? 1 : 0; // a cut
-  return Math.min(Math.max((position - first + 1) / (stop - first + 1), 0), 1);
+  return shareOf((position - first + 1) / (stop - first + 1));
 }
 
 /** Which segments are seen at a frame position, in order, and how much of each, as SegmentedVideo.weights has it. */
@@ -30,6 +32,7 @@ export class Segments {
   /** `lead`: the first one's model; `spans` null: it is the whole clip, and the clip's time is its own. */
   constructor(lead, spans, decoder) {
     this.spans = spans ?? [{ first: 0, num_frames: lead.times.length, num_gaussians: lead.num }];
+    this.even = spans !== null; // of the clip's time
     this.decoder = decoder;
     this.most = MOST_HELD;
     this.total = this.spans.reduce((sum, span) => sum + span.num_gaussians, 0);
@@ -38,8 +41,8 @@ export class Segments {
     this.check = () => {}; // throws where a model cannot be drawn
     this.onReady = this.onError = () => {};
     const own = this.hold(0, lead), numFrames = this.spans.at(-1).first + this.spans.at(-1).num_frames;
-    const even = () => Array.from({ length: numFrames }, (_, k) => k / Math.max(numFrames - 1, 1));
-    this.timeline = spans ? new Timeline(even(), lead.header.fps) : own.timeline;
+    const times = () => Array.from({ length: numFrames }, (_, k) => k / Math.max(numFrames - 1, 1));
+    this.timeline = spans ? new Timeline(times(), lead.header.fps) : own.timeline;
     this.goTo(0);
   }
 
@@ -51,7 +54,8 @@ export class Segments {
 
   /** The frame position of a time of the clip. */
   positionOf(time) {
-    const position = this.timeline.positionOf(time), nearest = Math.round(position);
+    const { even, timeline } = this, position = even ? shareOf(time) * timeline.last : timeline.positionOf(time);
+    const nearest = Math.round(position);
     return Math.abs(position - nearest) < CLOSE ? nearest : position;
   }
 
