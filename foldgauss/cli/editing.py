@@ -18,6 +18,7 @@ from foldgauss.cli._shared import (
     clip_of_model,
     counted,
     draw,
+    err,
     named_after,
     out,
     parse_size,
@@ -175,7 +176,8 @@ def export_command(
     if file_format == "html":
         check_writable(out_path)
         frames = None if original is None else clip_of_model(model, model_path, original, None)
-        write_html(out_path, model_path, original=frames, quality=original_quality)
+        with err.status("Making the page"):
+            write_html(out_path, model_path, original=frames, quality=original_quality)
         size = out_path.stat().st_size / 1e6
         out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
         return
