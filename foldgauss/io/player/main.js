@@ -66,6 +66,7 @@ async function start() {
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches && player.timeline.last > 0) player.play();
   else player.changed();
   setTimeout(() => !player.playing && player.pause(), 150); // the first picture has the model's own pixels, to be there soon
+  requestAnimationFrame(() => requestAnimationFrame(() => segments.begin()));
   window.foldgauss.player = player;
   Object.defineProperties(window.foldgauss, Object.getOwnPropertyDescriptors(hooks(player)));
 }

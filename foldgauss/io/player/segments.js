@@ -43,7 +43,14 @@ export class Segments {
     const own = this.hold(0, lead), numFrames = this.spans.at(-1).first + this.spans.at(-1).num_frames;
     const times = () => Array.from({ length: numFrames }, (_, k) => k / Math.max(numFrames - 1, 1));
     this.timeline = spans ? new Timeline(times(), lead.header.fps) : own.timeline;
+    this.begun = false;
     this.goTo(0);
+  }
+
+  /** From now on decode ahead: not before the first picture, which is to be there soon. */
+  begin() {
+    this.begun = true;
+    this.work();
   }
 
   hold(number, model) {
@@ -110,6 +117,7 @@ export class Segments {
   /** Decode the next one wanted, one at a time; what is not seen gives way to what is. */
   work() {
     if (this.missing === undefined) for (const { resolve } of this.waiting.splice(0)) resolve();
+    if (this.missing === undefined && !this.begun) return;
     const next = this.wanted.find((number) => !this.held.has(number));
     if (this.error || (next !== undefined && next === this.decoding)) return;
     if (this.decoding !== undefined) {
