@@ -57,8 +57,16 @@ class Opened:
         return self
 
     def until(self, condition):
-        """Wait until an expression holds; asked at each picture, as the page's policy lets no text be run."""
-        self.page.evaluate(f"async () => {{ while (!({condition})) await new Promise(requestAnimationFrame); }}")
+        """Wait until an expression holds; here, as the page's policy does not let Playwright's own waiting run."""
+        self.page.evaluate(
+            f"""async () => {{
+              const begun = performance.now();
+              while (!({condition})) {{
+                await new Promise((next) => setTimeout(next, 20));
+                if (performance.now() - begun > 120_000) throw new Error("not yet: " + JSON.stringify(foldgauss.stats));
+              }}
+            }}"""
+        )
         return self
 
     @property
