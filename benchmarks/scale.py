@@ -1,11 +1,13 @@
 """Long clips in segments and many clips at once: what workers bring, what kills cost, where segments meet.
 
     python -m benchmarks.scale workers --json workers.json    2,000 frames by 1, 2 and 4 workers of one thread each
+    python -m benchmarks.scale seams --json seams.json        whether it shows where segments meet, on three clips
     python -m benchmarks.scale kills --json kills.json        SIGKILLs of workers and of the scheduler
     python -m benchmarks.scale many --json many.json          50 small clips, 3 of them broken
     python -m benchmarks.scale hours --json hours.json        what grows with the length: reading, planning, joining
 
-Clips are made of the sample clips Bunny and bikes, forwards and backwards in turn. `workers` wants a quiet machine.
+Clips are made of the sample clips, forwards and backwards in turn: of Bunny, which has no cuts, for `workers`, of Bunny
+and bikes otherwise. `workers` wants a quiet machine.
 """
 
 import argparse
@@ -28,15 +30,18 @@ from benchmarks._common import console, machine, parse, parser, size, whole
 from foldgauss.datasets import sample_clip
 from foldgauss.io import index_video, join_segments, load_video_model, read_video, save_video_model, write_video
 from foldgauss.io._atomic import atomic_path
-from foldgauss.video import FitConfig, SegmentedVideo, fit, plan_segments
+from foldgauss.jobs import seam_drops
+from foldgauss.video import FitConfig, SegmentedVideo, fit, plan_segments, psnr
 
 FPS = 25.0
 
 
-def made_clip(path: Path, num_frames: int, frame_size: tuple[int, int]) -> Path:
-    """The sample clips, forwards and backwards in turn, as one video of so many frames."""
-    bunny, bikes = (read_video(sample_clip(name), size=frame_size).frames for name in ("bunny", "bikes"))
-    parts = [bunny, bunny[::-1], bikes, bikes[::-1]]
+def made_clip(path: Path, num_frames: int, frame_size: tuple[int, int], *names: str) -> Path:
+    """Sample clips, forwards and backwards in turn, as one video of so many frames."""
+    parts = []
+    for name in names:
+        frames = read_video(sample_clip(name), size=frame_size).frames
+        parts += [frames, frames[::-1]]
     numbers = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
     within = np.concatenate([np.arange(len(part)) for part in parts])
     pictures = (parts[numbers[k % len(numbers)]][within[k % len(numbers)]] for k in range(num_frames))
@@ -60,28 +65,42 @@ def done_event(text: str) -> dict[str, Any]:
 
 def workers(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """The same fit by more and more workers of one thread each, on the cores that there are."""
-    clip = made_clip(folder / "long.mp4", options.frames, options.size)
+    clip = made_clip(folder / "long.mp4", options.frames, options.size, "bunny")
+    short = made_clip(folder / "short.mp4", options.frames // 4, options.size, "bunny")
+    how = ("--threads", 1, "--steps", options.steps, "--segment-seconds", options.seconds)
     rows, digests = [], set()
-    for count in options.workers:
-        out = folder / f"by{count}.safetensors"
-        how = ("--workers", count, "--threads", 1, "--steps", options.steps, "--segment-seconds", options.seconds)
+    for source, count in [*((clip, count) for count in options.workers), (short, 2)]:
+        out = folder / f"{source.stem}-by-{count}.safetensors"
         begun = time.perf_counter()
-        told = subprocess.run(fit_words(clip, out, *how), check=True, capture_output=True, text=True).stdout
+        words = fit_words(source, out, "--workers", count, *how)
+        told = subprocess.run(words, check=True, capture_output=True, text=True).stdout
         seconds = time.perf_counter() - begun
-        done = done_event(told)
-        digests.add(out.read_bytes())
-        rows.append({"workers": count, "seconds": round(seconds, 1), **done})
-        console.print(f"{count} workers: {seconds:.1f} s")
+        rows.append({"workers": count, "seconds": round(seconds, 1), **done_event(told)})
+        if source == clip:
+            digests.add(out.read_bytes())
+            last = out
+        console.print(f"{rows[-1]['num_frames']} frames, {count} workers: {seconds:.1f} s")
     table = Table(title=f"{options.frames} frames of {options.size[0]}x{options.size[1]}, {options.steps} steps each")
-    for name in ("workers", "segments", "seconds", "faster by", "mean PSNR", "drop at seams", "MiB of a worker"):
+    for name in (
+        "frames",
+        "workers",
+        "segments",
+        "seconds",
+        "faster by",
+        "mean PSNR",
+        "drop at seams",
+        "MiB of a worker",
+    ):
         table.add_column(name, justify="right")
     for row in rows:
-        row["faster"] = round(rows[0]["seconds"] / row["seconds"], 2)
-        figures = row["workers"], row["num_segments"], row["seconds"], row["faster"], f"{row['mean_psnr']:.2f}"
-        table.add_row(*map(str, figures), f"{row['seam_drop']:+.2f} dB", str(row["peak_mib"]))
+        alike = row["num_frames"] == options.frames
+        row["faster"] = round(rows[0]["seconds"] / row["seconds"], 2) if alike else None
+        figures = row["num_frames"], row["workers"], row["num_segments"], row["seconds"], row["faster"] or ""
+        drop = f"{row['seam_drop']:+.2f} dB" if "seam_drop" in row else "no fades"
+        table.add_row(*map(str, figures), f"{row['mean_psnr']:.2f}", drop, str(row["peak_mib"]))
     console.print(table)
     console.print("The files are the same." if len(digests) == 1 else "THE FILES DIFFER.")
-    video = load_video_model(out)
+    video = load_video_model(last)
     return {"rows": rows, "same_bytes": len(digests) == 1, "spans": [[s.first, s.stop] for s in video.segments]}
 
 
@@ -181,7 +200,7 @@ def cluster_kills(options: argparse.Namespace, folder: Path, clip: Path, how: tu
 
 
 def kills(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    clip = made_clip(folder / "long.mp4", options.frames, options.size)
+    clip = made_clip(folder / "long.mp4", options.frames, options.size, "bunny", "bikes")
     how = ("--steps", options.steps, "--gaussians", options.gaussians, "--segment-seconds", options.seconds)
     how += ("--checkpoint-seconds", 1)
     reference = folder / "undisturbed.safetensors"
@@ -193,6 +212,51 @@ def kills(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     for row in rows:
         figures = row["killed"]["worker"], row["killed"]["scheduler"], row["started"], row["exit"]
         table.add_row(row["where"], *map(str, figures), "yes" if row["same"] else "NO")
+    console.print(table)
+    return {"rows": rows}
+
+
+# -------------------------------------------------------------------------------------------------- seams
+
+
+def seams(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Whether it shows where segments meet: their scores there, and how much what is shown changes from frame to frame
+    besides what the clip does."""
+    rows = []
+    for name in ("bunny", "bikes", "carphone"):
+        path, out = folder / f"{name}.mp4", folder / f"{name}.safetensors"
+        frames = read_video(sample_clip(name), size=options.size).frames
+        write_video(path, frames, FPS)
+        clip = read_video(path)
+        how = ("--workers", 2, "--threads", 1, "--steps", options.steps, "--segment-seconds", options.seconds)
+        subprocess.run(fit_words(path, out, *how), check=True, capture_output=True)
+        video = load_video_model(out)
+        pictures = np.stack(list(video.frames()))
+        scores = np.array([psnr(*pair) for pair in zip(clip.frames, pictures, strict=True)])
+        pairs = zip(video.segments[:-1], video.segments[1:], strict=True)
+        fades = [(after.first, before.stop) for before, after in pairs if after.first < before.stop]
+        error = pictures.astype(np.float32) - clip.frames
+        flicker = np.abs(np.diff(error, axis=0)).mean(axis=(1, 2, 3))  # of each step to the next frame
+        at_seams = np.zeros(len(flicker), bool)
+        for first, stop in fades:
+            at_seams[first - 1 : stop] = True
+        drops = seam_drops(scores, fades)
+        rows.append(
+            {
+                "clip": name,
+                "segments": len(video.segments),
+                "fades": len(fades),
+                "psnr": round(float(scores.mean()), 2),
+                "drop": round(float(drops.mean()), 3) if fades else None,
+                "worst_drop": round(float(drops.max()), 3) if fades else None,
+                "flicker_in_fades": round(float(flicker[at_seams].mean()), 3) if fades else None,
+                "flicker_elsewhere": round(float(flicker[~at_seams].mean()), 3),
+            }
+        )
+        console.print(rows[-1])
+    table = Table("clip", "segments", "fades", "PSNR", "drop in fades (dB)", "worst", "flicker in fades", "elsewhere")
+    for row in rows:
+        table.add_row(*map(str, row.values()))
     console.print(table)
     return {"rows": rows}
 
@@ -239,7 +303,7 @@ def hours(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     model = fit(read_video(sample_clip("bunny"), size=(32, 64), frames=(0, 24)).frames, FitConfig(steps=20)).model
     part, rows = save_video_model(folder / "part.safetensors", model), []
     for num in options.lengths:
-        clip = made_clip(folder / f"{num}.mp4", num, options.size)
+        clip = made_clip(folder / f"{num}.mp4", num, options.size, "bunny", "bikes")
         process, begun = psutil.Process(), time.perf_counter()
         index = index_video(clip)
         reading = time.perf_counter() - begun
@@ -288,10 +352,11 @@ def hours(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     return {"rows": rows}
 
 
-PARTS = {"workers": workers, "kills": kills, "many": many, "hours": hours}
+PARTS = {"workers": workers, "seams": seams, "kills": kills, "many": many, "hours": hours}
 #: Of each part, what is asked unless said otherwise.
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "workers": {"frames": 2000, "size": (160, 320), "steps": 1000, "seconds": 10.0},
+    "workers": {"frames": 2000, "size": (160, 320), "steps": 1000, "seconds": 10.32},
+    "seams": {"frames": 0, "size": (136, 240), "steps": 1000, "seconds": 2.0},
     "kills": {"frames": 2000, "size": (80, 160), "steps": 400, "seconds": 10.0},
     "many": {"frames": 8, "size": (48, 96), "steps": 100, "seconds": 10.0},
     "hours": {"frames": 0, "size": (160, 320), "steps": 20, "seconds": 10.0},

@@ -1,6 +1,7 @@
 """The commands on a model in segments."""
 
 import base64
+import dataclasses
 import json
 import re
 
@@ -13,15 +14,17 @@ from soft_models import NUM, soft_model
 from foldgauss.cli import viewing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.io.video_model import read_metadata
-from foldgauss.video import SegmentedVideo, evaluate, psnr, times_at
+from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, psnr, times_at
 
 #: Spans 0:7, 4:13 (three frames shared) and 13:18 (a cut).
 FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 13), (7, 9, 5), 18
 
 
 def video():
-    parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
-    return SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    """Of its first segment nothing is noted."""
+    parts = [Segment.of(first, soft_model(seed=k, num_frames=LENGTHS[k])) for k, first in enumerate(FIRSTS)]
+    noted = [dataclasses.replace(part, metadata={"mean_psnr": 31.5, "seed": 3}) for part in parts[1:]]
+    return SegmentedVideo([parts[0], *noted])
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +33,8 @@ def work(tmp_path_factory):
     folder = tmp_path_factory.mktemp("work")
     (folder / "clip").mkdir()
     frames = np.stack(list(video().frames()))
-    noisy = np.clip(frames + np.random.default_rng(0).integers(-6, 7, frames.shape), 0, 255).astype(np.uint8)
+    noise = np.random.default_rng(0).standard_normal(frames.shape) * np.linspace(2, 9, NUM_FRAMES)[:, None, None, None]
+    noisy = np.clip(np.rint(frames + noise), 0, 255).astype(np.uint8)
     for k, frame in enumerate([noisy[0], noisy[0], *noisy, noisy[-1]]):
         write_image(folder / "clip" / f"{k:03}.png", frame)
     save_video_model(folder / "long.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20]})
@@ -114,7 +118,7 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
     said = told(capsys)
     for text in (
         "18 of 40x64 (height x width), 25 a second", "3; begin at a cut: 1; fade in: 1", f"{3 * NUM} in all",
-        "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
+        "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │ 31.50 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
         "frames of the clip │ [2, 20]",
     ):  # fmt: skip
         assert text in said
@@ -157,7 +161,7 @@ def test_exports(here, capsys, tmp_path):
 def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     assert run("segment", here, 1) == 0
     assert "long.1.safetensors: segment 1, frames 4:13, 40 Gaussians" in told(capsys)
-    assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15]}
+    assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15], "mean_psnr": 31.5, "seed": 3}
     one = load_video_model("long.1.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))
     assert run("evaluate", "long.1.safetensors", work / "clip") == 0  # its own frames of the clip
@@ -190,16 +194,39 @@ def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
     assert served == [page.replace(">long<", ">clip<")]  # named after its clip
 
 
+NIGHT = '[[edits]]\ndo = "recolor"\ngain = 0.5\nframes = "4:14"\nease = 3\n'
+
+
+def test_edit_acts_on_all_segments(here, tmp_path, capsys):
+    """Into a model, which is edited again and rendered, and into pictures."""
+    (tmp_path / "night.toml").write_text(NIGHT)
+    assert run("edit", here, "night.toml") == 0
+    assert f"a model in 3 segments, {3 * NUM} Gaussians" in told(capsys)
+    wanted = edit(video()).recolor(gain=0.5, frames=(4, 14), ease=3).video()
+    made = load_video_model(tmp_path / "long.night.safetensors")
+    assert isinstance(made, SegmentedVideo)
+    np.testing.assert_array_equal(list(made.frames()), list(wanted.frames()))
+    about = read_metadata(tmp_path / "long.night.safetensors")
+    assert about == {"clip": "clip", "frames": [2, 20], "edited_by": "night.toml"}
+    assert run("edit", "long.night.safetensors", "night.toml", "--out", "twice") == 0
+    twice = edit(wanted).recolor(gain=0.5, frames=(4, 14), ease=3).video()
+    np.testing.assert_array_equal(pictures(tmp_path / "twice"), list(twice.frames()))
+    capsys.readouterr()
+    (tmp_path / "still.toml").write_text('# one\n[[edits]]\ndo = "freeze"\nat = 2\n')
+    before = sorted(tmp_path.iterdir())
+    assert run("edit", here, "still.toml") == 1
+    assert "still.toml, line 4, [[edits]] number 1: at: expected times of the segment that shows" in told(capsys)
+    assert sorted(tmp_path.iterdir()) == before
+
+
 @pytest.mark.parametrize(
     "words",
     [
         ("compress", "MODEL"),
         ("uncertainty", "MODEL", "clip"),
-        ("edit", "MODEL", "night.toml"),
     ],
 )
 def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, capsys):
-    (tmp_path / "night.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
     before = sorted(tmp_path.iterdir())
     given = {"MODEL": here, "clip": work / "clip"}
     assert run(*(given.get(word, word) for word in words)) == 2

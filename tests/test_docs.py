@@ -18,7 +18,7 @@ from markdown_it import MarkdownIt
 DOCS = ROOT / "docs"
 _NAMES = (
     *("distribution", "mixture", "fold", "envelope", "likelihood", "estimator", "moments", "divergence", "bridges"),
-    *("plot", "render", "video", "io", "uncertainty", "datasets"),
+    *("plot", "render", "video", "io", "uncertainty", "jobs", "datasets"),
 )
 #: Modules that an API page is made of.
 MODULES = ["foldgauss." + name for name in _NAMES]

@@ -140,6 +140,14 @@ def test_any_kind_of_chunks_will_do(tmp_path):
     _assert_same(_fit(x), _fit(parts, 1.0), 1e-9)
 
 
+def test_columns_are_scaled_each_by_its_own_spread():
+    x = _tracks() * [100.0, 1.0] + [7.0, 0.0]
+    whole, parted = _fit(x, time_column=0), _fit(np.split(x, CUTS), time_column=0)
+    np.testing.assert_allclose(parted._scaling.scale, whole._scaling.scale, rtol=1e-12)
+    np.testing.assert_allclose(parted._scaling.shift, whole._scaling.shift, rtol=1e-12)
+    _assert_same(whole, parted)
+
+
 def test_float32_chunks_are_fitted_in_float32():
     x = _tracks(dtype=np.float32)
     whole, parted = _fit(x), _fit(np.split(x, CUTS))
@@ -186,10 +194,11 @@ def test_of_equal_ends_the_first_is_kept():
 
 def test_a_draw_of_many_is_fair_and_without_repetition():
     rng = np.random.RandomState(0)
-    numbers = starts.drawn(10**12, rng)
+    num = 2**21  # without care some 95 would be drawn twice
+    numbers = starts.drawn(num, rng)
     assert len(np.unique(numbers)) == starts._MOST_POINTS
     # Uniform: the mean of 20,000 is within 5 standard errors of the middle (false alarm 6e-7).
-    assert abs(numbers.mean() / 1e12 - 0.5) < 5 / np.sqrt(12 * starts._MOST_POINTS)
+    assert abs(numbers.mean() / num - 0.5) < 5 / np.sqrt(12 * starts._MOST_POINTS)
 
 
 def test_a_warm_start_goes_on_with_chunks():
@@ -288,15 +297,16 @@ def test_chunks_of_a_dask_array_are_computed_one_at_a_time():
         alive[0] -= 1
 
     def made(block_info=None):
-        rows = _tracks(60)
+        rows = _tracks(20)
         weakref.finalize(rows, gone)
         alive[0] += 1
         most[0] = max(most[0], alive[0])
         return rows
 
-    rows = array.map_blocks(made, chunks=((60,) * 20, (2,)), dtype=np.float64, meta=np.zeros((0, 0)))
+    rows = array.map_blocks(made, chunks=((20,) * 30, (2,)), dtype=np.float64, meta=np.zeros((0, 0)))
     _fit(rows, max_iter=2)
-    assert most[0] == 2  # the one that is looked at, and the one being computed
+    # The one that is looked at, the one being computed, and what is not yet collected: not the five of a part.
+    assert most[0] < 5
 
 
 def _workers(**options):
@@ -440,8 +450,8 @@ def test_ragged_chunks_share_one_program(monkeypatch):
     traced = []
     sums = loop.accumulate
     monkeypatch.setattr(loop, "accumulate", lambda *args, **options: traced.append(1) or sums(*args, **options))
-    for cuts in (CUTS, range(3, N, 7), (), (599,)):
-        _fit(np.split(_tracks(), cuts), n_components=4, max_iter=3)  # a number that no other test compiles
+    for num, cuts in ((N, CUTS), (N, range(3, N, 7)), (N, ()), (450, (449,))):
+        _fit(np.split(_tracks(num), cuts), n_components=4, max_iter=3)  # a number that no other test compiles
     assert len(traced) == 1
 
 

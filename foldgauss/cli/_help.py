@@ -39,6 +39,18 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("A small file that is good enough", "foldgauss fit holiday.mp4 --economy --max-size-mb 2"),
             Example("Frames as images; go on with a fit that was stopped", "foldgauss fit frames/ --resume"),
             Example("For slow motion", "foldgauss fit holiday.mp4 --between-share 0.5"),
+            Example("A long clip, in segments of 10 seconds, by four processes", "foldgauss fit film.mp4 --workers 4"),
+            Example(
+                "The same by a cluster of dask, whose workers see these folders",
+                "foldgauss fit film.mp4 --scheduler tcp://node1:8786",
+            ),
+        ),
+        "fit-many": (
+            Example("A model of each clip, into holidays-models", "foldgauss fit-many holidays/"),
+            Example(
+                "By four processes, small; the same again does what is left",
+                "foldgauss fit-many holidays/ --out models --size 160x320 --workers 4",
+            ),
         ),
         "demo": (Example("Fit, play and judge the clip Bunny", "foldgauss demo --out first-look"),),
         "render": (

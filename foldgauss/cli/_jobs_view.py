@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from foldgauss._progress import Manner, print_json
 from foldgauss._threads import available_cores
 from foldgauss.cli._app import Stopped, WrongUse, err
+from foldgauss.cli._shared import TIME_LEFT
 from foldgauss.cli._signals import noted_signals
 from foldgauss.jobs import Crew, FitJob, Outcome, local_workers, run_here, run_on, running_cluster
 from foldgauss.jobs import Progress as Share
@@ -119,8 +120,8 @@ def _told(share: Share) -> str:
 class _Bars(_View):
     def __init__(self, what: str, total: int, progress: Progress):
         super().__init__(what, total)
-        self.progress, self.begun = progress, time.monotonic()
-        self.all = progress.add_task(self.counts, total=total, told="starting")
+        self.progress = progress
+        self.all = progress.add_task(self.counts, total=total, told="")
         self.tasks: dict[str, TaskID] = {}
 
     def watch(self, share: Share) -> None:
@@ -137,9 +138,7 @@ class _Bars(_View):
         self._whole()
 
     def _whole(self) -> None:
-        passed, share = time.monotonic() - self.begun, self.completed / self.total
-        left = f"{passed * (1 - share) / share:.0f} s left" if 0.02 < share < 1 else ""
-        self.progress.update(self.all, description=self.counts, completed=self.completed, told=left)
+        self.progress.update(self.all, description=self.counts, completed=self.completed)
 
 
 class _Lines(_View):
@@ -188,6 +187,7 @@ def _shown(what: str, total: int, manner: Manner) -> Iterator[_View]:
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
         TimeElapsedColumn(),
+        *TIME_LEFT,
         TextColumn("{task.fields[told]}"),
     )
     with Progress(*columns, console=err) as progress:

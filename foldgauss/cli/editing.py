@@ -96,7 +96,6 @@ def edit_command(
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
-    refuse_segments(model_path)
     model = load_video_model(model_path)
     if not as_model:
         refuse_huge(picture_size or model.size)
@@ -106,6 +105,8 @@ def edit_command(
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
         save_video_model(out_path, edited, metadata=about)
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
+        if isinstance(edited, SegmentedVideo):
+            kind = f"a model in {len(edited.segments)} segments"
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     draw(edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=picture_size, overwrite=overwrite)

@@ -8,7 +8,7 @@ from typing import Any
 
 from foldgauss._progress import Manner, print_json
 from foldgauss.cli._app import Stopped, WrongUse, as_option, err, out
-from foldgauss.cli._jobs_view import Hands, run_jobs
+from foldgauss.cli._jobs_view import LINE, Hands, run_jobs
 from foldgauss.cli._shared import print_figures, progress_bar
 from foldgauss.jobs import LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.long import SEGMENT_SECONDS
@@ -91,13 +91,16 @@ def _clear(folder: Path) -> None:
 def _planned(video: Path, target: Path, config: FitConfig, manner: Manner, asked: dict[str, Any]) -> LongFit:
     """The plan, for which the whole clip is looked through once: that is shown."""
     status = err.status("Looking through the clip") if manner == "bar" else None
-    count = 0
+    count, due = 0, time.monotonic() + LINE
 
     def on_frame() -> None:
-        nonlocal count
+        nonlocal count, due
         count += 1
         if status is not None and count % 25 == 0:
             status.update(f"Looking through the clip: {count:,} frames")
+        elif manner == "lines" and time.monotonic() > due:
+            due = time.monotonic() + LINE
+            err.print(f"looking through the clip: {count:,} frames")
 
     try:
         with nullcontext() if status is None else status:
@@ -110,6 +113,9 @@ def _planned(video: Path, target: Path, config: FitConfig, manner: Manner, asked
 
 def _say_plan(fit: LongFit, config: FitConfig, manner: Manner, video: Path, crew: str) -> None:
     index = fit.index
+    if index.num_declared > index.num_frames:
+        told = f"only {index.num_frames} of {index.num_declared} frames of {video} decode; those are used."
+        err.print(f"warning: {told}", soft_wrap=True)
     for note in index.notes:
         err.print(f"warning: {video}: {note}", soft_wrap=True)
     lengths = [stop - first for first, stop in fit.spans]

@@ -1,6 +1,7 @@
 """The command that fits many clips: `fit-many`."""
 
 import os
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -60,6 +61,8 @@ from foldgauss.jobs.fitting import finished
 from foldgauss.jobs.many import RECORDS
 
 SUMMARY = "summary.json"
+#: The summary is written anew no more often: there may be thousands of clips.
+SUMMARY_SECONDS = 5.0
 #: Above, the table shows failures alone; the summary has all.
 MOST_ROWS = 60
 
@@ -139,9 +142,14 @@ def fit_many(
             out.print(f"left alone, no clips: {names}", soft_wrap=True)
     ended: dict[str, Outcome] = {}
 
+    written = -SUMMARY_SECONDS
+
     def on_end(outcome: Outcome) -> None:
+        nonlocal written
         ended[outcome.job.target] = outcome
-        _summarise(out_dir, jobs, ended)
+        if len(ended) == len(jobs) or time.monotonic() - written > SUMMARY_SECONDS:
+            _summarise(out_dir, jobs, ended)
+            written = time.monotonic()
 
     with hands.crew() as crew:
         outcomes = run_jobs(jobs, "clips", manner, crew, cure="Give the same command again to go on.", on_end=on_end)

@@ -17,6 +17,7 @@ Schema, every table optional; paths are relative to the script, angles in degree
 import dataclasses
 import difflib
 import math
+import operator
 import os
 import re
 import tomllib
@@ -32,11 +33,16 @@ from foldgauss.io.selections import load_selection
 from foldgauss.io.video_model import load_video_model
 from foldgauss.render import Camera
 from foldgauss.video.edit import Edit, edit
-from foldgauss.video.edited import EditedVideo, layers
+from foldgauss.video.edited import EditedVideo
 from foldgauss.video.model import VideoModel
+from foldgauss.video.segment_edits import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segment_layers import layers
+from foldgauss.video.segments import SegmentedVideo
 from foldgauss.video.select import Selection
 
-Video = VideoModel | EditedVideo
+Video = VideoModel | EditedVideo | SegmentedVideo
+Selected = Selection | SegmentedSelection
+Chain = Edit | SegmentedEdit
 
 #: The largest script that is read: tens of thousands of edits.
 MAX_BYTES = 4_000_000
@@ -146,7 +152,7 @@ class _Action:
     def keys(self) -> _Keys:
         return {**self.needs, **self.takes, **(_WHEN if self.spans else {})}
 
-    def apply(self, edit: Edit, given: dict[str, Any]) -> Edit:
+    def apply(self, edit: Chain, given: dict[str, Any]) -> Chain:
         given = {key: _radians(value) if key == "degrees" else value for key, value in given.items()}
         return getattr(edit, self.method)(**{self.named.get(key, key): value for key, value in given.items()})
 
@@ -198,7 +204,7 @@ class EditScript:
     _within: tuple[Path, ...] = ()  # this file, and the scripts that it is read from
 
     def apply(self, video: Video) -> Video:
-        """The edited video: a plain `VideoModel` where all edits could be baked.
+        """The edited video: a plain `VideoModel` where all edits could be baked; of a clip in segments one in segments.
 
         **Raises:** `EditScriptError`, with the line, for values that the edits refuse and files that cannot be read.
         """
@@ -208,7 +214,10 @@ class EditScript:
                 named[name] = self._selected(video, table, named)
         for number, table in enumerate(self.tables.get("edits", ())):
             action = ACTIONS[table["do"]]
-            with self._at("edits", number, **{own: key for key, own in action.named.items()}):
+            place = self._at("edits", number, **{own: key for key, own in action.named.items()})
+            with place:
+                if isinstance(edits, SegmentedEdit):
+                    edits = edits.within(place)  # of what only the models tell, later
                 edits = self._edited(edits, action, table, named)
         video = self._stacked(edits.video())
         if "camera" in self.tables:
@@ -216,13 +225,14 @@ class EditScript:
                 video = edit(video).seen_from(_camera(self.tables["camera"], video.size)).video()
         return video
 
-    def _selected(self, video: Video, table: dict[str, Any], named: dict[str, Selection]) -> Selection:
+    def _selected(self, video: Video, table: dict[str, Any], named: dict[str, Selected]) -> Selected:
         if table.keys() & _COMBINED.keys():
             return _combined(table, named)
         criteria = _with_pairs(table)
         if "file" in criteria:
             if not isinstance(video, VideoModel):
-                raise invalid("file", expected="a model without layers or overlays", got="an edited video")
+                got = "one in segments" if isinstance(video, SegmentedVideo) else "an edited video"
+                raise invalid("file", expected="a model without layers or overlays", got=got)
             found = load_selection(self._path(criteria.pop("file")), video)
             return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
@@ -231,7 +241,7 @@ class EditScript:
             criteria["mask"] = _of_frames(masks, video.num_frames, criteria)
         return edit(video).select(**criteria).selection
 
-    def _edited(self, edits: Edit, action: _Action, table: dict[str, Any], named: dict[str, Selection]) -> Edit:
+    def _edited(self, edits: Chain, action: _Action, table: dict[str, Any], named: dict[str, Selected]) -> Chain:
         if "select" in table:
             edits = edits.select_begun(named[table["select"]])
             if not len(edits.selection):
@@ -458,12 +468,12 @@ def _check_layer(place: _Place, table: dict[str, Any], selections: dict[str, Any
         raise place.error("where", "'front' or 'behind'", repr(table["where"]))
 
 
-def _combined(table: dict[str, Any], named: dict[str, Selection]) -> Selection:
-    some = [reduce(Selection.__or__, (named[name] for name in table["any"]))] if "any" in table else []
+def _combined(table: dict[str, Any], named: dict[str, Selected]) -> Selected:
+    some = [reduce(operator.or_, (named[name] for name in table["any"]))] if "any" in table else []
     every = [named[name] for name in table.get("all", ())]
     any_one = next(iter(named.values()))
-    found = reduce(Selection.__and__, some + every or [any_one | ~any_one])
-    return reduce(Selection.__sub__, (named[name] for name in table.get("without", ())), found)
+    found = reduce(operator.and_, some + every or [any_one | ~any_one])
+    return reduce(operator.sub, (named[name] for name in table.get("without", ())), found)
 
 
 def _of_frames(masks, num_frames: int, criteria: dict[str, Any]):

@@ -62,7 +62,10 @@ def join_segments(
         files.append(file)
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
         specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
-        segments.append(_segment(entries[-1], about["tensors"], partial(_load, file)))
+        try:
+            segments.append(_segment(entries[-1], about["tensors"], partial(_load, file)))
+        except (KeyError, TypeError, ValueError) as error:
+            raise _unfit(file, f"one with {error}", "Fit it again.") from error
     SegmentedVideo(segments)  # they go together
     check_writable(path)
 
@@ -199,7 +202,7 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     timeline = models[lead]
     height, width = timeline["size"]
     if not (whole(height, 1) and whole(width, 1)) or not within(timeline["fps"], "(0, inf)"):
-        raise ValueError("a size or a rate is out of range")
+        raise ValueError("a size or a rate out of range")
     compositing = timeline.get("compositing", "over")  # files from before there was another
     one_of("compositing", compositing, COMPOSITINGS)
     return Segment(

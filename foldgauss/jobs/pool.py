@@ -12,19 +12,20 @@ import secrets
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from foldgauss._checks import invalid, whole
 from foldgauss._threads import available_cores
-from foldgauss.jobs.fitting import FitJob, Progress, Stopped, fit_job
+from foldgauss.jobs.fitting import FitJob, Progress, Stopped, finished, fit_job
 
 if TYPE_CHECKING:
     from distributed import Client
 
-#: A job whose worker dies so often without a new checkpoint is given up; dask counts the deaths between.
-FRUITLESS = 3
+#: dask gives a job back once so many of its workers have died, and it is given up after so many such rounds without a
+#: new checkpoint.
+DEATHS, ROUNDS = 3, 3
 #: Seconds that workers have to keep what they do, once they are asked to stop.
 GRACE = 60.0
 #: Seconds that a scheduler has to answer.
@@ -52,12 +53,15 @@ class Outcome:
 Watch = Callable[[Progress], None]
 
 
-def run_here(jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False):
+def run_here(
+    jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
+) -> Iterator[Outcome]:
     """Outcomes of the jobs, one after another, done by this process.
 
     Raises `Stopped` at a job that stops, since `asked_to_stop` says so; it is kept.
     """
-    for job in jobs:
+    waiting = yield from _done_before(jobs)
+    for job in waiting:
 
         def tell(progress: Progress) -> bool:
             watch(progress)
@@ -66,6 +70,18 @@ def run_here(jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[]
         if asked_to_stop():
             raise Stopped("stopped between two jobs")
         yield _tried(job, tell)
+
+
+def _done_before(jobs: Sequence[FitJob]) -> Generator[Outcome, None, list[FitJob]]:
+    """Outcomes of jobs that somebody has done; returns the others."""
+    waiting = []
+    for job in jobs:
+        record = finished(job)
+        if record is None:
+            waiting.append(job)
+        else:
+            yield Outcome(job, record)
+    return waiting
 
 
 def _tried(job: FitJob, tell: Callable[[Progress], bool]) -> Outcome:
@@ -147,7 +163,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
         environment["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
     settings = {
         "distributed.worker.profile.enabled": False,
-        "distributed.scheduler.allowed-failures": FRUITLESS - 1,
+        "distributed.scheduler.allowed-failures": DEATHS - 1,
         "distributed.admin.system-monitor.gil.enabled": False,
     }
     with ExitStack() as stack, _silenced():
@@ -208,7 +224,8 @@ def run_on(
 
     Raises `Stopped` once `asked_to_stop` says so and the workers have kept what they do, `SchedulerLost`.
     """
-    yield from _Run(crew, jobs, watch, asked_to_stop).outcomes()
+    waiting = yield from _done_before(jobs)
+    yield from _Run(crew, waiting, watch, asked_to_stop).outcomes()
 
 
 class _Run:
@@ -223,7 +240,7 @@ class _Run:
         self.told: queue.SimpleQueue = queue.SimpleQueue()
         self.waiting, self.ended = deque(jobs), queue.SimpleQueue()
         self.open: dict[str, tuple[Any, FitJob]] = {}
-        self.deaths: dict[str, tuple[int, Any]] = {}
+        self.rounds: dict[str, tuple[int, Any]] = {}  # in which a job's workers died
         self.seen = time.monotonic()  # workers
 
     def outcomes(self) -> Iterator[Outcome]:
@@ -289,15 +306,16 @@ class _Run:
 
     def _again(self, job: FitJob) -> Outcome | None:
         """A job whose workers died: once more while it gets on."""
-        count, before = self.deaths.get(job.target, (0, None))
+        fruitless, before = self.rounds.get(job.target, (0, None))
         now = _when(job)
-        if now == before:
+        fruitless = fruitless + 1 if now == before else 0
+        if fruitless >= ROUNDS:
             return Outcome(
                 job,
-                failure=f"{job.name}: its worker died {FRUITLESS * (count + 1)} times without getting on. "
+                failure=f"{job.name}: its workers died again and again without getting on. "
                 "Most likely memory is short: take fewer workers, shorter segments or smaller frames.",
             )
-        self.deaths[job.target] = (count + 1, now)
+        self.rounds[job.target] = (fruitless, now)
         self.waiting.appendleft(job)
         return None
 

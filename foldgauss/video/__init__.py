@@ -5,7 +5,7 @@ from foldgauss.video.config import FitConfig, LearningRates
 from foldgauss.video.density import density_image
 from foldgauss.video.economy import Economy
 from foldgauss.video.edit import Edit, edit
-from foldgauss.video.edited import EditedVideo, Layer, layers
+from foldgauss.video.edited import EditedVideo, Layer
 from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.growth import Growth
@@ -14,6 +14,8 @@ from foldgauss.video.independent import IndependentFrames, independent_frames
 from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.model import FoldedSplats, VideoModel
 from foldgauss.video.overlays import SelectedGaussians
+from foldgauss.video.segment_edits import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segment_layers import layers
 from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
 from foldgauss.video.select import (
     Selection,
@@ -50,6 +52,8 @@ __all__ = [
     "Layer",
     "LearningRates",
     "Segment",
+    "SegmentedEdit",
+    "SegmentedSelection",
     "SegmentedVideo",
     "SelectedGaussians",
     "Selection",

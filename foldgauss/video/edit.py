@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import functools
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -30,8 +31,9 @@ from foldgauss.video.overlays import (
     Retimed,
     SelectedGaussians,
 )
+from foldgauss.video.part import Part
 from foldgauss.video.select import Selection, select
-from foldgauss.video.timing import Clock, Span, checked_number, checked_numbers, span_of
+from foldgauss.video.timing import NEVER, Clock, Span, checked_number, checked_numbers, span_of
 
 Mask = Bool[np.ndarray, "num"]
 Bake = Callable[[FoldedSplats, Mask], FoldedSplats | None]
@@ -50,14 +52,20 @@ class When(TypedDict, total=False):
     curve: str
 
 
+@functools.singledispatch
 def edit(model: VideoModel | EditedVideo) -> "Edit":
     """The start of a chain of edits, everything selected. Raises ValueError for what is no video.
 
-    Example: `edit(model).select(ball).move((0.1, 0)).video()`; the methods are those of `Edit`.
+    Example: `edit(model).select(ball).move((0.1, 0)).video()`; the methods are those of `Edit`. Of a `SegmentedVideo`
+    it is a `SegmentedEdit`, which has the same.
     """
-    video = as_edited(model)
+    return begun(as_edited(model))
+
+
+def begun(video: EditedVideo, part: Part | None = None) -> "Edit":
+    """As `edit`; of a `part` of a longer clip, whose frames and times all edits are then given in."""
     counts = tuple(layer.num_gaussians for layer in video.layers)
-    return Edit(video, Selection(np.ones(sum(counts), bool)), counts, tuple(map(np.arange, counts)))
+    return Edit(video, Selection(np.ones(sum(counts), bool)), counts, tuple(map(np.arange, counts)), part)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,6 +97,7 @@ class Edit:
     # By layer: how many Gaussians the chain was begun with, and which of those each one is now, or is a copy of.
     _begun_with: tuple[int, ...] = dataclasses.field(repr=False)
     _sources: tuple[Int[np.ndarray, " num"], ...] = dataclasses.field(repr=False)
+    _part: Part | None = dataclasses.field(default=None, repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
         """What has been made: a folded model if all edits could be baked, else an edited video."""
@@ -123,10 +132,7 @@ class Edit:
         if selection is not None and criteria:
             got = f"{type(selection).__name__} and {', '.join(criteria)}"
             raise invalid("selection", expected="a selection or criteria for one", got=got)
-        layers = self._video.layers
-        if layer is not None and not (whole(layer, 0) and layer < len(layers)):
-            raise invalid("layer", expected=f"a whole number in [0, {len(layers) - 1}]", got=layer)
-        numbers = range(len(layers)) if layer is None else [layer]
+        layers, numbers = self._video.layers, self._layer_numbers(layer)
         if criteria:
             chosen = [select(layers[k].model, **criteria).mask for k in numbers]
         else:
@@ -135,6 +141,13 @@ class Edit:
         for k, mask in zip(numbers, chosen, strict=True):
             masks[k] = mask
         return dataclasses.replace(self, selection=Selection(np.concatenate(masks)))
+
+    def _layer_numbers(self, layer: int | None) -> Sequence[int]:
+        """Of one layer, or of all."""
+        num = len(self._video.layers)
+        if layer is not None and not (whole(layer, 0) and layer < num):
+            raise invalid("layer", expected=f"a whole number in [0, {num - 1}]", got=layer)
+        return range(num) if layer is None else [layer]
 
     def select_begun(self, selection: "Selection | Mask") -> "Edit":
         """Act on these of the Gaussians that the chain was begun with, wherever they are now, and on their copies.
@@ -270,15 +283,18 @@ class Edit:
             raise invalid("originals", expected="True or False", got=short_repr(originals))
         warn_of_degrees("angle", *each["angle"])
         for delay in each["delays"]:
-            _warn_of_frames("delays", delay, 1.0, 0.0, self._video.num_frames)
+            _warn_of_frames("delays", delay, 1.0, 0.0, self._num_frames)
         span = self._span(when)
+        if span is NEVER:  # no copy is ever seen
+            self._check_selected()
+            return self if originals else dataclasses.replace(self, selection=self.selection - self.selection)
         copied, copies = self._copied(len(shifts))
         for k, (shift, mask) in enumerate(zip(shifts, copies, strict=True)):
             one = dataclasses.replace(copied, selection=Selection(mask))
             size, still = each["scale"][k], (0.0, 0.0)
             one = one._map(0.0, ((size, 0.0), (0.0, size)), still, about, when)
             one = one._map(each["angle"][k], IDENTITY, still, about, when)._map(0.0, IDENTITY, shift, None, when)
-            one = one._by_line(each["delays"][k], 1.0, 0.0, "continue", when)
+            one = one._by_line(each["delays"][k], 1.0, 0.0, "continue", when, "delays")
             if span is not None:
                 one = one._overlaid(partial(Opacity, factor=1.0, before=0.0), span)
             copied = dataclasses.replace(one, selection=copied.selection)
@@ -293,7 +309,7 @@ class Edit:
             counts = np.where(mask, num + 1, 1)
             source = np.repeat(np.arange(len(mask)), counts)
             copy = np.arange(len(source)) - np.repeat(np.cumsum(counts) - counts, counts)  # 0: the original
-            made.append(_gathered(layer, source, mask, copy))
+            made.append(gathered(layer, source, mask, copy))
             chosen.append(mask[source])
             copies.append(copy)
             sources.append(source)
@@ -311,7 +327,7 @@ class Edit:
             delete = mask.any() and not mask.all() and _can_lose(layer, mask)
             source = np.flatnonzero(~mask) if delete else np.arange(len(mask))
             if delete:
-                layer = _gathered(layer, source, mask, np.zeros(len(source), int))
+                layer = gathered(layer, source, mask, np.zeros(len(source), int))
             elif mask.any():
                 layer = _with_overlay(layer, Opacity(mask, None, 0.0))
             made.append(layer)
@@ -335,7 +351,7 @@ class Edit:
         parts = self._parts()
         sources = [np.argsort(~mask if front else mask, kind="stable") for mask in parts]
         made = [
-            _gathered(layer, source, mask, np.zeros(len(source), int))
+            gathered(layer, source, mask, np.zeros(len(source), int))
             for layer, source, mask in zip(self._video.layers, sources, parts, strict=True)
         ]
         chosen = [mask[source] for mask, source in zip(parts, sources, strict=True)]
@@ -375,24 +391,20 @@ class Edit:
         if hue is not None and not within(hue, "[0, 1]"):
             raise invalid("hue", expected="turns in [0, 1]", got=repr(hue), cure="Degrees over 360.")
         if color is not None:
-            target = checked_numbers("color", color, 3)
-            if min(target) < 0 or max(target) > 1:
-                raise invalid("color", expected="red, green and blue in [0, 1]", got=target)
-            matrix, gain = np.outer(target, LIGHTNESS), 1 / self._mean_lightness()
+            target = checked_color(color)
+            self._check_selected()
+            matrix, gain = np.outer(target, LIGHTNESS), 1 / mean_lightness([self._light()])
         make = _recolor(gain, offset, matrix, None if hue is None else checked_number("hue", hue))
         identity = make(np.zeros(0, bool), None) == _recolor(None, None, None, None)(np.zeros(0, bool), None)
         bake = lambda splats, mask: baking.recolored(splats, mask, make(mask, None))  # noqa: E731
         return self._apply(make, when, bake, skip=bool(identity))
 
-    def _mean_lightness(self) -> float:
+    def _light(self) -> tuple[float, float]:
+        """What the selection's Gaussians have of lightness, by their opacity, and their opacity, in all."""
         parts = zip(self._video.layers, self._parts(), strict=True)
         looks = [baking.looks(layer.model.splats, mask) for layer, mask in parts]
         opacity, color = (np.concatenate(leaves) for leaves in zip(*looks, strict=True))
-        mean = float(opacity @ (color @ LIGHTNESS) / max(opacity.sum(), np.finfo(float).tiny))
-        if mean < DARKEST:
-            cure = "It is black, without shading: use offset=."
-            raise invalid("color", expected="an object with some light", got=f"lightness {mean:g}", cure=cure)
-        return mean
+        return float(opacity @ (color @ LIGHTNESS)), float(opacity.sum())
 
     # ------------------------------------------------------------------------------------------------------- when
 
@@ -425,15 +437,29 @@ class Edit:
             cure = "Clock(times, own_times) goes straight between knots." if callable(clock) else ""
             raise invalid("clock", expected="a Clock", got=type(clock).__name__, cure=cure)
         if clock is not None:
-            return self._apply(partial(Retimed, clock=clock), when)
+            return self._by_clock(clock, when, "clock")
         Clock.shifted(shift, stretch, about=about, outside=outside)  # the checks
-        _warn_of_frames("shift", shift, stretch, about, self._video.num_frames)
-        return self._by_line(shift, stretch, about, outside, when)
+        _warn_of_frames("shift", shift, stretch, about, self._num_frames)
+        return self._by_line(shift, stretch, about, outside, when, "shift")
 
-    def _by_line(self, shift: float, stretch: float, about: float, outside: str, when: When) -> "Edit":
+    def _by_clock(self, clock: Clock, when: When, parameter: str) -> "Edit":
+        """By another clock; always laid over."""
+        if self._part is not None:
+            self._part.check_own(clock, parameter, **when)
+            clock = self._part.clock(clock)
+        return self._apply(partial(Retimed, clock=clock), when)
+
+    def _by_line(self, shift: float, stretch: float, about: float, outside: str, when: When, parameter: str) -> "Edit":
         """What it does at t at about + shift + stretch (t - about): baked where it can be."""
         line = Clock.shifted(shift, stretch, about=about, outside=outside)
         identity = (shift, stretch) == (0, 1) and outside == "continue"
+        if self._part is not None and not identity:
+            own_line = self._part.line(shift, stretch, about)
+            if own_line is None:
+                return self._by_clock(line, when, parameter)
+            self._part.check_own(line, parameter, **when)
+            shift, stretch, about = own_line
+            line = self._part.clock(line)
         bake = partial(baking.retimed, shift=float(shift), stretch=float(stretch), about=float(about))
         # Between shots a clock shows the nearer one, of one frame alone that frame: no leaves say so.
         bakes = outside == "continue" and not any(layer.holds_frames for layer in self._video.layers)
@@ -445,7 +471,8 @@ class Edit:
         position = checked_number("at", at)
         if not 0 <= position <= len(times) - 1:
             raise invalid("at", expected=f"a frame in [0, {len(times) - 1}]", got=at)
-        return self.retime(clock=Clock.frozen(float(np.interp(position, np.arange(len(times)), times))), **when)
+        clock = Clock.frozen(float(np.interp(position, np.arange(len(times)), times)))
+        return self._by_clock(clock, when, "at")
 
     # ------------------------------------------------------------------------------------------------ any function
 
@@ -478,6 +505,8 @@ class Edit:
         if not callable(function):
             raise invalid("function", expected="a function", got=type(function).__name__)
         check_takes("function", function, of, "t")
+        if self._part is not None:
+            function = self._part.by_clip_time(function)
         return self._apply(partial(kind, function=function), when)
 
     # --------------------------------------------------------------------------------------------------- in space
@@ -516,6 +545,8 @@ class Edit:
             check_takes("camera", camera, "t")
         if isinstance(camera, Camera) and camera.position.ndim != 1:
             raise invalid("camera", expected="one camera", got=f"positions of shape {camera.position.shape}")
+        if self._part is not None and camera is not None and not isinstance(camera, Camera):
+            camera = self._part.by_clip_time(camera)
         return dataclasses.replace(self, _video=dataclasses.replace(self._video, camera=camera))
 
     # ---------------------------------------------------------------------------------------------------- the works
@@ -531,7 +562,7 @@ class Edit:
         """Bake the edit into each layer, or lay it over; nothing at all if it is known to change nothing."""
         span = self._span(when)
         self._check_selected()
-        if skip:
+        if skip or span is NEVER:
             return self
         made = []
         for layer, mask in zip(self._video.layers, self._parts(), strict=True):
@@ -580,17 +611,42 @@ class Edit:
                 near = difflib.get_close_matches(name, When.__annotations__, 1)
                 expected, cure = "one of " + ", ".join(When.__annotations__), f"Did you mean {near[0]}?" if near else ""
                 raise invalid("when", expected=expected, got=name, cure=cure)
-        return span_of(self._frame_times(), **when)
+        return span_of(self._frame_times(), **when) if self._part is None else self._part.span(**when)
+
+    @property
+    def _num_frames(self) -> int:
+        return self._video.num_frames if self._part is None else self._part.num_frames
 
     def _frame_times(self) -> Float[np.ndarray, " num_frames"]:
+        """Of the clip."""
+        if self._part is not None:
+            return self._part.frame_times
         return np.asarray(self._video.frame_times.times(), np.float64)
+
+
+def checked_color(color: ArrayLike) -> tuple[float, ...]:
+    """Red, green and blue. Raises ValueError unless all are in [0, 1]."""
+    target = checked_numbers("color", color, 3)
+    if min(target) < 0 or max(target) > 1:
+        raise invalid("color", expected="red, green and blue in [0, 1]", got=target)
+    return target
+
+
+def mean_lightness(light: Sequence[tuple[float, float]]) -> float:
+    """The mean of what `Edit` has of light, of one chain or several. Raises ValueError where it is dark."""
+    of_light, opacity = (sum(parts) for parts in zip(*light, strict=True))
+    mean = of_light / max(opacity, np.finfo(float).tiny)
+    if mean < DARKEST:
+        cure = "It is black, without shading: use offset=."
+        raise invalid("color", expected="an object with some light", got=f"lightness {mean:g}", cure=cure)
+    return mean
 
 
 def _split(mask: Mask, counts: Sequence[int]) -> list[Mask]:
     return np.split(mask, np.cumsum(counts)[:-1])
 
 
-def _gathered(
+def gathered(
     layer: Layer, source: Int[np.ndarray, " num_new"], chosen: Mask, copy: Int[np.ndarray, " num_new"]
 ) -> Layer:
     """A layer of the Gaussians `source`, with all edits that they had; those of `copy` k are its k-th copies.

@@ -161,19 +161,8 @@ class EditedVideo(eqx.Module):
         return notebook_frame(self)
 
 
-def layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
-    """Videos one over another, the front one first: drawn in one pass, what is in front covers what is behind.
-
-    Where the front lets light through, by an alpha that it was fitted with or where its Gaussians end, the next shows.
-    Each keeps its own model time, [0, 1] from its first frame to its last, unless it has a clock: see `Edit.retime` and
-    `Edit.freeze`. Sizes may differ in pixels, envelopes and degrees in all. The video numbered `timeline` (default: the
-    last, the background) gives frame times, size and rate.
-
-    **Example:** `layers(person, edit(street).freeze(10).video())`.
-
-    **Raises:** ValueError for no videos, those of another aspect (to a pixel), compositing or `RenderOptions`, and for
-    one with a camera: a camera sees all layers.
-    """
+def stacked(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
+    """Videos of one piece each one over another: see `foldgauss.video.layers`."""
     parts = [as_edited(video) for video in videos]
     if not parts:
         raise invalid("videos", expected="at least one", got="none")

@@ -63,8 +63,17 @@ class Segment:
 
     @property
     def model(self) -> VideoModel | EditedVideo:
-        """The model of its frames, an ordinary one: loaded whenever it is asked for."""
-        return self.load()
+        """The model of its frames, an ordinary one: loaded whenever it is asked for.
+
+        Raises ValueError where `load` gives one of other frames, and what it raises.
+        """
+        model = self.load()
+        if (model.num_frames, tuple(model.size)) != (self.num_frames, tuple(self.size)):
+            expected, got = (
+                f"{one.num_frames} frames of {one.size[0]}x{one.size[1]} (height x width)" for one in (self, model)
+            )
+            raise invalid("segment.load()", expected=f"a model of {expected}", got=f"one of {got}")
+        return model
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
@@ -150,12 +152,37 @@ def select(
 
     **Raises:** ValueError without any criterion, for options of a criterion that is not there, and as the functions.
     """
+    given = {"mask": mask, "box": box, "polygon": polygon, "color": color, "click": click, "times": times}
+    where = {"frame": frame, "frames": frames, "tolerance": tolerance}
+    asked = questions(**given, **where, alive=alive, threshold=threshold, follow=follow)
+    return functools.reduce(Selection.__and__, [function(model, **named) for function, named in asked])
+
+
+def questions(
+    *,
+    mask: Masks | None = None,
+    box: tuple[float, float, float, float] | None = None,
+    polygon: Float[ArrayLike, "corners 2"] | None = None,
+    color: tuple[float, float, float] | None = None,
+    click: tuple[float, float] | None = None,
+    times: tuple[float, float] | None = None,
+    frame: int | None = None,
+    frames: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    alive: bool = False,
+    threshold: float = THRESHOLD,
+    follow: bool = True,
+) -> list[tuple[Callable[..., Selection], dict[str, Any]]]:
+    """What `select` asks a model, whose answers are intersected: functions such as `by_mask`, and their arguments.
+
+    Raises ValueError as `select` for what needs no model to be told.
+    """
     where = {"frame": frame, "frames": frames}
     own_tolerance = {} if tolerance is None else {"tolerance": tolerance}
-    found = []
-    for value, function in ((mask, by_mask), (box, by_box), (polygon, by_polygon)):
+    found: list[tuple[Callable[..., Selection], dict[str, Any]]] = []
+    for name, value, function in (("mask", mask, by_mask), ("box", box, by_box), ("polygon", polygon, by_polygon)):
         if value is not None:
-            found.append(function(model, value, **where, threshold=threshold, follow=follow))
+            found.append((function, {name: value, **where, "threshold": threshold, "follow": follow}))
     placed = bool(found) or click is not None
     regional, timed = bool(found), times is not None or not (placed or (frame is None and frames is None))
     for name, given, wanted in (
@@ -169,19 +196,19 @@ def select(
     if tolerance is not None and color is None and click is None:
         raise invalid("tolerance", expected="color or click with it", got="neither")
     if color is not None:
-        found.append(by_color(model, color, **own_tolerance))
+        found.append((by_color, {"color": color, **own_tolerance}))
     if click is not None:
         if frame is None:
             raise invalid("frame", expected="the frame that was clicked in", got="none", cure="Give frame=k.")
-        found.append(by_click(model, click, frame=frame, **own_tolerance))
+        found.append((by_click, {"click": click, "frame": frame, **own_tolerance}))
     if times is not None:
-        found.append(by_time(model, times, alive=alive))
+        found.append((by_time, {"times": times, "alive": alive}))
     if not placed and (frame is not None or frames is not None):
-        found.append(by_time(model, **where, alive=alive))
+        found.append((by_time, {**where, "alive": alive}))
     if not found:
         cure = "Selection.all(model) is everything."
         raise invalid("select", expected="at least one criterion", got="none", cure=cure)
-    return functools.reduce(Selection.__and__, found)
+    return found
 
 
 def contribution(

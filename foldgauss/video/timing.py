@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 from numbers import Real
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -88,6 +89,34 @@ def span_of(
     **Raises:** ValueError for more than one of the three, frames or times that the clip has not, and ease without a
     span, or longer than it.
     """
+    knots = np.asarray(frame_times, np.float64)
+    stretch = stretch_of(knots, frame=frame, frames=frames, times=times, ease=ease, curve=curve)
+    return None if stretch is None else span_in(stretch, knots)
+
+
+class Stretch(NamedTuple):
+    """A span as positions among a clip's frames: from `begin` to `end`, infinite where it has no end.
+
+    `rise` and `fall`: how many frames it takes to come in and to go out.
+    """
+
+    begin: float
+    end: float
+    rise: float
+    fall: float
+    curve: str
+
+
+def stretch_of(
+    frame_times: Float[np.ndarray, " num_frames"],
+    *,
+    frame: int | None = None,
+    frames: tuple[int | None, int | None] | None = None,
+    times: tuple[float, float] | None = None,
+    ease: float | tuple[float, float] = 0,
+    curve: str = "linear",
+) -> Stretch | None:
+    """As `span_of`, among the frames."""
     knots, one_of_them = np.asarray(frame_times, np.float64), [x for x in (frame, frames, times) if x is not None]
     one_of("curve", curve, CURVES)
     if len(one_of_them) > 1:
@@ -98,7 +127,12 @@ def span_of(
             raise invalid("ease", expected="a span to ease into", got=ease, cure="Give frame=, frames= or times=.")
         return None
     begin, end = _positions(knots, frame, frames, times)
-    return _eased(knots, begin, end, lengths, curve)
+    rise, fall = (length if math.isfinite(x) else 0.0 for length, x in zip(lengths, (begin, end), strict=True))
+    first, last = max(begin, 0.0), min(end, len(knots) - 1.0)
+    if rise + fall > last - first:
+        expected = f"no more than the span's {last - first:g} frames, in and out together"
+        raise invalid("ease", expected=expected, got=f"{rise:g} and {fall:g}", cure="Make the span longer.")
+    return Stretch(begin, end, rise, fall, curve)
 
 
 def _positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
@@ -123,14 +157,23 @@ def _positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
 
 
-def _eased(knots: np.ndarray, begin: float, end: float, lengths: tuple[float, float], curve: str) -> Span:
-    rise, fall = (length if math.isfinite(x) else 0.0 for length, x in zip(lengths, (begin, end), strict=True))
-    first, last = max(begin, 0.0), min(end, len(knots) - 1.0)
-    if rise + fall > last - first:
-        expected = f"no more than the span's {last - first:g} frames, in and out together"
-        raise invalid("ease", expected=expected, got=f"{rise:g} and {fall:g}", cure="Make the span longer.")
-    number, corners = np.arange(len(knots)), {first, last, first + rise, last - fall}
-    positions = np.array(sorted(corners | set(number[(number > first) & (number < last)].tolist())))
+def span_in(stretch: Stretch, frame_times: Float[np.ndarray, " num_frames"], first: int = 0) -> Span:
+    """A clip's span in the own time of a part of it, whose frames, at `frame_times`, begin with the clip's `first`.
+
+    At each frame and between progress is what it is in the clip; `NEVER` where it reaches no frame of the part.
+    """
+    knots, last = np.asarray(frame_times, np.float64), len(frame_times) - 1
+    # From here on frames count from the part's first.
+    begin, end, rise, fall = stretch.begin - first, stretch.end - first, stretch.rise, stretch.fall
+    if end <= 0 or begin > last:
+        return NEVER
+    number, ends = np.arange(last + 1), (max(begin, 0.0), min(end, float(last)))
+    start = None if begin <= 0 else float(np.interp(begin, number, knots))
+    stop = None if end > last else float(np.interp(end, number, knots))
+    if not rise and not fall:
+        return Span(start, stop, curve=stretch.curve)
+    corners = {*ends, *(x for x in (begin + rise, end - fall) if ends[0] < x < ends[1])}
+    positions = np.array(sorted(corners | set(number[(number > ends[0]) & (number < ends[1])].tolist())))
     values = np.ones(len(positions))
     if rise:
         values = np.minimum(values, (positions - begin) / rise)
@@ -138,11 +181,8 @@ def _eased(knots: np.ndarray, begin: float, end: float, lengths: tuple[float, fl
         values = np.minimum(values, (end - positions) / fall)
     times = np.interp(positions, number, knots)
     apart = np.concatenate([np.diff(times) > 0, [True]])  # frames at one and the same time are one knot
-    start, stop = (float(np.interp(x, number, knots)) if math.isfinite(x) else None for x in (begin, end))
-    if not rise and not fall:
-        return Span(start, stop, curve=curve)
     values = np.clip(values, 0.0, 1.0)
-    return Span(start, stop, tuple(times[apart].tolist()), tuple(values[apart].tolist()), curve)
+    return Span(start, stop, tuple(times[apart].tolist()), tuple(values[apart].tolist()), stretch.curve)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,3 +286,7 @@ def _pair(parameter: str, value: object) -> Sequence:
         cure = "For one frame give frame=k." if parameter == "frames" else ""
         raise invalid(parameter, expected="two of them, (start, stop)", got=short_repr(value), cure=cure)
     return value
+
+
+#: Of an edit that no frame of a part of a clip is reached by: no video has these times.
+NEVER = Span(2.0, 3.0)

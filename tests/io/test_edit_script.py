@@ -19,9 +19,11 @@ from foldgauss.io import save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
 from foldgauss.render import Camera
-from foldgauss.video import EditedVideo, Selection, VideoModel, edit, layers, select
+from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
 
 MODEL = soft_model()
+#: The same as a clip in segments, of one segment.
+IN_ONE = SegmentedVideo.of([(0, MODEL)])
 BOX, FRAME = (12, 10, 32, 30), 3
 THERE = f"[selections.it]\nbox = {list(BOX)}\nframe = {FRAME}\n"
 
@@ -329,6 +331,57 @@ def test_dotted_keys_and_strange_line_ends():
     )
     # Only a line feed ends a line of TOML: editors that know count like this.
     assert error('# \u2028 \x85\n[[edits]]\ndo = "mov"').startswith("script, line 3, ")
+
+
+def in_one(text):
+    """What a script makes of a clip that has one segment: that segment's model."""
+    (segment,) = made(text, IN_ONE).segments
+    return segment.model
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_a_script_does_to_segments_what_it_does_to_a_model(name):
+    do = f'[[edits]]\ndo = "{name.split()[0]}"\nselect = "it"\n{CHAINS[name][0]}\n'
+    do += SPAN if ACTIONS[name.split()[0]].spans else ""
+    more = '\n[[edits]]\ndo = "opacity"\nselect = "rest"\nfactor = 0.8\n[camera]\nazimuth = 20'
+    text = (
+        f"{THERE}[selections.early]\ntimes = [0, 0.5]\n[selections.rest]\nany = ['early']\nwithout = ['it']\n{do}{more}"
+    )
+    assert same(in_one(text), made(text))
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_selections_in_segments_are_those_in_a_model(name):
+    text = f'[selections."{name}"]\n{CRITERIA[name]}\n[[edits]]\ndo = "vanish"\nselect = "{name}"'
+    assert same(in_one(text), made(text))
+
+
+@pytest.mark.parametrize("text", [text for text in MISTAKES if "file" not in text])  # which none may have
+def test_mistakes_in_segments_are_told_as_in_a_model(text):
+    assert error(text, IN_ONE) == error(text)
+
+
+def test_what_only_the_models_of_segments_tell_has_its_line():
+    long = SegmentedVideo.of([(0, soft_model(num_frames=7)), (4, soft_model(seed=1, num_frames=7))])
+    still = THERE + "[[edits]]\ndo = 'move'\noffset = [0.1, 0]\n[[edits]]\ndo = 'freeze'\nat = 2\n"
+    told = error(still, long)
+    assert told.startswith(
+        "script, line 9, [[edits]] number 2: at: expected times of the segment that shows the object"
+    )
+    copies = "[[edits]]\ndo = 'multiply'\noffsets = [[0.1, 0]]\ndelays = 0.2\n[[edits]]\ndo = 'to_front'"
+    assert error(copies, long).startswith("script, line 4, [[edits]] number 1: delays: ")
+    turned = THERE + "[[edits]]\ndo = 'rotate'\ndegrees = 9\n[[edits]]\ndo = 'freeze'\nselect = 'it'\nat = 5\nframe = 5"
+    assert error(turned, long).startswith(
+        "script, line 7, [[edits]] number 2: selection: expected another time for all"
+    )
+    gone = THERE + "[[edits]]\ndo = 'vanish'\nselect = 'it'\n[[edits]]\ndo = 'move'\nselect = 'it'\noffset = [0, 1]"
+    assert error(gone, long).startswith("script, line 9, [[edits]] number 2: select: expected a selection of at least")
+    dark = "[[edits]]\ndo = 'recolor'\ngain = 0\n[[edits]]\ndo = 'recolor'\ncolor = [1, 0, 0]"
+    assert error(dark, long).startswith("script, line 6, [[edits]] number 2: color: expected an object with some light")
+    kept = "[selections.it]\nfile = 'it.selection'\n"
+    assert error(kept, long) == (
+        "script, line 2, [selections.it]: file: expected a model without layers or overlays, got one in segments."
+    )
 
 
 def test_a_selection_of_nothing_names_itself():

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.lib import recfunctions
+from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model, read_pseudomesh, save_video_model, write_pseudomesh
@@ -33,6 +34,7 @@ from foldgauss.video.model import LASTING
 from foldgauss.video.packing import columns as columns_of
 from foldgauss.video.packing import pack, unpack
 from foldgauss.video.playback import Playback
+from foldgauss.video.shots import time_logits
 
 NUM, DEGREE, FRAMES = 60, 3, 5
 HALF_WIDTH = math.tan(0.6911112 / 2)  # of the published frame, at distance 1
@@ -656,3 +658,12 @@ def test_structured_rows_are_plain_numbers(tmp_path):
     expected = np.stack([np.float32(column) for column in columns.values()], axis=1)
     np.testing.assert_array_equal(recfunctions.structured_to_unstructured(rows), expected)
     assert ply_file.is_vegas(read_ply(tmp_path / "x.ply", ["vertex"])) is False
+
+
+def test_within_a_cut_it_is_the_nearer_frame():
+    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(time_logits(7, [3])))
+    times = np.asarray(model.frame_times.times())
+    for share, k in ((0.1, 2), (0.9, 3)):
+        inside = (1 - share) * times[2] + share * times[3]
+        found, expected = frame_gaussians(model, inside), frame_gaussians(model, times[k])
+        np.testing.assert_array_equal(found.mean, expected.mean)

@@ -218,6 +218,29 @@ def test_what_is_no_ordinary_model_is_refused(work, tmp_path):
     assert not (tmp_path / "out.safetensors").exists()
 
 
+def test_a_source_that_does_not_fit_its_header_is_refused(work, tmp_path):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes((work / "a.safetensors").read_bytes())
+    rewritten(path, lambda header, outer: outer.update({"splats.more": outer.pop("splats.angle_logit")}))
+    with pytest.raises(ModelFileError, match="angle_logit"):
+        join_segments(tmp_path / "out.safetensors", [(0, path)])
+    path.write_bytes((work / "a.safetensors").read_bytes())
+    rewritten(path, lambda header, outer: header.update({"fps": float("inf")}))
+    with pytest.raises(ModelFileError, match="got one with a size or a rate out of range"):
+        join_segments(tmp_path / "out.safetensors", [(0, path)])
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_source_that_changes_meanwhile_is_refused(work, tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes((work / "a.safetensors").read_bytes())
+    longer = soft_model(num_frames=8)
+    monkeypatch.setattr(segmented, "check_writable", lambda _: save_video_model(path, longer))
+    with pytest.raises(ModelFileError, match=r"got one that has changed meanwhile.*Join them again"):
+        join_segments(tmp_path / "out.safetensors", [(0, path)])
+    assert not (tmp_path / "out.safetensors").exists()
+
+
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
@@ -280,6 +303,7 @@ def setting(*keys, to):
         setting("segments", 1, "kind", to="fit-checkpoint"),
         setting("segments", 1, "metadata", to=[1]),
         setting("segments", 0, "header", "num_frames", to=10**30),
+        setting("segments", 2, "header", "num_frames", to=10**30),
         setting("segments", 0, "header", "num_gaussians", to=10**30),
         setting("segments", 0, "header", "degree", to=10**400),
         setting("segments", 0, "header", "degree", to=-1),
@@ -305,6 +329,19 @@ def test_headers_that_make_no_sense_are_refused(change, work, tmp_path):
     with pytest.raises(ModelFileError, match="path: expected") as caught:
         load_video_model(path)
     assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("fps", float("inf")), ("fps", -1.0), ("compositing", "none"), ("size", [0, 5]), ("options", {"low_pass": -1.0})],
+)
+def test_facts_that_make_no_sense_are_refused_of_one_segment_too(name, value, work, tmp_path):
+    """With others it would not go together."""
+    path = tmp_path / "one.safetensors"
+    join_segments(path, [(0, work / "a.safetensors")])
+    rewritten(path, setting("segments", 0, "header", name, to=value))
+    with pytest.raises(ModelFileError, match="does not describe it"):
+        load_video_model(path)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import weakref
+from functools import partial
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -27,7 +28,6 @@ from foldgauss.video import (
     evaluate,
     fit,
     interpolated_times,
-    layers,
     plan_segments,
     played_positions,
     psnr,
@@ -174,13 +174,22 @@ def _largest_jump(pictures):
 
 def test_three_are_seen_where_one_fade_meets_the_next():
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate((5, 6, 5))]
-    clip = SegmentedVideo.of(list(zip((0, 3, 5), parts, strict=True)))
+    loaded = []
+
+    def load(number):
+        loaded.append(number)
+        return parts[number]
+
+    segments = SegmentedVideo.of(list(zip((0, 3, 5), parts, strict=True))).segments
+    clip = SegmentedVideo([dataclasses.replace(s, load=partial(load, n)) for n, s in enumerate(segments)])
     seen = clip.weights(4.5)
     assert [n for n, _ in seen] == [0, 1, 2]
     assert sum(weight for _, weight in seen) == pytest.approx(1)
     around = [at(clip, position) for position in (4.4999, 4.5, 4.5001)]
     assert max(np.abs(a - around[1]).max() for a in around) < 1e-3
+    loaded.clear()
     assert len(list(Playback(clip).frames(np.linspace(0, 1, 57)))) == 57
+    assert loaded == [0, 1, 2]
 
 
 def test_two_segments_of_one_clip_show_no_seam():
@@ -396,10 +405,8 @@ def test_segments_that_do_not_go_together_are_refused():
 @pytest.mark.parametrize(
     "call",
     [
-        edit,
         compress,
         flattened,
-        lambda clip: layers(soft_model(), clip),
         lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
         lambda clip: Selection.all(clip),
         lambda clip: Screen(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
@@ -410,6 +417,14 @@ def test_what_takes_one_model_says_how_to_get_one(call):
     with pytest.raises(ValueError, match=r"video\.segments\[k\]\.model") as caught:
         call(video())
     assert "\n" not in str(caught.value)
+
+
+def test_a_model_of_other_frames_is_refused_when_it_comes():
+    lead = Segment.of(0, soft_model())
+    for other in (soft_model(num_frames=8), soft_model(size=(20, 32))):
+        clip = SegmentedVideo([dataclasses.replace(lead, load=lambda other=other: other)])
+        with pytest.raises(ValueError, match=r"^segment\.load\(\): expected a model of 7 frames of 40x64"):
+            clip.render(0.5)
 
 
 # -------------------------------------------------------------------------------------------------- plans

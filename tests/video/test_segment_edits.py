@@ -1,0 +1,667 @@
+"""Edits of clips in segments: one chain for all, objects carried over the seams, times those of the whole clip."""
+
+import dataclasses
+import functools
+import gc
+import weakref
+
+import jax
+import numpy as np
+import pytest
+from object_clips import BACKGROUND, BOX, DISC, SPEED, named_model, square
+from scipy.special import expit
+from soft_models import NUM, OBJECT, soft_model
+
+from foldgauss.io import load_video_model, save_video_model
+from foldgauss.render import Camera
+from foldgauss.video import (
+    Clock,
+    EditedVideo,
+    FrameTimes,
+    Segment,
+    SegmentedEdit,
+    SegmentedSelection,
+    SegmentedVideo,
+    Selection,
+    VideoModel,
+    by_color,
+    by_mask,
+    by_time,
+    edit,
+    influence,
+    layers,
+)
+from foldgauss.video.segments import READY
+
+#: Three segments of a dozen frames, three of which are shared with each neighbour.
+FIRSTS, LENGTH, NUM_FRAMES = (0, 9, 18), 12, 30
+SHARED = (9, 10, 11, 18, 19, 20)
+
+
+def learned(model, seed):
+    """The same with frame times of its own."""
+    logits = 0.3 * np.random.default_rng(seed).standard_normal(model.num_frames - 1).astype(np.float32)
+    return dataclasses.replace(model, frame_times=FrameTimes(logits))
+
+
+def span_of_scene(first, seed):
+    """A dozen frames of one long scene, by Gaussians of their own: the model, and what each was made for."""
+    model, label = named_model(LENGTH, (40, 60), each=150, seed=seed)
+    own = expit(np.float64(model.splats.time_loc_logit))
+    later = (first + own * (LENGTH - 1)) / (NUM_FRAMES - 1) - own
+    speed = np.array([SPEED[name] for name in label])
+    loc = np.float32(model.splats.loc + later[:, None] * speed)
+    coefficients = np.float32(model.splats.coefficients * (LENGTH - 1) / (NUM_FRAMES - 1))
+    return dataclasses.replace(
+        model, splats=dataclasses.replace(model.splats, loc=loc, coefficients=coefficients)
+    ), label
+
+
+@functools.cache
+def scene():
+    """The long scene in three segments, labels of each."""
+    models, labels = zip(*(span_of_scene(first, seed) for seed, first in enumerate(FIRSTS)), strict=True)
+    return SegmentedVideo.of(list(zip(FIRSTS, models, strict=True))), labels
+
+
+@functools.cache
+def pictures_of_scene():
+    return np.stack(list(scene()[0].frames()))
+
+
+def disc_box(k):
+    rows, columns = np.nonzero(square(scene()[0], DISC, k))
+    return tuple(map(int, (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)))
+
+
+@functools.cache
+def disc():
+    """The disc, by a box in a frame of the first segment alone."""
+    return edit(scene()[0]).select(box=disc_box(2), frame=2).selection
+
+
+def soft_video(lengths=(7, 9, 6), overlap=3, evenly=False):
+    """Segments that have nothing to do with each other, of times of their own."""
+    firsts = np.cumsum([0, *(length - overlap for length in lengths[:-1])]).tolist()
+    models = [soft_model(seed=k, num_frames=length) for k, length in enumerate(lengths)]
+    models = models if evenly else [learned(model, k) for k, model in enumerate(models)]
+    return SegmentedVideo.of(list(zip(firsts, models, strict=True)))
+
+
+def drawn(video):
+    return np.stack(list(video.frames())).astype(int)
+
+
+# ------------------------------------------------------------------------------------ one segment is the model
+
+
+def wider(gaussians, t):
+    return dataclasses.replace(gaussians, factor=gaussians.factor * np.float32(1 + t))
+
+
+def orbit(t):
+    return Camera.front(0.625).orbit(0.5 * t, 0.0)
+
+
+CHAINS = {
+    "move": lambda e: e.move((0.2, 0.1)),
+    "about its centre": lambda e: e.rotate(0.4).scale(1.3),
+    "a colour, eased": lambda e: e.recolor((0.9, 0.2, 0.1), frames=(2, 6), ease=1, curve="smooth"),
+    "a colour": lambda e: e.recolor((0.9, 0.2, 0.1)),
+    "hue, at times": lambda e: e.recolor(hue=0.3, times=(0.2, 0.61), ease=(0.5, 1)),
+    "copies": lambda e: e.multiply([(0.1, 0.0), (0.2, 0.1)], delays=[0.05, 0.2], scale=0.8).to_front(),
+    "copies over a span": lambda e: e.multiply([(0.1, 0.0)], delays=0.1, originals=True, frames=(1, 4)).opacity(0.5),
+    "later": lambda e: e.retime(shift=0.05),
+    "held": lambda e: e.retime(stretch=2, about=0.3, outside="hold", frames=(1, None)),
+    "a clock": lambda e: e.retime(clock=Clock((0, 0.5, 1), (0, 1, 0))),
+    "still": lambda e: e.freeze(2.5).to_back(),
+    "gone": lambda e: e.vanish().select().opacity(0.7),
+    "in space": lambda e: e.place(depth=0.2, rotate=(0, 0.4, 0)).seen_from(orbit),
+    "a function": lambda e: e.apply(wider, frame=3).select(lambda video: chosen(video)).transform([[1, 0.2], [0, 1]]),
+}
+
+
+def chosen(video):
+    mask = np.arange(NUM) % 3 == 0
+    return SegmentedSelection((Selection(mask),)) if isinstance(video, SegmentedVideo) else mask
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_one_segment_is_edited_as_the_model_to_the_bit(name):
+    model = soft_model()
+    box = {"box": (12, 10, 32, 30), "frame": 3}
+    wanted = CHAINS[name](edit(model).select(**box)).video()
+    got = CHAINS[name](edit(SegmentedVideo.of([(0, model)])).select(**box)).video()
+    assert isinstance(got, SegmentedVideo)
+    made = got.segments[0].model
+    leaves, described = jax.tree.flatten(made)
+    wanted_leaves, wanted_described = jax.tree.flatten(wanted)
+    assert described == wanted_described
+    for one, other in zip(leaves, wanted_leaves, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (got.num_gaussians, got.num_floats) == (wanted.num_gaussians, wanted.num_floats)
+    np.testing.assert_array_equal(drawn(got), drawn(wanted))
+
+
+QUESTIONS = {
+    "box": {"box": (12, 10, 32, 30), "frame": 3},
+    "box along": {"box": (12, 10, 32, 30), "frames": (2, None), "threshold": 0.7},
+    "polygon": {"polygon": [(5, 5), (40, 8), (20, 38)], "frames": (1, 4), "follow": False},
+    "mask": {"mask": {1: np.eye(40, 64, 10) > 0, 4: np.tri(40, 64) > 0}},
+    "masks": {"mask": np.stack([np.tri(20, 32, k) for k in range(7)]).astype(np.float32)},
+    "click": {"click": (22, 20), "frame": 3, "tolerance": 30},
+    "color": {"color": (0.6, 0.4, 0.5), "tolerance": 30},
+    "frames": {"frames": (2, 4)},
+    "times": {"times": (0.3, 0.62)},
+    "alive": {"times": (0.0, 0.2), "alive": True, "color": (0.6, 0.4, 0.5), "tolerance": 25},
+    "all": {"box": (2, 2, 32, 38), "frame": 3, "color": (0.5, 0.5, 0.5), "times": (0.2, 0.9), "tolerance": 40},
+}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_one_segment_answers_as_the_model(name):
+    wanted = edit(soft_model()).select(**QUESTIONS[name]).selection
+    got = edit(SegmentedVideo.of([(0, soft_model())])).select(**QUESTIONS[name]).selection
+    assert 0 < len(wanted) < NUM
+    assert got == SegmentedSelection((wanted,))
+
+
+# ------------------------------------------------------------------------------------ who, from segment to segment
+
+
+def shares(selection):
+    """Of each segment's disc what is selected, and of all else that moves."""
+    masks, labels = [part.mask for part in selection.parts], scene()[1]
+    of_disc = [mask[label == DISC].mean() for mask, label in zip(masks, labels, strict=True)]
+    return of_disc, [mask[label == BOX].mean() for mask, label in zip(masks, labels, strict=True)]
+
+
+def test_an_object_is_carried_from_the_first_segment_to_the_last():
+    of_disc, of_box = shares(disc())
+    assert min(of_disc) > 0.9
+    assert max(of_box) == 0
+
+
+@pytest.mark.parametrize("k", [14, 27])
+def test_an_object_is_carried_both_ways(k):
+    masks = np.stack([square(scene()[0], DISC, number) for number in (k - 1, k)])
+    of_disc, of_box = shares(edit(scene()[0]).select(mask=masks[1], frame=k).selection)
+    assert min(of_disc) > 0.9
+    assert max(of_box) < 0.05
+    several = edit(scene()[0]).select(mask=masks, frames=(k - 1, k + 1)).selection
+    assert min(shares(several)[0]) > 0.9
+
+
+def test_a_click_is_carried():
+    model, label = scene()[0].segments[2].model, scene()[1][2]
+    rows, columns = np.nonzero(square(scene()[0], DISC, 28))
+    place = (float(columns.mean()), float(rows.mean()))
+    alone = edit(SegmentedVideo.of([(0, model)])).select(click=place, frame=10, tolerance=25).selection.parts[0]
+    assert alone.mask[label == DISC].mean() > 0.8
+    carried = edit(scene()[0]).select(click=place, frame=28, tolerance=25).selection
+    assert carried.parts[2] == alone
+    assert min(shares(carried)[0]) > 0.75
+    assert max(shares(carried)[1]) < 0.1
+
+
+def test_what_is_told_of_both_ends_is_told_between():
+    """The middle segment hears from both neighbours: a disc that the last one denies ends in it."""
+    video = scene()[0]
+    nothing = np.zeros((40, 60), bool)
+    nothing[0, 0] = True
+    masks = {2: square(video, DISC, 2)} | dict.fromkeys(range(21, 30), nothing)
+    selection = edit(video).select(mask=masks).selection
+    assert shares(selection)[0][0] > 0.9
+    assert shares(selection)[0][2] == 0
+    middle = scene()[0].segments[1].model
+    shown = carried_masks(0, 1, selection) | carried_masks(2, 1, selection)
+    assert selection.parts[1] == by_mask(middle, shown)
+
+
+def carried_masks(one, other, selection):
+    from foldgauss.video import matte
+
+    segments = scene()[0].segments
+    shared = range(max(segments[one].first, segments[other].first), min(segments[one].stop, segments[other].stop))
+    model = segments[one].model
+    times = np.asarray(model.frame_times.times())
+    picture = lambda k: matte(model, selection.parts[one], float(times[k - segments[one].first])) >= 0.5  # noqa: E731
+    return {k - segments[other].first: picture(k) for k in shared}
+
+
+def test_nothing_is_carried_over_a_cut_or_without_follow():
+    box = {"box": disc_box(2), "frame": 2}
+    still = edit(scene()[0]).select(**box, follow=False).selection
+    assert len(still.parts[0])
+    assert not len(still.parts[1]) + len(still.parts[2])
+    models = [segment.model for segment in scene()[0].segments]
+    cut = SegmentedVideo.of([(0, models[0]), (12, models[1]), (21, models[2])])
+    found = edit(cut).select(**box).selection
+    assert found.parts[0] == disc().parts[0]
+    assert not len(found.parts[1]) + len(found.parts[2])
+    found = edit(cut).select(box=disc_box(10), frame=13).selection
+    assert not len(found.parts[0])
+    assert len(found.parts[1])
+    assert len(found.parts[2])
+
+
+def test_colours_and_times_are_asked_of_every_segment():
+    video, labels = scene()
+    red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
+    assert red.parts == tuple(by_color(segment.model, (0.9, 0.3, 0.1), tolerance=25) for segment in video.segments)
+    both = edit(video).select(box=disc_box(2), frame=2, color=(0.9, 0.3, 0.1), tolerance=25).selection
+    assert both == disc() & red
+    middle = edit(video).select(frames=(10, 15)).selection
+    last = video.segments[2].model
+    assert middle.parts[0] == by_time(video.segments[0].model, frames=(10, 12))
+    assert middle.parts[1] == by_time(video.segments[1].model, frames=(1, 6))
+    assert middle.parts[2] == Selection.none(last)
+    timed = edit(video).select(times=(10 / 29, 20 / 29), alive=True).selection
+    assert timed.parts[2] == by_time(last, (0.0, 2 / 11), alive=True)
+    assert sum(label.size for label in labels) == timed.num_gaussians
+
+
+def test_selections_are_sets():
+    video = scene()[0]
+    red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
+    masks = [[part.mask for part in one.parts] for one in (red, disc())]
+    for got, combine in (
+        (red | disc(), np.logical_or),
+        (red & disc(), np.logical_and),
+        (red - disc(), lambda one, other: one & ~other),
+        (red ^ disc(), np.logical_xor),
+    ):
+        assert [part.mask.tolist() for part in got.parts] == [
+            combine(*pair).tolist() for pair in zip(*masks, strict=True)
+        ]
+        assert len(got) == sum(int(part.mask.sum()) for part in got.parts)
+    assert ~~red == red
+    assert red != disc()
+    assert red != "red"
+    assert repr(red).startswith(f"SegmentedSelection({len(red):,} of {video.num_gaussians:,}")
+    with pytest.raises(TypeError, match="SegmentedSelection, got Selection"):
+        red | red.parts[0]
+    with pytest.raises(ValueError, match="in 3 segments, got one in 1"):
+        red | SegmentedSelection(red.parts[:1])
+    with pytest.raises(ValueError, match="a Selection for each segment"):
+        SegmentedSelection((np.ones(3, bool),))
+
+
+# ------------------------------------------------------------------------------------------------ pictures
+
+
+def reached(k, selection):
+    """Where a selection's Gaussians are at a frame, in whichever segments show it."""
+    there = np.zeros((40, 60), bool)
+    for segment, part in zip(scene()[0].segments, selection.parts, strict=True):
+        if segment.first <= k < segment.stop:
+            model = segment.model
+            there |= influence(model, part, float(model.frame_times.times()[k - segment.first]))
+    return there
+
+
+def orange(pictures):
+    """How much of a frame looks like the disc."""
+    return (pictures[..., 0].astype(int) - pictures[..., 1] > 70).sum((1, 2))
+
+
+@pytest.mark.parametrize("name", ["vanish", "recolor", "move"])
+def test_an_object_is_edited_in_all_frames_and_nothing_else_is(name):
+    video, before = scene()[0], pictures_of_scene()
+    chain = edit(video).select(disc())
+    edited = {"vanish": chain.vanish, "recolor": lambda: chain.recolor((0.2, 0.2, 1.0)), "move": None}[name]
+    edited = chain.move((0.0, -0.3)).video() if edited is None else edited().video()
+    assert all(isinstance(segment.model, VideoModel) for segment in edited.segments)
+    after = np.stack(list(edited.frames()))
+    changed = (before != after).any(-1)
+    for k in range(NUM_FRAMES):
+        touched = reached(k, disc())
+        if name == "move":
+            touched = touched | np.roll(touched, -18, 0)
+        assert not changed[k][~touched].any()
+        assert changed[k][square(video, DISC, k)].mean() > 0.5, k
+    if name != "move":  # nothing of it is left, in no frame: no flash of it at the seams
+        assert (orange(before) > 40).all()
+        assert (orange(after) < 0.25 * orange(before)).all()
+
+
+def test_copies_are_in_all_segments():
+    video = scene()[0]
+    doubled = edit(video).select(disc()).to_front().multiply([(0.0, -0.3)]).video()
+    assert doubled.num_gaussians == video.num_gaussians + len(disc())
+    assert (orange(np.stack(list(doubled.frames()))) > 1.3 * orange(pictures_of_scene())).all()
+
+
+def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, curve="linear"):
+    """How far along an edit over a span is at a frame position, by the words of `span_of`."""
+    if times is not None:
+        begin, end = times[0] * last, times[1] * last
+    else:
+        first, stop = (frame, frame + 1) if frames is None else frames
+        begin = -np.inf if first is None else first - 0.5
+        end = np.inf if stop is None else stop - 0.5
+    rise, fall = ease if isinstance(ease, tuple) else (ease, ease)
+    if not begin <= position < end:
+        return 0.0
+    into = (position - begin) / rise if rise and np.isfinite(begin) else 1.0
+    out_of = (end - position) / fall if fall and np.isfinite(end) else 1.0
+    s = min(1.0, into, out_of)
+    return s if curve == "linear" else s * s * (3 - 2 * s)
+
+
+@pytest.mark.parametrize("evenly", [True, False])
+@pytest.mark.parametrize(
+    "when",
+    [
+        {"frames": (2, 9), "ease": 3, "curve": "smooth"},
+        {"frames": (5, 11), "ease": (4, 1)},
+        {"frames": (None, 12), "ease": 5},
+        {"times": (0.3, 0.8), "ease": 2},
+        {"frame": 5},
+        {"frame": 9},
+        {"frames": (4, 7)},
+    ],
+    ids=str,
+)
+def test_a_span_acts_over_seams_as_if_there_were_none(when, evenly):
+    """Light by a factor that comes and goes: each picture is the unedited one times it, whichever segment shows it."""
+    video = soft_video(evenly=evenly)
+    edited = edit(video).recolor(gain=0.2, **when).video()
+    times = video.frame_times.times()
+    last = len(times) - 1
+    progress = np.array([progress_at(k, last, **when) for k in range(len(times))])
+    assert 0 < (progress > 0).sum() < len(times)
+    before, after = np.stack(list(video.frames())), np.stack(list(edited.frames()))
+    exact = np.stack([video.render(t) for t in times])
+    for k, s in enumerate(progress):
+        np.testing.assert_allclose(edited.render(times[k]), exact[k] * (1 - 0.8 * s), atol=2e-6, err_msg=f"frame {k}")
+        if s == 0:
+            np.testing.assert_array_equal(before[k], after[k])
+    between = (np.arange(4 * len(times) - 3) / 4 / (len(times) - 1))[1::4]
+    for t in between:
+        position = t * (len(times) - 1)
+        seen = [number for number, _ in video.weights(position)]
+        if len(seen) == 1:  # between the frames of a fade's ends one model shows its last frame, edited as that is
+            expected = video.render(t) * (1 - 0.8 * progress_at(position, last, **when))
+            np.testing.assert_allclose(edited.render(t), expected, atol=1e-5)
+
+
+def test_what_a_span_does_not_reach_is_the_same_segment():
+    video = soft_video()
+    edited = edit(video).move((0.1, 0), frames=(7, 9)).video()
+    assert edited.segments[0] is video.segments[0]
+    assert edited.segments[2] is not video.segments[2] or video.segments[2].first > 8
+    assert isinstance(edited.segments[1].model, EditedVideo)
+    unchanged = edit(video).move((0.0, 0.0)).video()
+    assert unchanged.segments == video.segments
+    copies = edit(video).multiply([(0.1, 0)], frames=(0, 2))
+    assert copies.video().segments[2] is video.segments[2]
+    then = copies.recolor(gain=0.5).video()  # of the copies, which the last segments have not
+    assert then.segments[2] is video.segments[2]
+    both = edit(video).multiply([(0.1, 0)], originals=True, frames=(0, 2)).recolor(gain=0.5).video()
+    assert both.segments[2] is not video.segments[2]
+
+
+def test_one_colour_for_the_object_in_all_segments():
+    """By the mean lightness over all, so that it does not jump where one segment follows another."""
+    video = soft_video()
+    models = [segment.model for segment in video.segments]
+    opacity = np.concatenate([expit(np.float64(model.splats.opacity_logit)) for model in models])
+    color = np.concatenate([np.maximum(0.5 + 0.28209479177387814 * np.float64(m.splats.color_dc), 0) for m in models])
+    lightness = color @ [0.2126, 0.7152, 0.0722]
+    mean = (opacity * lightness).sum() / opacity.sum()
+    wanted = np.outer([0.9, 0.3, 0.2], [0.2126, 0.7152, 0.0722])
+    by_hand = edit(video).recolor(gain=1 / mean, matrix=wanted).video()
+    np.testing.assert_allclose(drawn(edit(video).recolor((0.9, 0.3, 0.2)).video()), drawn(by_hand), atol=1)
+    alone = edit(models[0]).recolor((0.9, 0.3, 0.2)).video()
+    assert np.abs(drawn(alone)[0] - drawn(by_hand)[0]).max() > 3
+    assert edit(video).recolor((0.9, 0.3, 0.2), frame=0).video().segments[2] is video.segments[2]
+
+
+# ------------------------------------------------------------------------------------------------ clocks, functions
+
+
+@pytest.mark.parametrize("evenly", [True, False])
+def test_clocks_go_by_the_clip(evenly):
+    """Shown at frame k what is there at another, where one segment has both: frames 4 to 12 are the second's."""
+    video = soft_video(evenly=evenly)
+    assert [segment.first for segment in video.segments] == [0, 4, 10]
+    before, per_frame = drawn(video), 1 / (video.num_frames - 1)
+    later = edit(video).retime(shift=2 * per_frame, frames=(9, 10)).video()
+    np.testing.assert_allclose(drawn(later)[9], before[7], atol=1)
+    np.testing.assert_array_equal(drawn(later)[:9], before[:9])
+    np.testing.assert_array_equal(drawn(later)[10:], before[10:])
+    still = drawn(edit(video).freeze(7, frames=(7, 10)).video())
+    np.testing.assert_allclose(still[7:10], before[[7, 7, 7]], atol=1)
+    clock = Clock((7 * per_frame, 9 * per_frame), (9 * per_frame, 7 * per_frame))
+    turned = drawn(edit(video).retime(clock=clock, frames=(7, 10)).video())
+    np.testing.assert_allclose(turned[7:10], before[[9, 8, 7]], atol=1)
+    fast = edit(video).retime(stretch=0.5, about=7 * per_frame, frames=(7, 9)).video()
+    np.testing.assert_allclose(fast.render(7.5 * per_frame), video.render(8 * per_frame), atol=1e-4)
+    half = edit(video).retime(stretch=2, about=7 * per_frame, frames=(7, 10)).video()
+    wanted = edit(video.segments[1].model)
+    own = np.asarray(video.segments[1].model.frame_times.times())
+    wanted = wanted.retime(clock=Clock.frozen(float((own[3] + own[4]) / 2)), frame=4).video()
+    np.testing.assert_allclose(half.render(8 * per_frame), wanted.render(float(own[4])), atol=1e-4)
+
+
+def test_the_first_segment_goes_on_before_the_clip_and_the_last_behind_it():
+    """As a model of one piece does: there is no other segment to ask."""
+    video = soft_video(evenly=True)
+    first, last = (video.segments[k].model for k in (0, 2))
+    steps = video.num_frames - 1
+    none = [Selection(np.zeros(NUM, bool))] * 3
+    begin = edit(video).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
+    wanted = edit(first).select(OBJECT).retime(shift=2 / 6).video()
+    np.testing.assert_allclose(drawn(begin)[:4], drawn(wanted)[:4], atol=1)
+    assert begin.segments[1:] == video.segments[1:]
+    uneven = soft_video()
+    model = uneven.segments[0].model
+    early = Clock.frozen(-2 * float(model.frame_times.times()[1]))
+    begin = edit(uneven).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
+    wanted = edit(model).select(OBJECT).retime(clock=early).video()
+    np.testing.assert_allclose(begin.render(0.0), wanted.render(0.0), atol=1e-4)
+    end = edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=-2 / steps).video()
+    np.testing.assert_allclose(
+        drawn(end)[13:], drawn(edit(last).select(OBJECT).retime(shift=-2 / 5).video())[3:], atol=1
+    )
+    with pytest.raises(ValueError, match=r"shift: .*frames 10 to 15, got frame 8 for frame 10, which another"):
+        edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=2 / steps).video()
+
+
+@pytest.mark.parametrize(
+    ("parameter", "change"),
+    [
+        ("shift", lambda e: e.retime(shift=0.1)),
+        ("at", lambda e: e.freeze(2)),
+        ("delays", lambda e: e.multiply([(0.1, 0)], delays=0.1)),
+        ("clock", lambda e: e.retime(clock=Clock((0, 0.5, 1), (0, 1, 0)))),
+        ("shift", lambda e: e.retime(shift=-0.4, frames=(4, 6))),
+        ("at", lambda e: e.freeze(2, frames=(8, 9))),
+    ],
+)
+def test_what_another_segment_has_is_refused(parameter, change):
+    with pytest.raises(ValueError, match=rf"^{parameter}: expected times of the segment that shows .*another segment"):
+        change(edit(soft_video())).video()
+
+
+@pytest.mark.parametrize("evenly", [True, False])
+def test_functions_and_cameras_are_given_the_clips_time(evenly):
+    video, told, asked = soft_video(evenly=evenly), [], []
+
+    def note(gaussians, t):
+        told.append(t)
+        return gaussians
+
+    def note_faces(vertices, t):
+        told.append(t)
+        return vertices
+
+    def camera(t):
+        asked.append(t)
+        return Camera.front(0.625)
+
+    edited = edit(video).apply(note).apply_triangles(note_faces).seen_from(camera).video()
+    times = video.frame_times.times()
+    for k in (0, 3, 5, 9, 11, 15):
+        told.clear()
+        asked.clear()
+        edited.render(times[k])
+        num = len(video.weights(k))
+        np.testing.assert_allclose(told, [times[k]] * 2 * num, atol=1e-4 if evenly else 1e-6)
+        np.testing.assert_allclose(asked, [times[k]] * num, atol=1e-4 if evenly else 1e-6)
+    nobody = SegmentedSelection((Selection(OBJECT), *[Selection(np.zeros(NUM, bool))] * 2))  # in all but the first
+    other = edit(video).select(nobody).seen_from(Camera.front(0.625).orbit(0.4, 0)).video()
+    assert all(segment.model.camera is not None for segment in other.segments)
+
+
+# ------------------------------------------------------------------------------------------------ the chain
+
+
+def test_edits_act_in_their_order_and_a_selection_goes_along():
+    """As on each model alone."""
+    video = soft_video()
+    parts = SegmentedSelection(tuple(Selection(np.arange(NUM) % (k + 2) == 0) for k in range(3)))
+    chain = lambda e, one: (  # noqa: E731
+        e.select(one).multiply([(0.2, 0)]).to_front().select_begun(one).rotate(0.3, about=(0, 0)).select().opacity(0.6)
+    )
+    edited = chain(edit(video), parts).video()
+    for segment, part in zip(edited.segments, parts.parts, strict=True):
+        model = next(own.model for own in video.segments if own.first == segment.first)
+        wanted = chain(edit(model), part).video()
+        for one, other in zip(jax.tree.leaves(segment.model), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert (segment.num_gaussians, segment.num_floats) == (wanted.num_gaussians, wanted.num_floats)
+    copied = edit(video).select(parts).multiply([(0.2, 0)])
+    assert len(copied.selection) == len(parts)
+    assert len(copied.select_begun(parts).selection) == 2 * len(parts)
+    assert copied.selection.num_gaussians == video.num_gaussians + len(parts)
+    again = edit(edited).select(color=(0.5, 0.5, 0.5), tolerance=30).vanish().video()
+    assert again.num_gaussians < edited.num_gaussians
+    assert len(edit(video).vanish().select().selection) == video.num_gaussians
+
+
+def test_layers_of_segments_are_edited():
+    """Of each segment's layers one is selected; what is found in one layer is carried in that layer."""
+    models = [layers(*(span_of_scene(first, 10 * k + n)[0] for n in range(2))) for k, first in enumerate((0, 9))]
+    video = SegmentedVideo.of([(0, models[0]), (9, models[1])])
+    found = edit(video).select(box=disc_box(2), frame=2, layer=1).selection
+    for part, model in zip(found.parts, models, strict=True):
+        front = model.layers[0].num_gaussians
+        assert not part.mask[:front].any()
+        assert part.mask[front:].any()
+    assert found.parts[0] == edit(models[0]).select(box=disc_box(2), frame=2, layer=1).selection
+    with pytest.raises(ValueError, match="layer: expected a whole number in"):
+        edit(video).select(layer=2).video()
+
+
+@pytest.fixture
+def quick_collection():
+    """All that is there already is left out of it."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("quick_collection")
+def test_models_are_loaded_one_after_another_and_let_go():
+    alive, most = [], 0
+
+    def loading(model):
+        def load():
+            nonlocal most
+            gc.collect()
+            most = max(most, sum(one() is not None for one in alive))
+            copied = dataclasses.replace(model)
+            alive.append(weakref.ref(copied))
+            return copied
+
+        return load
+
+    spans = [(k * 2, soft_model(seed=k, num_frames=4)) for k in range(9)]
+    segments = [dataclasses.replace(Segment.of(first, model), load=loading(model)) for first, model in spans]
+    video = SegmentedVideo(segments)
+    chain = edit(video).select(color=(0.5, 0.5, 0.5), tolerance=40).move((0.1, 0), frames=(0, 19))
+    list(chain.video().frames())
+    assert len(alive) > 9
+    before = len(alive)
+    assert len(edit(video).select(box=(0, 0, 64, 40), frame=0, follow=False, times=(0.0, 0.5)).selection) > 0
+    assert len(edit(video).select(frames=(0, 2)).selection) > 0
+    assert len(alive) == before + 3  # once for each question: those that cannot answer are not loaded
+    assert most <= 2 * READY + 1  # those that are drawn, and those before them
+
+
+def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
+    video = soft_video()
+    edited = edit(video).select(color=(0.5, 0.5, 0.5), tolerance=40).move((0.2, 0), frames=(3, 12), ease=2).video()
+    save_video_model(tmp_path / "edited.safetensors", edited)
+    loaded = load_video_model(tmp_path / "edited.safetensors")
+    assert [type(segment.model) for segment in loaded.segments] == [EditedVideo] * 3
+    np.testing.assert_array_equal(drawn(loaded), drawn(edited))
+    again = edit(loaded).recolor(gain=0.5, frames=(3, 12)).video()
+    save_video_model(tmp_path / "again.safetensors", again)
+    np.testing.assert_array_equal(drawn(load_video_model(tmp_path / "again.safetensors")), drawn(again))
+    assert not np.array_equal(drawn(again), drawn(edited))
+
+
+# ------------------------------------------------------------------------------------------------ mistakes
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda e: e.select(np.ones(NUM, bool)), "selection: expected a SegmentedSelection, got ndarray"),
+        (lambda e: e.select(Selection(OBJECT)), "selection: expected a SegmentedSelection, got Selection"),
+        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),))), "in 3 segments, got one in 1"),
+        (lambda e: e.select(lambda video: 3), "expected a SegmentedSelection, got int"),
+        (lambda e: e.select(box=(0, 0, 9, 9), frame=16), r"frame: expected a frame's number in \[0, 16\), got 16"),
+        (lambda e: e.select(box=(0, 0, 9, 9), frames=(3, 17)), "frames: expected .first, stop. with .* <= 16"),
+        (lambda e: e.select(box=(70, 0, 90, 9), frame=6), "box: expected pixels of a 40x64 frame"),
+        (lambda e: e.select(mask=np.zeros((40, 64), bool), frame=6), "mask: expected a mask with something in it"),
+        (lambda e: e.select(click=(3, 3)), "frame: expected the frame that was clicked in"),
+        (lambda e: e.select(times=(0.5, 2)), "times: expected .start, stop."),
+        (lambda e: e.select(frame=3, color=(2, 0, 0)), "color: expected red, green and blue"),
+        (lambda e: e.select(tolerance=3, frame=1), "tolerance: expected color or click"),
+        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),) * 3), frame=1), "a selection or criteria for one"),
+        (lambda e: e.select(layer=-1), "layer: expected a whole number >= 0"),
+        (lambda e: e.move((1, 2, 3)), "offset: expected 2 finite numbers"),
+        (lambda e: e.move((0.1, 0), frames=(3, 17)), "frames: expected .*stop <= 16"),
+        (lambda e: e.move((0.1, 0), frame=3, easing=2), "when: expected one of .*got easing"),
+        (lambda e: e.recolor((2, 0, 0)), "color: expected red, green and blue"),
+        (lambda e: e.recolor((1, 0, 0), hue=0.3), "expected one way to recolour"),
+        (lambda e: e.freeze(16), r"at: expected a frame in \[0, 15\], got 16"),
+        (lambda e: e.select(color=(1, 0, 1), tolerance=0).move((0.1, 0)), "selection: expected at least one Gaussian"),
+        (lambda e: e.select(color=(1, 0, 1), tolerance=0).recolor((1, 0, 0)), "selection: expected at least one"),
+        (lambda e: e.vanish().move((0.1, 0)), "selection: expected at least one Gaussian"),
+        (lambda e: e.opacity(0).recolor((1, 0, 0)), "selection: expected at least one Gaussian"),
+        (lambda e: e.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object with some light"),
+        (lambda e: e.seen_from("left"), "camera: expected a Camera"),
+    ],
+)
+def test_mistakes_are_told_when_they_are_made(change, match):
+    with pytest.raises(ValueError, match=match):
+        change(edit(soft_video()))
+
+
+def test_what_only_the_models_tell_is_told_by_video():
+    all_of = SegmentedSelection((Selection(OBJECT),) * 3)
+    gone = edit(soft_video()).select(all_of).vanish().select_begun(all_of).move((0.1, 0))
+    with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
+        gone.video()
+    some = SegmentedSelection((Selection(np.arange(NUM) < 3),) * 3)
+    with pytest.raises(ValueError, match="Retime it before that edit"):
+        edit(soft_video()).select(all_of).rotate(0.3).select(some).freeze(7, frames=(7, 9)).video()
+
+
+def test_warnings_and_forgotten_ends():
+    with pytest.warns(UserWarning, match="expected radians, got 45") as told:
+        edit(soft_video()).rotate(45).video()
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    assert isinstance(edit(soft_video()), SegmentedEdit)
+    with pytest.raises(AttributeError, match="End the chain with"):
+        edit(soft_video()).frames()
+    with pytest.raises(TypeError, match="colour"):
+        edit(soft_video()).select(colour=(1, 0, 0))
+    assert BACKGROUND not in (DISC, BOX)
