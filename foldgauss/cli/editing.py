@@ -27,7 +27,6 @@ from foldgauss.cli._shared import (
     refuse_existing,
     refuse_huge,
     refuse_input,
-    refuse_segments,
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
