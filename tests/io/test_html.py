@@ -650,7 +650,7 @@ def test_play_goes_over_the_seams(opened):
         """() => {
           const { player } = foldgauss, draw = player.draw;
           window.been = [];
-          player.loop = false;
+          [player.loop, player.speed] = [false, 0.5]; // so that slow pictures do not leave a segment out
           player.draw = function () {
             draw.call(this);
             been.push([this.position, ...this.seen.map((part) => part.number)]);
@@ -731,11 +731,21 @@ def test_the_brush_acts_on_the_segment_seen(opened):
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.page.evaluate("foldgauss.seek(1 / 18)")
     before = page.picture()
+    page.page.evaluate(
+        """() => {
+          const { selection } = foldgauss.player, paint = selection.paint;
+          selection.paint = function (time, ...more) {
+            window.paintedAt = time;
+            paint.call(this, time, ...more);
+          };
+        }"""
+    )
     page.page.mouse.move(*middle)
     page.page.mouse.down()
     page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
     own = page.page.evaluate("foldgauss.player.selection.indices()")
     assert own
+    assert page.page.evaluate("paintedAt") == pytest.approx(1 / 6)  # the segment's own time
     assert page.page.locator("#picked").inner_text() == f"{len(own)} in this segment"
     assert page.page.locator("#follow").inner_text() == "Follow through segment 1 of 5"
     page.page.evaluate("foldgauss.seek(13 / 18)")  # with the brush down: a stroke of its own there
