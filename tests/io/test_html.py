@@ -771,8 +771,15 @@ def test_the_brush_acts_on_the_segment_seen(opened):
     np.testing.assert_array_equal(page.picture(), before)
     page.page.evaluate("foldgauss.seek(13 / 18)")
     assert page.stats["picked"] == len(other)  # undone was the stroke in the segment seen
+    page.page.evaluate("foldgauss.seek(1 / 18)")
+    page.page.mouse.move(*middle)
+    page.page.mouse.down()
+    page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
+    page.page.mouse.up()
+    assert page.stats["picked"]
     page.page.click("#clear")
-    assert page.stats["picked"] == 0
+    page.page.evaluate("foldgauss.seek(13 / 18)")
+    assert page.stats["picked"] == 0  # nowhere
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the brush's own conditioning")
