@@ -56,6 +56,19 @@ class Opened:
         self.page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
         return self
 
+    def until(self, condition):
+        """Wait until an expression holds; here, as the page's policy does not let Playwright's own waiting run."""
+        self.page.evaluate(
+            f"""async () => {{
+              const begun = performance.now();
+              while (!({condition})) {{
+                await new Promise((next) => setTimeout(next, 20));
+                if (performance.now() - begun > 120_000) throw new Error("not yet: " + JSON.stringify(foldgauss.stats));
+              }}
+            }}"""
+        )
+        return self
+
     @property
     def stats(self):
         return self.page.evaluate("foldgauss.stats")

@@ -1,7 +1,9 @@
 """The commands on a model in segments."""
 
+import base64
 import dataclasses
 import json
+import re
 
 import cv2
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from commands import run
 from soft_models import NUM, soft_model
 
+from foldgauss.cli import viewing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.io.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, psnr, times_at
@@ -174,6 +177,23 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
         assert message in told(capsys)
 
 
+def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "long.html"
+    assert run("export", here, "--format", "html", "--original", work / "clip") == 0
+    assert f"long.html: a page of 0.1 MB, {3 * NUM} Gaussians" in told(capsys)
+    page = out.read_text(encoding="utf-8")
+    assert page.count('id="model-') == 3
+    assert page.count('id="frame-') == NUM_FRAMES
+    third = re.search(r'id="frame-2">([^<]*)<', page)[1]
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(third), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    noted = read_video(work / "clip").frames[2 + 2]  # the model's frame 2 is the folder's fourth
+    assert psnr(shown, noted) > 25
+    served = []
+    monkeypatch.setattr(viewing._Server, "serve_forever", lambda server: served.append(server.page.decode()))
+    assert run("view", here, "--no-browser", "--original", work / "clip") == 0
+    assert served == [page.replace(">long<", ">clip<")]  # named after its clip
+
+
 NIGHT = '[[edits]]\ndo = "recolor"\ngain = 0.5\nframes = "4:14"\nease = 3\n'
 
 
@@ -204,8 +224,6 @@ def test_edit_acts_on_all_segments(here, tmp_path, capsys):
     [
         ("compress", "MODEL"),
         ("uncertainty", "MODEL", "clip"),
-        ("export", "MODEL", "--format", "html"),
-        ("view", "MODEL"),
     ],
 )
 def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, capsys):

@@ -18,6 +18,7 @@ from foldgauss.cli._shared import (
     clip_of_model,
     counted,
     draw,
+    err,
     named_after,
     out,
     parse_size,
@@ -26,7 +27,6 @@ from foldgauss.cli._shared import (
     refuse_existing,
     refuse_huge,
     refuse_input,
-    refuse_segments,
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
@@ -157,8 +157,6 @@ def export_command(
         }
         out_path = named_after(model_path, endings.get(file_format, f"-{file_format}"))
     refuse_input(out_path, "model", model_path)
-    if file_format == "html":
-        refuse_segments(model_path)
     if segmented and out_path.suffix and not out_path.is_dir():
         cure = "Each segment becomes a file in it."
         raise WrongUse(str(invalid("--out", expected="a folder without extension", got=out_path, cure=cure)))
@@ -178,7 +176,8 @@ def export_command(
     if file_format == "html":
         check_writable(out_path)
         frames = None if original is None else clip_of_model(model, model_path, original, None)
-        write_html(out_path, model_path, original=frames, quality=original_quality)
+        with err.status("Making the page"):
+            write_html(out_path, model_path, original=frames, quality=original_quality)
         size = out_path.stat().st_size / 1e6
         out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
         return

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from foldgauss._checks import invalid
-from foldgauss.cli._shared import ModelFile, WrongUse, app, clip_of_model, err, out, refuse_segments
+from foldgauss.cli._shared import ModelFile, WrongUse, app, clip_of_model, err, out
 from foldgauss.cli.editing import Original, OriginalQuality
 from foldgauss.io.html import QUALITY, html_page, warn_of_size
 from foldgauss.io.video_model import load_video_model
@@ -28,7 +28,6 @@ def view_command(
 
     The page is served to this machine alone. To keep it: foldgauss export MODEL --format html.
     """
-    refuse_segments(model_path)
     frames = None
     if original is not None:
         frames = clip_of_model(load_video_model(model_path), model_path, original, None)

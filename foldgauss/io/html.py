@@ -1,7 +1,7 @@
 """A model as one page of HTML: a player that draws the folded Gaussians themselves, at any time, in a browser.
 
-The page holds all it needs, the model as a compact file, and asks no network for anything. Its sources are the files in
-`player/`; `compact.js` decodes the model there. See docs/player.md.
+The page holds all it needs, the model as a compact file (of a video in segments one of each), and asks no network for
+anything. Its sources are the files in `player/`; `compact.js` decodes the models there. See docs/player.md.
 """
 
 import base64
@@ -11,7 +11,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 
 from foldgauss._checks import invalid, short_repr, whole
 from foldgauss.io._atomic import atomic_path, checked_path
-from foldgauss.io.compact import is_compact, load_compact_model, packed
+from foldgauss.io.compact import is_compact, packed
 from foldgauss.io.video_file import Clip
 from foldgauss.io.video_model import load_video_model, read_origin
 from foldgauss.video.alpha import BLACK, composited
@@ -42,7 +42,8 @@ _IMPORT = re.compile(r'^import (?:\{[^}]*\}|(?P<text>\w+)) from "\./(?P<name>[\w
 _EVEN = -18.0
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
-Model = VideoModel | EditedVideo | Quantised | str | os.PathLike
+Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantised
+Model = Loaded | str | os.PathLike
 Frames = Clip | UInt8[np.ndarray, "num_frames height width channels"]
 
 
@@ -73,7 +74,9 @@ def write_html(
 def warn_of_size(page: str, has_original: bool) -> None:
     """Say so where a page is larger than browsers like, with the cure."""
     if len(page) > LARGE:
-        cure = "Leave the original out, or lower its quality." if has_original else "Compress the model first."
+        cure = (
+            "Leave the original out, or lower its quality." if has_original else "Compress the model, or show a part."
+        )
         warnings.warn(f"page: {len(page) / 1e6:.0f} MB, which browsers are slow to open. {cure}", stacklevel=3)
 
 
@@ -81,26 +84,26 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
     """The page as text.
 
     `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantised
-    finely: see docs/player.md for how near the picture comes. `original`: the clip's frames, of the model's number and
-    size, shown beside it; as WebP of `quality`, 1 to 100.
+    finely, and so is each segment of a video in segments: see docs/player.md for how near the picture comes.
+    `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
 
-    Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, for a video in
-    segments, and for frames that do not fit; errors of reading as `load_video_model`.
+    Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
+    and for frames that do not fit; errors of reading as `load_video_model`.
 
     Example: `html_page(model, title="holiday")`.
     """
     if not (whole(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
-    data, plain, name = _compact(model)
+    plain, name = _loaded(model)
     pictures = [] if original is None else _pictures(original, plain, quality)
-    return _assembled(data, pictures, name if title is None else title)
+    return _assembled(_model_blocks(model, plain), pictures, name if title is None else title)
 
 
-def notebook_frame(model: VideoModel | EditedVideo) -> str | None:
+def notebook_frame(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
     """The page in a frame of a notebook; None where it would be too large, or there is no page of such a model."""
     try:
-        page = html_page(model, title="foldgauss")
-    except ValueError:
+        page = _assembled(_up_to(_model_blocks(model, model), LARGEST_IN_NOTEBOOK), [], "foldgauss")
+    except (ValueError, OSError):  # the file of a video in segments may be gone
         return None
     if len(page) > LARGEST_IN_NOTEBOOK:
         return None
@@ -113,21 +116,49 @@ def notebook_frame(model: VideoModel | EditedVideo) -> str | None:
 # ----------------------------------------------------------------------------------------------- the model
 
 
-def _compact(model: Model) -> tuple[bytes, VideoModel | EditedVideo | Quantised, str]:
-    """The bytes of a compact file, the model that they are of, and a name for it."""
-    if isinstance(model, Quantised):
-        return packed(model), model, "foldgauss"
+def _loaded(model: Model) -> tuple[Loaded, str]:
+    """The model, and a name for it."""
     if isinstance(model, str | os.PathLike):
         path = checked_path(model, "model")
         name = read_origin(path).get("clip", path.stem)
-        if is_compact(path):
-            return path.read_bytes(), load_compact_model(path), name
-        loaded = load_video_model(path)
-        return packed(_fine(flattened(loaded))), loaded, name
-    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
+        return load_video_model(path), name
+    if not isinstance(model, Loaded):
         cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)
-    return packed(_fine(flattened(model))), model, "foldgauss"
+    return model, "foldgauss"
+
+
+def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
+    """The page's blocks with the model, made one by one: of a compact file its own bytes."""
+    if isinstance(loaded, SegmentedVideo):
+        names = ("first", "num_frames", "num_gaussians")
+        spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
+        yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
+        for number, segment in enumerate(loaded.segments):
+            yield _block(f"model-{number}", packed(_fine(_flattened(number, segment.model))))
+    elif isinstance(model, Quantised):
+        yield _block("model", packed(model))
+    elif loaded is not model and is_compact(model):
+        yield _block("model", Path(model).read_bytes())
+    else:
+        yield _block("model", packed(_fine(flattened(loaded))))
+
+
+def _flattened(number: int, model: VideoModel | EditedVideo) -> VideoModel:
+    try:
+        return flattened(model)
+    except ValueError as error:
+        raise ValueError(f"segment {number}: {error}") from error
+
+
+def _up_to(blocks: Iterable[str], most: float) -> Iterator[str]:
+    """The blocks as long as there is room for them. Raises ValueError at the first that goes beyond."""
+    total = 0
+    for block in blocks:
+        total += len(block)
+        if total > most:
+            raise invalid("model", expected=f"a page of at most {most / 1e6:g} MB", got="a larger one")
+        yield block
 
 
 def _fine(model: VideoModel) -> Quantised:
@@ -161,7 +192,7 @@ _STEPS = {"size": -8.5, "stretch": -8.5, "luma": -8.5, "blue": -8.5, "green": -8
 # -------------------------------------------------------------------------------------------- the original
 
 
-def _pictures(original: Frames, model: VideoModel | EditedVideo | Quantised, quality: int) -> list[bytes]:
+def _pictures(original: Frames, model: Loaded, quality: int) -> list[bytes]:
     """The original's frames as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
     size, num = _size_and_number(model)
@@ -173,7 +204,7 @@ def _pictures(original: Frames, model: VideoModel | EditedVideo | Quantised, qua
     return [_webp(frame, quality) for frame in frames]
 
 
-def _size_and_number(model: VideoModel | EditedVideo | Quantised) -> tuple[tuple[int, int], int]:
+def _size_and_number(model: Loaded) -> tuple[tuple[int, int], int]:
     if isinstance(model, Quantised):
         return tuple(model.facts.size), len(model.intervals) + 1
     return tuple(model.size), model.num_frames
@@ -190,9 +221,9 @@ def _webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> by
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assembled(data: bytes, pictures: Iterable[bytes], title: str) -> str:
+def _assembled(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
     script, style = bundled("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
-    blocks = [_block("model", data), *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
+    blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
     parts = {
         "policy": _policy(script, style),
         "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8

@@ -210,6 +210,10 @@ class SegmentedVideo:
         """Pictures at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
         yield from Playback(self, size, background=background).frames(times)
 
+    def _repr_html_(self) -> str | None:
+        """The player, in a notebook, as of a `VideoModel`; None where its page would be too large."""
+        return VideoModel._repr_html_(self)
+
     def position(self, t: float) -> float:
         """The frame position of time t: 2.5 is half way from frame 2 to frame 3."""
         position = float(min(max(float(t), 0.0), 1.0) * (self.num_frames - 1))

@@ -22,7 +22,7 @@ from foldgauss.io import OutputError, export, html_page, load_video_model, save_
 from foldgauss.io import html as page_module
 from foldgauss.io.html import _fine, bundled
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, edit, fit, layers
+from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, edit, fit, layers
 from foldgauss.video.playback import Playback
 from foldgauss.video.quantise import dequantise
 from foldgauss.video.shots import time_logits
@@ -483,7 +483,7 @@ def test_buttons_have_names_and_themes_change(opened):
 
 def test_nothing_is_drawn_where_nothing_changes(opened):
     page = opened(soft_model()).settle()
-    page.page.wait_for_timeout(400)  # until the first picture has been sharpened
+    page.until("foldgauss.player.quality === 1").settle()  # the first picture has been sharpened
     count = """foldgauss.player.renderer.count = 0; foldgauss.player.draw = new Proxy(foldgauss.player.draw, {
         apply: (draw, own, values) => (own.renderer.count++, Reflect.apply(draw, own, values)) })"""
     page.page.evaluate(f"() => {{ {count} }}")
@@ -525,6 +525,261 @@ def test_the_player_works_in_a_notebooks_frame(browser, tmp_path):
     assert frame.evaluate("foldgauss.stats.total") == NUM
     page.close()
     assert not page.said
+
+
+# ------------------------------------------------------------------------------------------ a clip in segments
+
+SMALL = {"viewport": {"width": 400, "height": 400}}  # quickly drawn
+#: Spans 0:7, 4:10 and 7:12, whose fades meet: between frames 6 and 7 three are seen; 12:16 and 16:19 after cuts.
+FIRSTS, LENGTHS, WHOLE = (0, 4, 7, 12, 16), (7, 6, 5, 4, 3), 19
+
+
+def segmented(**how):
+    parts = [soft_model(seed=k, num_frames=num, options=RenderOptions(), **how) for k, num in enumerate(LENGTHS)]
+    logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5]).astype(np.float32)
+    parts[1] = _with(parts[1], frame_times=FrameTimes(logits))  # of its own, learned times
+    parts[3] = _with(parts[3], frame_times=FrameTimes(time_logits(4, (2,))))  # a cut within it
+    return SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+
+
+def test_a_page_of_segments_has_a_model_of_each(tmp_path):
+    video = segmented()
+    page = html_page(video, title="long")
+    spans = json.loads(_Elements(page).text("script", id="segments"))
+    assert [(span["first"], span["num_frames"]) for span in spans] == list(zip(FIRSTS, LENGTHS, strict=True))
+    assert [span["num_gaussians"] for span in spans] == [NUM] * 5
+    for number, segment in enumerate(video.segments):
+        (tmp_path / "out.fgz").write_bytes(data_of(page, f"model-{number}"))
+        again = Playback(load_video_model(tmp_path / "out.fgz")).frame(0.4)
+        assert np.abs(again - Playback(segment.model).frame(0.4).astype(float)).mean() < 0.5
+    path = save_video_model(tmp_path / "long.safetensors", video, metadata={"clip": "a long clip"})
+    assert html_page(path, title="long") == page
+    assert "<title>a long clip</title>" in html_page(path)
+    plain = html_page(soft_model())
+    assert 'id="segments"' not in plain
+    assert data_of(plain)
+
+
+def test_segments_that_no_page_holds_are_told(monkeypatch):
+    late = SegmentedVideo.of([(0, soft_model()), (5, _late(soft_model()))])
+    with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model holds"):
+        html_page(late)
+    assert late._repr_html_() is None
+    with pytest.raises(ValueError, match=r"original: expected frames uint8 .19, 40, 64, 3."):
+        html_page(segmented(), original=waves(7, *SIZE))
+    video, made = segmented(), []
+    (frame,) = [one for tag, one in _Elements(video._repr_html_()).tags if tag == "iframe"]
+    assert frame["srcdoc"] == html_page(video, title="foldgauss")
+    monkeypatch.setattr(page_module, "packed", lambda model: made.append(model) or bytes(1000))
+    monkeypatch.setattr(page_module, "LARGEST_IN_NOTEBOOK", 3000)
+    assert video._repr_html_() is None
+    assert len(made) == 2  # more have no room
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
+    """Inside, in fades, of three at once, at cuts of both kinds, between frames, to and fro over the seams."""
+    video = segmented(compositing=compositing)
+    page, play = opened(video, **SMALL), Playback(video)
+    many = {len(video.weights(position)) for position in (2, 4, 6.5)}
+    assert many == {1, 2, 3}
+    positions = [0, 2.3, 3.4, 4, 5.25, 6.5, 6.8, 7, 9, 9.6, 10, 11.4, 11.5, 13.4, 13.6, 15, 15.6, 18]
+    if compositing == "sum":
+        positions = [3.4, 6.5, 11.6]
+    for position in (*positions, 1, 17, 5, 6.5, 11.4, 0.5):
+        t = position / (WHOLE - 1)
+        wanted = play.frame(t)
+        assert np.abs(page.picture(t).astype(float) - wanted).mean() < 0.5, position
+    twice = """() => {
+      const one = foldgauss.pixels(64, 40), other = foldgauss.pixels(64, 40);
+      return one.every((value, k) => value === other[k]);
+    }"""
+    page.page.evaluate("foldgauss.seek(6.5 / 18)")
+    assert page.page.evaluate(twice)
+    larger = Playback(video, (60, 100)).frame(5 / 18)
+    assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
+
+
+def test_few_segments_are_held_whatever_the_length(opened):
+    parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
+    video = SegmentedVideo.of(parts)
+    page, play = opened(video, **SMALL), Playback(video)
+    page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
+    page.page.evaluate("foldgauss.player.segments.most = 0")
+    for position, held in ((27, [3, 4, 5]), (51, [0, 7, 8]), (0, [0, 1, 2]), (30, [3, 4, 5, 6]), (15, [1, 2, 3])):
+        t = position / (video.num_frames - 1)
+        assert np.abs(page.picture(t).astype(float) - play.frame(t)).mean() < 0.5
+        page.until(f"foldgauss.stats.decoded.join() === '{','.join(map(str, held))}'")
+        assert page.stats["textures"] <= 4
+        assert page.stats["total"] == 9 * NUM
+
+
+def test_controls_work_on_the_whole_clip(opened):
+    clip = np.zeros((WHOLE, *SIZE, 3), np.uint8)
+    clip[..., 1] = 12 * np.arange(WHOLE)[:, None, None]
+    page = opened(segmented(), original=clip, **SMALL)
+    keyboard, text = page.page.keyboard, page.page.locator
+    page.until("foldgauss.stats.decoded.length === 5")
+    assert "19 frames in 5 segments" in text("#facts").inner_text()
+    assert text("#whole").inner_text() == "/ 0:00.72"
+    assert f"{NUM} of {5 * NUM} Gaussians" in text("#stats").inner_text()
+    keyboard.press("End")
+    assert (page.stats["position"], page.stats["time"]) == (18, 1)
+    for _ in range(7):
+        keyboard.press(",")
+    assert (page.stats["position"], page.stats["segment"]) == (11, 2)
+    assert page.stats["time"] == pytest.approx(11 / 18)
+    keyboard.press(".")
+    assert page.stats["segment"] == 3  # at the cut
+    assert text("#now").inner_text() == "0:00.48"
+    page.page.locator("#scrub").fill("5")
+    assert (page.stats["position"], page.stats["segment"]) == (5, 0)
+    page.settle()
+    assert f"{2 * NUM} of {5 * NUM} Gaussians" in text("#stats").inner_text()  # two are seen
+    keyboard.press("2")
+    page.page.locator("#scrub").fill("14.2")
+    page.until("foldgauss.player.originals.pictures.has(14)")
+    page.settle()
+    shot = cv2.imdecode(np.frombuffer(page.page.locator("#canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert abs(int(shot[shot.shape[0] // 2, shot.shape[1] // 2, 1]) - 12 * 14) <= 4
+
+
+def test_play_goes_over_the_seams(opened):
+    page = opened(segmented(), **SMALL)
+    page.page.evaluate(
+        """() => {
+          const { player } = foldgauss, draw = player.draw;
+          window.been = [];
+          [player.loop, player.speed] = [false, 0.5]; // so that slow pictures do not leave a segment out
+          player.draw = function () {
+            draw.call(this);
+            been.push([this.position, ...this.seen.map((part) => part.number)]);
+          };
+          player.play();
+        }"""
+    )
+    page.until("!foldgauss.stats.playing")
+    been = page.page.evaluate("been")
+    positions = [own[0] for own in been]
+    assert positions == sorted(positions)
+    assert positions[-1] == WHOLE - 1
+    assert {number for own in been for number in own[1:]} == set(range(5))
+
+
+#: Segments come when the test lets them.
+_HELD_BACK = """() => {
+  const { decoder, held } = foldgauss.player.segments, decode = decoder.decode.bind(decoder);
+  window.bring = {};
+  decoder.decode = (number) => new Promise((resolve) => (bring[number] = () => resolve(decode(number, () => {}))));
+  for (const number of [...held.keys()]) if (number) held.delete(number);
+}"""
+
+
+def test_play_waits_for_a_segment_that_is_not_decoded(opened):
+    video = segmented()
+    page, play = opened(video, **SMALL), Playback(video)
+    page.until("foldgauss.stats.decoded.length === 5")
+    page.page.evaluate(_HELD_BACK)
+    page.page.evaluate("foldgauss.seek(2 / 18)")
+    before = page.picture()
+    page.page.evaluate("void (sought = foldgauss.seek(12 / 18))")
+    assert (page.stats["missing"], page.stats["segment"]) == (3, 0)
+    page.page.get_by_text("Decoding segment 4").wait_for()
+    with pytest.raises(Exception, match="still being decoded"):
+        page.picture()
+    page.page.evaluate("foldgauss.player.play()")
+    page.settle()
+    assert (page.stats["position"], page.stats["playing"]) == (12, True)  # it waits there
+    again = page.page.evaluate("foldgauss.player.seen.map((part) => [part.number, part.time])")
+    assert again == [[0, pytest.approx(2 / 6)]]  # what was seen stays
+    page.page.evaluate("foldgauss.player.pause()")
+    page.page.evaluate("bring[3]()")
+    page.page.evaluate("sought")
+    page.page.locator("#toast").wait_for(state="hidden")
+    assert np.abs(page.picture().astype(float) - play.frame(12 / 18)).mean() < 0.5
+    assert np.abs(page.picture().astype(float) - before).mean() > 2
+    page.page.evaluate("void (sought = foldgauss.seek(5.5 / 18))")
+    page.page.evaluate("bring[1]()")
+    page.page.evaluate("sought")
+    assert np.abs(page.picture().astype(float) - play.frame(5.5 / 18)).mean() < 0.5
+
+
+def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
+    path = write_html(tmp_path / "page.html", segmented())
+    text = path.read_text(encoding="utf-8")
+    good = base64.b64encode(data_of(text, "model-3")).decode()
+    path.write_text(text.replace(good, good[:60] + good[60:-40][::-1] + good[-40:]), encoding="utf-8")
+    page = Opened(browser, path).ready()
+    page.page.locator("#notice").wait_for()
+    told = page.page.locator("#notice-text").inner_text()
+    assert told
+    with pytest.raises(Exception, match=re.escape(told[:30])):
+        page.page.evaluate("foldgauss.seek(13 / 18)")
+    page.page.keyboard.press("Space")
+    page.settle()
+    page.close()
+    assert not page.said
+
+
+def test_the_brush_acts_on_the_segment_seen(opened):
+    video = segmented()
+    page = opened(video)
+    page.until("foldgauss.stats.decoded.length === 5")
+    page.page.evaluate("foldgauss.player.segments.most = 0")
+    page.page.keyboard.press("b")
+    box = page.page.locator("#canvas").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.page.evaluate("foldgauss.seek(1 / 18)")
+    before = page.picture()
+    page.page.evaluate(
+        """() => {
+          const { selection } = foldgauss.player, paint = selection.paint;
+          selection.paint = function (time, ...more) {
+            window.paintedAt = time;
+            paint.call(this, time, ...more);
+          };
+        }"""
+    )
+    page.page.mouse.move(*middle)
+    page.page.mouse.down()
+    page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
+    own = page.page.evaluate("foldgauss.player.selection.indices()")
+    assert own
+    assert page.page.evaluate("paintedAt") == pytest.approx(1 / 6)  # the segment's own time
+    assert page.page.locator("#picked").inner_text() == f"{len(own)} in this segment"
+    assert page.page.locator("#follow").inner_text() == "Follow through segment 1 of 5"
+    page.page.evaluate("foldgauss.seek(13 / 18)")  # with the brush down: a stroke of its own there
+    assert page.stats["picked"] == 0
+    page.page.mouse.move(middle[0] + 60, middle[1] + 30, steps=3)
+    page.page.mouse.up()
+    other = page.page.evaluate("foldgauss.player.selection.indices()")
+    assert other
+    page.page.click("#vanish")
+
+    def without(number, gone):
+        model = video.segments[number].model
+        left = np.ones(NUM, bool)
+        left[gone] = False
+        return Playback(edit(model).select(~left).vanish().video())
+
+    times = np.asarray(video.segments[3].model.frame_times.times())
+    assert np.abs(page.picture(13 / 18).astype(float) - without(3, other).frame(float(times[1]))).mean() < 0.5
+    page.page.evaluate("foldgauss.seek(18 / 18)")
+    page.until("foldgauss.stats.missing === undefined")
+    assert np.abs(page.picture(1 / 18).astype(float) - without(0, own).frame(1 / 6)).mean() < 0.5  # it was kept
+    page.page.keyboard.press("z")
+    np.testing.assert_array_equal(page.picture(), before)
+    page.page.evaluate("foldgauss.seek(13 / 18)")
+    assert page.stats["picked"] == len(other)  # undone was the stroke in the segment seen
+    page.page.evaluate("foldgauss.seek(1 / 18)")
+    page.page.mouse.move(*middle)
+    page.page.mouse.down()
+    page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
+    page.page.mouse.up()
+    assert page.stats["picked"]
+    page.page.click("#clear")
+    page.page.evaluate("foldgauss.seek(13 / 18)")
+    assert page.stats["picked"] == 0  # nowhere
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the brush's own conditioning")

@@ -405,7 +405,7 @@ def test_frames_go_out_as_they_are_played(tmp_path):
     assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
 
 
-def test_there_is_no_page_yet(work):
+def test_a_page_that_cannot_be_says_of_which_segment(work):
     for model in (work / "long.safetensors", load_video_model(work / "long.safetensors")):
-        with pytest.raises(ValueError, match="model: expected a model of one piece, got one of 3 segments"):
+        with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model holds"):
             html_page(model)

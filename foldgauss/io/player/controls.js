@@ -66,9 +66,10 @@ export class Controls {
   }
 
   describe() {
-    const { model, timeline } = this.player, [height, width] = model.header.size, { length } = element("model").textContent;
-    const bytes = (length * 3) / 4, size = bytes < 1e6 ? `${Math.round(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
-    put("facts", `${width} × ${height} · ${timeline.last + 1} frames · ${size}`);
+    const { model, timeline, segments } = this.player, [height, width] = model.header.size, bytes = segments.decoder.numBytes;
+    const size = bytes < 1e6 ? `${Math.round(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+    const parts = segments.spans.length > 1 ? ` in ${segments.spans.length} segments` : "";
+    put("facts", `${width} × ${height} · ${timeline.last + 1} frames${parts} · ${size}`);
     element("scrub").max = timeline.last;
     for (const one of document.querySelectorAll(".with-original")) one.hidden = !this.player.hasOriginal;
     element("modes").hidden = !this.player.hasOriginal;
@@ -92,7 +93,7 @@ export class Controls {
     const number = (value) => value.toLocaleString("en");
     const rate = playing && player.rate > 2 ? ` · ${player.rate} fps` : "";
     if (!playing || this.toldAt !== Math.floor(performance.now() / 250))
-      put("stats", `${number(player.alive)} of ${number(player.model.num)} Gaussians${rate}`);
+      put("stats", `${number(player.alive)} of ${number(player.segments.total)} Gaussians${rate}`);
     this.toldAt = Math.floor(performance.now() / 250);
     put("zoom", player.view.isReset ? "" : `${player.view.zoom.toFixed(1)}×`);
     element("stage").classList.toggle("zoomed", !player.view.isReset);
@@ -100,12 +101,15 @@ export class Controls {
     for (const button of element("modes").children)
       button.setAttribute("aria-pressed", String(button.dataset.mode === player.mode));
     this.updatePanel(edit, selection.count, number);
+    this.updateMissing(player.segments.missing);
     this.updateOverlays();
   }
 
   updatePanel(edit, count, number) {
     element("panel").hidden = !this.player.brushing;
-    put("picked", count ? `${number(count)} picked` : "Paint over something");
+    const { segments, lead } = this.player, { length } = segments.spans;
+    put("picked", count ? `${number(count)} ${length > 1 ? "in this segment" : "picked"}` : "Paint over something");
+    if (!this.following) put("follow", `Follow through ${length > 1 ? `segment ${lead.number + 1} of ${length}` : "the clip"}`);
     press("pick", !this.erasing);
     press("erase", this.erasing);
     press("vanish", edit.vanish);
@@ -120,6 +124,15 @@ export class Controls {
     put("scale-told", `${edit.scale.toFixed(2)}×`);
     put("copies-told", String(edit.copies));
     put("offset-told", edit.offset.toFixed(2));
+  }
+
+  /** Say so where one waits for a segment. */
+  updateMissing(missing) {
+    if (missing === this.missing) return;
+    if (this.missing !== undefined) element("toast").hidden = true;
+    this.missing = missing;
+    clearTimeout(this.soon);
+    if (missing !== undefined) this.soon = setTimeout(() => this.toast(`Decoding segment ${missing + 1}`, 60_000), 200);
   }
 
   /** Captions and the divider, where the pictures are. */
@@ -144,11 +157,11 @@ export class Controls {
     divider.setAttribute("aria-valuenow", String(Math.round(100 * player.split)));
   }
 
-  toast(text) {
+  toast(text, milliseconds = 2600) {
     put("toast", text);
     element("toast").hidden = false;
     clearTimeout(this.hiding);
-    this.hiding = setTimeout(() => (element("toast").hidden = true), 2600);
+    this.hiding = setTimeout(() => (element("toast").hidden = true), milliseconds);
   }
 
   // --------------------------------------------------------------------------------------------------- buttons
@@ -282,26 +295,26 @@ export class Controls {
 
   async follow() {
     if (this.following) return;
-    const { player } = this, before = player.selection.count;
+    const { player } = this;
+    let more = 0;
     this.following = true;
     player.onChange();
     try {
-      await player.selection.follow(player.time, player.timeline.times, async (share) => {
+      more = await player.follow(async (share) => {
         put("follow", `Following ${Math.round(100 * share)} %`);
         await new Promise((next) => setTimeout(next));
       });
     } finally {
       this.following = false;
-      put("follow", "Follow through the clip");
     }
-    this.toast(`${(player.selection.count - before).toLocaleString("en")} more Gaussians belong to it`);
+    this.toast(`${more.toLocaleString("en")} more Gaussians belong to it`);
     player.changed();
   }
 
   /** The numbers of those picked, for Python. */
   async copy() {
-    const { selection, model } = this.player;
-    const text = JSON.stringify({ num_gaussians: model.num, indices: selection.indices() });
+    const { selection, model, segments, lead } = this.player, which = segments.spans.length > 1 ? { segment: lead.number } : {};
+    const text = JSON.stringify({ ...which, num_gaussians: model.num, indices: selection.indices() });
     try {
       await navigator.clipboard.writeText(text);
       this.toast("Copied. See docs/player.md for how to use it in Python.");
@@ -343,7 +356,7 @@ export class Controls {
     this.pointers.set(event.pointerId, { x, y });
     this.travelled = this.pointers.size > 1 ? Infinity : 0;
     if (this.player.brushing && this.pointers.size === 1) {
-      this.player.selection.begin();
+      this.player.beginStroke();
       this.paint(event);
     }
   }
@@ -379,7 +392,7 @@ export class Controls {
     if (!this.pointers.delete(event.pointerId)) return;
     element("stage").classList.remove("moving");
     const { player } = this;
-    if (player.brushing && player.selection.strokes.at(-1)?.length === 0) player.selection.strokes.pop();
+    player.endStroke();
     if (event.type === "pointerup" && !player.brushing && this.travelled < CLICK) player.toggle();
     player.changed();
   }

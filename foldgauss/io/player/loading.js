@@ -13,7 +13,7 @@ function bytesOf(text) {
   return bytes;
 }
 
-/** The worker's side: one message with the file's text, answers with the share done, then the model or an error. */
+/** The worker's side: messages with a file's text, answers with the share done, then the model or an error. */
 export function serve(scope) {
   scope.onmessage = ({ data }) => {
     try {
@@ -25,34 +25,57 @@ export function serve(scope) {
   };
 }
 
-/** The page's model, decoded; `onShare` is told how far that has come. */
-export function load(onShare) {
-  const text = document.getElementById("model").textContent;
-  return new Promise((resolve, reject) => {
-    const here = () => {
+/** The segments' spans, of a page that has more models than one. */
+export function spansOfPage() {
+  return JSON.parse(document.getElementById("segments")?.textContent ?? "null");
+}
+
+function started() {
+  const script = new Blob([document.getElementById("player").textContent], { type: "text/javascript" });
+  return new Worker(URL.createObjectURL(script));
+}
+
+/** Decodes the page's models, one at a time. */
+export class Decoder {
+  constructor() {
+    this.blocks = [...document.querySelectorAll('script[id^="model"]')]; // in the clip's order
+  }
+
+  /** Of all models, as they are in the page. */
+  get numBytes() {
+    return this.blocks.reduce((sum, { textContent }) => sum + (textContent.length * 3) / 4, 0);
+  }
+
+  /** A model, decoded; `onShare` is told how far that has come. */
+  decode(number, onShare) {
+    const text = this.blocks[number].textContent;
+    return new Promise((resolve, reject) => {
+      const here = () => {
+        this.stop();
+        try {
+          resolve(prepared(bytesOf(text).buffer, onShare));
+        } catch (error) {
+          reject(error);
+        }
+      };
       try {
-        resolve(prepared(bytesOf(text).buffer, onShare));
-      } catch (error) {
-        reject(error);
+        this.worker ??= started();
+      } catch {
+        setTimeout(here);
+        return;
       }
-    };
-    let worker;
-    try {
-      const script = new Blob([document.getElementById("player").textContent], { type: "text/javascript" });
-      worker = new Worker(URL.createObjectURL(script));
-    } catch {
-      setTimeout(here);
-      return;
-    }
-    worker.onerror = () => {
-      worker.terminate();
-      here();
-    };
-    worker.onmessage = ({ data }) => {
-      if ("share" in data) return onShare(data.share);
-      worker.terminate();
-      return data.error ? reject(new Error(data.error)) : resolve(data.model);
-    };
-    worker.postMessage(text);
-  });
+      this.worker.onerror = here;
+      this.worker.onmessage = ({ data }) => {
+        if ("share" in data) return onShare(data.share);
+        return data.error ? reject(new Error(data.error)) : resolve(data.model);
+      };
+      this.worker.postMessage(text);
+    });
+  }
+
+  /** Leave what is being decoded: its promise is never kept. */
+  stop() {
+    this.worker?.terminate();
+    this.worker = null;
+  }
 }

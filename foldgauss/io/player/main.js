@@ -1,9 +1,10 @@
 // The page's beginning: as a worker, decode; as a page, decode in a worker, then play.
 import { element } from "./elements.js";
 import { Controls } from "./controls.js";
-import { load, serve } from "./loading.js";
+import { Decoder, serve, spansOfPage } from "./loading.js";
 import { Player } from "./player.js";
 import { Renderer } from "./renderer.js";
+import { Segments } from "./segments.js";
 
 /** Tell people in place of the picture; `share` of 0 to 1 as a bar. */
 function tell(text, share) {
@@ -34,8 +35,10 @@ function hooks(player) {
     get stats() {
       const { alive, rate, position, time, playing, speed, loop, mode, edit, view, brushing } = player;
       const picked = player.selection.count, zoom = view.zoom, [height, width] = player.model.header.size;
-      const total = player.model.num, numFrames = player.timeline.last + 1;
-      const about = { total, numFrames, width, height, loadSeconds: player.loadSeconds };
+      const { segments } = player, { total } = segments, numFrames = player.timeline.last + 1;
+      const decoded = [...segments.held.keys()].sort((a, b) => a - b), textures = player.renderer.held.size;
+      const parts = { segment: player.lead.number, segments: segments.spans.length, decoded, textures, missing: segments.missing };
+      const about = { total, numFrames, width, height, loadSeconds: player.loadSeconds, ...parts };
       return { alive, rate, position, time, playing, speed, loop, mode, edit: { ...edit }, picked, zoom, brushing, ...about };
     },
   };
@@ -46,18 +49,24 @@ let failed = false; // what is told then stays, though a worker may still be dec
 async function start() {
   const canvas = element("canvas");
   tell("Decoding", 0);
-  const loading = load((share) => failed || tell("Decoding", share));
+  const decoder = new Decoder();
+  const loading = decoder.decode(0, (share) => failed || tell("Decoding", share));
   const renderer = new Renderer(canvas); // its programs are compiled meanwhile
-  const model = await loading;
+  const segments = new Segments(await loading, spansOfPage(), decoder);
   let controls;
-  const player = new Player(canvas, renderer, model, () => controls?.update());
+  const player = new Player(canvas, renderer, segments, () => controls?.update());
   controls = new Controls(player);
   survive(canvas, player);
+  segments.onError = (error) => {
+    player.pause();
+    tell(error.message);
+  };
   tell("");
   player.loadSeconds = performance.now() / 1000;
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches && player.timeline.last > 0) player.play();
   else player.changed();
   setTimeout(() => !player.playing && player.pause(), 150); // the first picture has the model's own pixels, to be there soon
+  requestAnimationFrame(() => requestAnimationFrame(() => segments.begin()));
   window.foldgauss.player = player;
   Object.defineProperties(window.foldgauss, Object.getOwnPropertyDescriptors(hooks(player)));
 }

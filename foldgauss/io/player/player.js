@@ -1,8 +1,6 @@
 // The player: what time it is, what is shown of it and how, and when to draw.
 import { Originals } from "./originals.js";
 import { WHAT } from "./renderer.js";
-import { Selection } from "./selection.js";
-import { Timeline } from "./timeline.js";
 import { View, common } from "./view.js";
 
 export const SPEEDS = [1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2];
@@ -14,35 +12,56 @@ const SLOW = 1 / 27, FAST = 1 / 50; // seconds a picture: draw fewer pixels, mor
 const UNCHANGED = { vanish: false, front: null, scale: 1, copies: 1, offset: 0.2 };
 
 export class Player {
-  constructor(canvas, renderer, model, onChange) {
+  constructor(canvas, renderer, segments, onChange) {
     this.canvas = canvas;
-    this.model = model;
+    this.segments = segments;
     this.onChange = onChange;
-    this.timeline = new Timeline(model.times, model.header.fps);
-    this.view = new View(model.header.size);
-    this.selection = new Selection(model);
+    this.timeline = segments.timeline;
     this.renderer = renderer;
-    renderer.take(model);
+    this.goTo(0);
+    this.view = new View(this.model.header.size);
+    renderer.check(this.model);
+    segments.check = (model) => renderer.check(model);
+    segments.onReady = () => {
+      this.goTo(this.position);
+      this.changed();
+    };
     this.originals = new Originals(() => this.invalidate());
-    Object.assign(this, { position: 0, time: this.timeline.timeAt(0), playing: false, speed: 1, loop: true });
+    Object.assign(this, { playing: false, speed: 1, loop: true });
     Object.assign(this, { mode: "model", split: 0.5, background: [0, 0, 0], brushing: false, edit: { ...UNCHANGED } });
     Object.assign(this, { quality: 0.1, alive: 0, drawn: [], waiting: false, before: 0, pace: 0 });
   }
 
   // ---------------------------------------------------------------------------------------------- time
 
+  /** Be at a position; what was seen before stays until that is decoded. */
+  goTo(position) {
+    this.position = position;
+    this.time = this.timeline.timeAt(position);
+    this.segments.goTo(position);
+    this.seen = this.segments.parts() ?? this.seen;
+    this.lead = this.seen.reduce((one, other) => (other.weight > one.weight ? other : one));
+  }
+
   /** Go to a position, in frames; between frames is the model's own in-between time. */
   seekPosition(position) {
-    this.position = Math.min(Math.max(position, 0), this.timeline.last);
-    this.time = this.timeline.timeAt(this.position);
+    this.goTo(Math.min(Math.max(position, 0), this.timeline.last));
     this.changed();
   }
 
-  /** Go to a time of the model, 0 to 1. */
+  /** Go to a time of the clip, 0 to 1; fulfilled when what is seen then is decoded. */
   seek(time) {
-    this.position = this.timeline.positionOf(time);
-    this.time = this.timeline.outOfCuts(time);
-    this.changed();
+    this.seekPosition(this.segments.positionOf(time));
+    return this.segments.ready();
+  }
+
+  /** Of the segment that is seen most: its model, and what is picked of it. */
+  get model() {
+    return this.lead.model;
+  }
+
+  get selection() {
+    return this.lead.selection;
   }
 
   step(frames) {
@@ -72,14 +91,17 @@ export class Player {
     const passed = this.before ? Math.min((now - this.before) / 1000, 0.25) : 0, { last } = this.timeline;
     this.before = now;
     this.adapt(passed);
+    if (this.segments.missing !== undefined) return; // it goes on when that is decoded
     const next = this.position + passed * this.timeline.fps * this.speed, rest = this.rest ?? 0;
-    if (next <= last) [this.position, this.rest] = [next, 0];
-    else if (!this.loop) {
+    let to = next;
+    this.rest = 0;
+    if (next > last && !this.loop) {
       this.pause();
       return this.seekPosition(last);
-    } else if (rest + next - last < 1) [this.position, this.rest] = [last, rest + next - last]; // the last frame's own time
-    else [this.position, this.rest] = [0, 0];
-    this.time = this.timeline.timeAt(this.position);
+    }
+    if (next > last && rest + next - last < 1) [to, this.rest] = [last, rest + next - last]; // the last frame's own time
+    else if (next > last) to = 0;
+    this.goTo(to);
   }
 
   /** Fewer pixels where pictures come slowly, down to the model's own; all of them where there is time, or a pause. */
@@ -105,6 +127,7 @@ export class Player {
       this.waiting = false;
       if (this.playing) this.advance(now);
       this.draw();
+      if (this.playing && this.segments.next) this.renderer.take(this.segments.next); // before it is to be drawn
       this.drawn = [...this.drawn.filter((own) => now - own < 1000), now];
       this.onChange();
       if (this.playing) this.invalidate();
@@ -161,11 +184,15 @@ export class Player {
   }
 
   drawTo(target) {
-    const { list, alive } = this.selection.instances(this.time, { ...this.edit, front: this.inFront });
-    const { scale, offset } = this.edit, pivot = this.selection.middle(this.time);
-    const highlight = this.brushing ? 0.65 : 0;
-    this.alive = alive;
-    this.renderer.draw(list, this.time, target, { scale, pivot, shift: [offset, 0], highlight, tint: TINT });
+    const { scale, offset } = this.edit, highlight = this.brushing ? 0.65 : 0;
+    this.alive = 0;
+    const parts = this.seen.map(({ model, selection, time, weight }) => {
+      const { list, alive } = selection.instances(time, { ...this.edit, front: this.inFront });
+      const edit = { scale, pivot: selection.middle(time), shift: [offset, 0], highlight, tint: TINT };
+      this.alive += alive;
+      return { model, instances: list, time, weight, edit };
+    });
+    this.renderer.draw(parts, target);
   }
 
   /** Put one part on the screen. */
@@ -189,6 +216,7 @@ export class Player {
 
   /** The picture of this time as the engines of foldgauss draw it, width x height: red, green, blue, 255. */
   pixels(width, height) {
+    if (this.segments.missing !== undefined) throw new Error("This time is still being decoded: await seek(t) first.");
     const [rows, columns] = this.model.header.size, aspect = rows / columns;
     const unit = Math.max(height / Math.min(1, aspect), width / Math.min(1, 1 / aspect));
     const lowPass = this.model.header.options.low_pass;
@@ -203,10 +231,25 @@ export class Player {
 
   // ------------------------------------------------------------------------------------------ the brush
 
+  beginStroke() {
+    this.stroke = this.selection;
+    this.stroke.begin();
+  }
+
+  endStroke() {
+    if (this.stroke?.strokes.at(-1)?.length === 0) this.stroke.strokes.pop();
+    this.stroke = null;
+  }
+
   /** Pick under the brush: a point of the screen and a radius, device pixels. */
   paint(x, y, radius, erase) {
+    if (this.segments.missing !== undefined) return; // what is shown is of another time
+    if (this.stroke !== this.selection) { // another segment has come: a stroke of its own
+      this.endStroke();
+      this.beginStroke();
+    }
     const pane = this.view.paneAt(x, y, this.numPanes), [atX, atY, unit] = this.view.toModel(x, y, pane);
-    this.selection.paint(this.time, atX, atY, radius / unit, erase, this.edit.vanish);
+    this.selection.paint(this.lead.time, atX, atY, radius / unit, erase, this.edit.vanish);
     this.changed();
   }
 
@@ -215,8 +258,15 @@ export class Player {
   }
 
   resetEdit() {
-    this.selection.clear();
+    this.segments.clear();
     this.edit = { ...UNCHANGED };
     this.changed();
+  }
+
+  /** Find those picked at all frames of their segment; returns how many more there are. */
+  async follow(onShare) {
+    const { selection, time, timeline } = this.lead, before = selection.count;
+    await selection.follow(time, timeline.times, onShare);
+    return selection.count - before;
   }
 }

@@ -4,9 +4,13 @@ import splatVertex from "./splat.vert.glsl";
 import splatFragment from "./splat.frag.glsl";
 import showVertex from "./show.vert.glsl";
 import showFragment from "./show.frag.glsl";
+import mixFragment from "./mix.frag.glsl";
 
 export const WHAT = { model: 0, original: 1, difference: 2 };
 const NO_BOUND = 1e30;
+const ALL_OF_IT = [0, 0, 1, 1], UPRIGHT = [0, 1, 1, -1]; // a target, whose rows go up, filled
+/** Models on the graphics card at once: those of a fade, and the next. */
+const HELD = 4;
 
 function compiled(gl, kind, source) {
   const shader = gl.createShader(kind);
@@ -77,7 +81,10 @@ export class Renderer {
     const half = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.splat = program(gl, splatVertex, splatFragment);
     this.show = program(gl, showVertex, showFragment);
+    this.blend = program(gl, showVertex, mixFragment);
     this.drawn = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
+    this.mixed = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
+    this.result = this.drawn; // which of them is shown
     this.bytes = new Target(gl, gl.RGBA8);
     this.original = texture(gl, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
@@ -90,26 +97,70 @@ export class Renderer {
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
     gl.disable(gl.DITHER);
-    if (this.model) this.take(this.model);
+    this.held = new Map(); // models' textures, in the order of their last use
   }
 
-  /** The Gaussians that are to be drawn. */
-  take(model) {
+  /** Throw an Error with a text for people where a model is too large. */
+  check(model) {
     const { gl } = this;
-    this.model = model;
-    if (model.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE))
+    if (model.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE) && !gl.isContextLost())
       throw new Error(`This graphics card has no room for ${model.num.toLocaleString("en")} Gaussians.`);
-    this.gaussians = texture(gl, gl.NEAREST);
-    const size = [TEXTURE_WIDTH, model.rows];
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ...size, 0, gl.RGBA, gl.FLOAT, model.values);
+  }
+
+  /** A model's Gaussians on the graphics card: the texture of one of the few used last. */
+  take(model) {
+    const { gl, held } = this, found = held.get(model);
+    held.delete(model);
+    if (!found)
+      for (const [old, own] of held) {
+        if (held.size < HELD) break;
+        held.delete(old);
+        gl.deleteTexture(own);
+      }
+    const made = found ?? texture(gl, gl.NEAREST), size = [TEXTURE_WIDTH, model.rows];
+    if (!found) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ...size, 0, gl.RGBA, gl.FLOAT, model.values);
+    held.set(model, made);
+    return made;
+  }
+
+  /** Draw parts, see `drawOne`, each with its `weight`, into one picture: their weighted sum. */
+  draw(parts, target) {
+    const many = parts.length > 1;
+    parts.forEach((part, k) => {
+      this.drawOne(part, target);
+      if (many) this.mix(part.weight, k === 0);
+    });
+    this.result = many ? this.mixed : this.drawn;
+    this.compositing = parts[0].model.header.compositing;
+  }
+
+  /** Add what was drawn to the sum. */
+  mix(weight, begin) {
+    const { gl, drawn, blend: { made, at } } = this;
+    this.mixed.bind(drawn.width, drawn.height);
+    gl.clearColor(0, 0, 0, 0);
+    if (begin) gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.useProgram(made);
+    gl.bindVertexArray(null);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, drawn.texture);
+    gl.uniform1i(at.drawn, 0);
+    gl.uniform1f(at.weight, weight);
+    gl.uniform4fv(at.onScreen, UPRIGHT);
+    gl.uniform4fv(at.inTarget, ALL_OF_IT);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE);
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    gl.disable(gl.BLEND);
   }
 
   /**
-   * Draw the Gaussians listed, front to back, at a time into a picture of width x height pixels. `frame` says where the
-   * model's frame is in it: `unit`, pixels per unit, and `origin`, its centre; `lowPass` in px^2.
+   * Draw a model's Gaussians listed, front to back, at a time into a picture of width x height pixels. The target says
+   * where the model's frame is in it: `unit`, pixels per unit, and `origin`, its centre; `lowPass` in px^2.
    */
-  draw(instances, time, { width, height, unit, origin, lowPass }, edit) {
-    const { gl, model, splat: { made, at } } = this, { header } = model, { options } = header;
+  drawOne({ model, instances, time, edit }, { width, height, unit, origin, lowPass }) {
+    const { gl, splat: { made, at } } = this, { header } = model, { options } = header;
+    const gaussians = this.take(model);
     this.drawn.bind(width, height);
     gl.disable(gl.SCISSOR_TEST);
     gl.clearColor(0, 0, 0, 1); // the light that is left, in place of alpha
@@ -120,7 +171,7 @@ export class Renderer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.instances);
     gl.bufferData(gl.ARRAY_BUFFER, instances, gl.STREAM_DRAW);
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.gaussians);
+    gl.bindTexture(gl.TEXTURE_2D, gaussians);
     gl.uniform1i(at.gaussians, 0);
     gl.uniform1i(at.texels, model.texels);
     gl.uniform1i(at.degree, model.degree);
@@ -168,18 +219,18 @@ export class Renderer {
 
   /** Show a part of what was drawn, or of the original. Rectangles are (left, top, width, height), in shares. */
   put(what, onScreen, inPicture, inTarget, background, gain = 4) {
-    const { gl, show: { made, at }, model } = this;
+    const { gl, show: { made, at } } = this;
     gl.useProgram(made);
     gl.bindVertexArray(null);
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.drawn.texture);
+    gl.bindTexture(gl.TEXTURE_2D, this.result.texture);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.original);
     gl.uniform1i(at.drawn, 0);
     gl.uniform1i(at.original, 1);
     gl.uniform1i(at.what, what);
     gl.uniform1f(at.gain, gain);
-    gl.uniform3fv(at.background, model.header.compositing === "sum" ? [0, 0, 0] : background);
+    gl.uniform3fv(at.background, this.compositing === "sum" ? [0, 0, 0] : background);
     gl.uniform4fv(at.onScreen, onScreen);
     gl.uniform4fv(at.inPicture, inPicture);
     gl.uniform4fv(at.inTarget, inTarget);
@@ -188,9 +239,9 @@ export class Renderer {
 
   /** What was drawn, as bytes: red, green, blue, 255, the top row first. */
   read(background) {
-    const { gl, drawn: { width, height } } = this, whole = [0, 0, 1, 1], bytes = new Uint8Array(4 * width * height);
+    const { gl, result: { width, height } } = this, bytes = new Uint8Array(4 * width * height);
     this.bytes.bind(width, height);
-    this.put(WHAT.model, [0, 1, 1, -1], whole, whole, background);
+    this.put(WHAT.model, UPRIGHT, ALL_OF_IT, ALL_OF_IT, background);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     return bytes;
   }

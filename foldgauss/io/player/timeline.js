@@ -50,10 +50,4 @@ export class Timeline {
     const span = this.times[high] - this.times[low];
     return low + (span > 0 ? Math.min(Math.max((time - this.times[low]) / span, 0), 1) : 0);
   }
-
-  /** The time itself, or where it lies between two shots that of the nearer frame. */
-  outOfCuts(time) {
-    const position = this.positionOf(time), k = Math.min(Math.floor(position), this.last - 1);
-    return this.last === 0 || this.isCut[k] ? this.timeAt(position) : time;
-  }
 }
