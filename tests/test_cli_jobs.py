@@ -1,18 +1,22 @@
 """Long clips in segments and many clips at once, by the command."""
 
 import dataclasses
+import io
 import json
 import os
 import shutil
 import signal
+import sys
 
 import numpy as np
 import pytest
 from commands import run
+from rich.console import Console
 
 import foldgauss.jobs.fitting as fitting
-from foldgauss.cli import _jobs_view
+from foldgauss.cli import _jobs_view, many
 from foldgauss.io import load_video_model, read_video, write_image, write_video
+from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -126,6 +130,56 @@ def test_begun_anew_and_left_alone(long_clip, whole, tmp_path, capsys):
     assert target.read_bytes() == whole.read_bytes()
 
 
+def stopped(monkeypatch, where, *words):
+    with monkeypatch.context() as patch:
+        Stopping(patch, where)
+        assert run(*words) == 1
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
+def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path, capsys, monkeypatch):
+    target = tmp_path / "m.safetensors"
+    stopped(monkeypatch, "segment 1", "fit", long_clip, "--out", target, *SEGMENTS)
+    capsys.readouterr()
+    assert run("fit", long_clip, "--out", target, *QUICK, "--preview", tmp_path / "p.png") == 2
+    assert "--preview: expected a fit in one piece" in capsys.readouterr().err
+    assert run("fit", long_clip, "--out", target, *QUICK, "--log-json") == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[0])["spans"] == [[0, 15], [12, 27], [24, 39]]
+    checkpoint = tmp_path / "m.safetensors.checkpoint"
+    (tmp_path / "m.safetensors.segments").mkdir()
+    (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
+    checkpoint.write_bytes(b"of a fit in one piece")
+    assert run("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume") == 1
+    assert checkpoint.name in capsys.readouterr().err
+    assert target.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
+def test_what_is_begun_anew_and_stopped_is_not_begun_anew_again(long_clip, whole, tmp_path, capsys, monkeypatch):
+    target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
+    target.write_bytes(b"of before")
+    words = ("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite")
+    stopped(monkeypatch, "segment 1", *words)
+    assert "Give the same command again with --resume added to go on." in capsys.readouterr().err
+    stamp = (folder / "segment-0000.safetensors").stat().st_mtime_ns
+    assert run("fit", tmp_path / "misspelt.mp4", *words[2:]) == 2
+    assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
+    stopped(monkeypatch, "segment 2", *words, "--resume")
+    assert "Give the same command again to go on." in capsys.readouterr().err
+    assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
+    assert run(*words, "--resume", "--quiet") == 0
+    assert target.read_bytes() == whole.read_bytes()
+
+
+def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):
+    def gone(event, figures):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(_jobs_view, "print_json", gone)
+    assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS, "--log-json") == 0
+    assert (tmp_path / "m.safetensors").read_bytes() == whole.read_bytes()
+
+
 WRONG = {
     "history": (("--history", "h.jsonl", "--segment-seconds", "2"), "--history: expected a fit in one piece"),
     "preview": (("--preview", "p.png", "--workers", "2"), "--preview: expected a fit in one piece"),
@@ -219,6 +273,70 @@ def test_many_clips_stopped_in_one_go_on_there(clips, tmp_path, capsys, monkeypa
     assert run("fit-many", clips, "--out", other, *QUICK, "--quiet") == 1
     for path in other.glob("*.safetensors"):
         assert (out / path.name).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
+def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "models"
+    assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
+    other = (*QUICK[:-1], "2")
+    stopped(monkeypatch, "clip1.mp4", "fit-many", clips, "--out", out, *other, "--overwrite")
+    assert "Give the command again without --overwrite to go on." in capsys.readouterr().err
+    assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
+    assert "exists, of other settings" in capsys.readouterr().err
+    kept = out / "records" / "clip1.safetensors.checkpoint"
+    before, stamp = kept.read_bytes(), (out / "clip0.safetensors").stat().st_mtime_ns
+    assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
+    assert kept.read_bytes() == before
+    assert run("fit-many", clips, "--out", out, *other) == 1
+    assert "4 clips, 1 of them done before" in capsys.readouterr().out
+    assert (out / "clip0.safetensors").stat().st_mtime_ns == stamp
+    assert {load_video_model(path).degree for path in out.glob("*.safetensors")} == {2}
+
+
+def test_a_checkpoint_of_other_settings_is_not_thrown_away(clips, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "models"
+    stopped(monkeypatch, "clip0.mp4", "fit-many", clips, "--out", out, *QUICK)
+    kept = out / "records" / "clip0.safetensors.checkpoint"
+    before = kept.read_bytes()
+    capsys.readouterr()
+    assert run("fit-many", clips, "--out", out, *QUICK[:-1], "2") == 2
+    assert f"{kept} exists, of other settings" in " ".join(capsys.readouterr().err.split())
+    assert kept.read_bytes() == before
+
+
+@pytest.mark.parametrize("options", [("--workers", "2"), ("--scheduler", "tcp://127.0.0.1:1")])
+def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, options):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
+    assert f"{options[0]}: needs dask.distributed: pip install" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys, monkeypatch):
+    def full(*given):
+        raise OutputError("path: expected room for 'summary.json', got none.")
+
+    monkeypatch.setattr(many, "write_json", full)
+    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK) == 1
+    assert "3 models in" in (told := capsys.readouterr()).out
+    assert "warning: path: expected room" in told.err
+    assert len(list((tmp_path / "models").glob("*.safetensors"))) == 3
+
+
+def test_names_hold_no_pictures(capsys):
+    assert run("fit-many", "no:smile:folder") == 2
+    assert "no:smile:folder" in "".join(capsys.readouterr().err.split())
+
+
+def test_names_are_shown_as_they_are(monkeypatch):
+    """In a bar, too, brackets are no commands for a colour."""
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(_jobs_view, "err", console)
+    with _jobs_view._shown("clips", 2, "bar") as view:
+        view.watch(Progress("[red]one.mp4", 0.5, 30.0, 3, 40, 1.0, 1.0))
+        view.progress.refresh()
+    assert "[red]one.mp4" in console.file.getvalue()
 
 
 def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):

@@ -52,9 +52,9 @@ class _Plain(Console):
 
 
 app = App(cls=_Root, no_args_is_help=True, pretty_exceptions_enable=False)
-# No markup: names of files may hold brackets.
-out = _Plain(markup=False, highlight=False)
-err = _Plain(stderr=True, markup=False, highlight=False)
+# No markup: names of files may hold brackets, and what is a code for a picture elsewhere.
+out = _Plain(markup=False, emoji=False, highlight=False)
+err = _Plain(stderr=True, markup=False, emoji=False, highlight=False)
 
 
 def _show_version(wanted: bool) -> None:

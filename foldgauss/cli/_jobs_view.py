@@ -4,7 +4,9 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from importlib.util import find_spec
+from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -21,6 +23,12 @@ from foldgauss.jobs import Stopped as JobsStopped
 FIRST_LINE, LINE = 10.0, 30.0
 #: Jobs of which each has a line in a log.
 FEW = 20
+
+
+def tell_json(event: str, figures: dict[str, Any]) -> None:
+    """A line of JSON; that nobody listens any more is no reason to lose a fit."""
+    with suppress(OSError):
+        print_json(event, figures)
 
 
 def run_jobs(
@@ -70,6 +78,9 @@ class Hands:
             raise WrongUse(f"{other}: expected no --scheduler beside it, which has workers of its own. Leave one out.")
         if self.threads is not None and self.workers is None:
             raise WrongUse("--threads: expected --workers beside it. Of this process: FOLDGAUSS_NUM_THREADS.")
+        if (self.workers is not None or self.scheduler is not None) and find_spec("distributed") is None:
+            option = "--workers" if self.scheduler is None else "--scheduler"
+            raise WrongUse(f"{option}: needs dask.distributed: pip install 'foldgauss[distributed]'.")
         if self.workers is not None and self.threads is None:
             object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
 
@@ -166,15 +177,15 @@ class _Json(_View):
     def watch(self, share: Share) -> None:
         super().watch(share)
         finite = {name: value for name, value in share._asdict().items() if value == value and value != math.inf}
-        print_json("progress", finite)
+        tell_json("progress", finite)
 
     def ended(self, outcome: Outcome) -> None:
         super().ended(outcome)
         if outcome.failure is not None:
-            print_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
+            tell_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
         else:
             figures = {name: outcome.record[name] for name in ("mean_psnr", "mean_ssim", "seconds", "steps")}
-            print_json("ended", {"name": outcome.job.name} | figures)
+            tell_json("ended", {"name": outcome.job.name} | figures)
 
 
 @contextmanager
@@ -184,7 +195,7 @@ def _shown(what: str, total: int, manner: Manner) -> Iterator[_View]:
         yield kinds[manner](what, total)
         return
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # names of files
         BarColumn(bar_width=20),
         TimeElapsedColumn(),
         *TIME_LEFT,

@@ -85,6 +85,7 @@ from foldgauss.io.pictures import comparison
 from foldgauss.io.video_file import Clip, read_video, write_image, write_video
 from foldgauss.io.video_model import MODEL_SUFFIX, check_model_name, load_checkpoint, save_checkpoint, save_video_model
 from foldgauss.jobs.fitting import CHECKPOINT_SECONDS
+from foldgauss.jobs.long import kept_seconds
 from foldgauss.video.config import (
     FitConfig,
     chosen_num_gaussians,
@@ -228,7 +229,8 @@ def fit(
     hands = Hands(workers, scheduler, threads)
     context.with_resource(only_writer(target, own=(kept,)))
     refuse_existing(target, overwrite)
-    if not (segment_seconds is None and workers is None and scheduler is None):
+    begun = kept_seconds(target) is not None and not kept.exists() and (resume or not overwrite)
+    if begun or not (segment_seconds is None and workers is None and scheduler is None):
         for option, path in (("--history", history), ("--preview", preview)):
             if path is not None:
                 raise WrongUse(f"{option}: expected a fit in one piece, got one in segments. Leave it out.")

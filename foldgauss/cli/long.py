@@ -1,17 +1,16 @@
 """`fit` of a long clip: in segments, by workers if asked."""
 
-import shutil
 import time
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from foldgauss._progress import Manner, print_json
+from foldgauss._progress import Manner
 from foldgauss.cli._app import Stopped, WrongUse, as_option, err, out
-from foldgauss.cli._jobs_view import LINE, Hands, run_jobs
+from foldgauss.cli._jobs_view import LINE, Hands, run_jobs, tell_json
 from foldgauss.cli._shared import print_figures, progress_bar
 from foldgauss.jobs import LongFit, Outcome, plan_long_fit, segments_folder
-from foldgauss.jobs.long import SEGMENT_SECONDS
+from foldgauss.jobs.long import SEGMENT_SECONDS, kept_seconds
 from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
 
 
@@ -33,21 +32,23 @@ def fit_in_segments(
     begun, folder = time.monotonic(), segments_folder(target)
     if resume and not folder.is_dir():
         raise WrongUse(f"--resume: expected a stopped fit in {folder}, got none. Start it without --resume.")
-    if overwrite and not resume and folder.is_dir():
-        _clear(folder)
-    asked = {"size": size, "frames": frames, "checkpoint_seconds": checkpoint_seconds}
+    anew = overwrite and not resume
+    if segment_seconds is None:
+        segment_seconds = None if anew else kept_seconds(target)
+    asked = {"size": size, "frames": frames, "checkpoint_seconds": checkpoint_seconds, "anew": anew}
     asked["segment_seconds"] = SEGMENT_SECONDS if segment_seconds is None else segment_seconds
     with hands.crew() as crew:  # first: they get ready while the clip is looked through
         fit = _planned(video, target, config, manner, asked)
         _say_plan(fit, config, manner, video, str(hands))
-        again = "Give the same command again to go on."
+        again = f"Give the same command again{' with --resume added' if anew else ''} to go on."
         outcomes = run_jobs(fit.jobs, "segments", manner, crew, cure=again)
     _say_warnings(outcomes)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if failed:
         for outcome in failed:
             err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
-        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed; the others are kept in {fit.folder}. {again}")
+        others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
+        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
     records = {outcome.job.name: outcome.record for outcome in outcomes}
     shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
     with progress_bar("Joining", max(shared, 1), shown=manner == "bar" and shared > 0) as advance:
@@ -74,18 +75,9 @@ def fit_in_segments(
     if joined.seam_drop is not None:
         figures["seam_drop"] = round(joined.seam_drop, 3)
     if manner == "json":
-        print_json("done", {"model": str(target)} | figures)
+        tell_json("done", {"model": str(target)} | figures)
     elif manner != "quiet":
         print_figures(str(target), figures)
-
-
-def _clear(folder: Path) -> None:
-    """Remove the parts of a fit that is begun anew; a folder with other things in it is refused."""
-    own = ("segment-", ".segment-", "plan.json", ".plan.", "index.npz", ".index.", ".lock")
-    foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(own))
-    if foreign:
-        raise WrongUse(f"--out: expected {folder} to hold parts of a fit, got {foreign[0]!r} in it. Move it away.")
-    shutil.rmtree(folder)
 
 
 def _planned(video: Path, target: Path, config: FitConfig, manner: Manner, asked: dict[str, Any]) -> LongFit:
@@ -106,8 +98,8 @@ def _planned(video: Path, target: Path, config: FitConfig, manner: Manner, asked
         with nullcontext() if status is None else status:
             return plan_long_fit(video, target, config, on_frame=on_frame, **asked)
     except ValueError as error:
-        if str(error).startswith(("segment_seconds", "resume")):
-            raise WrongUse(as_option(str(error))) from error
+        if str(error).startswith(("segment_seconds:", "resume:", "target:")):
+            raise WrongUse(as_option(str(error)).replace("--target:", "--out:", 1)) from error
         raise
 
 
@@ -122,11 +114,12 @@ def _say_plan(fit: LongFit, config: FitConfig, manner: Manner, video: Path, crew
     pairs = zip(fit.spans[:-1], fit.spans[1:], strict=True)
     at_cuts = sum(before[1] == after[0] for before, after in pairs)
     size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
-    num = chosen_num_gaussians(config, max(lengths), *size)
+    longest = fit.jobs[lengths.index(max(lengths))].config  # it has its share of a file's size
+    num = chosen_num_gaussians(longest, max(lengths), *size)
     steps = planned_steps(config, max(lengths))
     if manner == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
-        print_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
+        tell_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
     if manner in ("json", "quiet"):
         return
     budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
@@ -134,8 +127,9 @@ def _say_plan(fit: LongFit, config: FitConfig, manner: Manner, video: Path, crew
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     where = f" ({at_cuts} end at cuts)" if at_cuts else ""
     segments = "1 segment" if len(lengths) == 1 else f"{len(lengths)} segments"
+    frames = "1 frame" if index.num_frames == 1 else f"{index.num_frames:,} frames"
     out.print(
-        f"{video}: {index.num_frames:,} frames of {size[0]}x{size[1]} in {segments} of {span} frames{where}, "
+        f"{video}: {frames} of {size[0]}x{size[1]} in {segments} of {span} frame{'' if span == '1' else 's'}{where}, "
         f"each with {num:,} Gaussians of degree {config.degree} and {plan}, by {crew}",
         soft_wrap=True,
     )

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from foldgauss._progress import print_json
 from foldgauss.cli._app import WrongUse, as_option, err, out
 from foldgauss.cli._completion import files
 from foldgauss.cli._fit_options import (
@@ -41,7 +40,7 @@ from foldgauss.cli._fit_options import (
     config_of,
     manner_of,
 )
-from foldgauss.cli._jobs_view import Hands, run_jobs
+from foldgauss.cli._jobs_view import Hands, run_jobs, tell_json
 from foldgauss.cli._shared import (
     AlphaCutoff,
     Frames,
@@ -57,7 +56,7 @@ from foldgauss.cli._shared import (
 from foldgauss.cli.fitting import make_folder
 from foldgauss.io._lock import only_writer
 from foldgauss.jobs import FitJob, Outcome, find_clips, jobs_of
-from foldgauss.jobs.fitting import finished
+from foldgauss.jobs.fitting import begin, begun, finished
 from foldgauss.jobs.many import RECORDS
 
 SUMMARY = "summary.json"
@@ -148,14 +147,18 @@ def fit_many(
         nonlocal written
         ended[outcome.job.target] = outcome
         if len(ended) == len(jobs) or time.monotonic() - written > SUMMARY_SECONDS:
-            _summarise(out_dir, jobs, ended)
+            try:
+                _summarise(out_dir, jobs, ended)
+            except OSError as error:  # a full disk now is no reason to lose the fits
+                err.print(f"warning: {error}", soft_wrap=True)
             written = time.monotonic()
 
+    again = "Give the command again without --overwrite" if overwrite else "Give the same command again"
     with hands.crew() as crew:
-        outcomes = run_jobs(jobs, "clips", manner, crew, cure="Give the same command again to go on.", on_end=on_end)
+        outcomes = run_jobs(jobs, "clips", manner, crew, cure=f"{again} to go on.", on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if manner == "json":
-        print_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
+        tell_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
     elif manner != "quiet":
         _print_table(str(out_dir), outcomes)
     for outcome in failed:
@@ -169,16 +172,27 @@ def _number(count: int, what: str) -> str:
 
 
 def _make_room(jobs: list[FitJob], overwrite: bool) -> None:
-    """Refuse models that are there and are not what is asked for, or remove them and what was kept of them."""
-    for job in jobs:
+    """Refuse models and stopped fits that are there and are not of what is asked for, or give them up.
+
+    What is asked is noted for each clip: given again, the command may replace what stood there when it was begun.
+    """
+    waiting = jobs if overwrite else [job for job in jobs if finished(job) is None]
+    for job in [] if overwrite else waiting:
+        before = begun(job)
+        if before == job.asked:
+            continue
+        for path in (job.target, job.kept):
+            mine = before is None and job.kept.exists()
+            if os.path.exists(path) and not mine:
+                raise WrongUse(
+                    f"--out: {path} exists, of other settings or another clip. Remove it, choose another folder, or "
+                    "add --overwrite, which begins all anew."
+                )
+    for job in waiting:
         if overwrite:
-            for path in (job.kept, job.record):
-                path.unlink(missing_ok=True)
-        elif os.path.exists(job.target) and not job.kept.exists() and finished(job) is None:
-            raise WrongUse(
-                f"--out: {job.target} exists, of other settings or another clip. Choose another folder, or add "
-                "--overwrite, which begins all anew."
-            )
+            job.kept.unlink(missing_ok=True)
+        if overwrite or begun(job) != job.asked:
+            begin(job)
 
 
 def _summarise(out_dir: Path, jobs: list[FitJob], ended: dict[str, Outcome]) -> None:

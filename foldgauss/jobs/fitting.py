@@ -5,13 +5,16 @@ how it went. Whoever does it again takes up what is there.
 """
 
 import dataclasses
+import hashlib
 import json
 import os
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,6 +50,10 @@ class Progress(NamedTuple):
     seconds: float
     seconds_left: float
 
+
+#: What a record says besides `asked` and the scores of each frame.
+_TOLD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}
+_TOLD |= {"file_bytes", "file_digest", "peak_bytes", "warnings"}
 
 #: Is told how far a job is, and answers whether to go on.
 Tell = Callable[[Progress], bool]
@@ -102,8 +109,8 @@ def fit_job(job: FitJob, tell: Tell | None = None) -> dict[str, Any]:
     """Do the job, or what is left of it; returns its record.
 
     The record: `asked`, `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame, `mean_psnr`,
-    `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `peak_bytes` (of the process, so far)
-    and `warnings`.
+    `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `file_digest`, `peak_bytes` (of the
+    process, so far) and `warnings`.
 
     Raises `Stopped` where `tell` answers False; ValueError and OSError for a clip that cannot be read or fitted, and
     outputs that cannot be written, `FitDiverged` as `fit_steps` does.
@@ -117,13 +124,38 @@ def fit_job(job: FitJob, tell: Tell | None = None) -> dict[str, Any]:
 
 
 def finished(job: FitJob) -> dict[str, Any] | None:
-    """The record of a job that is done: its model is there, of what it asks."""
+    """The record of a job that is done: its model is there, of what it asks.
+
+    Of a segment's it is looked at whether they are the same bytes: segments of one length are of one size.
+    """
     try:
         record = json.loads(job.record.read_text())
         same = record["asked"] == job.asked and os.path.getsize(job.target) == record["file_bytes"]
+        same = same and len(record["psnr"]) == len(record["ssim"]) == record["num_frames"] and record.keys() >= _TOLD
+        same = same and (job.index is None or record["file_digest"] == file_digest(job.target))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return record if same else None
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """blake2b of 16 bytes over a file, as a hexadecimal text."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, partial(hashlib.blake2b, digest_size=16)).hexdigest()
+
+
+def begin(job: FitJob) -> None:
+    """Note what a job asks where its record is to be. Not atomic: there may be thousands, and half of one is none."""
+    job.record.write_text(json.dumps({"asked": job.asked}) + "\n")
+
+
+def begun(job: FitJob) -> dict[str, Any] | None:
+    """What was asked when a job of its target was begun, or done; None where nothing says so."""
+    try:
+        asked = json.loads(job.record.read_text())["asked"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return asked if isinstance(asked, dict) else None
 
 
 @contextmanager
@@ -148,8 +180,7 @@ def _only_one(job: FitJob) -> Iterator[None]:
 def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
     clip = _read(job)
     source = fingerprint(clip)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with _EARS.heard() as caught:
         state, info = _steps(job, clip, source, tell)
     model = to_model(state, job.config, clip.size, clip.fps)
     scores = evaluate(model, clip.frames)
@@ -169,16 +200,60 @@ def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
         "seconds": round(info.seconds, 2),
         "stopped_by": info.stopped_by,
         "file_bytes": os.path.getsize(job.target),
+        "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
         "warnings": [
             *(_of_clip(clip) if job.index is None else ()),
-            *dict.fromkeys(" ".join(str(one.message).split()) for one in caught),
+            *dict.fromkeys(caught),
+            *_missed(job.config, scores.mean_psnr, info),
         ],
     }
     with atomic_path(job.record) as temporary:
         temporary.write_text(json.dumps(record) + "\n")
     job.kept.unlink(missing_ok=True)
     return record
+
+
+def _missed(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]:
+    """What was asked for and not reached."""
+    if config.economy is None or config.economy.psnr is None or info.stopped_by == "smallest_at_psnr":
+        return []
+    return [f"{config.economy.psnr:g} dB were not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
+
+
+class _Ears:
+    """Warnings by the thread that gives them: a worker may do two jobs at once, and `warnings` has one ear for all."""
+
+    def __init__(self):
+        self._lock, self._open, self._heard = threading.Lock(), ExitStack(), {}
+
+    @contextmanager
+    def heard(self) -> Iterator[list[str]]:
+        """The texts of those that this thread gives in the block; others' are shown as ever."""
+        number, texts = threading.get_ident(), []
+        with self._lock:
+            if not self._heard:
+                self._open.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("always")
+                warnings.showwarning = partial(self._take, warnings.showwarning)
+            self._heard[number] = texts
+        try:
+            yield texts
+        finally:
+            with self._lock:
+                del self._heard[number]
+                if not self._heard:
+                    self._open.close()
+
+    def _take(self, show: Callable[..., Any], message: Warning | str, *where: Any, **more: Any) -> None:
+        texts = self._heard.get(threading.get_ident())
+        if texts is None:
+            show(message, *where, **more)
+        else:
+            texts.append(" ".join(str(message).split()))
+
+
+_EARS = _Ears()
 
 
 def _read(job: FitJob) -> Clip:

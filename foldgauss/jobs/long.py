@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.frame_index import FrameIndex, index_video, read_indexed
 from foldgauss.io.segmented import join_segments
 from foldgauss.io.video_model import load_video_model
-from foldgauss.jobs.fitting import FitJob
+from foldgauss.jobs.fitting import FitJob, file_digest
 from foldgauss.video.config import FitConfig
 from foldgauss.video.metrics import psnr, ssim
 from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
@@ -52,8 +53,14 @@ class LongFit:
         """Write the segments as one model, once all jobs are done; `records` by name of the job.
 
         The frames that two segments share are scored as they are played. The same segments give the same bytes. The
-        folder stays: see `tidy`. Raises as `join_segments`.
+        folder stays: see `tidy`. Raises as `join_segments`, and `OutputError` where a segment's file is not what its
+        record tells of.
         """
+        for job in self.jobs:
+            if file_digest(job.target) != records[job.name]["file_digest"]:
+                got = f"a changed {job.target!r}"
+                cure = "Give the same command again, and it is fitted again."
+                raise OutputError(str(invalid("path", expected=f"{job.name} as it was written", got=got, cure=cure)))
         sources = [(first, job.target) for (first, _), job in zip(self.spans, self.jobs, strict=True)]
         scores = [(records[job.name]["psnr"], records[job.name]["ssim"]) for job in self.jobs]
         psnr_of, ssim_of = (_joined(self.spans, kind) for kind in zip(*scores, strict=True))
@@ -85,9 +92,9 @@ class LongFit:
         for name in (_INDEX, _PLAN):
             (self.folder / name).unlink(missing_ok=True)
         for entry in self.folder.iterdir():
-            if entry.name.startswith(".segment-") or entry.name.startswith(
-                f".{Path(_PLAN).stem}."
-            ):  # of killed writers
+            if entry.name.startswith(
+                (".segment-", f".{Path(_PLAN).stem}.", f".{Path(_INDEX).stem}.")
+            ):  # of killed ones
                 entry.unlink(missing_ok=True)
         try:
             self.folder.rmdir()
@@ -164,21 +171,22 @@ def plan_long_fit(
     overlap: int = OVERLAP,
     checkpoint_seconds: float | None = None,
     on_frame: Callable[[], None] = lambda: None,
+    anew: bool = False,
 ) -> LongFit:
-    """Look through a clip once and plan its segments, or take up the plan that is there.
+    """Look through a clip once and plan its segments, or take up the plan that is there, unless `anew`.
 
     Segments are cut at scene changes near their length, `segment_seconds`, else they share `overlap` frames with the
     next. `config` is that of each segment; its `max_size_mb` is shared out by their frames. `clip`, `size` and
     `frames` as in `read_video`. Memory does not grow with the clip, but for some tens of bytes a frame.
 
     Raises ValueError for settings that are out of range, and where the folder holds a plan of others, or of another
-    clip; `VideoError`, FileNotFoundError, `OutputError`.
+    clip, or, `anew`, what is no part of a fit; `VideoError`, FileNotFoundError, `OutputError`.
 
     Example: `plan_long_fit("long.mp4", "long.safetensors").jobs`, for `run_here` or `run_on`.
     """
     config = FitConfig() if config is None else config
-    if not within(segment_seconds, "(0, inf)"):
-        raise invalid("segment_seconds", expected="a number of seconds > 0", got=repr(segment_seconds))
+    if not within(segment_seconds, "(0, 1e9]"):
+        raise invalid("segment_seconds", expected="a number of seconds > 0, at most 1e9", got=repr(segment_seconds))
     if not whole(overlap, 1):
         raise invalid("overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
@@ -191,7 +199,9 @@ def plan_long_fit(
         "overlap": overlap,
     }
     asked = json.loads(json.dumps(asked))
-    plan = _kept_plan(folder, asked)
+    if anew:
+        _check_own(folder)
+    plan = None if anew else _kept_plan(folder, asked)
     index = _kept_index(folder, plan, clip)
     if index is None:
         index = index_video(clip, frames=frames, on_frame=on_frame)
@@ -199,11 +209,13 @@ def plan_long_fit(
             cure = "Give that clip, or start anew with --overwrite."
             expected = f"the clip that was begun with, {plan['clip']!r}"
             raise invalid("clip", expected=expected, got=f"other frames in {str(clip)!r}", cure=cure)
-    if plan is None:
-        length = max(round(segment_seconds * index.fps), 1)
+    if plan is None or not _cover(plan["spans"], index.num_frames):
+        length = max(round(segment_seconds * index.fps), 2)
         spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_overlap(overlap, length))
     else:
-        spans = [tuple(span) for span in plan["spans"]]
+        spans = plan["spans"]
+    if anew and folder.is_dir():
+        shutil.rmtree(folder)  # not before the clip has turned out to be one
     _make(folder)
     index.save(folder / _INDEX)
     kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": asked, "spans": spans}
@@ -211,9 +223,18 @@ def plan_long_fit(
         temporary.write_text(json.dumps(kept) + "\n")
     noted = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
     begin = 0 if frames is None else frames[0] or 0
-    jobs = (_job(number, span, folder, clip, config, size, index, begin) for number, span in enumerate(spans))
+    each = _shared_out(config, spans)
+    jobs = (_job(number, span, folder, clip, each[number], size, index, begin) for number, span in enumerate(spans))
     jobs = tuple(dataclasses.replace(job, checkpoint_seconds=checkpoint_seconds) for job in jobs)
     return LongFit(target, folder, index, tuple(spans), jobs, noted)
+
+
+def _shared_out(config: FitConfig, spans: Sequence[tuple[int, int]]) -> list[FitConfig]:
+    """The settings of each segment: of a file's size their frames' share, those counted twice that two fit."""
+    if config.max_size_mb is None:
+        return [config] * len(spans)
+    lengths = [stop - first for first, stop in spans]
+    return [dataclasses.replace(config, max_size_mb=config.max_size_mb * one / sum(lengths)) for one in lengths]
 
 
 def _overlap(asked: int, length: int) -> int:
@@ -231,9 +252,7 @@ def _job(
     index: FrameIndex,
     begin: int,
 ) -> FitJob:
-    if config.max_size_mb is not None:
-        share = (span[1] - span[0]) / index.num_frames
-        config = dataclasses.replace(config, max_size_mb=config.max_size_mb * share)
+    low, high = index.span(*span)  # as `read_video` counts, where damage left frames out
     return FitJob(
         name=f"segment {number}",
         clip=str(clip),
@@ -244,8 +263,37 @@ def _job(
         index=str(folder / _INDEX),
         fps=index.fps,
         source={"digest": index.digest},
-        noted={"clip": clip.name, "frames": [begin + span[0], begin + span[1]]},
+        noted={"clip": clip.name, "frames": [begin + low, begin + high]},
     )
+
+
+def _check_own(folder: Path) -> None:
+    """Raise ValueError for a folder in which there is more than parts of a fit."""
+    if not folder.is_dir():
+        return
+    own = ("segment-", ".segment-", _PLAN, f".{Path(_PLAN).stem}.", _INDEX, f".{Path(_INDEX).stem}.")
+    foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(own))
+    if foreign:
+        got = f"{foreign[0]!r} in it"
+        raise invalid("target", expected=f"parts of a fit alone in {folder}", got=got, cure="Move it away.")
+
+
+def _cover(spans: Sequence[tuple[int, int]], num_frames: int) -> bool:
+    """Whether spans are those of a plan: nobody is to edit one."""
+    if not spans or spans[0][0] != 0 or spans[-1][1] != num_frames:
+        return False
+    pairs, apart = pairwise(spans), zip(spans[:-2], spans[2:], strict=True)
+    in_order = all(one[0] < other[0] <= one[1] < other[1] for one, other in pairs)
+    return in_order and all(one[1] <= other[0] for one, other in apart)
+
+
+def kept_seconds(target: str | os.PathLike) -> float | None:
+    """The length of segments in the plan of a fit that was begun; None where there is none."""
+    try:
+        seconds = json.loads((segments_folder(target) / _PLAN).read_text())["asked"]["segment_seconds"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return seconds if within(seconds, "(0, 1e9]") else None
 
 
 def _make(folder: Path) -> None:
@@ -262,8 +310,10 @@ def _kept_plan(folder: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
     try:
         plan = json.loads((folder / _PLAN).read_text())
         before = plan["asked"]
-        plan["digest"], plan["clip"], plan["spans"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        before.get("config", {}).get("seed")
+        plan["digest"], plan["clip"]
+        plan["spans"] = [(int(first), int(stop)) for first, stop in plan["spans"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     changed = sorted(name for name in asked if asked[name] != before.get(name))
     if changed:
@@ -286,9 +336,10 @@ def _kept_index(folder: Path, plan: dict[str, Any] | None, clip: Path) -> FrameI
     if plan is None or plan.get("stamp") != _stamp(clip) or plan.get("clip") != str(clip) or not clip.is_file():
         return None
     try:
-        return FrameIndex.load(folder / _INDEX)
+        index = FrameIndex.load(folder / _INDEX)
     except (OSError, ValueError):
         return None
+    return index if index.digest == plan["digest"] else None
 
 
 def _stamp(clip: Path) -> list[int]:

@@ -85,14 +85,24 @@ def jobs_of(
     Checkpoints and records go to `RECORDS`, a folder in `out`, which must be there.
     """
     out, config = Path(out).absolute(), FitConfig() if config is None else config
-    stems = Counter(_stem(clip).casefold() for clip in clips)
     jobs = []
-    for clip in clips:
-        stem = _stem(clip) if stems[_stem(clip).casefold()] == 1 else clip.name
+    for clip, stem in zip(clips, _names(clips), strict=True):
         target = str(out / f"{stem}{MODEL_SUFFIX}")
         job = FitJob(clip.name, str(clip.absolute()), target, config, size, frames, source=_stamp(clip))
         jobs.append(dataclasses.replace(job, checkpoint_seconds=checkpoint_seconds, folder=str(out / RECORDS)))
     return jobs
+
+
+def _names(clips: Sequence[Path]) -> list[str]:
+    """A name of each that no other has: its stem, or all of it."""
+    names = [_stem(clip) for clip in clips]
+    while True:
+        counts = Counter(name.casefold() for name in names)
+        alike = [k for k, name in enumerate(names) if counts[name.casefold()] > 1 and name != clips[k].name]
+        if not alike:
+            return names
+        for k in alike:  # and once more, since a.mp4 beside a.avi is called as a.mp4.mkv is
+            names[k] = clips[k].name
 
 
 def _stem(clip: Path) -> str:

@@ -9,11 +9,13 @@ import logging
 import os
 import queue
 import secrets
+import signal
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from foldgauss._checks import invalid, whole
@@ -88,7 +90,9 @@ def _tried(job: FitJob, tell: Callable[[Progress], bool]) -> Outcome:
     """The outcome of a job done here; what is wrong with its clip or its disk is one."""
     try:
         return Outcome(job, fit_job(job, tell))
-    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+    except Stopped:
+        raise
+    except Exception as error:  # any: the others go on
         return Outcome(job, failure=one_line(error))
 
 
@@ -104,6 +108,11 @@ class Crew:
     def __init__(self, client: "Client", cluster: Any = None, count: int = 0):
         self.client, self._cluster, self._count = client, cluster, count
         self._since, self._patience = time.monotonic(), MEND_SECONDS
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether others start its workers."""
+        return self._cluster is None
 
     @property
     def threads(self) -> int:
@@ -147,8 +156,10 @@ def _silenced() -> Iterator[None]:
 def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]:
     """A crew of `count` processes of this machine, each with `threads` of its cores (default: an equal share).
 
-    Workers end with this process, however it ends, and are replaced when they die. Raises ValueError for counts that
-    are none, ImportError where dask.distributed is not installed.
+    Workers end with this process, however it ends, and are replaced when they die. They import the program that starts
+    them: in a file of your own, do so under `if __name__ == "__main__":`, or none comes to work.
+
+    Raises ValueError for counts that are none, ImportError where dask.distributed is not installed.
     """
     for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
         if not whole(value, 1):
@@ -175,15 +186,24 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
             processes=True,
             memory_limit=None,  # a worker that is stopped for its memory would be stopped again
             dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # a port of its own: two commands may run at once
             local_directory=scratch,
             silence_logs=50,
             env=environment,
             preload=["foldgauss._worker"],
         )
         stack.enter_context(cluster)
+        cluster.loop.add_callback(_block_ctrl_c)
         crew = Crew(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
         cluster.scale(count)
         yield crew
+
+
+def _block_ctrl_c() -> None:
+    """On the thread that starts workers, and so in these from the first moment: a terminal sends it to them, too."""
+    if hasattr(signal, "pthread_sigmask"):  # not Windows
+        resource_tracker.ensure_running()  # or starting it, with the first worker, would take the block away
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 @contextmanager
@@ -260,7 +280,7 @@ class _Run:
         if threads:
             self.seen = time.monotonic()
         elif time.monotonic() - self.seen > NO_WORKERS:
-            told = "start some, and give the command again"
+            told = "start some, and give the command again" if self.crew.is_remote else _NONE_HERE
             raise SchedulerLost(f"No worker came for {NO_WORKERS:g} s. What is finished is kept: {told}.")
         while self.waiting and len(self.open) < threads:
             self._submit(self.waiting.popleft())
@@ -335,6 +355,10 @@ class _Run:
             return
 
 
+_NONE_HERE = (
+    "they die while they start, of what is told above; a program of your own must start them under "
+    '`if __name__ == "__main__":`'
+)
 _LOST = "The scheduler is gone. What is finished is kept: start one, and give the command again."
 
 

@@ -3,6 +3,9 @@
 import dataclasses
 import json
 import os
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import only_writer
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.fitting import finished
+from foldgauss.video.economy import Economy
 
 NUM_FRAMES = 10
 
@@ -65,7 +69,7 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
     assert reads.count == 0
 
 
-@pytest.mark.parametrize("change", ["config", "source", "size", "model"])
+@pytest.mark.parametrize("change", ["config", "source", "size", "model", "record"])
 def test_a_record_of_something_else_is_none(done, clip, tmp_path, change):
     job, _record = done
     changed = {
@@ -73,12 +77,17 @@ def test_a_record_of_something_else_is_none(done, clip, tmp_path, change):
         "source": {"source": {"digest": "another"}},
         "size": {"size": (12, 16)},
         "model": {},
+        "record": {},
     }[change]
     other = job_of(clip, tmp_path, **changed)
     for made, wanted in ((job.target, other.target), (job.record, other.record)):
         Path(wanted).write_bytes(Path(made).read_bytes())
     if change == "model":
         Path(other.target).write_bytes(Path(job.target).read_bytes()[:-1])
+    if change == "record":
+        told = json.loads(job.record.read_text())
+        del told["mean_psnr"]
+        other.record.write_text(json.dumps(told))
     assert finished(other) is None
 
 
@@ -165,6 +174,44 @@ def test_a_full_disk_at_a_checkpoint_costs_no_fit(done, clip, tmp_path, monkeypa
     job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
     fit_job(job)
     assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+
+
+def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch):
+    """Two at once in one process, the second of which begins later and ends first."""
+    real, begun, joined, warned, over = fitting._steps, *(threading.Event() for _ in range(4))
+
+    def steps(job, *given):
+        if job.name == "second":
+            joined.set()
+            assert warned.wait(60)
+        else:
+            begun.set()
+            assert joined.wait(60)
+        warnings.warn(f"of {job.name}", stacklevel=1)
+        if job.name == "first":
+            warned.set()
+            assert over.wait(60)
+        return real(job, *given)
+
+    monkeypatch.setattr(fitting, "_steps", steps)
+    jobs = [
+        dataclasses.replace(job_of(clip, tmp_path, f"{name}.safetensors"), name=name) for name in ("first", "second")
+    ]
+    before, shown = warnings.filters.copy(), warnings.showwarning
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(fit_job, jobs[0])
+        assert begun.wait(60)
+        second = fit_job(jobs[1])
+        over.set()
+        records = first.result(), second
+    assert [record["warnings"] for record in records] == [["of first"], ["of second"]]
+    assert (warnings.filters, warnings.showwarning) == (before, shown)
+
+
+def test_a_psnr_that_was_not_reached_is_told(clip, tmp_path):
+    config = dataclasses.replace(CONFIG, economy=Economy(psnr=60.0))
+    (told,) = fit_job(job_of(clip, tmp_path, config=config))["warnings"]
+    assert told.startswith("60 dB were not reached, got ")
 
 
 def test_files_go_where_they_are_asked_to(clip, tmp_path):

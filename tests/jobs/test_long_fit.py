@@ -5,12 +5,15 @@ import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from drifting import CONFIG, write_drifting
+from drifting import CONFIG, SIZE, drifting, write_drifting
 
+import foldgauss.jobs.fitting as fitting
 import foldgauss.jobs.long as long
-from foldgauss.io import VideoError, load_video_model, read_video
+from foldgauss.io import VideoError, index_video, load_video_model, read_video
+from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -166,8 +169,9 @@ def test_a_short_clip_is_an_ordinary_model(tmp_path):
 def test_file_sizes_are_shared_out_by_frames(clip, tmp_path):
     config = dataclasses.replace(CONFIG, max_size_mb=3.4)
     fit = plan_long_fit(clip, tmp_path / "long.safetensors", config, **ASKED)
-    for (first, stop), job in zip(fit.spans, fit.jobs, strict=True):
-        assert job.config.max_size_mb == pytest.approx(0.1 * (stop - first))
+    lengths, shares = [stop - first for first, stop in fit.spans], [job.config.max_size_mb for job in fit.jobs]
+    assert sum(shares) == pytest.approx(3.4)  # of the one file, though some frames are in two segments
+    assert shares == pytest.approx([3.4 * one / sum(lengths) for one in lengths])
 
 
 @pytest.mark.parametrize(
@@ -175,6 +179,7 @@ def test_file_sizes_are_shared_out_by_frames(clip, tmp_path):
     [
         ({"segment_seconds": 0.0}, "segment_seconds"),
         ({"segment_seconds": np.nan}, "segment_seconds"),
+        ({"segment_seconds": 1e308}, "segment_seconds"),
         ({"overlap": 0}, "overlap"),
     ],
 )
@@ -182,6 +187,92 @@ def test_settings_out_of_range_are_refused(clip, tmp_path, asked, name):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **asked)
     assert not list(tmp_path.iterdir())
+
+
+def test_no_segment_is_shorter_than_two_frames(clip, tmp_path):
+    """A rate of a frame in ten seconds, or seconds that are few."""
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, segment_seconds=0.01)
+    assert {stop - first for first, stop in fit.spans} == {2}
+
+
+EDITED = {
+    "cut short": lambda plan: plan["spans"].pop(),
+    "gap": lambda plan: plan["spans"][1].__setitem__(0, 20),
+    "out of order": lambda plan: plan["spans"].reverse(),
+    "beyond": lambda plan: plan["spans"][-1].__setitem__(1, 1000),
+    "three at a frame": lambda plan: plan["spans"][0].__setitem__(1, 30),
+    "none": lambda plan: plan["spans"].clear(),
+    "words": lambda plan: plan.update(spans="all of it"),
+    "no dict": lambda plan: plan.update(asked=[]),
+}
+
+
+@pytest.mark.parametrize("edit", EDITED)
+def test_a_plan_that_somebody_has_edited_is_made_again(clip, tmp_path, edit):
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    plan = json.loads((fit.folder / "plan.json").read_text())
+    EDITED[edit](plan)
+    (fit.folder / "plan.json").write_text(json.dumps(plan))
+    again = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    assert again.spans == fit.spans
+    assert again.jobs == fit.jobs
+
+
+def test_models_in_the_place_of_others_are_not_taken_for_them(whole, clip, tmp_path):
+    """Segments of one length have files of one size."""
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    records = {outcome.job.name: outcome.record for outcome in done_here(fit)}
+    one, other = (Path(job.target) for job in fit.jobs[:2])
+    assert one.stat().st_size == other.stat().st_size
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(OutputError, match="expected segment 0 as it was written"):
+        fit.join(records)
+    assert not fit.target.exists()
+    assert joined(fit).path.read_bytes() == whole[1].path.read_bytes()
+
+
+def test_an_index_of_another_clip_is_made_again(clip, tmp_path):
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+    other = write_drifting(tmp_path / "other.mp4", 20)
+    index_video(other).save(fit.folder / "index.npz")
+    assert plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED).jobs == fit.jobs
+
+
+def test_anew_gives_up_what_is_kept_once_the_clip_can_be_read(clip, tmp_path):
+    target = tmp_path / "long.safetensors"
+    fit = plan_long_fit(clip, target, CONFIG, **ASKED)
+    kept = fit.folder / "segment-0000.safetensors.checkpoint"
+    kept.write_bytes(b"hours")
+    with pytest.raises(FileNotFoundError):
+        plan_long_fit(tmp_path / "none.mp4", target, CONFIG, **ASKED, anew=True)
+    (fit.folder / "mine.txt").write_text("")
+    with pytest.raises(ValueError, match=r"target: expected parts of a fit alone in .*'mine.txt' in it"):
+        plan_long_fit(clip, target, CONFIG, **ASKED, anew=True)
+    (fit.folder / "mine.txt").unlink()
+    assert kept.exists()
+    changed = plan_long_fit(clip, target, CONFIG, segment_seconds=2.0, anew=True)
+    assert changed.spans != fit.spans
+    assert not kept.exists()
+
+
+def test_segments_of_a_damaged_clip_name_the_frames_that_read_video_finds(tmp_path):
+    path = tmp_path / "damaged.avi"
+    codec = cv2.VideoWriter.fourcc(*"png ")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, 10.0, SIZE[::-1])
+    for picture in drifting(NUM_FRAMES):
+        writer.write(np.ascontiguousarray(picture[..., ::-1]))
+    writer.release()
+    data = bytearray(path.read_bytes())
+    starts = [at for at in range(len(data)) if data.startswith(b"\x89PNG", at)]
+    for k in (5, 6):
+        data[starts[k] : starts[k] + 30] = bytes(30)
+    path.write_bytes(data)
+    fit = plan_long_fit(path, tmp_path / "long.safetensors", CONFIG, **ASKED, frames=(2, NUM_FRAMES))
+    assert fit.index.num_frames < NUM_FRAMES - 2
+    whole_clip = read_video(path, frames=(2, NUM_FRAMES)).frames
+    for (first, stop), job in zip(fit.spans, fit.jobs, strict=True):
+        named = read_video(path, frames=tuple(job.noted["frames"])).frames
+        np.testing.assert_array_equal(named, whole_clip[first:stop])
 
 
 def test_what_is_no_clip_leaves_nothing(tmp_path):
@@ -209,3 +300,14 @@ def test_a_failure_is_an_outcome_and_others_go_on(clip, tmp_path):
     assert [outcome.failure is None for outcome in outcomes] == [False, True]
     assert "none.npz" in outcomes[0].failure
     assert "\n" not in outcomes[0].failure
+
+
+def test_a_failure_of_any_kind_is_an_outcome(clip, tmp_path, monkeypatch):
+    fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
+
+    def fails(*given, **named):
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr(fitting, "fit_steps", fails)
+    outcomes = list(run_here(fit.jobs[:2], ignored))
+    assert [outcome.failure for outcome in outcomes] == ["ZeroDivisionError: by nothing"] * 2

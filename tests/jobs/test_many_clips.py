@@ -53,6 +53,18 @@ def test_models_of_clips_of_one_name_are_told_apart(tmp_path):
     assert {job.record.parent for job in jobs} == {tmp_path / "out" / "records"}
 
 
+def test_no_two_clips_have_one_model(tmp_path):
+    """The whole name of one may be the stem of another."""
+    made(tmp_path, "a.mp4", "a.avi", "a.mp4.mkv", "b.mov")
+    (tmp_path / "a.mp4.mkv.gif").write_bytes(b"")
+    jobs = jobs_of(find_clips(tmp_path).clips, tmp_path / "out")
+    names = {job.name: Path(job.target).name for job in jobs}
+    assert names["b.mov"] == "b.safetensors"
+    assert names["a.mp4"] == "a.mp4.safetensors"
+    assert names["a.mp4.mkv"] == "a.mp4.mkv.safetensors"
+    assert len(set(names.values())) == len(jobs) == 5
+
+
 def test_a_clip_in_the_place_of_another_is_another(tmp_path):
     made(tmp_path, "one.mp4")
     before = jobs_of(find_clips(tmp_path).clips, tmp_path)[0]

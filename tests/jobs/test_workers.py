@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import distributed
 import pytest
 from drifting import CONFIG, write_drifting
 
@@ -74,6 +75,26 @@ def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_he
     assert {progress.name for progress in told if progress.share == 1} == {f"clip{k}.mp4" for k in range(3)}
 
 
+@pytest.mark.parametrize(("is_remote", "says"), [(True, "start some"), (False, "if __name__")])
+def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, says):
+    class NoCrew:
+        client, threads = None, 0
+
+        def mend(self, alive):
+            assert alive == 0
+
+    monkeypatch.setattr(pool, "NO_WORKERS", -1.0)
+    monkeypatch.setattr(distributed, "Event", lambda *given, **named: None)
+    crew = NoCrew()
+    crew.is_remote = is_remote
+    with pytest.raises(SchedulerLost, match=says):
+        pool._Run(crew, [], ignored, lambda: False)._fill()
+
+
+def test_two_commands_at_once_take_no_port_from_each_other(crew):
+    assert crew._cluster.scheduler.http_server.port != 8787  # dask's own, of which it warns when it is taken
+
+
 def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips, done_here, tmp_path):
     (job,) = (job for job in jobs_into(tmp_path, clips) if job.name == "clip1.mp4")
     kills, firsts = [], []
@@ -120,6 +141,23 @@ def test_a_job_that_kills_whoever_takes_it_is_given_up(crew, clips, tmp_path, mo
     assert len(killed) >= pool.DEATHS
     assert "its workers died" in outcomes[0].failure
     assert "fewer workers" in outcomes[0].failure
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="reads of a process what Linux tells in /proc")
+def test_a_worker_that_starts_leaves_ctrl_c_to_others():
+    """A terminal sends it to all of them."""
+    others = workers()
+    with local_workers(1):
+        until = time.monotonic() + 120
+        while not (started := [child for child in workers() if child not in others]):
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        (told,) = (
+            line
+            for line in Path(f"/proc/{started[0].pid}/status").read_text().splitlines()
+            if line.startswith("SigBlk")
+        )
+    assert int(told.split()[1], 16) >> (signal.SIGINT - 1) & 1
 
 
 @pytest.mark.parametrize(("named", "name"), [({"count": 0}, "workers"), ({"count": 1, "threads": 0}, "threads")])
