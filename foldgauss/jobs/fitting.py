@@ -18,6 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io._lock import only_writer
 from foldgauss.io.frame_index import FrameIndex, read_indexed
@@ -33,6 +35,10 @@ from foldgauss.video.metrics import evaluate
 CHECKPOINT_SECONDS, TELL_SECONDS = 30.0, 1.0
 #: So long a job waits for one that has the same target: a worker that is taken for dead may be about to end.
 WAIT_SECONDS = 60.0
+
+
+#: Clips of so many shapes are fitted with what has been compiled for them at hand.
+SHAPES = 8
 
 
 class Stopped(Exception):
@@ -177,8 +183,28 @@ def _only_one(job: FitJob) -> Iterator[None]:
         holder.__exit__(None, None, None)
 
 
+class _Programs:
+    """What JAX has compiled, which it never forgets: some MiB for each number and size of frames."""
+
+    def __init__(self) -> None:
+        self._shapes: set[tuple[int, ...]] = set()
+        self._lock = threading.Lock()
+
+    def make_room(self, shape: tuple[int, ...]) -> None:
+        """For clips of another shape: where there have been `SHAPES`, all are forgotten."""
+        with self._lock:
+            if shape not in self._shapes and len(self._shapes) >= SHAPES:
+                jax.clear_caches()
+                self._shapes.clear()
+            self._shapes.add(shape)
+
+
+_PROGRAMS = _Programs()
+
+
 def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
     clip = _read(job)
+    _PROGRAMS.make_room(clip.frames.shape)
     source = fingerprint(clip)
     with _EARS.heard() as caught:
         state, info = _steps(job, clip, source, tell)

@@ -221,3 +221,17 @@ def test_files_go_where_they_are_asked_to(clip, tmp_path):
     assert job.record.parent == tmp_path / "records"
     assert job.record.exists()
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["model.safetensors", "records"]
+
+
+def test_what_was_compiled_for_many_shapes_is_forgotten(monkeypatch):
+    """Else a worker that goes through a thousand clips would hold programs for each."""
+    cleared = []
+    monkeypatch.setattr(fitting.jax, "clear_caches", lambda: cleared.append(True))
+    programs = fitting._Programs()
+    for length in [*range(fitting.SHAPES), 0, 1]:
+        programs.make_room((length, 8, 8, 3))
+    assert not cleared
+    programs.make_room((100, 8, 8, 3))
+    assert len(cleared) == 1
+    programs.make_room((0, 8, 8, 3))
+    assert len(cleared) == 1
