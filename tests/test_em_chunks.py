@@ -97,7 +97,10 @@ class _Files:
     "options",
     [
         {},
-        {"envelope": "time_likelihood", "covariance_type": "full", "degree": 1, "n_init": 1, "max_iter": 30},
+        pytest.param(
+            {"envelope": "time_likelihood", "covariance_type": "full", "degree": 1, "n_init": 1, "max_iter": 30},
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"covariance_type": "full", "n_init": 1}, marks=pytest.mark.slow),
         pytest.param(
             {"n_components": "auto", "degree": "auto", "max_components": 4, "annealing": 0.5}, marks=pytest.mark.slow
@@ -480,6 +483,7 @@ print(peaks[1] - peaks[0])
 """
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_chunks():
     """20 times the rows, 96 MB in all: the peak grows by less than 16 of the chunks' 1.2 MB."""
     pytest.importorskip("resource", reason="needs resource.getrusage")
