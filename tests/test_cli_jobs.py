@@ -112,6 +112,7 @@ def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole,
     assert run("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2") == 2  # not with other options
     assert "segment_seconds=1.5" in capsys.readouterr().err
     assert run("fit", long_clip, "--out", target, *SEGMENTS, "--resume") == 0
+    assert "taken up: 1 of 3 segments done, 1 begun" in capsys.readouterr().err
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()
 

@@ -56,8 +56,8 @@ def run_jobs(
                 on_end(outcome)
         except JobsStopped as error:
             done = sum(outcome.failure is None for outcome in ended.values())
-            told = f"stopped by {asked.name or 'the worker'}; {done} of {len(jobs)} {what} are done, the others kept"
-            raise Stopped(f"{told}. {cure}") from error
+            told = f"stopped by {asked.name or 'the worker'}; {done} of {len(jobs)} {what} are done"
+            raise Stopped(f"{told}, what was begun is kept. {cure}") from error
     return [ended[job.target] for job in jobs]
 
 
@@ -168,7 +168,7 @@ class _Lines(_View):
 
     def ended(self, outcome: Outcome) -> None:
         super().ended(outcome)
-        if self.total <= FEW and self.done + self.failed < self.total:
+        if self.total <= FEW:
             what = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
             err.print(f"{self.counts}: {outcome.job.name}, {what}", soft_wrap=True)
 

@@ -1,5 +1,6 @@
 """The commands that change a model, and take it to other programs and back: `edit`, `segment`, `export`, `import`."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -102,6 +103,8 @@ def edit_command(
     if as_model:
         about = read_origin(model_path)
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
+        if isinstance(edited, SegmentedVideo):
+            edited = _without_scores(model, edited)
         save_video_model(out_path, edited, metadata=about)
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
         if isinstance(edited, SegmentedVideo):
@@ -109,6 +112,18 @@ def edit_command(
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     draw(edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=picture_size, overwrite=overwrite)
+
+
+def _without_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
+    """The edited video; what was noted of its segments' quality is of them unedited."""
+    before = set(map(id, model.segments))
+    segments = []
+    for segment in edited.segments:
+        if id(segment) not in before:
+            kept = {name: value for name, value in segment.metadata.items() if name in ("clip", "frames")}
+            segment = dataclasses.replace(segment, metadata=kept)
+        segments.append(segment)
+    return SegmentedVideo(segments)
 
 
 @app.command(name="export")

@@ -10,6 +10,7 @@ from foldgauss.cli._app import Stopped, WrongUse, as_option, err, out
 from foldgauss.cli._jobs_view import LINE, Hands, run_jobs, tell_json
 from foldgauss.cli._shared import print_figures, progress_bar
 from foldgauss.jobs import LongFit, Outcome, plan_long_fit, segments_folder
+from foldgauss.jobs.fitting import finished
 from foldgauss.jobs.long import SEGMENT_SECONDS, kept_seconds
 from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
 
@@ -99,7 +100,8 @@ def _planned(video: Path, target: Path, config: FitConfig, manner: Manner, asked
             return plan_long_fit(video, target, config, on_frame=on_frame, **asked)
     except ValueError as error:
         if str(error).startswith(("segment_seconds:", "resume:", "target:")):
-            raise WrongUse(as_option(str(error)).replace("--target:", "--out:", 1)) from error
+            text = as_option(str(error)).replace("--target:", "--out:", 1).replace("num_gaussians=", "gaussians=")
+            raise WrongUse(text) from error
         raise
 
 
@@ -122,6 +124,10 @@ def _say_plan(fit: LongFit, config: FitConfig, manner: Manner, video: Path, crew
         tell_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
     if manner in ("json", "quiet"):
         return
+    done = sum(finished(job) is not None for job in fit.jobs)
+    begun = sum(job.kept.exists() for job in fit.jobs)
+    if done or begun:
+        err.print(f"taken up: {done} of {len(fit.jobs)} segments done, {begun} begun", soft_wrap=True)
     budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
     plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"

@@ -326,7 +326,7 @@ def _kept_plan(folder: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
             "resume",
             expected=", ".join(f"{name}={pair[0]!r}" for name, pair in told.items()),
             got=", ".join(f"{name}={pair[1]!r}" for name, pair in told.items()),
-            cure=f"Continue {str(folder)!r} with the options it was begun with, or start anew with --overwrite.",
+            cure=f"What was begun is kept in {str(folder)!r}: give its options, or start anew with --overwrite.",
         )
     return plan
 

@@ -8,10 +8,12 @@ import dataclasses
 import logging
 import os
 import queue
+import re
 import secrets
 import signal
 import tempfile
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
 DEATHS, ROUNDS = 3, 3
 #: Seconds that workers have to keep what they do, once they are asked to stop.
 GRACE = 60.0
+#: What dask takes for an address.
+_ADDRESS = re.compile(r"((tcp|tls|ucx|ucxx|ws|wss)://)?[^/\s]+:[0-9]{1,5}/?")
+#: Seconds after which it is said that a cluster has no workers.
+TOLD_SECONDS = 10.0
 #: Seconds that a scheduler has to answer.
 CONNECT_SECONDS = 10.0
 #: Seconds that a cluster may be without workers.
@@ -219,6 +225,9 @@ def running_cluster(address: str) -> Iterator["Crew"]:
 
 
 def _client(distributed: Any, address: str) -> "Client":
+    if not _ADDRESS.fullmatch(address):  # dask would take its time, and leave half a client
+        expected, cure = "an address as tcp://host:8786", "It is what `dask scheduler` says when it starts."
+        raise invalid("scheduler", expected=expected, got=repr(address), cure=cure)
     try:
         return distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
     except (OSError, TimeoutError, ValueError) as error:
@@ -261,7 +270,7 @@ class _Run:
         self.waiting, self.ended = deque(jobs), queue.SimpleQueue()
         self.open: dict[str, tuple[Any, FitJob]] = {}
         self.rounds: dict[str, tuple[int, Any]] = {}  # in which a job's workers died
-        self.seen = time.monotonic()  # workers
+        self.seen, self.told_lonely = time.monotonic(), False  # workers; that there are none
 
     def outcomes(self) -> Iterator[Outcome]:
         # Events come on the client's own thread, and go to `watch` on this one.
@@ -282,6 +291,9 @@ class _Run:
         elif time.monotonic() - self.seen > NO_WORKERS:
             told = "start some, and give the command again" if self.crew.is_remote else _NONE_HERE
             raise SchedulerLost(f"No worker came for {NO_WORKERS:g} s. What is finished is kept: {told}.")
+        elif self.crew.is_remote and not self.told_lonely and time.monotonic() - self.seen > TOLD_SECONDS:
+            self.told_lonely = True
+            warnings.warn("No worker has come yet. Start some: dask worker ADDRESS --nthreads 1.", stacklevel=2)
         while self.waiting and len(self.open) < threads:
             self._submit(self.waiting.popleft())
 

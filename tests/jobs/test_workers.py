@@ -176,3 +176,10 @@ def test_without_dask_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match=r"foldgauss\[distributed\]"), local_workers(1):
         pass
+
+
+@pytest.mark.parametrize("address", ["localhost", "http://127.0.0.1:8786", "tcp://host:port", ""])
+def test_what_is_no_address_is_refused_at_once(address):
+    refused = pytest.raises(ValueError, match=r"^scheduler: expected an address as tcp://host:8786")
+    with refused, running_cluster(address):
+        pass
