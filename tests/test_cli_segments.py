@@ -233,3 +233,16 @@ def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, c
     said = told(capsys)
     assert "MODEL: expected a model of one piece, got one of 3 segments. Take one out: foldgauss segment" in said
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_was_noted_of_quality_is_not_that_of_edited_segments(here, tmp_path):
+    """Segments that an edit leaves alone keep it."""
+    noted = [dataclasses.replace(part, metadata={"clip": "clip", "mean_psnr": 30.0}) for part in video().segments]
+    save_video_model(tmp_path / "noted.safetensors", SegmentedVideo(noted))
+    (tmp_path / "dark.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\nframe = 0\n')
+    assert (
+        run("edit", tmp_path / "noted.safetensors", tmp_path / "dark.toml", "--out", tmp_path / "dark.safetensors") == 0
+    )
+    first, *others = load_video_model(tmp_path / "dark.safetensors").segments
+    assert first.metadata == {"clip": "clip"}
+    assert all(segment.metadata == {"clip": "clip", "mean_psnr": 30.0} for segment in others)
