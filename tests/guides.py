@@ -12,7 +12,7 @@ Every fenced block says what it is, and what it is says what becomes of it:
 A block without one of these languages is refused, as are commands that stand in an indented block, so that none
 escapes. All of a page runs in one folder, which holds the clip and whatever else the page takes for granted (`GIVEN`).
 
-Commands run in this process, where kernels are compiled once. What they are given is what the page says, with five
+Commands run in this process, where kernels are compiled once. What they are given is what the page says, with six
 exceptions, which are all there are:
 
 - `CHEAPER` adds options to what would take minutes: fewer steps, no other work. Only to a command that does not say
@@ -20,6 +20,8 @@ exceptions, which are all there are:
 - `foldgauss.video.fit` takes as many steps as the page says, and where it gives more than `SHORT` minutes or
   nothing, `STEPS`.
 - `foldgauss demo` takes all its steps on one page, README, and `STEPS` on others.
+- Workers are tested elsewhere: what `--workers` and `--scheduler` are asked to do is done by this process; of `dask`
+  the options are looked up.
 - `foldgauss view` makes its page and its server, opens no browser, and is ended as by Ctrl-C.
 - `pip`, `pytest`, `ruff` and so on change the machine or run this very suite: what they name (extras, files, markers,
   tools) is looked up. `python -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no
@@ -151,6 +153,7 @@ def _run_command(words: list[str], where: str) -> None:
 
 
 def _foldgauss(words: list[str], where: str) -> None:
+    words = _alone(words)
     more = CHEAPER.get(words[0], [])
     given = {word.partition("=")[0] for word in words}
     if not given & {"--steps", "--minutes", "--only"} and not (words[0] == "compress" and "--passes" in given):
@@ -169,6 +172,23 @@ def _foldgauss(words: list[str], where: str) -> None:
         warnings.simplefilter("default")
         code = run(*words)
     assert code == 0, f"{where}: foldgauss {' '.join(map(str, words))}"
+
+
+def _alone(words: list[str]) -> list[str]:
+    """A command without its workers; a fit that they would do in segments is done in segments."""
+    for option in ("--workers", "--scheduler"):
+        if option in words:
+            at = words.index(option)
+            segments = ["--segment-seconds", "10"] if words[0] == "fit" else []
+            words = [*words[:at], *words[at + 2 :], *segments]
+    return words
+
+
+def _dask(words: list[str], where: str) -> None:
+    """Its subcommand and options are those of `dask`."""
+    known = importlib.import_module(f"distributed.cli.dask_{words[0]}").main.params
+    options = {option for parameter in known for option in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= options, where
 
 
 def _ended(server) -> None:
@@ -251,6 +271,7 @@ _TOOLS = {
     "mkdocs": _developer_tool("mkdocs"),
     "jupyter": _developer_tool("jupyterlab"),
     "bash": _bash,
+    "dask": _dask,
 }
 
 
@@ -312,6 +333,12 @@ def _edit_script(folder: Path) -> None:
     (folder / "edits.toml").write_text('[[edits]]\ndo = "rotate"\ndegrees = 5\nabout = [0, 0]\n')
 
 
+def _holidays(folder: Path) -> None:
+    """A folder with clips."""
+    (folder / "holidays").mkdir()
+    write_video(folder / "holidays" / "beach.mp4", _clip(), 25.0)
+
+
 def _ply(folder: Path) -> None:
     """A video as the published code writes it."""
     model = fit(_clip(), FitConfig(num_gaussians=100, steps=5), fps=24.0).model
@@ -320,18 +347,19 @@ def _ply(folder: Path) -> None:
 
 #: By name as pages write it.
 THINGS = {
-    **{name: _video(name) for name in ("holiday.mp4", "clip.mp4", "bunny.mp4")},
+    **{name: _video(name) for name in ("holiday.mp4", "clip.mp4", "bunny.mp4", "film.mp4")},
     **{f"{name}.safetensors": _model(f"{name}.safetensors") for name in ("holiday", "model", "bunny")},
     "folder/of/images": _images("folder/of/images"),
     "masks": _masks,
     "point_cloud.ply": _ply,
     "DAVIS": _davis,
+    "holidays": _holidays,
     "edits.toml": _edit_script,
 }
 #: What each page takes for granted.
 GIVEN = {
-    "README.md": ("holiday.mp4", "masks"),
-    "docs/commands.md": ("holiday.mp4", "edits.toml"),
+    "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
+    "docs/commands.md": ("holiday.mp4", "edits.toml", "film.mp4", "holidays"),
     "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/editing.md": ("holiday.safetensors", "edits.toml", "point_cloud.ply"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
@@ -340,6 +368,7 @@ GIVEN = {
     "docs/player.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/quickstart.md": ("holiday.mp4",),
     "docs/results.md": ("bunny.mp4", "bunny.safetensors"),
+    "docs/scale.md": ("film.mp4", "holidays"),
     "docs/slow-motion.md": ("holiday.mp4",),
     "docs/tradeoff.md": ("holiday.mp4",),
     "docs/uncertainty.md": ("clip.mp4", "model.safetensors"),
