@@ -6,6 +6,7 @@ function of pieces: of a dask array it is done by parts, on workers where a `das
 the results come in the order of the rows. dask is imported only if the rows are a dask array.
 """
 
+import abc
 import functools
 import itertools
 import sys
@@ -56,23 +57,23 @@ def chunks_of(X, sample_weight=None, width: int | None = None) -> "Chunks":
     return (_DaskChunks if _dask_kind(X) else _Stream)(X, sample_weight, width)
 
 
-class Chunks:
+class Chunks(abc.ABC):
     """Chunks that can be gone through again and again. `num_parts` tasks make a pass."""
 
     num_parts: int
     width: int | None
     on_workers = False
 
+    @abc.abstractmethod
     def run(self, task: Callable, *arguments, each: Sequence | None = None) -> Iterator:
         """`task(pieces, *arguments)` of every part, or `task(pieces, each[part], *arguments)`; in order."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def mapped(self, function: Callable, known, *, num_columns: int | None = None, dtype=None):
         """`function(known, x)` of each chunk, (n_i,) or (n_i, num_columns): an iterator, or a dask array.
 
         `dtype` is that of the results, by default float32 of float32 chunks and else float64.
         """
-        raise NotImplementedError
 
 
 class _Stream(Chunks):

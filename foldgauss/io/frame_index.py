@@ -68,7 +68,7 @@ _NO_INDEX = (
     TypeError,
     ValueError,
     AttributeError,
-    NotImplementedError,
+    NotImplementedError,  # zipfile: of a compression that it does not know
     zipfile.BadZipFile,
     zlib.error,
 )
