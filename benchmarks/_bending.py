@@ -7,9 +7,9 @@ import numpy as np
 from sklearn.mixture import GaussianMixture
 from sklearn.model_selection import GridSearchCV, GroupKFold
 
-from foldgauss import datasets
-from foldgauss.estimator import FoldedGaussianMixture
-from foldgauss.video.motion import Motion
+from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
+from foldgauss.io import datasets
+from foldgauss.video.fitting.optical_flow import Motion
 
 #: s = sum_j c_j t^j, two space coordinates: three curves that cross.
 CURVES = np.array(

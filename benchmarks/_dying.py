@@ -104,7 +104,7 @@ class Plan:
 def main(arguments: list[str]) -> None:
     plan = Plan(**json.loads(arguments[0]))
     from foldgauss import cli
-    from foldgauss.cli import fitting
+    from foldgauss.cli.fitting import fit as fitting
 
     if plan.every is not None:
         fitting.CHECKPOINT_SECONDS = plan.every

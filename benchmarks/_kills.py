@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks._dying import HIDDEN
-from foldgauss.datasets import bunny
-from foldgauss.io.model_file import ModelFileError, load_model, read_header
-from foldgauss.io.video_file import write_video
-from foldgauss.io.video_model import load_video_model, read_metadata, save_video_model
+from foldgauss.io.datasets import bunny
+from foldgauss.io.media.video_file import write_video
+from foldgauss.io.models.model_file import ModelFileError, load_model, read_header
+from foldgauss.io.models.video_model import load_video_model, read_metadata, save_video_model
 
 #: Frames and size of the clip that is fitted.
 FRAMES, SIZE = (0, 12), (80, 160)

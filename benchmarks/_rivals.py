@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._common import Scene
-from foldgauss._kernels import kernel
-from foldgauss._threads import run_tasks
-from foldgauss._vectors import choose, every, exp2, lanes, load, store
+from foldgauss._numerics.simd import choose, every, exp2, lanes, load, store
+from foldgauss._runtime.kernels import kernel
+from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, _cpu_kernels, cpu
 from foldgauss.render._cpu_kernels import _f, _i, _u
 

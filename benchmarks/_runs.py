@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks._common import console, machine
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.video_file import Clip
+from foldgauss.io.media.video_file import Clip
 from foldgauss.video import FitConfig, VideoModel, fit, fit_steps, psnr, ssim
 
 Run = dict[str, Any]
@@ -102,7 +102,7 @@ TIMED, UNTIMED = 12, 4
 
 def seconds_per_step(clip: Clip, config: FitConfig, num_gaussians: int) -> float:
     """The median of some steps at full size with so many Gaussians, none of them born or dead."""
-    still = {"num_gaussians": num_gaussians, "growth": None, "quarter_share": 0.0, "half_share": 0.0}
+    still = {"num_gaussians": num_gaussians, "growth": None, "quarter_fraction": 0.0, "half_fraction": 0.0}
     timed = dataclasses.replace(config, steps=UNTIMED + TIMED, minutes=None, **still)
     seconds = [info.seconds for _, info in fit_steps(clip.frames, timed)]
     return statistics.median(np.diff(seconds[UNTIMED - 1 :]))

@@ -21,7 +21,7 @@ import warnings
 import numpy as np
 
 from benchmarks import _common
-from foldgauss.estimator import FoldedGaussianMixture
+from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
 #: Rows that are made from one seed, so that every way has the same ones.
 SEED_ROWS = 12_500

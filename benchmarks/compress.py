@@ -21,13 +21,13 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
 from foldgauss.io import read_video, save_compact, save_video_model
-from foldgauss.io.video_file import Clip
-from foldgauss.io.video_model import load_video_model
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import Clip
+from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit, psnr
-from foldgauss.video.light import LitModel, contributions
-from foldgauss.video.regions import Region
+from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.regions import Region
 
 SIZE, CLIPS, PRUNED_DB = (160, 320), ("bunny", "bikes"), 0.01
 #: Arguments of each coder; {q} is its quality, 0 the best.
@@ -39,7 +39,7 @@ CODERS = {
 
 def pruned(model: VideoModel, clip: Clip) -> VideoModel:
     """Without as many of the Gaussians that add least as `PRUNED_DB` allows."""
-    lit = LitModel(model)
+    lit = Contributions(model)
     everywhere = np.ones(model.size, np.float32)
     order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     before, least, most = evaluate(model, clip.frames).mean_psnr, 0, model.num_gaussians - 1

@@ -24,9 +24,9 @@ from pathlib import Path
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted
-from foldgauss.datasets import davis
+from foldgauss.io.datasets import davis
 from foldgauss.video import FitConfig
-from foldgauss.video.config import PRESETS
+from foldgauss.video.fitting.config import PRESETS
 
 MINUTES, CROP = 10.0, (960, 1920)
 SMALL, FULL = ("480p",), ("Full-Resolution", "1080p")  # names of folders: DAVIS 2017, DAVIS 2016

@@ -18,11 +18,11 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import console
 from benchmarks.compress import kept
-from foldgauss.datasets import sample_clip
 from foldgauss.io import read_video, save_video_model
+from foldgauss.io.datasets import sample_clip
 from foldgauss.video import Economy, FitConfig, VideoModel, evaluate, fit
-from foldgauss.video.light import LitModel, contributions
-from foldgauss.video.regions import Region
+from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.regions import Region
 
 SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (1, 3, 7, 0)
 #: Where the search begins, for the default clip, and its step.
@@ -31,7 +31,7 @@ FIRST, RATIO = 12_000, 2**0.125
 
 def pruned(model: VideoModel, frames: np.ndarray, psnr: float) -> VideoModel:
     """Without as many of the Gaussians that add least as leave the mean PSNR at `psnr`."""
-    lit, everywhere = LitModel(model), np.ones(model.size, np.float32)
+    lit, everywhere = Contributions(model), np.ones(model.size, np.float32)
     order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     least, most = 0, model.num_gaussians - 1
     while most - least > max(model.num_gaussians // 200, 1):

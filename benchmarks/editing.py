@@ -33,8 +33,8 @@ from PIL import Image
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import bikes
 from foldgauss.io import load_video_model, save_video_model
+from foldgauss.io.datasets import bikes
 from foldgauss.video import (
     Edit,
     EditedVideo,

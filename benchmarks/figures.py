@@ -20,8 +20,8 @@ from matplotlib.transforms import Affine2D
 from benchmarks import _common
 from benchmarks.editing import Scene, fitted, rider
 from foldgauss import Constant, FoldedGaussian, PolynomialFold, TimeLikelihood, ZeroFold
+from foldgauss.analysis.plot import plot_density
 from foldgauss.io._atomic import atomic_path
-from foldgauss.plot import plot_density
 from foldgauss.render import Camera, Gaussians3D, project, render
 from foldgauss.video import FitConfig, VideoModel, by_mask
 
@@ -31,7 +31,7 @@ DPI = 140
 BRIGHTNESS = 1.6
 #: Frames that the sheet shows, one a column.
 SHOWN = (2, 5, 8)
-CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, between_share=0.5)
+CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, interpolation_fraction=0.5)
 #: One in so many Gaussians has its outline drawn.
 EVERY = 4
 

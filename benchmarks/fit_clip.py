@@ -10,7 +10,7 @@ and get `default_num_gaussians` by it; other presets have their own numbers. `--
 this with other defaults.
 
 The way there is the running PSNR of the fit itself (about one pass through the frames, before rounding to 8 bits);
-`--plot` draws it. The end is `foldgauss.video.metrics.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean
+`--plot` draws it. The end is `foldgauss.video.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean
 over all frames. `minutes` is the wall time of the whole fit, motion, starts and compilation included, reading and
 evaluation not.
 """
@@ -24,12 +24,12 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import Clip, read_video
-from foldgauss.video.config import PRESETS, FitConfig
-from foldgauss.video.fit import FitInfo, fit
-from foldgauss.video.metrics import Evaluation, evaluate
-from foldgauss.video.model import VideoModel
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.video.fitting.config import PRESETS, FitConfig
+from foldgauss.video.fitting.loop import FitInfo, fit
+from foldgauss.video.models.metrics import Evaluation, evaluate
+from foldgauss.video.models.video_model import VideoModel
 
 SAMPLES = ("bunny", "bikes", "carphone")
 BUNNY_SIZE, BUNNY_GAUSSIANS = (160, 320), 40_000  # the line of the design, section 7

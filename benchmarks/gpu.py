@@ -28,12 +28,12 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import Scene, Task, console, interleaved, random_scene
 from benchmarks.rasterizer import num_boxes
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import read_video
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions, Splats2D, cpu, pallas, render, tiles, xla
-from foldgauss.video.config import FitConfig
-from foldgauss.video.fit import fit_steps, mean_psnr, to_model
-from foldgauss.video.model import VideoModel
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.loop import fit_steps, mean_psnr, to_model
+from foldgauss.video.models.video_model import VideoModel
 
 ENGINES = {"xla": xla.TILE_SIZE, "pallas": pallas.TILE_SIZE}  # with the sides of their tiles
 PARTS = ("engines", "quality", "playback")

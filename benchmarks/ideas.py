@@ -15,17 +15,17 @@ import statistics
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import read_video
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, evaluate, fit
 
 #: What switches an idea off.
 IDEAS = {
     "starts along the flow, shots apart": {"follow_motion": False},
-    "rates in units of own time": {"own_time": False},
-    "coarse to fine": {"quarter_share": 0.0, "half_share": 0.0},
-    "squared error at the end": {"square_share": 0.0},
+    "rates in units of own time": {"scale_rates_by_duration": False},
+    "coarse to fine": {"quarter_fraction": 0.0, "half_fraction": 0.0},
+    "squared error at the end": {"l2_fraction": 0.0},
     "frame times learned": {"learn_frame_times": False},
     "low pass 0.1 px^2 instead of 0.3": {"options": RenderOptions()},
 }

@@ -23,14 +23,14 @@ import numpy as np
 
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
-from foldgauss.io.pictures import comparison
-from foldgauss.io.video_file import Clip, read_video, write_image
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.pictures import comparison
+from foldgauss.io.media.video_file import Clip, read_video, write_image
 from foldgauss.video import interpolated_times
-from foldgauss.video.config import FitConfig
-from foldgauss.video.fit import fit
-from foldgauss.video.metrics import psnr
-from foldgauss.video.shots import is_cut
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.loop import fit
+from foldgauss.video.models.metrics import psnr
+from foldgauss.video.models.shots import is_cut
 
 CLIPS, SIZE, GAUSSIANS, MINUTES = ("bunny", "bikes"), (160, 320), 40_000, 2.0
 SHOWN = 4

@@ -20,13 +20,13 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import Task, console
-from foldgauss._threads import set_num_threads
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import read_video
-from foldgauss.io.video_model import load_video_model
+from foldgauss._runtime.threads import set_num_threads
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import read_video
+from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.video.fit import FitConfig, fit
-from foldgauss.video.playback import Playback
+from foldgauss.video.fitting.loop import FitConfig, fit
+from foldgauss.video.models.renderer import VideoRenderer
 
 SIZE, SECONDS, GAUSSIANS, FRAMES = (320, 640), 120.0, 60_000, 12
 
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
         config = FitConfig(num_gaussians=GAUSSIANS, minutes=options.seconds / 60)
         console.print(f"fitting {GAUSSIANS:,} Gaussians for {options.seconds:.0f} s", style="dim")
         model = fit(clip.frames, config, fps=clip.fps).model
-    playback, times = Playback(model, options.size), np.asarray(model.frame_times.times())
+    playback, times = VideoRenderer(model, options.size), np.asarray(model.frame_times.times())
     shown = np.linspace(0, len(times) - 1, options.frames).astype(int)
     leaves = []
     for k in shown:

@@ -19,13 +19,13 @@ import numpy as np
 from sklearn.mixture import GaussianMixture
 
 from benchmarks import _bending, _common
-from foldgauss._em.loop import State, _steps, used_degrees
-from foldgauss._em.scaling import Scaling, to_mixture
-from foldgauss._em.starts import from_joint
-from foldgauss._em.statistics import points_of
-from foldgauss._em.updates import Model
 from foldgauss.envelope import Constant
-from foldgauss.estimator import FoldedGaussianMixture
+from foldgauss.estimator.em.loop import State, _steps, used_degrees
+from foldgauss.estimator.em.scaling import Scaling, to_mixture
+from foldgauss.estimator.em.starts import from_joint
+from foldgauss.estimator.em.statistics import points_of
+from foldgauss.estimator.em.updates import Model
+from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
 DIM = 3
 REG = 0.0  # scikit-learn adds it to the covariance as a whole, foldgauss to that of space given time and to time's

@@ -16,13 +16,13 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import read_video
-from foldgauss.io.video_model import load_video_model, save_video_model
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import read_video
+from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.render import cpu
-from foldgauss.video.fit import FitConfig, fit
-from foldgauss.video.model import VideoModel
-from foldgauss.video.playback import Playback, to_bytes
+from foldgauss.video.fitting.loop import FitConfig, fit
+from foldgauss.video.models.renderer import VideoRenderer, to_bytes
+from foldgauss.video.models.video_model import VideoModel
 
 SIZE, SECONDS, GAUSSIANS = (640, 1280), 300.0, 150_000
 
@@ -39,7 +39,7 @@ def fitted(options: argparse.Namespace) -> VideoModel:
     return model
 
 
-def stages(playback: Playback, times: np.ndarray) -> dict[str, float]:
+def stages(playback: VideoRenderer, times: np.ndarray) -> dict[str, float]:
     """Median milliseconds per frame of each stage."""
     seconds = {"condition": [], "blend": [], "to bytes": []}
     alive, pairs = [], []
@@ -65,7 +65,7 @@ def stages(playback: Playback, times: np.ndarray) -> dict[str, float]:
 def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(_parser(), arguments)
     facts, model = _common.machine(), fitted(options)
-    playback, times = Playback(model, options.size), np.asarray(model.frame_times.times())
+    playback, times = VideoRenderer(model, options.size), np.asarray(model.frame_times.times())
     list(playback.frames(times[:3]))  # compiled
     rates, slowest = [], 0.0
     for _ in range(options.rounds):

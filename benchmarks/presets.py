@@ -23,10 +23,10 @@ from pathlib import Path
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scaled, seconds_per_step, told
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import Clip, read_video
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig
-from foldgauss.video.config import PRESETS
+from foldgauss.video.fitting.config import PRESETS
 
 SIZES, MINUTES = ((160, 320), (320, 640)), 5.0
 #: The pace of `paper` is that with so many times the Gaussians at the start. Small frames grow more than the paper's

@@ -51,7 +51,7 @@ import numpy as np
 
 from benchmarks import _common, _rivals
 from benchmarks._common import Scene, Task, console, interleaved, random_scene
-from foldgauss._threads import run_tasks, set_num_threads
+from foldgauss._runtime.threads import run_tasks, set_num_threads
 from foldgauss.render import RenderOptions, Splats2D, cpu, render
 
 SCENES = {

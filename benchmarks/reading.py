@@ -21,8 +21,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
 from foldgauss.io import FrameIndex, LazyFrames, index_video, read_indexed, read_video
+from foldgauss.io.datasets import sample_clip
 
 FRAMES, ROUNDS = 2112, 3
 _ENCODER = ["-an", "-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p", "-g", "250", "-bf", "3"]

@@ -27,9 +27,9 @@ import psutil
 from rich.table import Table
 
 from benchmarks._common import console, machine, parse, parser, size, whole
-from foldgauss.datasets import sample_clip
 from foldgauss.io import index_video, join_segments, load_video_model, read_video, save_video_model, write_video
 from foldgauss.io._atomic import atomic_path
+from foldgauss.io.datasets import sample_clip
 from foldgauss.jobs import seam_drops
 from foldgauss.video import FitConfig, SegmentedVideo, fit, plan_segments, psnr
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.step [--json FILE] [--gaussians 200000] [--size 160x320] [--steps 24]
 
-The real fit (`foldgauss.video.fit.fit_steps`) runs on the sample clip Bunny, degree 3, one frame a step;
+The real fit (`foldgauss.video.fit_steps`) runs on the sample clip Bunny, degree 3, one frame a step;
 every function it calls is wrapped in a clock that waits for the result. The total is the time of a whole
 step, its own bookkeeping included; "target" (bytes to floats) is timed on its own, side by side; "other" is
 what remains of the total. All times are medians over the steps after the warm-up, which compiles.
@@ -28,15 +28,15 @@ import optax
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io.video_file import read_video
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import read_video
 from foldgauss.render import cpu
-from foldgauss.video.fit import FitConfig, FitState, fit_steps
-from foldgauss.video.packing import unpack
+from foldgauss.video.fitting.loop import FitConfig, FitState, fit_steps
+from foldgauss.video.models.row_layout import unpack
 
 #: The module, which the function `fit` of the package hides.
-fit_module = importlib.import_module("foldgauss.video.fit")
+fit_module = importlib.import_module("foldgauss.video.fitting.loop")
 WARMUP = 5  # steps: the first compiles, and the optimiser's pages are touched for the first time
 #: What is timed, in the order of a step.
 PARTS = {
@@ -184,7 +184,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(parser, arguments)
     facts = _common.machine()
     frames = read_video(sample_clip("bunny"), size=options.size).frames
-    config = FitConfig(num_gaussians=options.gaussians, degree=3, steps=3000, quarter_share=0.0, half_share=0.0)
+    config = FitConfig(num_gaussians=options.gaussians, degree=3, steps=3000, quarter_fraction=0.0, half_fraction=0.0)
     records, state, num_alive = measure(frames, config, options.steps)
     naive = naive_adam(state, config, max(7, options.steps // 2))
     height, width = options.size

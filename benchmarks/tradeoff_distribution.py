@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import Task
-from foldgauss._em.components import Parameters, log_likelihoods, pairs_of
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
+from foldgauss.estimator.em.components import Parameters, log_likelihoods, pairs_of
 from foldgauss.fold import FourierFold, PolynomialFold
 
 ORDERS = (4, 8, 16, 32, 64, 128)

@@ -27,10 +27,10 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.datasets import sample_clip
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model
-from foldgauss.io.video_file import read_video
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
@@ -43,7 +43,7 @@ from foldgauss.uncertainty import (
     frame_time_posterior,
     simulated_ranks,
 )
-from foldgauss.uncertainty.screen import Screen
+from foldgauss.uncertainty.likelihood.residuals import Screen
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, fit
 
 PARTS = "clip", "unseen", "calibration", "retimed"

@@ -7,12 +7,23 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING
 
+from foldgauss._runtime import notebook_hooks
+
 if TYPE_CHECKING:
+    from foldgauss.analysis.divergence import kl_divergence
     from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
-    from foldgauss.divergence import kl_divergence
     from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood, plain_envelope
+    from foldgauss.estimator import FoldedGaussianMixture
     from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
     from foldgauss.mixture import FoldedMixture, GaussianMixture
+
+for _kind, _location in {
+    "distribution": "foldgauss.analysis.notebook:distribution_png",
+    "mixture": "foldgauss.analysis.notebook:mixture_png",
+    "history": "foldgauss.analysis.notebook:history_png",
+    "video": "foldgauss.io.page.html:notebook_frame",
+}.items():
+    notebook_hooks.register(_kind, _location)
 
 __version__ = "0.1.0"
 
@@ -21,6 +32,7 @@ __all__ = [
     "CallableFold",
     "Constant",
     "FoldedGaussian",
+    "FoldedGaussianMixture",
     "FoldedMixture",
     "FourierFold",
     "Gaussian",
@@ -37,8 +49,9 @@ __all__ = [
 
 _HOMES = {
     "distribution": ("FoldedGaussian", "Gaussian", "Normal"),
-    "divergence": ("kl_divergence",),
+    "analysis.divergence": ("kl_divergence",),
     "envelope": ("CallableEnvelope", "Constant", "TimeLikelihood", "plain_envelope"),
+    "estimator": ("FoldedGaussianMixture",),
     "fold": ("CallableFold", "FourierFold", "PolynomialFold", "SplineFold", "ZeroFold"),
     "mixture": ("FoldedMixture", "GaussianMixture"),
 }

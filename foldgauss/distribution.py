@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from foldgauss import moments
-from foldgauss._batch import (
+from foldgauss._numerics.batch import (
     align,
     as_value,
     batch_of,
@@ -24,15 +23,16 @@ from foldgauss._batch import (
     fill,
     parts_of,
 )
-from foldgauss._checks import invalid
-from foldgauss._factor import check_loc, given_factor
-from foldgauss._far import far_reaching
-from foldgauss._restrict import checked_indices, restricted_fold, restricted_tril
-from foldgauss._threads import check_process
-from foldgauss._triangular import columns_of, lower_times, solve_lower, stacked
-from foldgauss.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
+from foldgauss._numerics.factor import check_loc, checked_indices, given_factor, restricted_tril
+from foldgauss._numerics.safe_grad import far_reaching
+from foldgauss._numerics.triangular import columns_of, lower_times, solve_lower, stacked
+from foldgauss._runtime import notebook_hooks
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import check_process
+from foldgauss.analysis import interop, moments
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
-from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, shift_at
+from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, restricted_fold, shift_at
 from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
@@ -417,33 +417,17 @@ class FoldedGaussian(eqx.Module):
 
     # --- fits, bridges, pictures: imported when asked for -----------------------------------------------------
 
-    @staticmethod
-    def fit(x: Float[Array, "n d"], **options):
-        """Maximum likelihood from points x = (s, t): see `foldgauss.likelihood.fit` for options and result.
-
-        **Example:** `FoldedGaussian.fit(x, degree=2).distribution`
-        """
-        from foldgauss import likelihood
-
-        return likelihood.fit(x, **options)
-
     def to_numpyro(self):
-        """This distribution for numpyro models: see `foldgauss.bridges.to_numpyro`."""
-        from foldgauss import bridges
-
-        return bridges.to_numpyro(self)
+        """This distribution for numpyro models: see `foldgauss.analysis.interop.to_numpyro`."""
+        return interop.to_numpyro(self)
 
     def to_scipy(self):
-        """This distribution, frozen, with scipy's methods: see `foldgauss.bridges.to_scipy`."""
-        from foldgauss import bridges
-
-        return bridges.to_scipy(self)
+        """This distribution, frozen, with scipy's methods: see `foldgauss.analysis.interop.to_scipy`."""
+        return interop.to_scipy(self)
 
     def _repr_png_(self) -> bytes | None:
         """What a notebook shows: the density over time and space, or of many coordinates some views of it."""
-        from foldgauss import _display
-
-        return _display.distribution_png(self)
+        return notebook_hooks.show("distribution", self)
 
 
 def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._checks import invalid
-from foldgauss._pointwise import call_each, split
+from foldgauss._numerics.pointwise import call_each, split
+from foldgauss._runtime.checks import invalid
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
 

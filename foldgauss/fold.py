@@ -16,10 +16,10 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._checks import invalid
-from foldgauss._pointwise import call_each, split
-from foldgauss._threads import check_process
-from foldgauss._triangular import columns_of, stacked
+from foldgauss._numerics.pointwise import call_each, split
+from foldgauss._numerics.triangular import columns_of, stacked
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import check_process
 
 __all__ = [
     "AbstractFold",
@@ -368,3 +368,29 @@ def _spline_basis(v: Array, knots: tuple[float, ...], degree: int) -> list[Array
 
 def _ramp(v: Array, start: float, end: float) -> Array:
     return (v - start) / (end - start) if start < end else jnp.zeros_like(v)
+
+
+class RestrictedFold(AbstractFold):
+    """Some coordinates of a fold of any class, `f(u)[indices]`."""
+
+    fold: AbstractFold
+    indices: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return self.fold.leaf_ranks
+
+    @property
+    def is_closed(self) -> bool:
+        return self.fold.is_closed
+
+    def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch kept"]:
+        return self.fold(u)[..., np.array(self.indices)]
+
+
+def restricted_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:
+    if isinstance(fold, ZeroFold):
+        return ZeroFold(len(indices))
+    if isinstance(fold, PolynomialFold):
+        return PolynomialFold(fold.coefficients[..., np.array(indices)])
+    return RestrictedFold(fold, indices)

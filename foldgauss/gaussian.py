@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
-from foldgauss._batch import (
+from foldgauss._numerics.batch import (
     align,
     as_value,
     batch_of,
@@ -24,12 +24,19 @@ from foldgauss._batch import (
     common_dtype,
     parts_of,
 )
-from foldgauss._checks import invalid
-from foldgauss._factor import check_space, check_tril
-from foldgauss._far import far_reaching
-from foldgauss._restrict import checked_indices, restricted_tril
-from foldgauss._threads import check_process
-from foldgauss._triangular import UNROLLED_SIZE, Columns, columns_of, lower_times, solve_lower, solve_upper, stacked
+from foldgauss._numerics.factor import check_space, check_tril, checked_indices, restricted_tril
+from foldgauss._numerics.safe_grad import far_reaching
+from foldgauss._numerics.triangular import (
+    UNROLLED_SIZE,
+    Columns,
+    columns_of,
+    lower_times,
+    solve_lower,
+    solve_upper,
+    stacked,
+)
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import check_process
 
 __all__ = ["Gaussian", "Normal"]
 

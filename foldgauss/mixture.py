@@ -21,14 +21,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from foldgauss import _display
-from foldgauss._batch import align, as_value, broadcast, check_event, checked_batch, fill, known, parts_of
-from foldgauss._checks import invalid
-from foldgauss._pairs import chunked, components_first, pair_log_prob
-from foldgauss._restrict import checked_indices
-from foldgauss._threads import check_process
-from foldgauss.bridges import to_numpyro, to_scipy
-from foldgauss.conditional import TimeDensity, TimeMixture
+from foldgauss._numerics.batch import align, as_value, broadcast, check_event, checked_batch, fill, known, parts_of
+from foldgauss._numerics.factor import checked_indices
+from foldgauss._runtime import notebook_hooks
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import check_process
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture
+from foldgauss.analysis.interop import to_numpyro, to_scipy
+from foldgauss.analysis.pair_densities import chunked, components_first, pair_log_prob
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import CallableFold
 from foldgauss.gaussian import Gaussian
@@ -155,11 +155,11 @@ class AbstractMixture(eqx.Module):
     # --- bridges --------------------------------------------------------------------------------------------
 
     def to_numpyro(self):
-        """This mixture for numpyro models: see `foldgauss.bridges.to_numpyro`."""
+        """This mixture for numpyro models: see `foldgauss.analysis.interop.to_numpyro`."""
         return to_numpyro(self)
 
     def to_scipy(self):
-        """This mixture, frozen, with scipy's methods: see `foldgauss.bridges.to_scipy`."""
+        """This mixture, frozen, with scipy's methods: see `foldgauss.analysis.interop.to_scipy`."""
         return to_scipy(self)
 
 
@@ -201,7 +201,7 @@ class FoldedMixture(AbstractMixture):
 
     def _repr_png_(self) -> bytes | None:
         """What a notebook shows: the density over time and space, or of many coordinates some views of it."""
-        return _display.mixture_png(self)
+        return notebook_hooks.show("mixture", self)
 
     def condition_time(self, t: Float[Array, "*#batch"]) -> "GaussianMixture":
         """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalised.

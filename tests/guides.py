@@ -47,9 +47,10 @@ from commands import run
 from markdown_it import MarkdownIt
 from PIL import Image
 
-from foldgauss import datasets, video
-from foldgauss.cli import fitting, viewing
-from foldgauss.io import export, save_video_model, write_image, write_video
+from foldgauss import video
+from foldgauss.cli import view as viewing
+from foldgauss.cli.fitting import fit as fitting
+from foldgauss.io import datasets, export, save_video_model, write_image, write_video
 from foldgauss.video import FitConfig, fit
 
 ROOT = Path(__file__).parents[1]

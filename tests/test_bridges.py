@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foldgauss.bridges import to_numpyro, to_scipy
+from foldgauss.analysis.interop import to_numpyro, to_scipy
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant
 from foldgauss.fold import PolynomialFold
@@ -149,7 +149,7 @@ def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
 
 
 def test_missing_numpyro_names_the_extra(monkeypatch):
-    from foldgauss import bridges
+    from foldgauss.analysis import interop as bridges
 
     monkeypatch.setitem(sys.modules, "numpyro", None)
     bridges._numpyro_class.cache_clear()
@@ -160,7 +160,7 @@ def test_missing_numpyro_names_the_extra(monkeypatch):
 
 def test_import_leaves_optional_libraries_alone():
     code = (
-        "import sys, foldgauss, foldgauss.bridges, foldgauss.plot; print({'numpyro', 'matplotlib'} & set(sys.modules))"
+        "import sys\nfrom foldgauss.analysis import interop, plot\nprint({'numpyro', 'matplotlib'} & set(sys.modules))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "set()"

@@ -15,9 +15,11 @@ import pytest
 from commands import run
 
 from foldgauss import cli
-from foldgauss.cli import _shared, drawing, fitting
+from foldgauss.cli import render as drawing
+from foldgauss.cli.app import shared as _shared
+from foldgauss.cli.fitting import fit as fitting
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
-from foldgauss.io.model_file import read_header
+from foldgauss.io.models.model_file import read_header
 
 SIZE = (48, 64)
 QUICK = ["--gaussians", "400", "--steps", "30"]

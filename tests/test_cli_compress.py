@@ -10,7 +10,7 @@ from commands import run
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
-from foldgauss.io.video_model import read_metadata, read_origin
+from foldgauss.io.models.video_model import read_metadata, read_origin
 from foldgauss.render import RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, layers
 

@@ -13,10 +13,10 @@ from commands import run
 from soft_models import soft_model
 
 from foldgauss import cli
-from foldgauss.cli._app import app, loaded
-from foldgauss.cli._commands import COMMANDS
-from foldgauss.cli._help import EXAMPLES
-from foldgauss.cli._shared import TIME_LEFT
+from foldgauss.cli.app.application import app, loaded
+from foldgauss.cli.app.help import EXAMPLES
+from foldgauss.cli.app.registry import COMMANDS
+from foldgauss.cli.app.shared import TIME_LEFT
 from foldgauss.io import save_video_model, write_video
 
 #: Of a terminal; Typer's help and ours go by it.
@@ -223,7 +223,7 @@ def test_bars_tell_the_time_left():
     from rich.progress import TimeRemainingColumn
 
     assert any(isinstance(column, TimeRemainingColumn) for column in TIME_LEFT)
-    sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.glob("*.py")}
+    sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.rglob("*.py")}
     bars = [name for name, text in sources.items() if "BarColumn(" in text]
     assert bars
     assert all("TIME_LEFT" in sources[name] for name in bars)

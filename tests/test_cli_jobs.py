@@ -14,7 +14,8 @@ from commands import run
 from rich.console import Console
 
 import foldgauss.jobs.fitting as fitting
-from foldgauss.cli import _jobs_view, many
+from foldgauss.cli.fitting import jobs_view as _jobs_view
+from foldgauss.cli.fitting import many
 from foldgauss.io import load_video_model, read_video, write_image, write_video
 from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Progress
@@ -352,7 +353,7 @@ def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
 
 def test_of_very_many_clips_the_table_shows_none(capsys):
     """Rows of more than a screen or two help nobody: the summary has them."""
-    from foldgauss.cli.many import MOST_ROWS, _print_table
+    from foldgauss.cli.fitting.many import MOST_ROWS, _print_table
     from foldgauss.jobs import FitJob, Outcome
     from foldgauss.video import FitConfig
 

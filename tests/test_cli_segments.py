@@ -11,9 +11,9 @@ import pytest
 from commands import run
 from soft_models import NUM, soft_model
 
-from foldgauss.cli import viewing
+from foldgauss.cli import view as viewing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
-from foldgauss.io.video_model import read_metadata
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, psnr, times_at
 
 #: Spans 0:7, 4:13 (three frames shared) and 13:18 (a cut).
@@ -90,7 +90,7 @@ def pictures_of(path):
 
 
 def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("foldgauss.cli._shared.read_video", lambda *_, **__: pytest.fail("the whole clip was read"))
+    monkeypatch.setattr("foldgauss.cli.app.shared.read_video", lambda *_, **__: pytest.fail("the whole clip was read"))
     assert run("evaluate", here, work / "clip", "--json", tmp_path / "scores.json") == 0
     said = told(capsys)
     clip = read_video(work / "clip", frames=(2, 20))
@@ -113,7 +113,7 @@ def test_evaluate_knows_another_clip(here, work, tmp_path, capsys):
 
 
 def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
-    monkeypatch.setattr("foldgauss.io.segmented.load_part", lambda *_: pytest.fail("a model was loaded"))
+    monkeypatch.setattr("foldgauss.io.models.segmented.load_part", lambda *_: pytest.fail("a model was loaded"))
     assert run("info", here) == 0
     said = told(capsys)
     for text in (

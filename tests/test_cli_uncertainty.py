@@ -14,10 +14,10 @@ from commands import run
 from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
 from foldgauss.cli import uncertainty as command
-from foldgauss.cli._evidence import keep_evidence
+from foldgauss.cli._profiles_file import keep_evidence
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.uncertainty import evidence
-from foldgauss.uncertainty.posterior import only_run
+from foldgauss.uncertainty.posterior.sampling import only_run
 from foldgauss.video import edit
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
@@ -86,7 +86,7 @@ def test_everything_is_there(done):
 
 
 def test_arviz_reads_the_draws(done):
-    from foldgauss.uncertainty.posterior import needed
+    from foldgauss.uncertainty.posterior.sampling import needed
 
     data = needed("arviz").from_netcdf(str(done / "posterior.nc"))
     t = data.posterior["t"]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from commands import run
 
-from foldgauss import _progress
-from foldgauss.cli import fitting
+from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.fitting import progress as _progress
 from foldgauss.io import read_video, write_video
 from foldgauss.io.history import read_history
 

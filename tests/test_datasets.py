@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from foldgauss import datasets
-from foldgauss.io import write_image
+from foldgauss.io import datasets, write_image
 
 
 @pytest.mark.parametrize("name", ["bunny", "bikes", "carphone"])

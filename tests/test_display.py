@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold, _display
+from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
+from foldgauss.analysis import notebook as _display
 from foldgauss.video import FitConfig, FitInfo, FitResult, fit
 
 pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")

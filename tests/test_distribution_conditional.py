@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from foldgauss.conditional import TimeDensity, TimeMixture
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture
+from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, gauss_hermite, normal_rule, peaks
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
-from foldgauss.quadrature import SEARCH_GRID, adaptive_panels, gauss_hermite, normal_rule, peaks
 
 BEND = np.array([[0.8, -0.5, 0.3], [0.6, 0.9, -0.4]])
 TRIL = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.1, 0.05, 0.25]])

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from foldgauss.analysis.divergence import kl_divergence
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.divergence import kl_divergence
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian, Normal

@@ -17,8 +17,9 @@ from markdown_it import MarkdownIt
 
 DOCS = ROOT / "docs"
 _NAMES = (
-    *("distribution", "mixture", "fold", "envelope", "likelihood", "estimator", "moments", "divergence", "bridges"),
-    *("plot", "render", "video", "io", "uncertainty", "jobs", "datasets"),
+    *("distribution", "mixture", "fold", "envelope", "estimator", "estimator.likelihood"),
+    *(f"analysis.{name}" for name in ("moments", "divergence", "interop", "plot")),
+    *("render", "video", "io", "io.datasets", "uncertainty", "jobs"),
 )
 #: Modules that an API page is made of.
 MODULES = ["foldgauss." + name for name in _NAMES]

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss._em import components
-from foldgauss._em.loop import EMStatus, best, expectation_maximisation, used_degrees
-from foldgauss._em.online import seen_from
-from foldgauss._em.scaling import Scaling, from_mixture, to_mixture
-from foldgauss._em.statistics import Times, accumulate, points_of, time_steps
-from foldgauss._em.updates import Model, newton_step, profile, updated
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
+from foldgauss.estimator.em import components
+from foldgauss.estimator.em.loop import EMStatus, best, expectation_maximisation, used_degrees
+from foldgauss.estimator.em.online import seen_from
+from foldgauss.estimator.em.scaling import Scaling, from_mixture, to_mixture
+from foldgauss.estimator.em.statistics import Times, accumulate, points_of, time_steps
+from foldgauss.estimator.em.updates import Model, newton_step, profile, updated
 
 K, N, DEGREE = 3, 200, 2
 NO_SCALING = Scaling(np.zeros(3), np.ones(3))

@@ -12,12 +12,12 @@ import pytest
 pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning
 
-from foldgauss import _chunks
-from foldgauss._chunks import chunks_of, is_chunked, survey, variances_of
-from foldgauss._em import loop, prune, starts, statistics
-from foldgauss._em.scaling import Prepare
-from foldgauss.estimator import FoldedGaussianMixture
-from foldgauss.selection import select_mixture
+from foldgauss.estimator import chunks as _chunks
+from foldgauss.estimator.chunks import chunks_of, is_chunked, survey, variances_of
+from foldgauss.estimator.em import loop, prune, starts, statistics
+from foldgauss.estimator.em.scaling import Prepare
+from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
+from foldgauss.estimator.model_selection import select_mixture
 
 N, CUTS = 600, (1, 1, 90, 91, 350, 595)  # a chunk of one row, one of none
 #: One set for nearly all tests: they share its programs.
@@ -173,7 +173,7 @@ def test_starts_look_at_the_same_rows(monkeypatch, ordered):
         seen.append((y, weights))
         return starts.start(kind, y, weights, *rest)
 
-    monkeypatch.setattr("foldgauss.estimator.start", start)
+    monkeypatch.setattr("foldgauss.estimator.folded_gaussian_mixture.start", start)
     _assert_same(_fit(x, weights), _fit(np.split(x, CUTS), np.split(weights, CUTS)))
     for (y, w), (again, mass) in zip(seen[:2], seen[2:], strict=True):
         assert len(y) == len(again) == 100

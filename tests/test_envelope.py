@@ -9,14 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss.envelope import (
-    AbstractEnvelope,
-    CallableEnvelope,
-    Constant,
-    TimeLikelihood,
-    as_envelope,
-    plain_envelope,
-)
+from foldgauss.envelope import AbstractEnvelope, CallableEnvelope, Constant, TimeLikelihood, as_envelope, plain_envelope
 
 TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
 

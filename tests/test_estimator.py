@@ -14,10 +14,10 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.mixture import GaussianMixture
 from sklearn.utils import estimator_checks
 
-from foldgauss import estimator
-from foldgauss._em.loop import ANNEALING_STEPS
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.estimator import EMStatus, FoldedGaussianMixture
+from foldgauss.estimator import folded_gaussian_mixture as estimator
+from foldgauss.estimator.em.loop import ANNEALING_STEPS
+from foldgauss.estimator.folded_gaussian_mixture import EMStatus, FoldedGaussianMixture
 
 K, N = 3, 300
 #: Three crossing curves, s = sum_j c_j t^j.

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss._far import far_reaching
+from foldgauss._numerics.safe_grad import far_reaching
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import CallableFold, PolynomialFold
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foldgauss._profile import Ascent, Profile, _step
-from foldgauss._regression import hermite, hermite_to_powers
+from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.estimator.likelihood import FitStatus, _cv_parts, _student_quantile, bootstrap, fit, select_degree
+from foldgauss.estimator.time_profile import Ascent, Profile, _step
 from foldgauss.fold import PolynomialFold
-from foldgauss.likelihood import FitStatus, _cv_parts, _student_quantile, bootstrap, fit, select_degree
 
 BEND = [[0.8, -0.5], [0.6, 0.9]]  # odd and even powers, so that each sign mistake shows
 TRIL = [[0.3, 0.0], [0.1, 0.2]]
@@ -77,13 +77,6 @@ def test_closed_form_is_generalised_least_squares(x64, covariance):
     close(np.vstack([result.standard_errors.loc, result.standard_errors.coefficients]), errors)
     close(result.log_likelihood, (weights * dist.log_prob(x)).sum())
     assert (dist.time_loc, dist.time_scale) == (0.35, 0.28)
-
-
-def test_the_class_knows_how_to_fit(x64):
-    x = _points()
-    here, there = FoldedGaussian.fit(x, degree=2), fit(x, degree=2)
-    assert here.log_likelihood == there.log_likelihood
-    assert here.distribution.event_shape == (3,)
 
 
 def test_own_estimates_of_time_are_mean_and_standard_deviation(x64):

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from foldgauss.analysis.plot import _mass_levels, plot_density, plot_history
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import PolynomialFold
-from foldgauss.plot import _mass_levels, plot_density, plot_history
 
 pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
 

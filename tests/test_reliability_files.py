@@ -18,11 +18,13 @@ from commands import run
 
 from benchmarks import _kills, _long, _outputs, _soak
 from benchmarks.memory import write_clip
-from foldgauss import _kernels
-from foldgauss.cli import _shared, fitting, uncertainty
+from foldgauss._runtime import kernels as _kernels
+from foldgauss.cli import uncertainty
+from foldgauss.cli.app import shared as _shared
+from foldgauss.cli.fitting import fit as fitting
 from foldgauss.io import load_video_model, save_video_model, write_video
 from foldgauss.io._lock import only_writer
-from foldgauss.io.model_file import load_model, read_header
+from foldgauss.io.models.model_file import load_model, read_header
 
 resource = pytest.importorskip("resource", reason="limits to the size of files are POSIX's; CI runs it on Linux")
 
@@ -489,7 +491,7 @@ def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
 def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsys):
     pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
-    from foldgauss.uncertainty import posterior
+    from foldgauss.uncertainty.posterior import sampling as posterior
 
     keep = posterior._Kept.keep
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from soft_models import soft_model
 
-from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import ENGINES, RenderOptions
 from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit
 from foldgauss.video import fit_steps as steps_of
-from foldgauss.video.fit import start, start_from, to_model
+from foldgauss.video.fitting.loop import start, start_from, to_model
 
 
 def moving_disc(num_frames=6, size=(48, 64)):

@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 from soft_models import soft_model
 
-from foldgauss import FoldedMixture, _threads
-from foldgauss._interrupts import leaving_at_once
-from foldgauss.estimator import FoldedGaussianMixture
+from foldgauss import FoldedMixture
+from foldgauss._runtime import threads as _threads
+from foldgauss._runtime.interrupts import leaving_at_once
+from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.render import ENGINES, render
 from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import FitConfig, fit
-from foldgauss.video.playback import Playback
+from foldgauss.video.models.renderer import VideoRenderer
 
 #: Seconds after which a process tells its stacks and is given up; what it does takes some ten, on a core of its own.
 LIMIT = 600
@@ -89,7 +90,7 @@ def _pictures(pallas):
     ]
     if pallas:
         works.append(drawn(models[0], "pallas", 0.1, (40, 64), low))
-    return [*works, lambda: np.stack(list(Playback(models[0], (90, 150)).frames()))]
+    return [*works, lambda: np.stack(list(VideoRenderer(models[0], (90, 150)).frames()))]
 
 
 @pytest.mark.usefixtures("three_threads")
@@ -121,7 +122,7 @@ def moving_disc(num_frames=5, size=(48, 64)):
 
 
 CLIP = moving_disc()
-SMALL = FitConfig(num_gaussians=2500, steps=12, half_share=0.3, quarter_share=0.0)
+SMALL = FitConfig(num_gaussians=2500, steps=12, half_fraction=0.3, quarter_fraction=0.0)
 
 
 def leaves_of(fitted) -> list[np.ndarray]:
@@ -297,12 +298,12 @@ FORKED = """
     from concurrent.futures import ProcessPoolExecutor
     import foldgauss as fg
     from foldgauss.estimator import FoldedGaussianMixture
-    from foldgauss.gradient_fit import fit_gradient
+    from foldgauss.estimator.gradient_fit import fit_gradient
     from foldgauss.io import load_video_model, save_video_model
     from foldgauss.render import render
     from foldgauss.uncertainty import evidence
     from foldgauss.video import FitConfig, compress, edit, evaluate, fit, layers
-    from foldgauss.video.playback import Playback
+    from foldgauss.video.models.renderer import Playback
     from soft_models import soft_model
 
     model = soft_model()
@@ -320,7 +321,7 @@ FORKED = """
         "model.render": lambda: model.render(0.3),
         "model.at": lambda: model.at(0.3),
         "model.frames": lambda: next(model.frames()),
-        "Playback": lambda: Playback(model),
+        "VideoRenderer": lambda: Playback(model),
         "times": lambda: model.frame_times.times(),
         "fit": lambda: fit(clip, FitConfig(num_gaussians=10, steps=1)),
         "evaluate": lambda: evaluate(model, clip),
@@ -346,7 +347,7 @@ FORKED = """
         "condition": lambda: dist.condition([2], [0.3]),
         "to_scipy": lambda: mixture.to_scipy().pdf(x),
         "kl": lambda: fg.kl_divergence(dist, dist),
-        "FoldedGaussian.fit": lambda: fg.FoldedGaussian.fit(x),
+        "likelihood.fit": lambda: likelihood.fit(x),
         "mixture.log_prob": lambda: mixture.log_prob(x),
         "mixture.sample": lambda: mixture.sample(key, (3,)),
         "mixture.weights": lambda: mixture.weights,
@@ -492,8 +493,8 @@ def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
         import os, signal, sys, threading
         import numpy as np
         from soft_models import soft_model
-        from foldgauss._threads import run_tasks
-        from foldgauss.video.playback import Playback
+        from foldgauss._runtime.threads import run_tasks
+        from foldgauss.video.models.renderer import Playback
         shown, size = Playback(soft_model(), (480, 960)), (480, 960)
         truth = shown.frame(0.5)
         started = threading.Event()
@@ -583,10 +584,12 @@ MADE = """
             "paper": FitConfig.preset("paper", steps=60, **paper),
             "economy": change(usual, economy=Economy()),
             "smallest": change(usual, economy=Economy(psnr=25.0)),
-            "batches": change(usual, batch_size=3, two_cameras=True, between_share=0.3),
+            "batches": change(usual, batch_size=3, two_cameras=True, interpolation_fraction=0.3),
             "sum": change(usual, compositing="sum"),
             "target": change(usual, target_psnr=30.0),
-            "fixed times": change(usual, learn_frame_times=False, degree=7, own_time=False, only_alive=False),
+            "fixed times": change(
+                usual, learn_frame_times=False, degree=7, scale_rates_by_duration=False, sparse_updates=False
+            ),
             "uniform": change(usual, initialization="uniform", follow_motion=False),
         }
 

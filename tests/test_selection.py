@@ -8,11 +8,11 @@ import pytest
 
 pytest.importorskip("sklearn")
 from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikelihood
-from foldgauss._em.loop import EMStatus
-from foldgauss.estimator import FoldedGaussianMixture
-from foldgauss.gradient_fit import fit_gradient
+from foldgauss.estimator.em.loop import EMStatus
+from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
+from foldgauss.estimator.gradient_fit import fit_gradient
+from foldgauss.estimator.model_selection import _parts, select_mixture
 from foldgauss.mixture import FoldedMixture
-from foldgauss.selection import _parts, select_mixture
 
 
 def _two_parabolas(n=300, seed=0):

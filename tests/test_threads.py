@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from foldgauss import _threads
+from foldgauss._runtime import threads as _threads
 
 
 @pytest.fixture(autouse=True)

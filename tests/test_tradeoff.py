@@ -17,20 +17,20 @@ import numpy as np
 import pytest
 from commands import run
 
+from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli import _tradeoff as kept
-from foldgauss.cli import fitting
 from foldgauss.cli import tradeoff as command
+from foldgauss.cli.fitting import fit as fitting
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
-from foldgauss.io.video_model import read_metadata
-from foldgauss.plot import Panel, plot_tradeoff
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig, evaluate, tradeoff
-from foldgauss.video.fit import start, to_model
-from foldgauss.video.model import LASTING
-from foldgauss.video.motion import Motion
+from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.optical_flow import Motion
+from foldgauss.video.models.splats import LASTING
 from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,
-    Pace,
+    Throughput,
     check_axes,
     front,
     halved,
@@ -131,7 +131,7 @@ def test_each_turn_changes_one_thing_and_has_a_command():
     made, left = points(BASE, tuple(AXES), 132, (320, 640))
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
-    words = kept.Words(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
+    words = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
     lines = [words.of(point, 132, (320, 640)) for point in made]
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
@@ -170,7 +170,7 @@ def test_turns_that_a_clip_cannot_have_are_left_out(where, axis, why):
 @pytest.mark.parametrize("seconds", [50.0, 200.0, 3600.0])
 def test_steps_fill_the_time(seconds):
     made, _ = points(BASE, tuple(AXES), 132, (320, 640))
-    pace = Pace(start=0.5, step=0.03, look=0.1)
+    pace = Throughput(start=0.5, step=0.03, look=0.1)
     steps = steps_within(seconds, made, pace, 132)
     assert seconds_of(made, steps, pace, 132) <= seconds < seconds_of(made, steps + 1, pace, 132)
     # Points of the base's model cost no fit.
@@ -403,7 +403,7 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
 def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
     """At a pace with which all fits take a minute if the base has 1,000 steps."""
     work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
-    pace = Pace(start=0.0, step=60 / command.SLOWER / (work * 1000.001), look=0.0)
+    pace = Throughput(start=0.0, step=60 / command.SLOWER / (work * 1000.001), look=0.0)
     monkeypatch.setattr(command._Run, "_pace", lambda self, config: pace)
     monkeypatch.setattr(command._Run, "measure", lambda self, made, base: (_ for _ in ()).throw(KeyboardInterrupt))
     arguments = ["--axes", "time,compositing", "--minutes", minutes]
@@ -530,7 +530,7 @@ def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     target = tmp_path / "m.safetensors"
     assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
     (config,) = seen
-    assert (config.ssim_share, config.quarter_share, config.half_share) == (0.3, 0.1, 0.2)
+    assert (config.ssim_fraction, config.quarter_fraction, config.half_fraction) == (0.3, 0.1, 0.2)
     options = load_video_model(target).options
     assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
     assert options.low_pass == FitConfig().options.low_pass

@@ -4,9 +4,9 @@ import numba as nb
 import numpy as np
 import pytest
 
-from foldgauss import _vectors
-from foldgauss._kernels import _OPTIONS
-from foldgauss._vectors import LANES, load, store
+from foldgauss._numerics import simd as _vectors
+from foldgauss._numerics.simd import LANES, load, store
+from foldgauss._runtime.kernels import _OPTIONS
 
 WIDE = np.linspace(-87, 87, 1 << 14)
 NEAR = np.linspace(-5, 5, 1 << 14)

@@ -18,16 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from foldgauss import __version__, _threads
-from foldgauss._machine import cpu_model
-from foldgauss._threads import available_cores, num_threads
-from foldgauss.datasets import sample_clip
-from foldgauss.io.video_file import memory_limit, read_video, write_video
-from foldgauss.io.video_model import load_video_model, save_video_model
+from foldgauss import __version__
+from foldgauss._runtime import threads
+from foldgauss._runtime.machine import cpu_model
+from foldgauss._runtime.threads import available_cores, num_threads
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media.video_file import memory_limit, read_video, write_video
+from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.render import ENGINES, Splats2D, render
-from foldgauss.video.config import FitConfig
-from foldgauss.video.fit import fit
-from foldgauss.video.metrics import psnr
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.loop import fit
+from foldgauss.video.models.metrics import psnr
 
 NAME = "foldgauss"
 #: Of each codec, the code that OpenCV knows it by and the ending of a file that holds it.
@@ -125,7 +126,7 @@ def machine() -> dict[str, Any]:
 
 
 def _why_threads() -> str:
-    if _threads._num_threads is not None:
+    if threads._num_threads is not None:
         return "set_num_threads said so"
     if os.environ.get("FOLDGAUSS_NUM_THREADS") is not None:
         return "FOLDGAUSS_NUM_THREADS says so"

@@ -13,20 +13,29 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from foldgauss._checks import short_repr, whole, within
-from foldgauss._machine import machine
-from foldgauss.cli._shared import WrongUse, err, out, write_json
+from foldgauss._runtime.checks import short_repr, whole, within
+from foldgauss._runtime.machine import machine
+from foldgauss.analysis.plot import Panel
+from foldgauss.cli.app.shared import WrongUse, err, out, write_json
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
-from foldgauss.plot import Panel
 from foldgauss.render import RenderOptions
-from foldgauss.video.config import FitConfig, default_num_gaussians
-from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Left, Point, front, knee
+from foldgauss.video.fitting.config import FitConfig, default_num_gaussians
+from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, front, knee
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
 #: Options of `fit` by field of `FitConfig`, and of `fit` and `evaluate` by constant of `RenderOptions`.
-_FIT_FIELDS = ("steps", "degree", "batch_size", "power", "compositing", "ssim_share", "quarter_share", "half_share")
+_FIT_FIELDS = (
+    "steps",
+    "degree",
+    "batch_size",
+    "power",
+    "compositing",
+    "ssim_fraction",
+    "quarter_fraction",
+    "half_fraction",
+)
 FIT_OPTIONS = {"num_gaussians": "--gaussians"} | {
     name: f"--{name.replace('_', '-')}" for name in (*_FIT_FIELDS, "seed")
 }
@@ -148,7 +157,7 @@ def _check_rest(kept: dict[str, Any]) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Words:
+class Commands:
     """The command lines that reproduce points, run from the folder that this one is run from."""
 
     video: Path
@@ -202,7 +211,7 @@ def settings_of(point: Point, base: FitConfig) -> dict[str, Any]:
     return changed | ({} if point.stored == FLOAT32 else {"stored": point.stored})
 
 
-def report(record: Record, made: list[Point], left: list[Left], clock: str) -> None:
+def report(record: Record, made: list[Point], left: list[Skipped], clock: str) -> None:
     """The fronts and their knees, into the files beside the record and onto the screen."""
     rows, folder = [record.rows[point.name] for point in made], record.path.parent
     names = [point.name for point in made]

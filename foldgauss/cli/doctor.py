@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from foldgauss.cli._checkup import NAME, Trial, facts, trials
-from foldgauss.cli._shared import app, err, out
+from foldgauss.cli.app.shared import app, err, out
 
 GREEN, RED, YELLOW = "green", "red", "yellow"
 _FOR = {

@@ -15,10 +15,11 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss import __version__
-from foldgauss._checks import invalid, one_of, within
-from foldgauss._machine import load_average
-from foldgauss.cli._completion import among, lists_of
-from foldgauss.cli._shared import (
+from foldgauss._runtime.checks import invalid, one_of, within
+from foldgauss._runtime.machine import load_average
+from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Commands, Record, report, settings_of
+from foldgauss.cli.app.completion import among, lists_of
+from foldgauss.cli.app.shared import (
     TIME_LEFT,
     Frames,
     NewClip,
@@ -37,28 +38,27 @@ from foldgauss.cli._shared import (
     scores_of,
     tell_of,
 )
-from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Record, Words, report, settings_of
-from foldgauss.cli.compressing import save_compressed, save_halved
-from foldgauss.cli.fitting import make_folder, noted
+from foldgauss.cli.compress import save_compressed, save_halved
+from foldgauss.cli.fitting.fit import make_folder, noted
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io._lock import only_writer
-from foldgauss.io.video_file import Clip, read_video
-from foldgauss.io.video_model import load_video_model, save_video_model
-from foldgauss.video.compress import compress
-from foldgauss.video.config import FitConfig, chosen_num_gaussians, planned_steps
-from foldgauss.video.fit import FitInfo, FitState, fit_steps, to_model
-from foldgauss.video.metrics import Evaluation, evaluate
-from foldgauss.video.model import VideoModel
-from foldgauss.video.motion import Motion
+from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io.models.video_model import load_video_model, save_video_model
+from foldgauss.video.compression.search import compress
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, to_model
+from foldgauss.video.fitting.optical_flow import Motion
+from foldgauss.video.models.metrics import Evaluation, evaluate
+from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.tradeoff import (
     AXES,
     FLOAT16,
     LEAST_STEPS,
     MAX_LOSS_DB,
     PASSES,
-    Left,
-    Pace,
     Point,
+    Skipped,
+    Throughput,
     check_axes,
     frames_per_second,
     points,
@@ -131,7 +131,7 @@ def tradeoff_command(
     own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))
     context.with_resource(only_writer(out_dir / RECORD, own=own, what="tradeoff"))
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
-    run = _Run(clip, record, Words(video, size, frames, out_dir), noted(clip, seed, frames))
+    run = _Run(clip, record, Commands(video, size, frames, out_dir), noted(clip, seed, frames))
     base = run.planned(wanted, chosen, minutes, steps)
     made, left = points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
     for one in left:
@@ -148,7 +148,7 @@ def tradeoff_command(
 class _Run:
     """The points of one clip, measured one after another."""
 
-    def __init__(self, clip: Clip, record: Record, words: Words, about: dict[str, Any]):
+    def __init__(self, clip: Clip, record: Record, words: Commands, about: dict[str, Any]):
         self.clip, self.record, self.words, self.about = clip, record, words, about
         self.folder = words.folder
         self._kept: VideoModel | None = None  # the base's model
@@ -193,7 +193,7 @@ class _Run:
                 soft_wrap=True,
             )
 
-    def _pace(self, config: FitConfig) -> Pace:
+    def _pace(self, config: FitConfig) -> Throughput:
         self._warm = True
         steps = list(self._fit(config, lambda info: None))
         state, last = steps[-1]
@@ -204,7 +204,7 @@ class _Run:
         frames_per_second(model)
         look = time.perf_counter() - begun
         step = (last.seconds - first.seconds) / max(last.step - first.step, 1)
-        return Pace(max(first.seconds - step, 0.0), step, look)
+        return Throughput(max(first.seconds - step, 0.0), step, look)
 
     def _fit(self, config: FitConfig, tell: Callable[[FitInfo], None]) -> Iterator[tuple[FitState, FitInfo]]:
         for state, info in fit_steps(self.clip.frames, config, motion=self._found_motion()):
@@ -219,7 +219,7 @@ class _Run:
             self.record.plan.setdefault("motion", _Spent.since(begun)._asdict())
         return self._motion
 
-    def measure(self, made: list[Point], base: FitConfig) -> list[Left]:
+    def measure(self, made: list[Point], base: FitConfig) -> list[Skipped]:
         """A row for each point that has none yet, kept as soon as it is there; and the points that cannot be had."""
         failed, busy = [], False
         with _bar(len(made), sum(point.name in self.record.rows for point in made)) as (tell, advance):
@@ -232,7 +232,7 @@ class _Run:
                 except ValueError as error:  # a fit that diverged, a loss out of reach
                     if point.axis == "base":
                         raise
-                    failed.append(Left(point.name, str(error)))
+                    failed.append(Skipped(point.name, str(error)))
                     advance(f"{point.name} is left out: {error}")
                     continue
                 self.record.rows[point.name] = row

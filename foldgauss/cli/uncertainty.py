@@ -14,10 +14,10 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss import __version__
-from foldgauss._checks import invalid
-from foldgauss.cli._completion import among
-from foldgauss.cli._evidence import is_evidence, keep_evidence, kept_evidence
-from foldgauss.cli._shared import (
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli._profiles_file import is_evidence, keep_evidence, kept_evidence
+from foldgauss.cli.app.completion import among
+from foldgauss.cli.app.shared import (
     TIME_LEFT,
     FittedClip,
     ModelFile,
@@ -34,22 +34,17 @@ from foldgauss.cli._shared import (
 )
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
 from foldgauss.io._lock import only_writer
-from foldgauss.io.video_file import Clip
-from foldgauss.io.video_model import load_video_model, read_origin
-from foldgauss.uncertainty import (
-    Evidence,
-    evidence,
-    frame_time_log_prob,
-    frame_time_posterior,
-    plots,
-)
-from foldgauss.uncertainty.increments import Increments
-from foldgauss.uncertainty.log_prob import LEVELS, at_level
-from foldgauss.uncertainty.noise import NOISES
-from foldgauss.uncertainty.pace import irregularities
-from foldgauss.uncertainty.posterior import FrameTimePosterior, check_settings, is_sealed, needed, only_run
-from foldgauss.uncertainty.report import frame_table, summary
-from foldgauss.video.model import VideoModel
+from foldgauss.io.media.video_file import Clip
+from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.uncertainty import LikelihoodProfiles, evidence, frame_time_log_prob, frame_time_posterior
+from foldgauss.uncertainty.diagnostics import plots
+from foldgauss.uncertainty.diagnostics.irregularities import irregularities
+from foldgauss.uncertainty.diagnostics.report import frame_table, summary
+from foldgauss.uncertainty.likelihood.noise import NOISES
+from foldgauss.uncertainty.posterior.increments import Increments
+from foldgauss.uncertainty.posterior.log_prob import LEVELS, at_level
+from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior, check_settings, is_sealed, needed, only_run
+from foldgauss.video.models.video_model import VideoModel
 
 CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
 PICTURES = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
@@ -235,7 +230,9 @@ def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] |
     return digest.hexdigest()
 
 
-def _evidence(model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars) -> Evidence:
+def _evidence(
+    model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars
+) -> LikelihoodProfiles:
     seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
     return at_level(level, model, clip.frames, seen, only, lambda done, total: bars("frames", done, total))
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from foldgauss._checks import invalid, short_repr
+from foldgauss._runtime.checks import invalid, short_repr
 
 #: Characters of an output's name that its temporary file bears.
 KEPT = 40

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from foldgauss._alone import Held, alone
+from foldgauss._runtime.file_lock import Held, alone
 from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, not_writable
 
 #: Seconds after which an unfinished file beside an output is one that a killed process left.

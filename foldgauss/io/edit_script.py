@@ -4,7 +4,7 @@ Schema, every table optional; paths are relative to the script, angles in degree
 
 - `[selections.NAME]`: `mask` (an image, folder or video, with `label`, `level`) or `file` (of `save_selection`), or
   `box`, `polygon`, `color`, `click`, `times`, with `frame`, `frames`, `tolerance`, `alive`, `threshold`, `follow`, as
-  `foldgauss.video.select.select` takes them; or `any`, `all`, `without`: names given before, united, intersected, left
+  `foldgauss.video.select` takes them; or `any`, `all`, `without`: names given before, united, intersected, left
   out. All are found in the video as it was before the first edit.
 - `[[edits]]`, in their order: `do` is one of `ACTIONS`, `select` a name (without: what is selected as it stands, at
   first everything), and the action's own keys; `frame`, `frames` or `times` with `ease` and `curve` for when.
@@ -26,19 +26,19 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from foldgauss._checks import invalid
+from foldgauss._runtime.checks import invalid
 from foldgauss.io._toml_lines import key_lines
-from foldgauss.io.masks import read_masks
-from foldgauss.io.selections import load_selection
-from foldgauss.io.video_model import load_video_model
+from foldgauss.io.media.masks import read_masks
+from foldgauss.io.models.selections import load_selection
+from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import Camera
-from foldgauss.video.edit import Edit, edit
-from foldgauss.video.edited import EditedVideo
-from foldgauss.video.model import VideoModel
-from foldgauss.video.segment_edits import SegmentedEdit, SegmentedSelection
-from foldgauss.video.segment_layers import layers
-from foldgauss.video.segments import SegmentedVideo
-from foldgauss.video.select import Selection
+from foldgauss.video.editing.chain import Edit, edit
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.layering import layers
+from foldgauss.video.segmented.segmented_edit import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+from foldgauss.video.selection.selectors import Selection
 
 Video = VideoModel | EditedVideo | SegmentedVideo
 Selected = Selection | SegmentedSelection

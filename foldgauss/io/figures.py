@@ -1,12 +1,12 @@
-"""Figures of `foldgauss.plot` as files."""
+"""Figures of `foldgauss.analysis.plot` as files."""
 
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.io._atomic import atomic_path
-from foldgauss.plot import Panel, plot_tradeoff
 
 DPI = 110
 

@@ -8,11 +8,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TextIO
 
-from foldgauss._checks import invalid, whole
+from foldgauss._runtime.checks import invalid, whole
+from foldgauss.analysis.plot import plot_history
 from foldgauss.io._atomic import atomic_path, not_writable
 from foldgauss.io.figures import write_figure
-from foldgauss.plot import plot_history
-from foldgauss.video.fit import FitInfo, FitState
+from foldgauss.video.fitting.loop import FitInfo, FitState
 
 #: What JSON has no number for is written as null, and means this.
 _NULL = {"loss": math.nan, "psnr": math.nan, "seconds_left": math.inf}

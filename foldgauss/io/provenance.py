@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from foldgauss.io.frame_index import LazyFrames
-from foldgauss.io.video_file import Clip
+from foldgauss.io.media.frame_index import LazyFrames
+from foldgauss.io.media.video_file import Clip
 
 
 def fingerprint(clip: Clip) -> dict[str, Any]:

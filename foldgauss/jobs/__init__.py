@@ -6,10 +6,9 @@ What is done is on disk, so any process may be killed: who comes next takes up w
 from foldgauss.jobs.fitting import FitJob, Progress, Stopped, fit_job
 from foldgauss.jobs.long import JoinedFit, LongFit, plan_long_fit, seam_drops, segments_folder
 from foldgauss.jobs.many import find_clips, jobs_of
-from foldgauss.jobs.pool import Crew, Outcome, SchedulerLost, local_workers, run_here, run_on, running_cluster
+from foldgauss.jobs.pool import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
 
 __all__ = [
-    "Crew",
     "FitJob",
     "JoinedFit",
     "LongFit",
@@ -17,6 +16,7 @@ __all__ = [
     "Progress",
     "SchedulerLost",
     "Stopped",
+    "WorkerPool",
     "find_clips",
     "fit_job",
     "jobs_of",

@@ -22,14 +22,14 @@ import jax
 
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io._lock import only_writer
-from foldgauss.io.frame_index import FrameIndex, read_indexed
+from foldgauss.io.media.frame_index import FrameIndex, read_indexed
+from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io.models.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
 from foldgauss.io.provenance import fingerprint, provenance
-from foldgauss.io.video_file import Clip, read_video
-from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
-from foldgauss.video.config import FitConfig
-from foldgauss.video.fit import FitInfo, FitState, fit_steps, to_model
-from foldgauss.video.guard import FitDiverged
-from foldgauss.video.metrics import evaluate
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.divergence import FitDiverged
+from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, to_model
+from foldgauss.video.models.metrics import evaluate
 
 #: A running job is kept on disk this often, and tells how far it is, in seconds.
 CHECKPOINT_SECONDS, TELL_SECONDS = 30.0, 1.0
@@ -206,7 +206,7 @@ def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
     clip = _read(job)
     _PROGRAMS.make_room(clip.frames.shape)
     source = fingerprint(clip)
-    with _EARS.heard() as caught:
+    with _CAPTURE.heard() as caught:
         state, info = _steps(job, clip, source, tell)
     model = to_model(state, job.config, clip.size, clip.fps)
     scores = evaluate(model, clip.frames)
@@ -247,7 +247,7 @@ def _missed(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]:
     return [f"{config.economy.psnr:g} dB were not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
 
 
-class _Ears:
+class _WarningCapture:
     """Warnings by the thread that gives them: a worker may do two jobs at once, and `warnings` has one ear for all."""
 
     def __init__(self):
@@ -279,7 +279,7 @@ class _Ears:
             texts.append(" ".join(str(message).split()))
 
 
-_EARS = _Ears()
+_CAPTURE = _WarningCapture()
 
 
 def _read(job: FitJob) -> Clip:

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, whole, within
 from foldgauss.io._atomic import OutputError, atomic_path
-from foldgauss.io.frame_index import FrameIndex, index_video, read_indexed
-from foldgauss.io.segmented import join_segments
-from foldgauss.io.video_model import load_video_model
+from foldgauss.io.media.frame_index import FrameIndex, index_video, read_indexed
+from foldgauss.io.models.segmented import join_segments
+from foldgauss.io.models.video_model import load_video_model
 from foldgauss.jobs.fitting import FitJob, file_digest
-from foldgauss.video.config import FitConfig
-from foldgauss.video.metrics import psnr, ssim
-from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.models.metrics import psnr, ssim
+from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
 
 #: Length of a segment, and frames that neighbours share, where nothing is said.
 SEGMENT_SECONDS, OVERLAP = 10.0, 8

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from foldgauss._checks import invalid
-from foldgauss.io.video_file import ANIMATION_SUFFIXES, IMAGE_SUFFIXES, image_paths, natural_order
-from foldgauss.io.video_model import MODEL_SUFFIX
+from foldgauss._runtime.checks import invalid
+from foldgauss.io.media.video_file import ANIMATION_SUFFIXES, IMAGE_SUFFIXES, image_paths, natural_order
+from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs.fitting import FitJob
-from foldgauss.video.config import FitConfig
+from foldgauss.video.fitting.config import FitConfig
 
 #: Names that video files have. A file of such a name is a clip, whatever is in it; others are left alone.
 CLIP_SUFFIXES = (

@@ -20,8 +20,8 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
-from foldgauss._checks import invalid, whole
-from foldgauss._threads import available_cores
+from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.fitting import FitJob, Progress, Stopped, finished, fit_job
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def one_line(error: BaseException) -> str:
     return text if plain else f"{type(error).__name__}: {text}"[:300]
 
 
-class Crew:
+class WorkerPool:
     """Workers of dask.distributed, as `local_workers` and `running_cluster` give them."""
 
     def __init__(self, client: "Client", cluster: Any = None, count: int = 0):
@@ -159,7 +159,7 @@ def _silenced() -> Iterator[None]:
 
 
 @contextmanager
-def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]:
+def local_workers(count: int, *, threads: int | None = None) -> Iterator["WorkerPool"]:
     """A crew of `count` processes of this machine, each with `threads` of its cores (default: an equal share).
 
     Workers end with this process, however it ends, and are replaced when they die. They import the program that starts
@@ -187,7 +187,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="foldgauss-", ignore_cleanup_errors=True))
         stack.enter_context(dask.config.set(settings))
         cluster = distributed.LocalCluster(
-            n_workers=0,  # for `Crew.mend` to bring: one that dies while it starts is no reason to fail
+            n_workers=0,  # for `WorkerPool.mend` to bring: one that dies while it starts is no reason to fail
             threads_per_worker=1,
             processes=True,
             memory_limit=None,  # a worker that is stopped for its memory would be stopped again
@@ -196,11 +196,11 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Crew"]
             local_directory=scratch,
             silence_logs=50,
             env=environment,
-            preload=["foldgauss._worker"],
+            preload=["foldgauss._runtime.worker"],
         )
         stack.enter_context(cluster)
         cluster.loop.add_callback(_block_ctrl_c)
-        crew = Crew(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
+        crew = WorkerPool(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
         cluster.scale(count)
         yield crew
 
@@ -213,7 +213,7 @@ def _block_ctrl_c() -> None:
 
 
 @contextmanager
-def running_cluster(address: str) -> Iterator["Crew"]:
+def running_cluster(address: str) -> Iterator["WorkerPool"]:
     """The crew of the scheduler at `address`, as tcp://host:8786. Its workers must find clips and outputs by the same
     paths, and are best started with one thread each, `dask worker --nthreads 1`, as a job has threads of its own.
 
@@ -221,7 +221,7 @@ def running_cluster(address: str) -> Iterator["Crew"]:
     """
     distributed = _distributed("scheduler")
     with _silenced(), _client(distributed, address) as client:
-        yield Crew(client)
+        yield WorkerPool(client)
 
 
 def _client(distributed: Any, address: str) -> "Client":
@@ -247,7 +247,7 @@ def _distributed(what: str):
 
 
 def run_on(
-    crew: Crew, jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
+    crew: WorkerPool, jobs: Sequence[FitJob], watch: Watch, *, asked_to_stop: Callable[[], bool] = lambda: False
 ) -> Iterator[Outcome]:
     """Outcomes of the jobs in the order in which they end, done by the workers of `crew`.
 
@@ -260,7 +260,7 @@ def run_on(
 class _Run:
     """Jobs on their way."""
 
-    def __init__(self, crew: Crew, jobs: Sequence[FitJob], watch: Watch, asked_to_stop: Callable[[], bool]):
+    def __init__(self, crew: WorkerPool, jobs: Sequence[FitJob], watch: Watch, asked_to_stop: Callable[[], bool]):
         from distributed import Event
 
         self.crew, self.client, self.watch, self.asked_to_stop = crew, crew.client, watch, asked_to_stop

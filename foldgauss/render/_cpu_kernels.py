@@ -8,8 +8,7 @@ import math
 import numba as nb
 import numpy as np
 
-from foldgauss._kernels import inline, kernel
-from foldgauss._vectors import (
+from foldgauss._numerics.simd import (
     LANES,
     any_of,
     between,
@@ -25,6 +24,7 @@ from foldgauss._vectors import (
     store,
     turned,
 )
+from foldgauss._runtime.kernels import inline, kernel
 
 TILE = 16
 PIXELS = TILE * TILE

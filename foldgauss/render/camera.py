@@ -15,8 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._batch import known
-from foldgauss._checks import invalid, one_of, short_repr, warn_of_degrees
+from foldgauss._numerics.batch import known
+from foldgauss._runtime.checks import invalid, one_of, short_repr, warn_of_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.

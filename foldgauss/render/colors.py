@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._checks import invalid
-from foldgauss.render.door import render
+from foldgauss._runtime.checks import invalid
+from foldgauss.render.api import render
 from foldgauss.render.splats import RenderOptions, Splats2D
 
 #: Pull towards the colours the solve starts from, as a share of a bound on the normal matrix's largest eigenvalue: the

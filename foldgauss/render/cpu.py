@@ -27,8 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._checks import invalid
-from foldgauss._threads import run_tasks
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.splats import RenderOptions, check_size
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jaxtyping import Array, Float
 
-from foldgauss._checks import invalid
+from foldgauss._runtime.checks import invalid
 from foldgauss.render.footprint import capped, raw_alpha, squared_distance
 from foldgauss.render.splats import RenderOptions
 from foldgauss.render.tiles import (

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._checks import invalid
+from foldgauss._runtime.checks import invalid
 
 #: Below the first support radius, in standard deviations, a splat is no Gaussian any more; the square of the second
 #: is still far from the end of float32.

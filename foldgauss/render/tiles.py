@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._checks import invalid
+from foldgauss._runtime.checks import invalid
 from foldgauss.render.footprint import covariance, squared_reach, whitening
 from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
 

@@ -6,8 +6,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._batch import known
-from foldgauss._checks import invalid
+from foldgauss._numerics.batch import known
+from foldgauss._runtime.checks import invalid
 from foldgauss.render.camera import THICKNESS, Gaussians3D
 from foldgauss.render.splats import check_shapes
 

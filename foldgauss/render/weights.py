@@ -6,8 +6,8 @@ import numba as nb
 import numpy as np
 import scipy.sparse
 
-from foldgauss._kernels import kernel
-from foldgauss._threads import run_tasks
+from foldgauss._runtime.kernels import kernel
+from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.cpu import TILE, Trace
 

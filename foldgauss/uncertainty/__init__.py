@@ -1,14 +1,7 @@
 """How sure the learned frame times are: likelihood profiles, and what is drawn from them."""
 
-from foldgauss.uncertainty.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
-from foldgauss.uncertainty.colors import evidence_without_colors
-from foldgauss.uncertainty.drawing import Evidence, evidence
-from foldgauss.uncertainty.exact import ExactTimes, exact_times
-from foldgauss.uncertainty.increments import Increments
-from foldgauss.uncertainty.laplace import LaplaceTimes, laplace_times
-from foldgauss.uncertainty.log_prob import FrameTimeLogProb, drawn_log_likelihood, frame_time_log_prob
-from foldgauss.uncertainty.noise import FrameNoise
-from foldgauss.uncertainty.pace import (
+from foldgauss.uncertainty.diagnostics.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
+from foldgauss.uncertainty.diagnostics.irregularities import (
     ComparedTimes,
     IncrementIntervals,
     Irregularity,
@@ -16,14 +9,20 @@ from foldgauss.uncertainty.pace import (
     intervals,
     irregularities,
 )
-from foldgauss.uncertainty.posterior import FrameTimePosterior, frame_time_posterior
-from foldgauss.uncertainty.profiles import Profiles
-from foldgauss.uncertainty.refit import Refit, RefitTimes, refit_frame_times, refits
-from foldgauss.uncertainty.report import frame_table, summary
+from foldgauss.uncertainty.diagnostics.report import frame_table, summary
+from foldgauss.uncertainty.likelihood.colors import evidence_without_colors
+from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
+from foldgauss.uncertainty.likelihood.noise import FrameNoise
+from foldgauss.uncertainty.likelihood.profiles import Profiles
+from foldgauss.uncertainty.likelihood.refit import Refit, RefitTimes, refit_frame_times, refits
+from foldgauss.uncertainty.posterior.exact import ExactTimes, exact_times
+from foldgauss.uncertainty.posterior.increments import Increments
+from foldgauss.uncertainty.posterior.laplace import LaplaceTimes, laplace_times
+from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, drawn_log_likelihood, frame_time_log_prob
+from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior, frame_time_posterior
 
 __all__ = [
     "ComparedTimes",
-    "Evidence",
     "ExactTimes",
     "FrameNoise",
     "FrameTimeLogProb",
@@ -32,6 +31,7 @@ __all__ = [
     "Increments",
     "Irregularity",
     "LaplaceTimes",
+    "LikelihoodProfiles",
     "Profiles",
     "Refit",
     "RefitTimes",

@@ -1,23 +1,31 @@
 """Videos as folded splats: the model, its fit and its quality. Frames are arrays here; files are `foldgauss.io`'s."""
 
-from foldgauss.video.compress import Compressed, compress
-from foldgauss.video.config import FitConfig, LearningRates
-from foldgauss.video.density import density_image
-from foldgauss.video.economy import Economy
-from foldgauss.video.edit import Edit, edit
-from foldgauss.video.edited import EditedVideo, Layer
-from foldgauss.video.fit import FitInfo, FitResult, FitState, fit, fit_steps, start_from
-from foldgauss.video.frame_times import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
-from foldgauss.video.growth import Growth
-from foldgauss.video.guard import DivergenceWarning, FitDiverged
-from foldgauss.video.independent import IndependentFrames, independent_frames
-from foldgauss.video.metrics import Evaluation, evaluate, psnr, ssim
-from foldgauss.video.model import FoldedSplats, VideoModel
-from foldgauss.video.overlays import SelectedGaussians
-from foldgauss.video.segment_edits import SegmentedEdit, SegmentedSelection
-from foldgauss.video.segment_layers import layers
-from foldgauss.video.segments import Segment, SegmentedVideo, plan_segments
-from foldgauss.video.select import (
+from foldgauss.video.compression.search import Compressed, compress
+from foldgauss.video.editing.chain import Edit, edit
+from foldgauss.video.editing.clock import Clock, Span
+from foldgauss.video.editing.edited_video import EditedVideo, Layer
+from foldgauss.video.editing.overlays import SelectedGaussians
+from foldgauss.video.fitting.config import FitConfig, LearningRates
+from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
+from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
+from foldgauss.video.fitting.per_frame_baseline import IndependentFrames, independent_frames
+from foldgauss.video.fitting.pruning.economy import Economy
+from foldgauss.video.models.density import density_image
+from foldgauss.video.models.frame_times import (
+    FrameTimes,
+    interpolated_times,
+    played_positions,
+    remapped_positions,
+    times_at,
+)
+from foldgauss.video.models.metrics import Evaluation, evaluate, psnr, ssim
+from foldgauss.video.models.splats import FoldedSplats
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.layering import layers
+from foldgauss.video.segmented.segmented_edit import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
+from foldgauss.video.selection.selectors import (
     Selection,
     by_box,
     by_click,
@@ -30,7 +38,6 @@ from foldgauss.video.select import (
     matte,
     select,
 )
-from foldgauss.video.timing import Clock, Span
 
 __all__ = [
     "Clock",

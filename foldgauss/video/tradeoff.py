@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foldgauss._checks import invalid
+from foldgauss._runtime.checks import invalid
 from foldgauss.render import RenderOptions
-from foldgauss.video.config import FitConfig
-from foldgauss.video.economy import Economy
-from foldgauss.video.edited import EditedVideo
-from foldgauss.video.model import VideoModel
-from foldgauss.video.playback import Playback
-from foldgauss.video.pyramid import levels
-from foldgauss.video.segments import SegmentedVideo
-from foldgauss.video.stored import to_stored
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.pruning.economy import Economy
+from foldgauss.video.fitting.pyramid import levels
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.sparse_storage import to_stored
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
 #: with that many passes over the clip, at a loss of at most `MAX_LOSS_DB`.
@@ -40,7 +40,7 @@ _LONG = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Turn:
+class Variant:
     """One setting of an axis, as what it changes of the base.
 
     `fit`: fields of `FitConfig`; `scale`: fields to be multiplied; `options`: constants of `RenderOptions`, fitted with
@@ -57,7 +57,7 @@ class Turn:
     work: float = 1.0
 
 
-def _cutoffs() -> tuple[Turn, ...]:
+def _cutoffs() -> tuple[Variant, ...]:
     """Constants drawn with, and those of them fitted with that save the most time."""
     values = {
         "alpha_cutoff": ("alpha", (("1/1024", 1 / 1024), ("1/64", 1 / 64), ("1/32", 1 / 32))),
@@ -66,46 +66,46 @@ def _cutoffs() -> tuple[Turn, ...]:
     }
     played, fitted = [], []
     for name, (shown, each) in values.items():
-        played += [Turn(f"{shown} {text}, played", options={name: value}, played=True) for text, value in each]
+        played += [Variant(f"{shown} {text}, played", options={name: value}, played=True) for text, value in each]
         text, value = each[1]
-        fitted.append(Turn(f"{shown} {text}, fitted", options={name: value}, work=0.85))
+        fitted.append(Variant(f"{shown} {text}, fitted", options={name: value}, work=0.85))
     return (*played, *fitted)
 
 
 #: The axes, in the order they are run in; see docs/tradeoff.md for what each buys and costs.
-AXES: Mapping[str, tuple[Turn, ...]] = MappingProxyType(
+AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
     {
         "time": (
-            Turn("{steps} steps", scale={"steps": 1 / 4}, work=0.25),
-            Turn("{steps} steps", scale={"steps": 1 / 2}, work=0.5),
-            Turn("{steps} steps", scale={"steps": 2}, work=2.0),
+            Variant("{steps} steps", scale={"steps": 1 / 4}, work=0.25),
+            Variant("{steps} steps", scale={"steps": 1 / 2}, work=0.5),
+            Variant("{steps} steps", scale={"steps": 2}, work=2.0),
         ),
         "gaussians": (
-            Turn("{num_gaussians}", scale={"num_gaussians": 1 / 4}, work=0.5),
-            Turn("{num_gaussians}", scale={"num_gaussians": 1 / 2}, work=0.7),
-            Turn("{num_gaussians}", scale={"num_gaussians": 2}, work=1.6),
+            Variant("{num_gaussians}", scale={"num_gaussians": 1 / 4}, work=0.5),
+            Variant("{num_gaussians}", scale={"num_gaussians": 1 / 2}, work=0.7),
+            Variant("{num_gaussians}", scale={"num_gaussians": 2}, work=1.6),
         ),
         "degree": (
-            Turn("0", fit={"degree": 0}, work=0.75),
-            Turn("1", fit={"degree": 1}, work=0.9),
-            Turn("7", fit={"degree": 7}, work=1.1),
+            Variant("0", fit={"degree": 0}, work=0.75),
+            Variant("1", fit={"degree": 1}, work=0.9),
+            Variant("7", fit={"degree": 7}, work=1.1),
         ),
         # As many frames are seen: of a batch's steps there are fewer.
         "batch": (
-            Turn("2", fit={"batch_size": 2}, scale={"steps": 1 / 2}),
-            Turn("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
+            Variant("2", fit={"batch_size": 2}, scale={"steps": 1 / 2}),
+            Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
         ),
         "schedule": (
-            Turn("full size", fit={"quarter_share": 0.0, "half_share": 0.0}, work=1.8),
-            Turn("half 0.4", fit={"quarter_share": 0.0, "half_share": 0.4}, work=1.3),
-            Turn("quarter 0.4, half 0.5", fit={"quarter_share": 0.4, "half_share": 0.5}, work=0.7),
+            Variant("full size", fit={"quarter_fraction": 0.0, "half_fraction": 0.0}, work=1.8),
+            Variant("half 0.4", fit={"quarter_fraction": 0.0, "half_fraction": 0.4}, work=1.3),
+            Variant("quarter 0.4, half 0.5", fit={"quarter_fraction": 0.4, "half_fraction": 0.5}, work=0.7),
         ),
         "cutoff": _cutoffs(),
-        "precision": tuple(Turn(stored, stored=stored) for stored in (FLOAT16, *PASSES)),
-        "power": (Turn("0", fit={"power": 0.0}), Turn("2", fit={"power": 2.0})),
-        "compositing": (Turn("sum", fit={"compositing": "sum"}, work=0.85),),
-        "ssim": (Turn("0", fit={"ssim_share": 0.0}, work=0.85), Turn("0.5", fit={"ssim_share": 0.5})),
-        "economy": (Turn("on", fit={"economy": Economy()}, work=1.5),),
+        "precision": tuple(Variant(stored, stored=stored) for stored in (FLOAT16, *PASSES)),
+        "power": (Variant("0", fit={"power": 0.0}), Variant("2", fit={"power": 2.0})),
+        "compositing": (Variant("sum", fit={"compositing": "sum"}, work=0.85),),
+        "ssim": (Variant("0", fit={"ssim_fraction": 0.0}, work=0.85), Variant("0.5", fit={"ssim_fraction": 0.5})),
+        "economy": (Variant("on", fit={"economy": Economy()}, work=1.5),),
     }
 )
 
@@ -131,7 +131,7 @@ class Point:
         return self.played is not None or self.stored != FLOAT32
 
 
-class Left(NamedTuple):
+class Skipped(NamedTuple):
     """A turn that is left out, and why."""
 
     name: str
@@ -149,7 +149,7 @@ def check_axes(names: Sequence[str]) -> tuple[str, ...]:
 
 def points(
     base: FitConfig, axes: Sequence[str], num_frames: int, size: tuple[int, int], *, has_alpha: bool = False
-) -> tuple[list[Point], list[Left]]:
+) -> tuple[list[Point], list[Skipped]]:
     """The base and every turn of `axes` about it, one setting changed at a time; and the turns left out.
 
     Left out are those that this clip cannot have, or that change nothing for it. `base` has numbers for `steps` and
@@ -161,13 +161,13 @@ def points(
             point = _turned(base, axis, turn)
             why = _why_not(point, base, num_frames, size, has_alpha)
             if why:
-                left.append(Left(point.name, why))
+                left.append(Skipped(point.name, why))
             else:
                 made.append(point)
     return made, left
 
 
-def _turned(base: FitConfig, axis: str, turn: Turn) -> Point:
+def _turned(base: FitConfig, axis: str, turn: Variant) -> Point:
     scaled = {name: max(round(factor * getattr(base, name)), 1) for name, factor in turn.scale.items()}
     options = dataclasses.replace(base.options, **turn.options)
     fitted = base.options if turn.played else options
@@ -182,12 +182,12 @@ def _why_not(point: Point, base: FitConfig, num_frames: int, size: tuple[int, in
         return f"there are {num_frames} frames"
     if point.of_base:
         return ""
-    shares = {"quarter_share": base.quarter_share, "half_share": base.half_share}
+    shares = {"quarter_fraction": base.quarter_fraction, "half_fraction": base.half_fraction}
     same = dataclasses.replace(point.config, **shares) == base and levels(point.config, size) == levels(base, size)
     return f"it changes nothing at {size[0]}x{size[1]}" if same else ""
 
 
-class Pace(NamedTuple):
+class Throughput(NamedTuple):
     """Seconds: of what comes before a fit's first step, of a step of the base, and of looking at a model."""
 
     start: float
@@ -195,19 +195,19 @@ class Pace(NamedTuple):
     look: float
 
 
-def seconds_of(made: Sequence[Point], steps: int, pace: Pace, num_frames: int) -> float:
+def seconds_of(made: Sequence[Point], steps: int, pace: Throughput, num_frames: int) -> float:
     """What measuring the points takes, about, if the base has so many steps."""
     fixed, each = _costs(made, pace, num_frames)
     return fixed + each * steps
 
 
-def steps_within(seconds: float, made: Sequence[Point], pace: Pace, num_frames: int) -> int:
+def steps_within(seconds: float, made: Sequence[Point], pace: Throughput, num_frames: int) -> int:
     """Steps of the base with which measuring the points takes so many seconds; below 1 where none are left for it."""
     fixed, each = _costs(made, pace, num_frames)
     return math.floor((seconds - fixed) / each)
 
 
-def _costs(made: Sequence[Point], pace: Pace, num_frames: int) -> tuple[float, float]:
+def _costs(made: Sequence[Point], pace: Throughput, num_frames: int) -> tuple[float, float]:
     """Seconds that steps do not change, and seconds for each step of the base."""
     fits = [point for point in made if not point.of_base]
     compressing = sum(_COMPRESSING[point.stored] for point in made) * num_frames * pace.step
@@ -278,7 +278,7 @@ def seconds_per_frame(*models: VideoModel | EditedVideo) -> list[float]:
     They are drawn in turn, frame by frame, and of each frame the fastest of a few rounds counts: so what else the
     machine does tells on all alike.
     """
-    playbacks = [Playback(model) for model in models]
+    playbacks = [VideoRenderer(model) for model in models]
     num_frames = min(model.num_frames for model in models)
     shown = np.unique(np.linspace(0, num_frames - 1, _SHOWN).round().astype(int))
     times = [np.asarray(model.frame_times.times())[shown] for model in models]

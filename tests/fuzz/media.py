@@ -14,11 +14,13 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli._evidence import keep_evidence, kept_evidence
-from foldgauss.io import VideoError, _containers, read_masks, read_video, write_video
-from foldgauss.io._containers import _ASF_SOUND, _CLUSTER, _MATROSKA_SOUND
-from foldgauss.io.labels import MOST_PER_BYTE, MOST_PIXELS
-from foldgauss.uncertainty import Evidence, FrameNoise, Profiles, posterior
+from foldgauss.cli._profiles_file import keep_evidence, kept_evidence
+from foldgauss.io import VideoError, read_masks, read_video, write_video
+from foldgauss.io.media import containers as _containers
+from foldgauss.io.media.containers import _ASF_SOUND, _CLUSTER, _MATROSKA_SOUND
+from foldgauss.io.media.labels import MOST_PER_BYTE, MOST_PIXELS
+from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, Profiles
+from foldgauss.uncertainty.posterior import sampling as posterior
 
 from .branches import ONLY
 from .models import written
@@ -53,7 +55,7 @@ def _images() -> list[bytes]:
 
 
 def _picture_memory(size: int) -> int:
-    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.labels`."""
+    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.media.labels`."""
     return 2 * CONSTANT + 12 * max(MOST_PIXELS, MOST_PER_BYTE * size)
 
 
@@ -86,7 +88,7 @@ MASKS = Target(
     _images,
     _read_mask,
     (ValueError,),
-    {"foldgauss.io.labels": (), "foldgauss.io.masks": ()},
+    {"foldgauss.io.media.labels": (), "foldgauss.io.media.masks": ()},
     lambda data: 8 if data.startswith(b"\x89PNG") else 2,
     _picture_memory,
     (png_resealed, png_sized),
@@ -128,7 +130,7 @@ def _read_picture(path: Path) -> None:
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
 
-#: The part of `foldgauss.io.video_file` that reads.
+#: The part of `foldgauss.io.media.video_file` that reads.
 _READ = (
     ONLY, "read_video", "readable_path", "reader_of", "_head", "read_file", "pass_through", "told_of_span", "_usable",
     "_gap_notes", "pace_notes", "read_folder", "_is_image", "_read_image_file", "_read_animation",
@@ -144,7 +146,7 @@ PICTURES = Target(
     lambda: [*_images(), *_more_images()],
     _read_picture,
     (VideoError,),
-    {"foldgauss.io.video_file": _READ, "foldgauss.io._containers": (), "foldgauss.io._rates": ()},
+    {"foldgauss.io.media.video_file": _READ, "foldgauss.io.media.containers": (), "foldgauss.io.media.rates": ()},
     lambda data: 8,
     lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
     (png_resealed, png_sized, _another_picture),
@@ -252,10 +254,10 @@ VIDEO = Target(
     _read_clip,
     (VideoError,),
     {
-        "foldgauss.io.video_file": _READ,
-        "foldgauss.io.masks": (),
-        "foldgauss.io._containers": (),
-        "foldgauss.io._rates": (),
+        "foldgauss.io.media.video_file": _READ,
+        "foldgauss.io.media.masks": (),
+        "foldgauss.io.media.containers": (),
+        "foldgauss.io.media.rates": (),
     },
     _clip_body,
     lambda size: 1 << 32,
@@ -299,7 +301,7 @@ HEADERS = Target(
     lambda: [*_clips(), *_images(), *_more_images()],
     _read_head,
     (ValueError,),
-    {"foldgauss.io._containers": ()},
+    {"foldgauss.io.media.containers": ()},
     lambda data: 8,
     mutations=(_resized_box, png_sized, _marked, _another_kind),
     past_header=2,
@@ -413,7 +415,7 @@ CHAINS = Target(
     _read_chains,
     (ValueError,),
     {
-        "foldgauss.uncertainty.posterior": (
+        "foldgauss.uncertainty.posterior.sampling": (
             ONLY, "_Kept", "-check_space", "-check_room", "-written",
             "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "is_sealed",
         )
@@ -430,7 +432,9 @@ CHAINS = Target(
 def _evidence() -> bytes:
     times, heights = np.linspace(0, 1, 4), np.array([0.0, -1.0, -0.5, -2.0])
     profiles = Profiles.of([times, times[:3], times], [heights, heights[:3], heights])
-    seen = Evidence(profiles, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",))
+    seen = LikelihoodProfiles(
+        profiles, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
+    )
     return written(lambda path: keep_evidence(path, "key", seen), ".npz")
 
 
@@ -447,7 +451,7 @@ EVIDENCE = Target(
     lambda: [_evidence()],
     _read_evidence,
     (ValueError,),
-    {"foldgauss.cli._evidence": ("keep_evidence", "is_evidence")},
+    {"foldgauss.cli._profiles_file": ("keep_evidence", "is_evidence")},
     lambda data: 4,
     lambda size: 2 * CONSTANT + 64 * size,
     (zip_resealed,),

@@ -13,7 +13,6 @@ import numpy as np
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import (
     ModelFileError,
-    compact,
     load_compact,
     load_selection,
     load_video_model,
@@ -21,18 +20,19 @@ from foldgauss.io import (
     save_selection,
     save_video_model,
 )
-from foldgauss.io.model_file import load_model
-from foldgauss.io.video_model import load_checkpoint, read_origin, save_checkpoint
+from foldgauss.io.models import compact
+from foldgauss.io.models.model_file import load_model
+from foldgauss.io.models.video_model import load_checkpoint, read_origin, save_checkpoint
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
-from foldgauss.video.config import FitConfig
-from foldgauss.video.edit import edit
-from foldgauss.video.growth import Statistics
-from foldgauss.video.model import LASTING, OPAQUE
-from foldgauss.video.quantise import Rule, column_names, describe, is_whole, quantise
-from foldgauss.video.select import Selection
-from foldgauss.video.sharing import Palette
-from foldgauss.video.state import TIME_ADAM, FitState
+from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantise
+from foldgauss.video.editing.chain import edit
+from foldgauss.video.fitting.codebook import Codebook
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.state import TIME_ADAM, FitState
+from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.selection.selectors import Selection
 
 from .branches import ONLY
 from .mutate import by_chance, json_changed, json_text_changed
@@ -181,7 +181,7 @@ def halved(data: bytes, random: Random) -> bytes:
 _MODEL_MUTATIONS = (facts_changed, table_changed, resized, halved)
 #: `_array_leaves` refuses models that are saved; what is loaded comes with the shapes of a skeleton.
 _MODEL_FILE = {
-    "foldgauss.io.model_file": (
+    "foldgauss.io.models.model_file": (
         "register_model", "save_model", "write_tensors", "_to_numpy", "_kind_of", "_check_described", "to_json",
         "_array_leaves",
         "_scalar", "plain",
@@ -235,14 +235,16 @@ VIDEO = Target(
     (ModelFileError,),
     _MODEL_FILE
     | {
-        "foldgauss.io.video_model": (
+        "foldgauss.io.models.video_model": (
             "save_video_model", "check_model_name", "save_checkpoint", "load_checkpoint", "_to_stored",
             "_describe_video", "_describe_edited",
             "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
             "_palette_skeleton", "_checkpoint_skeleton",
         ),
-        "foldgauss.io.segmented": ("join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "_load"),
-        "foldgauss.video.stored": (
+        "foldgauss.io.models.segmented": (
+            "join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "_load",
+        ),
+        "foldgauss.video.models.sparse_storage": (
             "to_stored", "stored_counts", "_is_regular", "_by_kind", "_by_index", "_num_bytes",
         ),
     },
@@ -263,8 +265,8 @@ def _checkpoint_seeds() -> list[bytes]:
         return rng.normal(size=shape).astype(np.float32)
 
     counts, width, num = np.arange(3, dtype=np.int32), 14, 3
-    shared = Palette(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
-    plain = Palette(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
+    shared = Codebook(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
+    plain = Codebook(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
     kept, state = [], None
     for statistics in (None, Statistics(floats(num), floats(num), counts)):
         state = FitState(
@@ -284,7 +286,7 @@ CHECKPOINT = Target(
     (ModelFileError, ValueError),
     _MODEL_FILE
     | {
-        "foldgauss.io.video_model": (
+        "foldgauss.io.models.video_model": (
             "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint",
             "read_origin", "_is_text", "_is_range", "_to_stored",
             "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
@@ -313,7 +315,7 @@ SELECTION = Target(
     ],
     lambda path: load_selection(path, _selected()),
     (ModelFileError, ValueError),
-    _MODEL_FILE | {"foldgauss.io.selections": ("save_selection", "_describe")},
+    _MODEL_FILE | {"foldgauss.io.models.selections": ("save_selection", "_describe")},
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
@@ -418,10 +420,17 @@ COMPACT = Target(
     _read_compact,
     (ModelFileError,),
     {
-        "foldgauss.io.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
-        "foldgauss.io._columns": (),
-        "foldgauss.io.video_model": (ONLY, "load_video_model", "read_metadata", "read_origin", "_is_text", "_is_range"),
-        "foldgauss.io._range_coder": ("encode", "_encode", "_put", "_put_learned"),
+        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
+        "foldgauss.io.models.columns": (),
+        "foldgauss.io.models.video_model": (
+            ONLY,
+            "load_video_model",
+            "read_metadata",
+            "read_origin",
+            "_is_text",
+            "_is_range",
+        ),
+        "foldgauss.io.models.range_coder": ("encode", "_encode", "_put", "_put_learned"),
     },
     _compact_body,
     lambda size: 4 * CONSTANT + 20_000 * size,  # a byte may hold 8 Gaussians of 16 powers: the format's own limit

@@ -18,7 +18,7 @@ from foldgauss.io import (
     write_pseudomesh,
     write_vegas_ply,
 )
-from foldgauss.io.mesh import read_obj
+from foldgauss.io.exchange.mesh import read_obj
 
 from .models import tiny_model, written
 from .mutate import by_chance, json_changed, json_text_changed
@@ -152,7 +152,7 @@ def _read_vegas(path: Path) -> None:
 
 
 _PLY = {
-    "foldgauss.io._ply": ("write_ply", "_encoded"),
+    "foldgauss.io.exchange.ply_format": ("write_ply", "_encoded"),
 }
 _WRITERS = (
     "write_vegas_ply", "_check_writable_as_vegas", "frame_gaussians", "_alive", "write_gaussians_ply", "write_3dgs_ply",
@@ -169,7 +169,7 @@ VEGAS = Target(
     ],
     _read_vegas,
     (FormatError,),
-    _PLY | {"foldgauss.io.ply": (*_WRITERS, "read_3dgs_ply", "_turned")},
+    _PLY | {"foldgauss.io.exchange.ply": (*_WRITERS, "read_3dgs_ply", "_turned")},
     _ply_body,
     lambda size: 2 * CONSTANT + 200 * size,
     _PLY_MUTATIONS,
@@ -188,7 +188,7 @@ SCENE = Target(
     (FormatError,),
     _PLY
     | {
-        "foldgauss.io.ply": (
+        "foldgauss.io.exchange.ply": (
             *_WRITERS, "read_vegas_ply", "_with_power", "_vegas_unit", "_check_vegas", "_degree", "_time_logits",
             "_filled_in", "_note",
         )
@@ -265,7 +265,7 @@ def _read_mesh(path: Path) -> None:
 
 
 _MESH = {
-    "foldgauss.io.mesh": (
+    "foldgauss.io.exchange.mesh": (
         "Pseudomesh", "_flat_factor", "write_pseudomesh", "_obj_text", "_axes",
     )
 }  # fmt: skip
@@ -276,7 +276,7 @@ OBJ = Target(
     lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"]), _from_the_end(_mesh()["frame_0000.obj"])],
     _read_mesh,
     (FormatError,),
-    {"foldgauss.io.mesh": (*_MESH["foldgauss.io.mesh"], "_notes", "_checked_notes")},
+    {"foldgauss.io.exchange.mesh": (*_MESH["foldgauss.io.exchange.mesh"], "_notes", "_checked_notes")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 400 * size,
     (line_changed,),
@@ -312,8 +312,9 @@ NOTES = Target(
     _read_notes,
     (FormatError,),
     {
-        "foldgauss.io.mesh": (
-            *_MESH["foldgauss.io.mesh"], "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parsed_vertex",
+        "foldgauss.io.exchange.mesh": (
+            *_MESH["foldgauss.io.exchange.mesh"],
+            "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parsed_vertex",
             "_parsed_face", "_check_soup",
         )
     },

@@ -18,19 +18,11 @@ import pytest
 from PIL import Image
 
 import foldgauss
-from foldgauss.cli._evidence import kept_evidence
-from foldgauss.io import (
-    VideoError,
-    html_page,
-    read_history,
-    read_masks,
-    read_video,
-    save_video_model,
-    write_video,
-)
-from foldgauss.io._containers import shown_seconds
+from foldgauss.cli._profiles_file import kept_evidence
+from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
-from foldgauss.uncertainty import posterior
+from foldgauss.io.media.containers import shown_seconds
+from foldgauss.uncertainty.posterior import sampling as posterior
 
 from . import media, models, scenes, texts
 from .models import sealed, tiny_model, unsealed
@@ -494,7 +486,7 @@ def test_a_name_that_is_no_text_is_shown_as_one(clip, tmp_path):
 
 def test_scripts_set_text_and_never_markup():
     """So what a compact file's header says cannot become an element, whatever it is."""
-    scripts = [*sorted((PACKAGE / "io" / "player").glob("*.js")), PACKAGE / "io" / "compact.js"]
+    scripts = [*sorted((PACKAGE / "io" / "page" / "player").glob("*.js")), PACKAGE / "io" / "page" / "compact.js"]
     assert len(scripts) > 5
     for path in scripts:
         text = path.read_text(encoding="utf-8")

@@ -10,14 +10,14 @@ from random import Random
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli._shared import WrongUse
 from foldgauss.cli._tradeoff import COLUMNS, Record
+from foldgauss.cli.app.shared import WrongUse
 from foldgauss.io import HistoryFile, read_history, save_selection, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
 from foldgauss.video import edit
-from foldgauss.video.fit import FitInfo
-from foldgauss.video.select import Selection
+from foldgauss.video.fitting.loop import FitInfo
+from foldgauss.video.selection.selectors import Selection
 
 from .branches import ONLY
 from .models import tiny_model, written

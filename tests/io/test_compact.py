@@ -15,14 +15,13 @@ import pytest
 from soft_models import SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import ModelFileError, compact, load_compact, load_video_model, save_compact, save_video_model
-from foldgauss.io.compact import MAGIC, VERSION, packed
-from foldgauss.io.video_model import read_metadata
+from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
+from foldgauss.io.models.compact import MAGIC, VERSION, packed
+from foldgauss.io.models.video_model import read_metadata
+from foldgauss.io.page import html
 from foldgauss.render import RenderOptions
 from foldgauss.video import compress, layers
-from foldgauss.video.metrics import evaluate
-from foldgauss.video.model import LASTING, OPAQUE
-from foldgauss.video.quantise import (
+from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
     _degrees,
@@ -33,11 +32,13 @@ from foldgauss.video.quantise import (
     is_whole,
     legendre,
     lower_paths,
-    moved_to,
     path_matrix,
     quantise,
     span_of,
 )
+from foldgauss.video.models.metrics import evaluate
+from foldgauss.video.models.row_layout import shift_path
+from foldgauss.video.models.splats import LASTING, OPAQUE
 
 
 def clip_of(model, noise=6.0):
@@ -268,7 +269,7 @@ def test_gaussians_that_nobody_sees_are_left_out():
 
 def test_loss_out_of_reach(monkeypatch):
     """Where even the finest steps lose more."""
-    module = sys.modules["foldgauss.video.compress"]  # its name in the package is the function's
+    module = sys.modules["foldgauss.video.compression.search"]  # its name in the package is the function's
     monkeypatch.setattr(module._Loss, "__call__", lambda *one: 0.3)
     with pytest.raises(ValueError, match=r"^max_loss_db: expected at least .* Allow a greater loss"):
         compress(soft_model())
@@ -313,7 +314,7 @@ def test_a_path_is_the_same_from_another_time():
     def at(place, u):
         return sum(place[:, k] * u[:, None] ** k for k in range(4))
 
-    np.testing.assert_allclose(at(moved_to(place, shift), u + shift), at(place, np.full(5, u)), rtol=1e-9)
+    np.testing.assert_allclose(at(shift_path(place, shift), u + shift), at(place, np.full(5, u)), rtol=1e-9)
 
 
 def test_paths_are_legendre_series_over_the_span():
@@ -339,7 +340,7 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     if how == "crowd of kinds":
         model = of_kinds(model)
     path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantised)
-    decoder = Path(compact.__file__).with_suffix(".js")
+    decoder = Path(html.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
         """

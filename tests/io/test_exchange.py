@@ -25,7 +25,7 @@ from foldgauss.io import (
 )
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, Selection, VideoModel, edit
-from foldgauss.video.packing import pack, unpack
+from foldgauss.video.models.row_layout import pack, unpack
 
 
 @pytest.fixture(scope="module")

@@ -17,19 +17,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from foldgauss.datasets import sample_clip
-from foldgauss.io import (
-    FrameIndex,
-    LazyFrames,
-    OutputError,
-    VideoError,
-    frame_index,
-    index_video,
-    read_indexed,
-    video_file,
-)
-from foldgauss.io.video_file import read_video, write_frames, write_image, write_video
-from foldgauss.video.motion import CutFinder, Motion
+from foldgauss.io import FrameIndex, LazyFrames, OutputError, VideoError, index_video, read_indexed
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media import frame_index, video_file
+from foldgauss.io.media.video_file import read_video, write_frames, write_image, write_video
+from foldgauss.video.fitting.optical_flow import CutFinder, Motion
 
 HEIGHT, WIDTH = 48, 64
 
@@ -463,7 +455,7 @@ def test_what_is_refused_is_refused_alike(tmp_path, long):
 
 def test_interlaced_fields_that_do_not_convert_are_refused(tmp_path, monkeypatch, long):
     path = _encoded(tmp_path / "a.mkv", np.repeat(_moving(1), 20, 0), *X264)
-    monkeypatch.setattr("foldgauss.io.video_file._converts", lambda path, num_frames: False)
+    monkeypatch.setattr("foldgauss.io.media.video_file._converts", lambda path, num_frames: False)
     with pytest.raises(VideoError, match="interlaced"):
         index_video(path)
 

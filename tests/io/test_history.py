@@ -9,7 +9,7 @@ import pytest
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.video.fit import FitInfo
+from foldgauss.video.fitting.loop import FitInfo
 
 
 def info(step, loss=0.25, **changes):

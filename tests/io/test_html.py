@@ -19,13 +19,13 @@ from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import OutputError, export, html_page, load_video_model, save_compact, save_video_model, write_html
-from foldgauss.io import html as page_module
-from foldgauss.io.html import _fine, bundled
+from foldgauss.io.page import html as page_module
+from foldgauss.io.page.html import _fine, bundled
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, edit, fit, layers
-from foldgauss.video.playback import Playback
-from foldgauss.video.quantise import dequantise
-from foldgauss.video.shots import time_logits
+from foldgauss.video.compression.quantize import dequantise
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.shots import time_logits
 
 #: What the brush is made of.
 MODULES = ("gaussians", "selection", "timeline")
@@ -293,7 +293,7 @@ def _with(model, **fields):
 @pytest.mark.parametrize("name", MODELS)
 def test_pictures_are_those_of_the_engine(opened, fitted, name):
     model = MODELS[name](fitted)
-    page, play = opened(model), Playback(model)
+    page, play = opened(model), VideoRenderer(model)
     times = np.asarray(model.frame_times.times())
     between = [float(0.6 * times[k] + 0.4 * times[k + 1]) for k in (0, 2)] if len(times) > 1 else [0.3]
     for t in (0.0, *between, 0.456, 1.0):
@@ -302,7 +302,7 @@ def test_pictures_are_those_of_the_engine(opened, fitted, name):
         assert far < 0.5, (t, far)
         assert wanted.std() > 3  # there is something to see
     height, width = (3 * side // 2 for side in model.size)
-    larger = Playback(model, (height, width + 10)).frame(0.456)
+    larger = VideoRenderer(model, (height, width + 10)).frame(0.456)
     assert np.abs(page.picture(0.456, (height, width + 10)).astype(float) - larger).mean() < 0.5
 
 
@@ -386,7 +386,7 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     gone = page.picture()
     left = np.ones(NUM, bool)
     left[picked] = False
-    wanted = Playback(edit(model).select(~left).vanish().video()).frame(0.5)
+    wanted = VideoRenderer(edit(model).select(~left).vanish().video()).frame(0.5)
     assert np.abs(gone.astype(float) - wanted).mean() < 0.5
     page.page.click("#vanish")
     page.page.locator("#scale").fill("0.5")
@@ -550,8 +550,8 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
     assert [span["num_gaussians"] for span in spans] == [NUM] * 5
     for number, segment in enumerate(video.segments):
         (tmp_path / "out.fgz").write_bytes(data_of(page, f"model-{number}"))
-        again = Playback(load_video_model(tmp_path / "out.fgz")).frame(0.4)
-        assert np.abs(again - Playback(segment.model).frame(0.4).astype(float)).mean() < 0.5
+        again = VideoRenderer(load_video_model(tmp_path / "out.fgz")).frame(0.4)
+        assert np.abs(again - VideoRenderer(segment.model).frame(0.4).astype(float)).mean() < 0.5
     path = save_video_model(tmp_path / "long.safetensors", video, metadata={"clip": "a long clip"})
     assert html_page(path, title="long") == page
     assert "<title>a long clip</title>" in html_page(path)
@@ -580,7 +580,7 @@ def test_segments_that_no_page_holds_are_told(monkeypatch):
 def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     """Inside, in fades, of three at once, at cuts of both kinds, between frames, to and fro over the seams."""
     video = segmented(compositing=compositing)
-    page, play = opened(video, **SMALL), Playback(video)
+    page, play = opened(video, **SMALL), VideoRenderer(video)
     many = {len(video.weights(position)) for position in (2, 4, 6.5)}
     assert many == {1, 2, 3}
     positions = [0, 2.3, 3.4, 4, 5.25, 6.5, 6.8, 7, 9, 9.6, 10, 11.4, 11.5, 13.4, 13.6, 15, 15.6, 18]
@@ -596,14 +596,14 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     }"""
     page.page.evaluate("foldgauss.seek(6.5 / 18)")
     assert page.page.evaluate(twice)
-    larger = Playback(video, (60, 100)).frame(5 / 18)
+    larger = VideoRenderer(video, (60, 100)).frame(5 / 18)
     assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
 
 
 def test_few_segments_are_held_whatever_the_length(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
     video = SegmentedVideo.of(parts)
-    page, play = opened(video, **SMALL), Playback(video)
+    page, play = opened(video, **SMALL), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
     page.page.evaluate("foldgauss.player.segments.most = 0")
     for position, held in ((27, [3, 4, 5]), (51, [0, 7, 8]), (0, [0, 1, 2]), (30, [3, 4, 5, 6]), (15, [1, 2, 3])):
@@ -677,7 +677,7 @@ _HELD_BACK = """() => {
 
 def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     video = segmented()
-    page, play = opened(video, **SMALL), Playback(video)
+    page, play = opened(video, **SMALL), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate(_HELD_BACK)
     page.page.evaluate("foldgauss.seek(2 / 18)")
@@ -760,7 +760,7 @@ def test_the_brush_acts_on_the_segment_seen(opened):
         model = video.segments[number].model
         left = np.ones(NUM, bool)
         left[gone] = False
-        return Playback(edit(model).select(~left).vanish().video())
+        return VideoRenderer(edit(model).select(~left).vanish().video())
 
     times = np.asarray(video.segments[3].model.frame_times.times())
     assert np.abs(page.picture(13 / 18).astype(float) - without(3, other).frame(float(times[1]))).mean() < 0.5

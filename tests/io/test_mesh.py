@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import OutputError
-from foldgauss.io._ply import FormatError
-from foldgauss.io.mesh import NOTES, _axes, read_obj, read_pseudomesh, write_pseudomesh
-from foldgauss.io.ply import frame_gaussians
+from foldgauss.io.exchange.mesh import NOTES, _axes, read_obj, read_pseudomesh, write_pseudomesh
+from foldgauss.io.exchange.ply import frame_gaussians
+from foldgauss.io.exchange.ply_format import FormatError
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
-from foldgauss.video.packing import unpack
-from foldgauss.video.playback import Playback
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.row_layout import unpack
 
 NUM, FRAMES, SIZE = 40, 3, (48, 80)
 
@@ -61,7 +61,7 @@ def test_the_frames_come_back(folder, model):
         assert expected.std() > 10
         assert np.abs(picture.astype(int) - expected).max() <= 1  # a rounding of 8 bits
     white = mesh.frame(1, (30, 40), background=(1, 1, 1))
-    expected = Playback(model, (30, 40), background=(1, 1, 1)).frame(0.5)
+    expected = VideoRenderer(model, (30, 40), background=(1, 1, 1)).frame(0.5)
     assert np.abs(white.astype(int) - expected).max() <= 1
 
 
@@ -150,7 +150,7 @@ def test_sums_go_out_and_come_back(tmp_path):
     model = random_model(compositing="sum")
     mesh = read_pseudomesh(write_pseudomesh(tmp_path / "mesh", model, [0.5]))
     assert mesh.compositing == "sum"
-    assert np.abs(mesh.frame(0).astype(int) - Playback(model).frame(0.5)).max() <= 1
+    assert np.abs(mesh.frame(0).astype(int) - VideoRenderer(model).frame(0.5)).max() <= 1
 
 
 def test_a_folder_of_another_program(folder):

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save_file
 
 from foldgauss.io._atomic import OutputError, atomic_path
-from foldgauss.io.model_file import ModelFileError, load_model, read_header, register_model, save_model
+from foldgauss.io.models.model_file import ModelFileError, load_model, read_header, register_model, save_model
 
 
 class Inner(eqx.Module):

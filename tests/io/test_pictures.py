@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from foldgauss.io.pictures import ERROR_GAIN, comparison
+from foldgauss.io.media.pictures import ERROR_GAIN, comparison
 
 
 def test_layout_and_error():

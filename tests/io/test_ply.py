@@ -16,10 +16,9 @@ from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model, read_pseudomesh, save_video_model, write_pseudomesh
-from foldgauss.io import ply as ply_file
 from foldgauss.io._atomic import OutputError
-from foldgauss.io._ply import FormatError, read_ply, write_ply
-from foldgauss.io.ply import (
+from foldgauss.io.exchange import ply as ply_file
+from foldgauss.io.exchange.ply import (
     frame_gaussians,
     read_3dgs_ply,
     read_vegas_ply,
@@ -28,13 +27,14 @@ from foldgauss.io.ply import (
     write_gaussians_ply,
     write_vegas_ply,
 )
+from foldgauss.io.exchange.ply_format import FormatError, read_ply, write_ply
 from foldgauss.render import Gaussians3D, RenderOptions, Splats2D, cpu
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit, psnr
-from foldgauss.video.model import LASTING
-from foldgauss.video.packing import columns as columns_of
-from foldgauss.video.packing import pack, unpack
-from foldgauss.video.playback import Playback
-from foldgauss.video.shots import time_logits
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.row_layout import columns as columns_of
+from foldgauss.video.models.row_layout import pack, unpack
+from foldgauss.video.models.shots import time_logits
+from foldgauss.video.models.splats import LASTING
 
 NUM, DEGREE, FRAMES = 60, 3, 5
 HALF_WIDTH = math.tan(0.6911112 / 2)  # of the published frame, at distance 1
@@ -158,7 +158,7 @@ def test_a_published_video_gives_the_published_picture(tmp_path, size):
     for t in times:
         expected = published_picture(columns, float(t), size)
         assert expected.std() > 0.05
-        np.testing.assert_allclose(drawn(Playback(model).splats(t), size, model), expected, atol=1e-3)
+        np.testing.assert_allclose(drawn(VideoRenderer(model).splats(t), size, model), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("wrong", ["rot_0", "z", "w1_1", "m_0", "scale_0"])
@@ -168,7 +168,7 @@ def test_the_reference_would_tell(tmp_path, wrong):
     model = read_vegas_ply(write_raw(tmp_path / "v.ply", columns, time_weights()), size=size)
     changed = columns | {wrong: columns["scale_2"] if wrong == "scale_0" else -columns[wrong]}
     expected = published_picture(changed, 0.4, size)
-    assert np.abs(drawn(Playback(model).splats(0.4), size, model) - expected).max() > 0.05
+    assert np.abs(drawn(VideoRenderer(model).splats(0.4), size, model) - expected).max() > 0.05
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_the_cutoff_of_scales_is_one(tmp_path):
     whole = np.asarray(model.splats.at(jnp.float32(0.4)).opacity) > 0
     assert 0 < seen.sum() < whole.sum()
     for one in (model, again, read_vegas_ply(write_vegas_ply(tmp_path / "w.ply", model))):
-        assert len(Playback(one).splats(0.4).opacity) == seen.sum()
+        assert len(VideoRenderer(one).splats(0.4).opacity) == seen.sum()
     own = random_model()
     assert read_vegas_ply(write_vegas_ply(tmp_path / "w.ply", own)).scale_cutoff == own.scale_cutoff == 0
 
@@ -344,7 +344,7 @@ def test_the_cutoff_of_scales_with_any_envelope(power, floor):
     for t in (0.1, 0.7):
         seen = np.asarray(model.at(jnp.float32(t)).opacity) > 0
         assert 0 < seen.sum() < (np.asarray(model.splats.at(jnp.float32(t)).opacity) > 0).sum()
-        assert len(Playback(model).splats(t).opacity) == seen.sum()
+        assert len(VideoRenderer(model).splats(t).opacity) == seen.sum()
 
 
 def test_size_and_rate_must_be_known(tmp_path):
@@ -371,7 +371,7 @@ def test_a_frame_in_space_is_the_frame(tmp_path, size, axes):
     model = random_model(size=size)
     path = write_3dgs_ply(tmp_path / "f.ply", model, 0.5, axes=axes, depth_step=2e-3)  # so deep that size tells
     gaussians = read_3dgs_ply(path, axes=axes)
-    splats = Playback(model).splats(0.5)
+    splats = VideoRenderer(model).splats(0.5)
     assert len(gaussians.opacity) == len(splats.opacity) > 20
     by_chance = np.random.default_rng(0).permutation(len(splats.opacity))
     nearest_first = by_chance[np.argsort(gaussians.mean[by_chance, 2])]
@@ -414,7 +414,7 @@ def test_layout_is_what_viewers_expect(tmp_path):
     model = random_model()
     raw = write_3dgs_ply(tmp_path / "f.ply", model, 0.5).read_bytes()
     head, body = raw.split(b"end_header\n", 1)
-    num = len(Playback(model).splats(0.5).opacity)
+    num = len(VideoRenderer(model).splats(0.5).opacity)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(45))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {num}", *(f"property float {n}" for n in names)]
@@ -423,7 +423,7 @@ def test_layout_is_what_viewers_expect(tmp_path):
     assert not table[:, 3:6].any()
     assert not table[:, 9:54].any()
     np.testing.assert_allclose(np.linalg.norm(table[:, 58:], axis=1), 1, rtol=1e-6)
-    splats = Playback(model).splats(0.5)
+    splats = VideoRenderer(model).splats(0.5)
     np.testing.assert_allclose(1 / (1 + np.exp(-table[:, 54])), splats.opacity, rtol=1e-5)
     np.testing.assert_allclose(np.maximum(0.5 + 0.28209479 * table[:, 6:9], 0), splats.color, atol=1e-6)
     small = write_3dgs_ply(tmp_path / "g.ply", model, 0.5, sh_degree=0)

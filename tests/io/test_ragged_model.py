@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_selection, load_video_model, save_selection, save_video_model
-from foldgauss.io.model_file import read_header
+from foldgauss.io.models.model_file import read_header
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, Selection, VideoModel, edit, layers
-from foldgauss.video.edited import EditedVideo
-from foldgauss.video.model import LASTING, OPAQUE
-from foldgauss.video.packing import unpack
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.row_layout import unpack
+from foldgauss.video.models.splats import LASTING, OPAQUE
 
 NUM, NUM_FRAMES = 50, 5
 #: Bytes of a Gaussian besides coefficients, times, colour and shape; those of frame times and envelope.

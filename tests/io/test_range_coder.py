@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from foldgauss.io import _range_coder as coder
+from foldgauss.io.models import range_coder as coder
 
 
 def columns():

@@ -21,14 +21,14 @@ from foldgauss.io import (
     read_vegas_ply,
     save_selection,
     save_video_model,
-    segmented,
 )
-from foldgauss.io.compact import MAGIC
-from foldgauss.io.model_file import read_header
-from foldgauss.io.video_model import read_metadata
+from foldgauss.io.models import segmented
+from foldgauss.io.models.compact import MAGIC
+from foldgauss.io.models.model_file import read_header
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
-from foldgauss.video.model import LASTING, OPAQUE
-from foldgauss.video.playback import Playback
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.splats import LASTING, OPAQUE
 from foldgauss.video.tradeoff import halved
 
 FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
@@ -98,7 +98,7 @@ def test_a_file_of_one_segment_plays_as_the_model(work, tmp_path):
     join_segments(tmp_path / "one.safetensors", [(0, work / "c.safetensors")])
     one, model = load_video_model(tmp_path / "one.safetensors"), load_video_model(work / "c.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(model.frames()))
-    np.testing.assert_array_equal(Playback(one).image(0.33), Playback(model).image(np.float32(0.33)))
+    np.testing.assert_array_equal(VideoRenderer(one).image(0.33), VideoRenderer(model).image(np.float32(0.33)))
 
 
 def test_saved_again_it_has_the_same_bytes(work, tmp_path):
@@ -399,7 +399,7 @@ def test_frames_go_out_as_they_are_played(tmp_path):
     t = 15 / 17
     export(video, "obj", tmp_path / "mesh", times=[t])
     mesh = read_pseudomesh(tmp_path / "mesh")
-    assert np.abs(mesh.frame(0).astype(int) - Playback(video).frame(t)).max() <= 1
+    assert np.abs(mesh.frame(0).astype(int) - VideoRenderer(video).frame(t)).max() <= 1
     export(video, "ply3dgs", tmp_path / "scene.ply", times=[t])
     export(parts[2], "ply3dgs", tmp_path / "own.ply", times=[0.5])
     assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()

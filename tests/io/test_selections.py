@@ -8,10 +8,10 @@ import pytest
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_selection, load_video_model, save_selection, save_video_model
-from foldgauss.io.model_file import read_header
+from foldgauss.io.models.model_file import read_header
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, Selection, VideoModel
-from foldgauss.video.packing import unpack
+from foldgauss.video.models.row_layout import unpack
 
 
 def model(num=50, seed=0):

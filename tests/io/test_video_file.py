@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from foldgauss.datasets import sample_clip
-from foldgauss.io import video_file
 from foldgauss.io._atomic import OutputError
-from foldgauss.io.video_file import Clip, VideoError, read_video, write_frames, write_image, write_video
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.media import video_file
+from foldgauss.io.media.video_file import Clip, VideoError, read_video, write_frames, write_image, write_video
 
 
 def _psnr(a, b):
@@ -428,7 +428,7 @@ def test_bad_files_print_nothing(tmp_path, clip_file):
     (tmp_path / "damaged.mp4").write_bytes(damaged)
     program = """
 import sys, contextlib, numpy, pathlib
-from foldgauss.io.video_file import VideoError, read_video, write_video
+from foldgauss.io.media.video_file import VideoError, read_video, write_video
 for path in sorted(pathlib.Path(sys.argv[1]).iterdir()):
     with contextlib.suppress(VideoError):
         read_video(path)

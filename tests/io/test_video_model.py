@@ -8,13 +8,13 @@ import pytest
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
-from foldgauss.io.model_file import read_header, save_model
-from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.model_file import read_header, save_model
+from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit_steps
-from foldgauss.video.fit import to_model
-from foldgauss.video.growth import Growth
-from foldgauss.video.packing import unpack
+from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.loop import to_model
+from foldgauss.video.models.row_layout import unpack
 
 CONFIG = FitConfig(num_gaussians=60, steps=8, degree=2)
 SOURCE = {"clip": "somewhere.mp4", "num_frames": 3, "size": [24, 32]}

@@ -18,8 +18,10 @@ import pytest
 from commands import run
 from PIL import Image
 
-from foldgauss.io import _containers, load_video_model, video_file
-from foldgauss.io.video_file import VideoError, read_video, write_video
+from foldgauss.io import load_video_model
+from foldgauss.io.media import containers as _containers
+from foldgauss.io.media import video_file
+from foldgauss.io.media.video_file import VideoError, read_video, write_video
 
 OLD = int(cv2.__version__.split(".")[0]) < 5
 FLAT = np.array(

@@ -8,7 +8,7 @@ import optax
 import pytest
 from scenes import scene
 
-from foldgauss.datasets import sample_clip
+from foldgauss.io.datasets import sample_clip
 from foldgauss.render import RenderOptions, Splats2D, render, solve_colors
 
 BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scenes import scene
 
-from foldgauss import _threads
+from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions, Splats2D, cpu
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.footprint import pixel_centres
@@ -306,8 +306,8 @@ def test_mutant_is_caught(wrong, monkeypatch):
 
 def test_exponential():
     """Within 2e-7 over the powers that are drawn, in a kernel of its own."""
-    from foldgauss._kernels import _OPTIONS
-    from foldgauss._vectors import LANES, exp2, load, store
+    from foldgauss._numerics.simd import LANES, exp2, load, store
+    from foldgauss._runtime.kernels import _OPTIONS
 
     @nb.njit(**_OPTIONS)  # not kept on disk: it is another function every time
     def apply(x, y):

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from scenes import KINDS, check_slope, scene
 
-from foldgauss import _threads
-from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, door, project, render
+from foldgauss._runtime import threads as _threads
+from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project, render
+from foldgauss.render import api as door
 from foldgauss.render.footprint import pixel_centres
 from foldgauss.render.reference import splat_alpha
 

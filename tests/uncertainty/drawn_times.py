@@ -3,11 +3,11 @@
 import numpy as np
 
 from foldgauss.uncertainty import (
-    Evidence,
     FrameNoise,
     FrameTimeLogProb,
     FrameTimePosterior,
     Increments,
+    LikelihoodProfiles,
     Profiles,
     exact_times,
     laplace_times,
@@ -30,7 +30,7 @@ def posterior_about(
     draws = exact.sample(int(np.prod(shape)), seed).reshape(*shape, num)
     told = np.ones(increments.num_free)
     noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
-    seen = Evidence(log_prob.profiles, noise, 0.7 ** np.arange(12.0), 100)
+    seen = LikelihoodProfiles(log_prob.profiles, noise, 0.7 ** np.arange(12.0), 100)
     return FrameTimePosterior(
         log_prob, draws, np.full(shape[0], 0.3), 40 * told, 1.001 * told, 1000 * told, True, "Converged.",
         laplace, exact, seen,

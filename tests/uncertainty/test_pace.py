@@ -8,7 +8,7 @@ from drawn_times import posterior_about
 from tiny_clips import NUM_FRAMES, TWICE, clip_of, model_of_12
 
 from foldgauss.uncertainty import FrameNoise, compare_times, drawn_log_likelihood, intervals, irregularities
-from foldgauss.uncertainty.pace import even_pace
+from foldgauss.uncertainty.diagnostics.irregularities import even_pace
 from foldgauss.video import FrameTimes, VideoModel
 
 

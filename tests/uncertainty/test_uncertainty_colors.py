@@ -9,10 +9,10 @@ import scipy.stats
 from soft_models import NUM, NUM_FRAMES, soft_model
 
 from foldgauss.uncertainty import FrameNoise, evidence
-from foldgauss.uncertainty import colors as module
-from foldgauss.uncertainty.colors import evidence_without_colors
-from foldgauss.uncertainty.equations import ColorEquations, solved
-from foldgauss.uncertainty.screen import Screen
+from foldgauss.uncertainty.likelihood import colors as module
+from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, solved
+from foldgauss.uncertainty.likelihood.colors import evidence_without_colors
+from foldgauss.uncertainty.likelihood.residuals import Screen
 
 SIZE, NOISE, PRIOR, FRAME = (20, 32), 0.03, 0.3, 3
 

@@ -5,8 +5,8 @@ import pytest
 import scipy.ndimage
 
 from foldgauss.uncertainty import FrameNoise
-from foldgauss.uncertainty import noise as module
-from foldgauss.uncertainty.noise import covariances, rings
+from foldgauss.uncertainty.likelihood import noise as module
+from foldgauss.uncertainty.likelihood.noise import covariances, rings
 
 SHAPE = (3, 160, 200)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from drawn_times import posterior_about
 
-from foldgauss.uncertainty import plots
+from foldgauss.uncertainty.diagnostics import plots
 
 pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
 

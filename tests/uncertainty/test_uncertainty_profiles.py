@@ -10,22 +10,22 @@ from soft_models import soft_model
 from time_clips import NUM_FRAMES, SCALE, SIZE, clip, model, parabolas, uneven, white
 
 from foldgauss.uncertainty import (
-    Evidence,
     FrameNoise,
     FrameTimeLogProb,
     Increments,
+    LikelihoodProfiles,
     Profiles,
-    drawing,
     drawn_log_likelihood,
     evidence,
     exact_times,
     frame_time_log_prob,
 )
-from foldgauss.uncertainty.screen import Sketches
+from foldgauss.uncertainty.likelihood import likelihood_profiles as drawing
+from foldgauss.uncertainty.likelihood.residuals import Sketches
 
 
 @pytest.fixture(scope="module")
-def seen() -> Evidence:
+def seen() -> LikelihoodProfiles:
     return evidence(model(), clip(uneven()), noise=white())
 
 

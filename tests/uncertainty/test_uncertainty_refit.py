@@ -7,8 +7,8 @@ import pytest
 import scipy.stats
 
 from foldgauss.uncertainty import RefitTimes, evidence, refit_frame_times, refits
-from foldgauss.uncertainty.refit import Refit, blocks_of, merged, resampled
-from foldgauss.uncertainty.screen import Screen
+from foldgauss.uncertainty.likelihood.refit import Refit, blocks_of, merged, resampled
+from foldgauss.uncertainty.likelihood.residuals import Screen
 from foldgauss.video import FitConfig, FrameTimes, LearningRates, fit
 
 CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2)

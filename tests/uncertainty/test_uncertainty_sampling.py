@@ -12,19 +12,19 @@ import scipy.stats
 from time_clips import clip, free_times, model, parabolas, uneven, white
 
 from foldgauss.uncertainty import (
-    Evidence,
     FrameNoise,
     FrameTimeLogProb,
     Increments,
+    LikelihoodProfiles,
     Profiles,
     drawn_log_likelihood,
     exact_times,
     frame_time_log_prob,
     frame_time_posterior,
 )
-from foldgauss.uncertainty.laplace import laplace_times
-from foldgauss.uncertainty.moves import BlockSweep
-from foldgauss.video.edited import EditedVideo, Layer
+from foldgauss.uncertainty.posterior.laplace import laplace_times
+from foldgauss.uncertainty.posterior.moves import BlockSweep
+from foldgauss.video.editing.edited_video import EditedVideo, Layer
 
 #: Two of the three so near that their order ties them.
 NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
@@ -377,15 +377,15 @@ def test_what_is_refused(change, word):
 def seen():
     """Of another clip."""
     profiles = parabolas((0.3, 0.6), (0.1, 0.1), 5)  # 4 frames
-    return Evidence(profiles, FrameNoise(np.full(4, 0.02), np.ones(4)), np.ones(3), 9)
+    return LikelihoodProfiles(profiles, FrameNoise(np.full(4, 0.02), np.ones(4)), np.ones(3), 9)
 
 
 def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, seen):
     def drawn(*_, **__):
         raise AssertionError("pictures were drawn")
 
-    monkeypatch.setattr("foldgauss.uncertainty.posterior.evidence", drawn)
-    monkeypatch.setattr("foldgauss.uncertainty.log_prob.evidence", drawn)
+    monkeypatch.setattr("foldgauss.uncertainty.posterior.sampling.evidence", drawn)
+    monkeypatch.setattr("foldgauss.uncertainty.posterior.log_prob.evidence", drawn)
     frames = np.zeros((6, 4, 4, 3), np.uint8)
     (tmp_path / "text.h5").write_text("no such file")
     both = [

@@ -6,7 +6,7 @@ import numpy as np
 from soft_models import soft_model
 
 from foldgauss.uncertainty import FrameNoise, Increments, Profiles
-from foldgauss.uncertainty.screen import Screen
+from foldgauss.uncertainty.likelihood.residuals import Screen
 
 SIZE, NUM_FRAMES, SCALE = (24, 32), 10, 0.02
 

@@ -6,7 +6,7 @@ from scipy.special import logit
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel
-from foldgauss.video.model import SH_C0
+from foldgauss.video.models.splats import SH_C0
 
 SIZE, NUM_FRAMES = (64, 96), 16
 BACKGROUND, DISC, BOX = 0, 1, 2

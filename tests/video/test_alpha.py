@@ -8,9 +8,9 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
-from foldgauss.video.alpha import checked_background, composited, random_background
-from foldgauss.video.playback import Playback
-from foldgauss.video.state import planar, to_model
+from foldgauss.video.fitting.state import planar, to_model
+from foldgauss.video.models.background import checked_background, composited, random_background
+from foldgauss.video.models.renderer import VideoRenderer
 
 CONFIG = FitConfig(num_gaussians=800, steps=250)
 WHITE, GREEN = (1.0, 1.0, 1.0), (0.0, 1.0, 0.0)
@@ -63,7 +63,7 @@ def test_drawn_on_black_unless_told_otherwise(fitted):
     assert white[0, 0].min() > 239
     np.testing.assert_array_equal(black, next(model.frames(background=(0, 0, 0))))
     slow = np.asarray(model.render(0.0, background=GREEN))
-    np.testing.assert_allclose(255 * slow.clip(0, 1), Playback(model, background=GREEN).frame(0.0), atol=2)
+    np.testing.assert_allclose(255 * slow.clip(0, 1), VideoRenderer(model, background=GREEN).frame(0.0), atol=2)
     for wrong in ((0, 0), (0, 0, 2), "red", (0, 0, np.nan)):
         with pytest.raises(ValueError, match="background: expected red, green and blue"):
             checked_background(wrong)

@@ -10,9 +10,9 @@ import pytest
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
-from foldgauss.video.conditioning import Shape, condition, pull_back, update_windows
-from foldgauss.video.model import FoldedSplats
-from foldgauss.video.packing import columns, pack, unpack
+from foldgauss.video.models.conditioning import Shape, condition, pull_back, update_windows
+from foldgauss.video.models.row_layout import columns, pack, unpack
+from foldgauss.video.models.splats import FoldedSplats
 
 SIZE, T = (48, 80), np.float32(0.4)
 

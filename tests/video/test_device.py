@@ -16,7 +16,7 @@ from commands import run
 
 from benchmarks import gpu
 from foldgauss.io import write_image
-from foldgauss.io.video_model import load_checkpoint, load_video_model, save_checkpoint
+from foldgauss.io.models.video_model import load_checkpoint, load_video_model, save_checkpoint
 from foldgauss.render import RenderOptions
 from foldgauss.video import (
     DivergenceWarning,
@@ -29,17 +29,17 @@ from foldgauss.video import (
     fit,
     fit_steps,
 )
-from foldgauss.video.conditioning import Shape, condition, update_windows
-from foldgauss.video.device import DeviceStepper, OnDevice, chosen_engine
-from foldgauss.video.device_loss import losses, similarity
-from foldgauss.video.device_step import _splats, adam, alive_at, lowered
-from foldgauss.video.fit import _Stepper, start
-from foldgauss.video.kinds import LASTS, SOLID
-from foldgauss.video.loss import image_loss, squared_loss, ssim_map
-from foldgauss.video.packing import columns
-from foldgauss.video.pyramid import levels
-from foldgauss.video.sparse_adam import sparse_adam
-from foldgauss.video.state import FitState
+from foldgauss.video.fitting.adam import sparse_adam
+from foldgauss.video.fitting.loop import _Stepper, start
+from foldgauss.video.fitting.pyramid import levels
+from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.steppers.jax_loss import losses, similarity
+from foldgauss.video.fitting.steppers.jax_step import _splats, adam, alive_at, lowered
+from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper, OnDevice, chosen_engine
+from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
+from foldgauss.video.models.conditioning import Shape, condition, update_windows
+from foldgauss.video.models.kinds import LASTS, SOLID
+from foldgauss.video.models.row_layout import columns
 
 #: Nothing in it is black: at a colour of 0 the slope is one thing or another by rounding.
 FRAMES = moving_blobs(height=32, width=40) // 2 + 40
@@ -61,7 +61,7 @@ GROWING = FitConfig(
     batch_size=4,
     power=2.0,
     two_cameras=True,
-    only_alive=False,
+    sparse_updates=False,
     growth=GROWTH,
     engine="xla",
 )
@@ -134,7 +134,7 @@ def test_a_step_of_growing_batches_is_that_of_the_cpu():
 
 @pytest.mark.slow
 def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
-    monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 16)
+    monkeypatch.setattr("foldgauss.video.fitting.pyramid.LEAST_SIDE", 16)
     assert [level.size for level in levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
     compare_steps(CONFIG, 0.1, level=0)
 
@@ -145,8 +145,8 @@ def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
     [
         {"degree": 0},
         {"floor": 0.1, "power": 0.5},
-        {"own_time": False, "learn_frame_times": False},
-        {"ssim_share": 0.0},
+        {"scale_rates_by_duration": False, "learn_frame_times": False},
+        {"ssim_fraction": 0.0},
         {"compositing": "sum", "options": RenderOptions()},
     ],
     ids=str,
@@ -167,20 +167,20 @@ def pictures_of(seed=0, shape=(2, 23, 31, 3)):
     return [np.float32(smooth + 0.1 * rng.normal(size=shape)) for _ in range(2)]
 
 
-@pytest.mark.parametrize(("ssim_share", "squared"), [(0.2, False), (0.0, False), (0.2, True)])
-def test_losses_are_those_of_the_cpu(ssim_share, squared):
+@pytest.mark.parametrize(("ssim_fraction", "squared"), [(0.2, False), (0.0, False), (0.2, True)])
+def test_losses_are_those_of_the_cpu(ssim_fraction, squared):
     """Values, errors and gradients."""
     rendered, target = pictures_of()
     rendered[0, 3:9, 4:9] = target[0, 3:9, 4:9]  # where |x - y| has a kink
 
     def total(rendered):
-        own, errors = losses(rendered, target, jnp.bool_(squared), ssim_share)
+        own, errors = losses(rendered, target, jnp.bool_(squared), ssim_fraction)
         return jnp.sum(own), (own, errors)
 
     gradient, (values, errors) = jax.jit(jax.grad(total, has_aux=True))(rendered)
     for k in range(2):
         planes = [np.ascontiguousarray(np.moveaxis(one[k], -1, 0)) for one in (rendered, target)]
-        judge = squared_loss(*planes) if squared else image_loss(*planes, ssim_share=ssim_share)
+        judge = squared_loss(*planes) if squared else image_loss(*planes, ssim_fraction=ssim_fraction)
         assert float(values[k]) == pytest.approx(judge.value, rel=1e-5)
         assert float(errors[k]) == pytest.approx(judge.mean_squared_error, rel=1e-5)
         close(np.moveaxis(gradient[k], -1, 0), judge.gradient)
@@ -449,7 +449,7 @@ def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
     ("changes", "message"),
     [
         ({"economy": Economy()}, "with an economy, got 'xla'. Give engine='cpu'"),
-        ({"between_share": 0.5}, "with between_share 0.5, got 'xla'. Give engine='cpu'"),
+        ({"interpolation_fraction": 0.5}, "with interpolation_fraction 0.5, got 'xla'. Give engine='cpu'"),
         ({"engine": "pallas", "options": RenderOptions(alpha_ceiling=1.0)}, "alpha_ceiling"),
         ({"engine": "pallas", "options": RenderOptions(tile_size=12)}, "tile_size"),
     ],
@@ -462,7 +462,7 @@ def test_what_it_does_not_know_is_refused(changes, message):
 
 
 def test_a_fit_refuses_it(monkeypatch):
-    monkeypatch.setattr(sys.modules["foldgauss.video.fit"], "_warm_up", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr(sys.modules["foldgauss.video.fitting.loop"], "_warm_up", lambda *_: pytest.fail("too late"))
     with pytest.raises(ValueError, match="with an economy"):
         next(fit_steps(FRAMES, dataclasses.replace(CONFIG, economy=Economy())))
 

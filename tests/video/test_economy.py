@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 from scenes_of_motion import SIZE, cut, disc, noise, still
 
-from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
-from foldgauss.video.conditioning import Shape, condition, update_windows
-from foldgauss.video.economy import MOST_SOLID, frame_weights
-from foldgauss.video.economy import cut as cut_rows
-from foldgauss.video.finish import refitted
-from foldgauss.video.fit import fit_steps, start, to_model
-from foldgauss.video.growth import Growth
-from foldgauss.video.kinds import LASTS, SOLID, degrees_of, forget, is_solid, kinds_of, lasts, numbers_of
-from foldgauss.video.ledger import Ledger, measured
-from foldgauss.video.light import LitModel
-from foldgauss.video.model import OPAQUE
-from foldgauss.video.packing import columns, pack
-from foldgauss.video.sharing import Palette, averaged, shared
-from foldgauss.video.sparse_adam import sparse_adam
-from foldgauss.video.stock import _long_axis_first
+from foldgauss.video.compression.finetune import refitted
+from foldgauss.video.fitting.adam import sparse_adam
+from foldgauss.video.fitting.codebook import Codebook, averaged, shared
+from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.loop import fit_steps, start, to_model
+from foldgauss.video.fitting.pruning.economy import MOST_SOLID, frame_weights
+from foldgauss.video.fitting.pruning.economy import cut as cut_rows
+from foldgauss.video.fitting.pruning.pruner import _long_axis_first
+from foldgauss.video.fitting.pruning.scores import PruningScores, measured
+from foldgauss.video.models.conditioning import Shape, condition, update_windows
+from foldgauss.video.models.kinds import LASTS, SOLID, degrees_of, forget, is_solid, kinds_of, lasts, numbers_of
+from foldgauss.video.models.row_layout import columns, pack
+from foldgauss.video.models.splats import OPAQUE
+from foldgauss.video.selection.contributions import Contributions
 
 STEPS = 700
 
@@ -49,7 +49,7 @@ def fitted(name: str, **changes):
 
 def weights(model) -> np.ndarray:
     """(num_frames, num_gaussians): what each Gaussian adds to each frame, in pixels."""
-    lit = LitModel(model)
+    lit = Contributions(model)
     out = np.zeros((model.num_frames, model.num_gaussians))
     for k in range(model.num_frames):
         light = lit.frame(k)
@@ -217,7 +217,9 @@ def test_the_lower_path_is_the_best(degree):
     span = 0.7
     moments = ((u / span)[:, None, None] ** np.arange(7)[:, None] * parts[:, None]).sum(0)
     none = np.zeros(1)
-    ledger = Ledger(none, none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, none, none, none)
+    ledger = PruningScores(
+        none, none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, none, none, none
+    )
     added, lower = ledger.lower(path[None], degree, np.array([0]))
     powers = u[:, None] ** np.arange(4)
     # sum over frames of |F^T (powers (path - lower))|^2
@@ -257,7 +259,7 @@ def test_kinds_are_those_of_the_stored_model():
 
 def test_what_a_kind_has_not_got_never_moves():
     frames = disc(lambda s: (15 + 50 * s, 24))
-    config = FitConfig(num_gaussians=200, steps=300, economy=Economy(rounds=2, first_share=0.3, last_share=0.4))
+    config = FitConfig(num_gaussians=200, steps=300, economy=Economy(rounds=2, first_fraction=0.3, last_fraction=0.4))
     for state, info in fit_steps(frames, config):
         pass
     at, kinds = columns(config.degree), state.kinds
@@ -297,7 +299,7 @@ def test_numbers_are_shared_where_it_pays(width):
 def test_what_is_shared_learns_as_one():
     """Adam on the sum of the gradients of those that took part; who did not moves along."""
     index = np.array([0, 1, 0, 2, 1])
-    palette, values = Palette.of(index, 2), np.array([[1, 2], [3, 4], [1, 2], [5, 6], [3, 4]], np.float32)
+    palette, values = Codebook.of(index, 2), np.array([[1, 2], [3, 4], [1, 2], [5, 6], [3, 4]], np.float32)
     grad = np.array([[1, 0], [9, 9], [2, -4], [0.5, 1], [9, 9]], np.float32)
     before, rate = values.copy(), np.float32([0.1, 0.01])
     palette.step(values, grad, np.array([0, 2, 3]), rate)
@@ -308,7 +310,7 @@ def test_what_is_shared_learns_as_one():
     assert (grad[[0, 2, 3]] == 0).all()
     assert palette.counts.tolist() == [1, 0, 1]
     np.testing.assert_allclose(palette.first[0], 0.1 * np.array([3, -4]), rtol=1e-5)
-    alone, shown = Palette.of(np.zeros(1, int), 2), np.zeros((1, 2), np.float32)
+    alone, shown = Codebook.of(np.zeros(1, int), 2), np.zeros((1, 2), np.float32)
     row, grad, moments = np.zeros((1, 11), np.float32), np.zeros((1, 11), np.float32), np.zeros((2, 1, 11), np.float32)
     counts, rates = np.zeros(1, np.int32), np.full(11, 0.1, np.float32)
     for gradient in np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32):
@@ -616,7 +618,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
         ({"psnr": float("nan")}, r"economy\.psnr"),
         ({"bits": 0}, r"economy\.bits"),
         ({"rounds": 0}, r"economy\.rounds"),
-        ({"first_share": 0.9}, r"economy\.first_share, last_share"),
+        ({"first_fraction": 0.9}, r"economy\.first_fraction, last_fraction"),
         ({"most_dropped": 2}, r"economy\.most_dropped"),
         ({"grows": "no"}, r"economy\.grows"),
     ],
@@ -635,7 +637,7 @@ def test_a_target_is_not_for_economies(psnr):
 
 
 def test_stock_is_taken_once_frames_are_whole_and_not_too_often():
-    economy = Economy(rounds=3, first_share=0.2, last_share=0.8)
+    economy = Economy(rounds=3, first_fraction=0.2, last_fraction=0.8)
     assert economy.steps(1000, passes=100, coarse=0.6).tolist() == [650, 725, 800]
     assert economy.steps(1000, passes=100, coarse=0).tolist() == [200, 500, 800]
     assert economy.steps(1000, passes=11, coarse=0).tolist() == [200, 800]

@@ -15,9 +15,9 @@ from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, RenderOptions, cpu
 from foldgauss.video import Clock, EditedVideo, FrameTimes, SelectedGaussians, Selection, VideoModel, edit, layers
-from foldgauss.video.playback import Playback
-from foldgauss.video.shots import time_logits
-from foldgauss.video.stage import Stage
+from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.shots import time_logits
 
 MODEL = soft_model()
 TIMES = np.asarray(MODEL.frame_times.times())
@@ -26,7 +26,7 @@ BETWEEN = (0.0, 0.31, float(TIMES[3]), 0.77, 1.0)
 
 
 def picture(video, t, size=None) -> np.ndarray:
-    return np.array(Playback(video, size).image(t))
+    return np.array(VideoRenderer(video, size).image(t))
 
 
 def apart(one, other, t) -> float:
@@ -91,7 +91,7 @@ FINER = 4
 def splines_around(t):
     """The picture with as much of what lies around it on each side, as splines over finer pixels."""
     height, width = (FINER * n for n in SIZE)
-    splats = Stage(MODEL, (height, width)).splats(t)
+    splats = PreparedModel(MODEL, (height, width)).splats(t)
     leaves = (splats.mean + np.float32([width, height]), splats.factor, splats.opacity, splats.color)
     image = cpu.forward(*leaves, np.zeros(3, np.float32), (3 * height, 3 * width), options=MODEL.options).image
     return [spline_filter(channel) for channel in image]
@@ -183,7 +183,7 @@ points = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 
 
 def splats(video, t=0.31):
-    return Stage(video, SIZE).splats(t)
+    return PreparedModel(video, SIZE).splats(t)
 
 
 def assert_same_splats(one, other, tolerance=1e-4):
@@ -244,8 +244,8 @@ def test_retiming_and_back(shift, stretch, about):
 @given(matrix=st.sampled_from(["rotate", "shear", "mirror", "scale two ways"]), progress=st.floats(0, 1))
 def test_no_way_through_nothing(matrix, progress):
     """On the way to a map that does not mirror nothing is flat."""
-    from foldgauss.video.edit import _polar
-    from foldgauss.video.overlays import Affine
+    from foldgauss.video.editing.chain import _polar
+    from foldgauss.video.editing.overlays import Affine
 
     target = MATRICES[matrix][0]
     angle, stretch = _polar(np.asarray(target, float))
@@ -498,13 +498,13 @@ def test_recolouring_keeps_the_shading():
     light = np.array([0.2126, 0.7152, 0.0722])
     base = edit(MODEL).apply(lambda g, t: g).video().at(0.5)
     red = edit(MODEL).select(OBJECT).recolor((0.8, 0.1, 0.1)).video()
-    got = Playback(red).splats(0.5)
+    got = VideoRenderer(red).splats(0.5)
     ratio = got.color[OBJECT] / np.array([0.8, 0.1, 0.1])
     np.testing.assert_allclose(ratio, np.repeat(ratio[:, :1], 3, 1), rtol=1e-4)
     np.testing.assert_allclose(got.opacity[OBJECT] @ ratio[:, 0] / got.opacity[OBJECT].sum(), 1, rtol=1e-4)
     before = base.color[OBJECT] @ light
     np.testing.assert_allclose(ratio[:, 0] / before, ratio[0, 0] / before[0], rtol=1e-3)
-    blue = Playback(edit(MODEL).select(OBJECT).recolor(hue=2 / 3).video()).splats(0.5).color[OBJECT]
+    blue = VideoRenderer(edit(MODEL).select(OBJECT).recolor(hue=2 / 3).video()).splats(0.5).color[OBJECT]
     assert (blue[:, 2] >= blue[:, :2].max(1) - 1e-5).all()
     unclipped = (blue > 0).all(1)
     assert unclipped.sum() > 3
@@ -585,7 +585,7 @@ def test_criteria_are_asked_of_each_layer(monkeypatch):
         asked.append((model, criteria))
         return Selection(OBJECT)
 
-    monkeypatch.setattr(importlib.import_module("foldgauss.video.edit"), "select", by_criteria)
+    monkeypatch.setattr(importlib.import_module("foldgauss.video.editing.chain"), "select", by_criteria)
     moved = edit(MODEL).move((0.1, 0))
     assert len(moved.select(box=(0, 0, 9, 9), frame=2).selection) == OBJECT.sum()
     model, criteria = asked.pop()

@@ -11,11 +11,11 @@ import pytest
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
-from foldgauss.io.model_file import read_header
+from foldgauss.io.models.model_file import read_header
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, project, render
 from foldgauss.video import Clock, EditedVideo, VideoModel, edit, layers
-from foldgauss.video.playback import Playback
-from foldgauss.video.stage import Stage
+from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.renderer import VideoRenderer
 
 MODEL = soft_model(options=RenderOptions())
 TIMES = np.asarray(MODEL.frame_times.times())
@@ -24,7 +24,7 @@ BETWEEN = (0.0, 0.31, 1.0)
 
 
 def picture(video, t, size=None) -> np.ndarray:
-    return np.array(Playback(video, size).image(t))
+    return np.array(VideoRenderer(video, size).image(t))
 
 
 def apart(one, other, t) -> float:
@@ -46,11 +46,11 @@ def test_it_is_asked_as_a_model_is():
     assert video.num_floats == MODEL.num_floats
     image = video.render(0.31, background=(0.2, 0.4, 0.6))
     assert image.shape == (*SIZE, 3)
-    played = Playback(video, background=(0.2, 0.4, 0.6)).frame(0.31)
+    played = VideoRenderer(video, background=(0.2, 0.4, 0.6)).frame(0.31)
     np.testing.assert_array_equal(np.floor(np.clip(image * np.float32(255) + np.float32(0.5), 0, 255)), played)
     frames = list(video.frames())
     assert len(frames) == MODEL.num_frames
-    np.testing.assert_array_equal(frames[2], Playback(video).frame(TIMES[2]))
+    np.testing.assert_array_equal(frames[2], VideoRenderer(video).frame(TIMES[2]))
     assert next(video.frames([0.3], (80, 128))).shape == (80, 128, 3)
     with pytest.raises(ValueError, match=r"^size: expected"):
         video.render(0.3, (0, 3))
@@ -78,7 +78,7 @@ def test_layers_are_composited_front_to_back():
     front, back = soft_model(seed=1, options=RenderOptions()), MODEL
     both = layers(front, back)
     for t in BETWEEN:
-        ahead, behind = (Playback(one).splats(t) for one in (front, back))
+        ahead, behind = (VideoRenderer(one).splats(t) for one in (front, back))
         together = both.at(t)
         for name in ("mean", "factor", "opacity", "color"):
             expected = np.concatenate([getattr(ahead, name), getattr(behind, name)])
@@ -95,14 +95,14 @@ def test_layers_of_different_kinds():
     front = soft_model(seed=1, power=1.0, floor=0.2, degree=1, size=(80, 128), options=RenderOptions())
     both = layers(front, MODEL)
     assert (both.size, both.num_gaussians) == (SIZE, 2 * NUM)
-    ahead = Playback(front, SIZE).splats(0.31)
+    ahead = VideoRenderer(front, SIZE).splats(0.31)
     np.testing.assert_array_equal(both.at(0.31).mean[:NUM], ahead.mean)
     np.testing.assert_array_equal(both.at(0.31).factor[:NUM], ahead.factor)
     assert layers(front, MODEL, timeline=0).size == (80, 128)
     lower = soft_model(seed=1, size=(79, 128), options=RenderOptions())  # the same shape to a pixel, and fitted over
-    fitted_over = Stage(lower, SIZE, aspect=SIZE[0] / SIZE[1]).splats(0.31)
+    fitted_over = PreparedModel(lower, SIZE, aspect=SIZE[0] / SIZE[1]).splats(0.31)
     np.testing.assert_array_equal(layers(lower, MODEL).at(0.31).mean[:NUM], fitted_over.mean)
-    assert np.abs(fitted_over.mean - Playback(lower, SIZE).splats(0.31).mean).max() > 0.1
+    assert np.abs(fitted_over.mean - VideoRenderer(lower, SIZE).splats(0.31).mean).max() > 0.1
     three = layers(MODEL, layers(front, MODEL, timeline=0), timeline=1)
     assert (len(three.layers), three.timeline, three.size) == (3, 1, (80, 128))
 
@@ -183,7 +183,7 @@ def test_depth_makes_smaller_and_hides():
     distance = -float(Camera.front(ASPECT).position[2])
     chain = edit(MODEL).select(OBJECT)
     far, half = chain.place(depth=distance).video(), chain.scale(0.5, about=(0, 0)).video()
-    got, expected = far.at(0.31), Playback(half).splats(0.31)
+    got, expected = far.at(0.31), VideoRenderer(half).splats(0.31)
     last = np.argsort(OBJECT, kind="stable")  # behind all others, in their order
     np.testing.assert_allclose(got.mean, expected.mean[last], atol=1e-3)
     np.testing.assert_array_equal(got.opacity, expected.opacity[last])
@@ -209,7 +209,7 @@ def test_turns_in_space():
     spun = chain.place(rotate=(0, np.pi / 2, 0)).video().at(0.31)
     width = lambda splats: np.sqrt(np.median((splats.factor[..., 0, :] ** 2).sum(-1)))  # noqa: E731
     only = edit(MODEL).select(~OBJECT).vanish().select().place(rotate=(0, 1.4, 0)).video().at(0.31)
-    whole = Playback(edit(MODEL).select(~OBJECT).vanish().video()).splats(0.31)
+    whole = VideoRenderer(edit(MODEL).select(~OBJECT).vanish().video()).splats(0.31)
     assert width(only) < 0.4 * width(whole)
     assert len(spun.opacity) == NUM
 

@@ -24,12 +24,12 @@ from foldgauss.video import (
     ssim,
     times_at,
 )
-from foldgauss.video.compress import EXACT_PSNR
-from foldgauss.video.config import chosen_num_gaussians
-from foldgauss.video.fit import start, to_model
-from foldgauss.video.initialize import CORE, ROUNDS, _even_chance
-from foldgauss.video.motion import Motion
-from foldgauss.video.shots import is_cut, out_of_cuts, time_logits
+from foldgauss.video.compression.search import EXACT_PSNR
+from foldgauss.video.fitting.config import chosen_num_gaussians
+from foldgauss.video.fitting.initialize import CORE, ROUNDS, _even_chance
+from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.optical_flow import Motion
+from foldgauss.video.models.shots import is_cut, out_of_cuts, time_logits
 
 SIZE = (24, 32)
 
@@ -93,7 +93,7 @@ SETTINGS = {
     "degree 0": {"degree": 0},
     "degree 7": {"degree": 7},
     "two cameras, batches": {"two_cameras": True, "batch_size": 3, "steps": 30},
-    "between, target": {"between_share": 0.5, "target_psnr": 99.0, "steps": 30},
+    "between, target": {"interpolation_fraction": 0.5, "target_psnr": 99.0, "steps": 30},
     "at rest": {"follow_motion": False},
 }
 

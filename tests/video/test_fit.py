@@ -10,13 +10,13 @@ import pytest
 from clips import moving_blobs
 from test_motion import panning
 
-from foldgauss import _threads
+from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
-from foldgauss.video.config import chosen_num_gaussians, planned_steps
-from foldgauss.video.fit import check_frames, start, start_from, to_model
+from foldgauss.video.fitting.config import chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
 
-fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
+fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
 
@@ -49,18 +49,18 @@ def test_learns_a_clip():
         {"batch_size": 3},
         {"batch_size": 9},  # more than the clip has frames
         {"power": 1.0},
-        {"ssim_share": 0.0},
+        {"ssim_fraction": 0.0},
         {"learn_frame_times": False},
         {"num_gaussians": 1},
         {"final_rate": 0.0},
         {"floor": 0.1},
         {"steps": None, "minutes": 0.01},
         {"follow_motion": False},
-        {"own_time": False},
-        {"square_share": 0.0},
-        {"square_share": 1.0},
-        {"between_share": 0.5},
-        {"between_share": 0.9, "batch_size": 2, "two_cameras": True, "target_psnr": 60.0},
+        {"scale_rates_by_duration": False},
+        {"l2_fraction": 0.0},
+        {"l2_fraction": 1.0},
+        {"interpolation_fraction": 0.5},
+        {"interpolation_fraction": 0.9, "batch_size": 2, "two_cameras": True, "target_psnr": 60.0},
     ],
     ids=str,
 )
@@ -139,7 +139,7 @@ def test_what_lies_between_frames_is_learned():
     seen, never = np.ascontiguousarray(finer[::2]), finer[1::2]
     scores = {}
     for share in (0.0, 0.6):
-        config = FitConfig(num_gaussians=600, steps=300, follow_motion=False, between_share=share)
+        config = FitConfig(num_gaussians=600, steps=300, follow_motion=False, interpolation_fraction=share)
         result = fit(seen, config)
         times = interpolated_times(np.asarray(result.model.frame_times.times()), 2)[1::2]
         drawn = list(result.model.frames(times))
@@ -150,8 +150,8 @@ def test_what_lies_between_frames_is_learned():
 
 def test_between_share_knows_no_alpha():
     frames = np.full((3, 20, 20, 4), 9, np.uint8)
-    with pytest.raises(ValueError, match="between_share"):
-        fit(frames, FitConfig(num_gaussians=9, steps=2, between_share=0.5))
+    with pytest.raises(ValueError, match="interpolation_fraction"):
+        fit(frames, FitConfig(num_gaussians=9, steps=2, interpolation_fraction=0.5))
 
 
 def test_seed_matters():
@@ -160,9 +160,9 @@ def test_seed_matters():
     assert not np.array_equal(one.splats.loc, other.splats.loc)
 
 
-@pytest.mark.parametrize("between_share", [0.0, 0.5])
-def test_a_stopped_fit_goes_on_to_the_same_bits(between_share):
-    frames, config = moving_blobs(), dataclasses.replace(CONFIG, between_share=between_share)
+@pytest.mark.parametrize("interpolation_fraction", [0.0, 0.5])
+def test_a_stopped_fit_goes_on_to_the_same_bits(interpolation_fraction):
+    frames, config = moving_blobs(), dataclasses.replace(CONFIG, interpolation_fraction=interpolation_fraction)
     whole = leaves_of(fit(frames, config).model)
     for state, info in fit_steps(frames, config):
         if info.step == 25:
@@ -284,11 +284,11 @@ def test_size_of_the_file_bounds_the_number():
         ({"minutes": float("nan")}, "minutes"),
         ({"target_psnr": 0}, "target_psnr"),
         ({"max_size_mb": -1.0}, "max_size_mb"),
-        ({"square_share": 1.5}, "square_share"),
+        ({"l2_fraction": 1.5}, "l2_fraction"),
         ({"follow_motion": 1}, "follow_motion"),
         ({"batch_size": 0}, "batch_size"),
         ({"power": -1.0}, "power"),
-        ({"ssim_share": 2.0}, "ssim_share"),
+        ({"ssim_fraction": 2.0}, "ssim_fraction"),
         ({"final_rate": float("inf")}, "final_rate"),
         ({"seed": -1}, "seed"),
         ({"degree": 99}, "degree"),
@@ -299,7 +299,7 @@ def test_size_of_the_file_bounds_the_number():
         ({"rates": 3}, "rates"),
         ({"options": None}, "options"),
         ({"learn_frame_times": "no"}, "learn_frame_times"),
-        ({"between_share": 1.0}, "between_share"),
+        ({"interpolation_fraction": 1.0}, "interpolation_fraction"),
     ],
 )
 def test_bad_settings(changes, message):

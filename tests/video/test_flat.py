@@ -7,9 +7,9 @@ from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FrameTimes, VideoModel, edit, layers
-from foldgauss.video.flat import flattened
-from foldgauss.video.playback import Playback
-from foldgauss.video.shots import time_logits
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.shots import time_logits
+from foldgauss.video.segmented.flatten import flattened
 
 
 def test_layers_become_one_model_of_the_same_pictures():
@@ -19,7 +19,7 @@ def test_layers_become_one_model_of_the_same_pictures():
     assert isinstance(flat, VideoModel)
     assert (flat.num_gaussians, flat.degree, flat.num_frames) == (2 * NUM, 3, 9)
     for t in (0.0, 0.31, 1.0):
-        np.testing.assert_array_equal(Playback(flat).frame(t), Playback(video).frame(t))
+        np.testing.assert_array_equal(VideoRenderer(flat).frame(t), VideoRenderer(video).frame(t))
 
 
 def test_plain_models_stay_as_they_are():

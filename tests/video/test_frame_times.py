@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foldgauss.video import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
-from foldgauss.video.shots import is_cut, out_of_cuts, time_logits
+from foldgauss.video.models.shots import is_cut, out_of_cuts, time_logits
 
 
 @settings(deadline=None, max_examples=50)

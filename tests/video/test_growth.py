@@ -9,12 +9,12 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import FitConfig, fit_steps
-from foldgauss.video.config import chosen_num_gaussians, most_gaussians
-from foldgauss.video.fit import start, to_model
-from foldgauss.video.growth import EXTENT, PUBLISHED_STEPS, Growth, Statistics, dim, grown
-from foldgauss.video.packing import columns
+from foldgauss.video.fitting.config import chosen_num_gaussians, most_gaussians
+from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, Growth, Statistics, dim, grown
+from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.models.row_layout import columns
 
-fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
+fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
 
 DEGREE, PLACE = 2, columns(2)
 GROWTH = Growth()
@@ -321,7 +321,7 @@ def test_a_reset_dims_the_fit():
 
 def test_the_screen_gradient_is_in_units_of_half_the_picture():
     """Against finite differences: the loss as one Gaussian's mean moves by a share of half the picture."""
-    config = FitConfig(num_gaussians=1, degree=0, seed=3, ssim_share=0.0, growth=Growth(), follow_motion=False)
+    config = FitConfig(num_gaussians=1, degree=0, seed=3, ssim_fraction=0.0, growth=Growth(), follow_motion=False)
     frames = moving_blobs(2, 24, 40)
 
     def stepper_of(state):

@@ -9,10 +9,10 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, evaluate, fit, fit_steps
-from foldgauss.video.fit import _Stepper
-from foldgauss.video.guard import MOST_BACKOFFS, Guard
-from foldgauss.video.packing import columns
-from foldgauss.video.state import running_psnr, to_model
+from foldgauss.video.fitting.divergence import MOST_BACKOFFS, Guard
+from foldgauss.video.fitting.loop import _Stepper
+from foldgauss.video.fitting.state import running_psnr, to_model
+from foldgauss.video.models.row_layout import columns
 
 CLIP = moving_blobs()
 CONFIG = FitConfig(num_gaussians=200, steps=240)
@@ -84,7 +84,7 @@ def test_folds_that_explode_are_named(usual):
         state.rows[:, columns(CONFIG.degree)["coefficients"]] *= 1e6
 
     with pytest.warns(DivergenceWarning, match="dB worse than they were, coefficients having moved most"):
-        got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_share=0, half_share=0))
+        got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_fraction=0, half_fraction=0))
     assert got > usual - 3
 
 

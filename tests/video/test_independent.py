@@ -9,7 +9,7 @@ from clips import moving_blobs
 
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, Growth, evaluate, fit, independent_frames, psnr
-from foldgauss.video.independent import FLOATS, _Allowance
+from foldgauss.video.fitting.per_frame_baseline import FLOATS, _Allowance
 
 FRAMES = moving_blobs(5, 24, 40)
 QUICK = FitConfig(steps=60)
@@ -59,11 +59,11 @@ def test_frames_share_nothing():
 
 def test_settings_reach_the_fits():
     plain = independent_frames(FRAMES[:1], 9 * 30, FitConfig(steps=8)).models[0]
-    for change in ({"seed": 3}, {"ssim_share": 1.0}, {"options": RenderOptions()}, {"compositing": "sum"}):
+    for change in ({"seed": 3}, {"ssim_fraction": 1.0}, {"options": RenderOptions()}, {"compositing": "sum"}):
         other = independent_frames(FRAMES[:1], 9 * 30, FitConfig(steps=8, **change)).models[0]
         assert not np.array_equal(other.splats.loc, plain.splats.loc), change
         assert other.compositing == change.get("compositing", "over")
-    timed = {"degree": 7, "power": 2.0, "own_time": False, "follow_motion": False}
+    timed = {"degree": 7, "power": 2.0, "scale_rates_by_duration": False, "follow_motion": False}
     same = independent_frames(FRAMES[:1], 9 * 30, FitConfig(steps=8, **timed)).models[0]
     np.testing.assert_array_equal(same.splats.loc, plain.splats.loc)
 
@@ -106,7 +106,7 @@ def test_minutes_end_the_fits():
         ({"target_psnr": 30.0}, "target_psnr"),
         ({"growth": Growth()}, "growth"),
         ({"economy": Economy()}, "economy"),
-        ({"between_share": 0.1}, "between_share"),
+        ({"interpolation_fraction": 0.1}, "interpolation_fraction"),
         ({"initialization": "uniform", "follow_motion": False}, "initialization"),
     ],
 )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from foldgauss import _threads
-from foldgauss.video.loss import C1, C2, RADIUS, SIGMA, image_loss, ssim_map
+from foldgauss._runtime import threads as _threads
+from foldgauss.video.fitting.steppers.loss import C1, C2, RADIUS, SIGMA, image_loss, ssim_map
 
 SIZES = [(97, 83), (40, 16), (41, 200), (11, 11), (3, 50), (1, 1)]
 
@@ -48,7 +48,7 @@ def test_value_and_gradient_agree_with_jax(height, width, share):
         wide = jnp.asarray(x, jnp.float64), jnp.asarray(y, jnp.float64)
         value, gradient = jax.value_and_grad(loss_in_jax)(*wide, share)
         value, gradient = float(value), np.asarray(gradient)
-    ours = image_loss(x, y, ssim_share=share)
+    ours = image_loss(x, y, ssim_fraction=share)
     assert ours.value == pytest.approx(value, abs=2e-6)
     assert ours.mean_squared_error == pytest.approx(np.mean((x - y) ** 2), rel=1e-5)
     np.testing.assert_allclose(ours.gradient, gradient, atol=1e-4 * np.abs(gradient).max())

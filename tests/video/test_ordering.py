@@ -6,9 +6,9 @@ import numpy as np
 from soft_models import soft_model
 
 from foldgauss.render import RenderOptions
-from foldgauss.video.light import LitModel
-from foldgauss.video.metrics import psnr
-from foldgauss.video.ordering import free_order, overlaps, swept
+from foldgauss.video.compression.sort_order import free_order, overlaps, swept
+from foldgauss.video.models.metrics import psnr
+from foldgauss.video.selection.contributions import Contributions
 
 
 def in_order(model, order):
@@ -42,7 +42,7 @@ def test_sweeps_keep_pairs_in_order():
 
 def test_pictures_stay():
     model = narrow(soft_model(options=RenderOptions()))
-    lit, cell = LitModel(model), np.random.default_rng(1).integers(0, 4, model.num_gaussians)
+    lit, cell = Contributions(model), np.random.default_rng(1).integers(0, 4, model.num_gaussians)
     order = free_order(cell, overlaps(lit), 0.0)
     assert (order != np.arange(len(order))).sum() > 10
     assert far_apart(in_order(model, order), model) > 48
@@ -53,7 +53,7 @@ def test_pictures_stay():
 def test_costs_are_what_changing_places_costs():
     """Of two Gaussians, by the pictures."""
     model = in_order(soft_model(options=RenderOptions()), np.array([20, 30]))
-    lit = LitModel(model)
+    lit = Contributions(model)
     front, back, cost = overlaps(lit)
     assert (front.tolist(), back.tolist()) == ([0], [1])
     shown = [np.stack(list(one.frames())) / 255.0 for one in (model, in_order(model, np.array([1, 0])))]

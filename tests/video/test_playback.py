@@ -8,10 +8,10 @@ import pytest
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, fit
-from foldgauss.video.frame_times import FrameTimes
-from foldgauss.video.initialize import initialize
-from foldgauss.video.model import VideoModel
-from foldgauss.video.playback import Playback, to_bytes
+from foldgauss.video.fitting.initialize import initialize
+from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.renderer import VideoRenderer, to_bytes
+from foldgauss.video.models.video_model import VideoModel
 
 
 def _model(power=2.0, floor=0.0, size=(37, 50)) -> VideoModel:
@@ -27,7 +27,7 @@ def test_it_draws_what_the_slow_way_draws(size, power, floor):
     model = _model(power, floor)
     for t in (0.0, 0.31, 1.0):
         slow = np.asarray(model.render(t, size, engine="reference"))
-        fast = Playback(model, size).frame(t)
+        fast = VideoRenderer(model, size).frame(t)
         assert fast.shape == slow.shape
         assert fast.std() > 5  # there is something to see
         # A pixel at a cutoff, or half way between two levels, may fall to the other side.
@@ -37,15 +37,15 @@ def test_it_draws_what_the_slow_way_draws(size, power, floor):
 
 def test_frames_are_those_of_the_frame_times():
     model = _model()
-    played = list(Playback(model).frames())
+    played = list(VideoRenderer(model).frames())
     assert len(played) == 5
-    np.testing.assert_array_equal(played[2], Playback(model).frame(np.asarray(model.frame_times.times())[2]))
+    np.testing.assert_array_equal(played[2], VideoRenderer(model).frame(np.asarray(model.frame_times.times())[2]))
     np.testing.assert_array_equal(np.stack(list(model.frames())), played)
 
 
 def test_splats_are_those_of_the_model_that_are_alive():
     model, t = eqx.tree_at(lambda m: m.splats.log_time_scale, _model(), replace_fn=lambda x: x - 1.5), 0.31
-    fast, slow = Playback(model, (60, 41)).splats(t), model.at(jnp.float32(t), (60, 41))
+    fast, slow = VideoRenderer(model, (60, 41)).splats(t), model.at(jnp.float32(t), (60, 41))
     alive = np.asarray(slow.opacity) > 0
     assert 0 < len(fast.opacity) == alive.sum() < alive.size
     covariance = lambda factor: np.asarray(factor) @ np.asarray(factor).mT  # noqa: E731
@@ -60,11 +60,11 @@ def test_one_envelope_for_all(name):
     model = _model(floor=0.1)
     values = np.full(300, getattr(model.splats.envelope, name), np.float32)
     some = lambda values: eqx.tree_at(lambda m: getattr(m.splats.envelope, name), model, jnp.asarray(values))  # noqa: E731
-    np.testing.assert_array_equal(Playback(some(values)).frame(0.31), Playback(model).frame(0.31))
+    np.testing.assert_array_equal(VideoRenderer(some(values)).frame(0.31), VideoRenderer(model).frame(0.31))
     values[7] *= 2
     message = rf"^model\.splats\.envelope\.{name}: expected one number for all Gaussians, got 2 .*VideoModel\.render"
     with pytest.raises(ValueError, match=message):
-        Playback(some(values))
+        VideoRenderer(some(values))
     assert bool(jnp.isfinite(some(values).render(0.31)).all())  # the cure
 
 
@@ -76,12 +76,12 @@ def test_bytes_are_rounded_and_held():
 def test_bad_models_and_sizes_are_refused():
     model = _model()
     for size in ((0, 5), (5.5, 5), 5):
-        for call in (Playback, lambda model, size: model.render(0.0, size)):
+        for call in (VideoRenderer, lambda model, size: model.render(0.0, size)):
             with pytest.raises(ValueError, match=r"^size: expected \(height, width\)"):
                 call(model, size)
     broken = eqx.tree_at(lambda m: m.splats.loc, model, jnp.asarray(model.splats.loc).at[3].set(jnp.nan))
     with pytest.raises(ValueError, match="finite"):
-        Playback(broken)
+        VideoRenderer(broken)
 
 
 def test_between_shots_is_the_nearer_one():
@@ -90,7 +90,7 @@ def test_between_shots_is_the_nearer_one():
     times = np.asarray(model.frame_times.times())
     assert times[3] - times[2] > 0.5  # the cut
     early, late = 0.9 * times[2] + 0.1 * times[3], 0.1 * times[2] + 0.9 * times[3]
-    playback = Playback(model)
+    playback = VideoRenderer(model)
     np.testing.assert_array_equal(playback.frame(early), playback.frame(times[2]))
     np.testing.assert_array_equal(playback.frame(late), playback.frame(times[3]))
     assert abs(np.mean(playback.frame(early)) - 200) < 15

@@ -11,14 +11,14 @@ from clips import moving_blobs
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
-from foldgauss.video.config import PRESETS, chosen_num_gaussians, planned_steps
-from foldgauss.video.fit import start, to_model
-from foldgauss.video.growth import Growth
-from foldgauss.video.initialize import initialize_uniform
-from foldgauss.video.model import SH_C0
-from foldgauss.video.packing import columns
+from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.initialize import initialize_uniform
+from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.splats import SH_C0
 
-fit_module = sys.modules["foldgauss.video.fit"]  # the name of the package's function, too
+fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
 
 FRAMES = moving_blobs(4, 24, 40)
 TAN = np.tan(0.6911112 / 2)  # the published frame's half width, in its units
@@ -57,7 +57,7 @@ def test_a_draft_is_smaller_than_the_standard():
 def test_the_published_numbers():
     paper = FitConfig.preset("paper")
     assert (paper.num_gaussians, paper.degree, paper.batch_size, paper.steps) == (500_000, 7, 3, 30_000)
-    assert (paper.power, paper.ssim_share, paper.square_share, paper.floor) == (2.0, 0.2, 0.0, 0.0)
+    assert (paper.power, paper.ssim_fraction, paper.l2_fraction, paper.floor) == (2.0, 0.2, 0.0, 0.0)
     assert paper.options == RenderOptions()
     assert paper.growth == Growth()
     rates = paper.rates
@@ -187,25 +187,25 @@ def test_views_from_the_back_are_taken_for_what_they_are():
 
 def test_all_take_part_where_only_alive_is_off():
     short = {"num_gaussians": 300, "steps": 12, "rates": PRESETS["paper"]["rates"]}
-    for only_alive in (True, False):
-        for state, info in fit_steps(FRAMES, FitConfig(only_alive=only_alive, **short)):
+    for sparse_updates in (True, False):
+        for state, info in fit_steps(FRAMES, FitConfig(sparse_updates=sparse_updates, **short)):
             assert info.num_alive <= 300
-        assert (state.counts.min() < 12) == only_alive
+        assert (state.counts.min() < 12) == sparse_updates
         assert state.counts.max() <= 12
 
 
-@pytest.mark.parametrize("falling", ["all", "loc"])
-def test_which_rates_fall(falling):
+@pytest.mark.parametrize("decayed", ["all", "loc"])
+def test_which_rates_fall(decayed):
     """Where the last step's rate is 0, only what does not fall still moves."""
-    config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, falling=falling)
+    config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, decayed=decayed)
     state = start(FRAMES, config)
     stepper, before = fit_module._Stepper(FRAMES, config, state), state.rows.copy()
     times = state.time_logits.copy()
     stepper(state, 1.0)
     moved = {name: not np.array_equal(state.rows[:, at], before[:, at]) for name, at in columns(3).items()}
     assert not moved.pop("loc")
-    assert set(moved.values()) == {falling == "loc"}
-    assert np.array_equal(np.asarray(state.time_logits), times) == (falling == "all")
+    assert set(moved.values()) == {decayed == "loc"}
+    assert np.array_equal(np.asarray(state.time_logits), times) == (decayed == "all")
 
 
 def test_a_small_fit_by_the_paper():
@@ -234,9 +234,9 @@ def test_a_small_fit_by_the_paper():
         ({"max_gaussians": 10**12}, "max_gaussians"),
         ({"initialization": "random"}, "initialization: expected one of 'clip', 'uniform'"),
         ({"initialization": "uniform"}, "follow_motion: expected False"),
-        ({"falling": "none"}, "falling: expected one of"),
+        ({"decayed": "none"}, "falling: expected one of"),
         ({"two_cameras": 2}, "two_cameras"),
-        ({"only_alive": None}, "only_alive"),
+        ({"sparse_updates": None}, "sparse_updates"),
         ({"growth": True}, "growth: expected a Growth"),
     ],
     ids=str,

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.io.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
 from foldgauss.video import Economy, FitConfig, evaluate, fit, fit_steps
-from foldgauss.video.fit import start, to_model
-from foldgauss.video.pyramid import level_at, levels, shrunk, work_done
+from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.pyramid import level_at, levels, shrunk, work_done
 
-fit_module = sys.modules["foldgauss.video.fit"]
-HALF = FitConfig(num_gaussians=800, steps=60, quarter_share=0.0, half_share=0.5)
+fit_module = sys.modules["foldgauss.video.fitting.loop"]
+HALF = FitConfig(num_gaussians=800, steps=60, quarter_fraction=0.0, half_fraction=0.5)
 
 
 def test_a_level_too_small_gives_its_share_to_the_next():
-    config = FitConfig(quarter_share=0.15, half_share=0.25)
+    config = FitConfig(quarter_fraction=0.15, half_fraction=0.25)
     assert [(round(share, 6), size) for share, size in levels(config, (640, 1280))] == [
         (0.15, (160, 320)),
         (0.25, (320, 640)),
@@ -28,14 +28,14 @@ def test_a_level_too_small_gives_its_share_to_the_next():
         (0.6, (272, 640)),
     ]
     assert levels(config, (160, 320)) == [(1.0, (160, 320))]
-    assert levels(dataclasses.replace(config, half_share=0.0), (640, 1280))[0].size == (160, 320)
+    assert levels(dataclasses.replace(config, half_fraction=0.0), (640, 1280))[0].size == (160, 320)
     assert [size for _, size in levels(config, (481, 853))] == [(120, 213), (240, 426), (481, 853)]
 
 
 def test_progress_goes_through_the_levels():
-    made = levels(FitConfig(quarter_share=0.25, half_share=0.25), (640, 1280))
+    made = levels(FitConfig(quarter_fraction=0.25, half_fraction=0.25), (640, 1280))
     assert [level_at(made, k / 8) for k in range(9)] == [0, 0, 1, 1, 2, 2, 2, 2, 2]
-    assert level_at(levels(FitConfig(quarter_share=0.5, half_share=0.5), (640, 1280)), 1.0) == 2
+    assert level_at(levels(FitConfig(quarter_fraction=0.5, half_fraction=0.5), (640, 1280)), 1.0) == 2
 
 
 def test_a_pixel_is_the_mean_of_those_it_stands_for():
@@ -48,7 +48,7 @@ def test_a_pixel_is_the_mean_of_those_it_stands_for():
 @pytest.fixture
 def small(monkeypatch):
     """Levels for clips of a few dozen pixels; only the fit's own steps."""
-    monkeypatch.setattr("foldgauss.video.pyramid.LEAST_SIDE", 8)
+    monkeypatch.setattr("foldgauss.video.fitting.pyramid.LEAST_SIDE", 8)
     monkeypatch.setattr(fit_module, "_warm_up", lambda *given: None)  # spies would see it
 
 
@@ -65,7 +65,7 @@ def test_steps_see_their_level(small, monkeypatch):
 def test_the_model_stands_still_between_levels(small, size):
     """Fitted at half size alone, it is right at full size, too: nothing is shifted or scaled."""
     frames = moving_blobs(height=size[0], width=size[1])
-    config = dataclasses.replace(HALF, steps=300, half_share=1.0)
+    config = dataclasses.replace(HALF, steps=300, half_fraction=1.0)
     model = fit(frames, config).model
     assert evaluate(model, frames).mean_psnr > 28
     shifted = np.roll(frames, 1, axis=2)
@@ -137,7 +137,7 @@ def test_the_running_psnr_starts_anew_at_another_level(small, monkeypatch):
 
 
 def test_time_is_counted_by_area():
-    made = levels(FitConfig(quarter_share=0.0, half_share=0.5), (640, 1280))
+    made = levels(FitConfig(quarter_fraction=0.0, half_fraction=0.5), (640, 1280))
     assert work_done(made, 0.5) == pytest.approx(0.2)
     assert work_done(made, 0.75) == pytest.approx(0.6)
     assert work_done(made, 1.0) == 1
@@ -192,8 +192,11 @@ def test_sums_cannot_have_alpha():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"half_share": -0.1}, r"^half_share: expected a number in \[0, 1\]"),
-        ({"half_share": 0.7, "quarter_share": 0.7}, "^quarter_share, half_share: expected at most 1 together"),
+        ({"half_fraction": -0.1}, r"^half_fraction: expected a number in \[0, 1\]"),
+        (
+            {"half_fraction": 0.7, "quarter_fraction": 0.7},
+            "^quarter_fraction, half_fraction: expected at most 1 together",
+        ),
         ({"compositing": "under"}, "^compositing: expected one of 'over', 'sum'"),
     ],
 )

@@ -31,7 +31,7 @@ from foldgauss.video import (
     influence,
     layers,
 )
-from foldgauss.video.segments import READY
+from foldgauss.video.segmented.segmented_video import READY
 
 #: Three segments of a dozen frames, three of which are shared with each neighbour.
 FIRSTS, LENGTH, NUM_FRAMES = (0, 9, 18), 12, 30

@@ -11,7 +11,7 @@ from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.render import Camera, cpu
 from foldgauss.video import EditedVideo, FrameTimes, SegmentedVideo, edit, layers
-from foldgauss.video.segments import Segment
+from foldgauss.video.segmented.segmented_video import Segment
 
 FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 10), (7, 9, 6), 16
 BLACK = np.zeros(3, np.float32)

@@ -15,7 +15,7 @@ from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.io import save_selection
 from foldgauss.render import RenderOptions
-from foldgauss.uncertainty.screen import Screen
+from foldgauss.uncertainty.likelihood.residuals import Screen
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -33,10 +33,10 @@ from foldgauss.video import (
     psnr,
     times_at,
 )
-from foldgauss.video.flat import flattened
-from foldgauss.video.playback import Playback
-from foldgauss.video.segments import READY
-from foldgauss.video.shots import is_cut, time_logits
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.shots import is_cut, time_logits
+from foldgauss.video.segmented.flatten import flattened
+from foldgauss.video.segmented.segmented_video import READY
 from foldgauss.video.tradeoff import frames_per_second
 
 #: Spans 0:7, 4:13 (three frames shared), 13:18 (a cut), 17:23 (one shared).
@@ -59,7 +59,7 @@ def video():
 
 
 def image(one, t):
-    return np.array(Playback(one).image(t))
+    return np.array(VideoRenderer(one).image(t))
 
 
 def at(clip, position):
@@ -188,7 +188,7 @@ def test_three_are_seen_where_one_fade_meets_the_next():
     around = [at(clip, position) for position in (4.4999, 4.5, 4.5001)]
     assert max(np.abs(a - around[1]).max() for a in around) < 1e-3
     loaded.clear()
-    assert len(list(Playback(clip).frames(np.linspace(0, 1, 57)))) == 57
+    assert len(list(VideoRenderer(clip).frames(np.linspace(0, 1, 57)))) == 57
     assert loaded == [0, 1, 2]
 
 
@@ -215,7 +215,7 @@ def test_what_is_given_for_one_time():
         t = position / 22
         own = parts[number]
         expected = own.stage(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
-        for found in (clip.at(t), Playback(clip).splats(t), Playback(clip).shown(t)):
+        for found in (clip.at(t), VideoRenderer(clip).splats(t), VideoRenderer(clip).shown(t)):
             np.testing.assert_array_equal(found.mean, expected.mean)
             np.testing.assert_array_equal(found.opacity, expected.opacity)
     np.testing.assert_array_equal(clip.render(0.3), np.moveaxis(image(clip, 0.3), 0, -1))
@@ -308,7 +308,7 @@ def counted():
 def test_played_through_each_segment_is_loaded_once(way):
     clip, loaded, alive = counted()
     assert loaded == []
-    playback = Playback(clip)
+    playback = VideoRenderer(clip)
     for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
         assert len(playback._stage._ready) <= READY
     assert loaded == [0, 1, 2, 3][::way]

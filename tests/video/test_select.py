@@ -29,8 +29,8 @@ from foldgauss.video import (
     matte,
     select,
 )
-from foldgauss.video.light import LitModel
-from foldgauss.video.playback import Playback
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.selection.contributions import Contributions
 
 MODEL, LABEL = named_model()
 HEIGHT, WIDTH = MODEL.size
@@ -49,7 +49,7 @@ def object_masks(name):
 
 def errors(found, wanted, model=MODEL):
     """The worst frame's shares of what the object, and of what all others add, that were missed and wrongly taken."""
-    lit, worst = LitModel(model), np.zeros(2)
+    lit, worst = Contributions(model), np.zeros(2)
     for t in np.linspace(0, 1, 2 * model.num_frames - 1):  # between frames, too
         light = lit.at(t)
         own, chosen = wanted.mask[light.alive], found.mask[light.alive]
@@ -128,7 +128,7 @@ def test_bad_sets():
 
 def weights(model, k):
     """The definition, pixel by pixel: (num_gaussians, height, width), float64."""
-    lit, options = LitModel(model), model.options
+    lit, options = Contributions(model), model.options
     splats = lit.frame(k).splats
     y, x = np.mgrid[: model.size[0], : model.size[1]] + 0.5
     found, light = np.zeros((lit.num_gaussians, *model.size)), np.ones(model.size)
@@ -171,7 +171,7 @@ def test_mattes_of_parts_come_to_one():
 def test_nothing_changes_beyond_the_influence(t):
     selection = truth(DISC)
     reached = influence(MODEL, selection, t)
-    before, after = (Playback(model).frame(t).astype(int) for model in (MODEL, without(MODEL, selection)))
+    before, after = (VideoRenderer(model).frame(t).astype(int) for model in (MODEL, without(MODEL, selection)))
     changed = (before != after).any(-1)
     assert not changed[~reached].any()
     assert 0.05 < changed.mean() <= reached.mean() < 0.2

@@ -5,8 +5,8 @@ import numpy as np
 import optax
 import pytest
 
-from foldgauss.video.packing import columns
-from foldgauss.video.sparse_adam import BETA1, BETA2, EPSILON, sparse_adam
+from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, sparse_adam
+from foldgauss.video.models.row_layout import columns
 
 
 @pytest.mark.parametrize("width", [11, 17, 25])

@@ -1,0 +1,134 @@
+"""Batches, dtypes and shape checks of pytrees whose every leaf has a rank of its own; the rest is batch."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import check_process
+
+_ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
+
+
+def _batch_rank(parts: list[tuple[Array, int]]) -> int:
+    return max(x.ndim - event for x, event in parts)
+
+
+def align(parts: list[tuple[Array, int]], rank: int | None = None) -> list[Array]:
+    """The arrays of (array, event rank) with equal batch ranks, by ones in front."""
+    rank = _batch_rank(parts) if rank is None else rank
+    return [lax.expand_dims(x, range(rank + event - x.ndim)) for x, event in parts]
+
+
+def broadcast(parts: list[tuple[Array, int]], batch: tuple[int, ...]) -> list[Array]:
+    return [jnp.broadcast_to(x, batch + x.shape[x.ndim - event :]) for x, event in parts]
+
+
+def parts_of(module: eqx.Module) -> list[tuple[Array, int]]:
+    """(leaf, event rank) of every leaf."""
+    check_process()
+    return list(zip(jax.tree.leaves(module), module.leaf_ranks, strict=True))
+
+
+def _map_parts(function: Callable[[tuple[Array, int]], Array], module: _ModuleT) -> _ModuleT:
+    return jax.tree.unflatten(jax.tree.structure(module), [function(part) for part in parts_of(module)])
+
+
+def expand(module: _ModuleT, rank: int) -> _ModuleT:
+    """`module` with at least `rank` batch dimensions on each leaf, by ones in front."""
+    return _map_parts(lambda part: align([part], max(rank, _batch_rank([part])))[0], module)
+
+
+def fill(module: _ModuleT, batch: tuple[int, ...]) -> _ModuleT:
+    """`module` with every leaf broadcast to the whole batch."""
+    return _map_parts(lambda part: broadcast([part], batch)[0], module)
+
+
+def batch_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
+    return jnp.broadcast_shapes(*(x.shape[: x.ndim - event] for x, event in parts))
+
+
+# --- dtypes -------------------------------------------------------------------------------------------------
+
+
+def common_dtype(*inputs: ArrayLike):
+    """The float type of the arrays among the inputs; Python numbers and lists follow, they do not lead."""
+    check_process()
+    dtypes = [x.dtype for x in inputs if hasattr(x, "dtype") and not isinstance(x, float)]
+    floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
+    if not floats:
+        return jnp.result_type(float)
+    return jax.dtypes.canonicalize_dtype(np.result_type(*floats))
+
+
+def as_value(x: ArrayLike, dtype) -> Array:
+    """A value as an array: float arrays keep their type, all else takes that of the distribution."""
+    check_process()
+    own = getattr(x, "dtype", None)
+    keeps = own is not None and jnp.issubdtype(own, jnp.floating) and not isinstance(x, float)
+    return jnp.asarray(x) if keeps else jnp.asarray(x, dtype)
+
+
+def cast(module: _ModuleT, dtype) -> _ModuleT:
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, module)
+
+
+# --- checks: shapes always, values only where there are values ----------------------------------------------
+
+
+def known(x: Array) -> np.ndarray | None:
+    """The numbers, in NumPy (nothing to compile); None under tracing, where there are none to look at."""
+    return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
+
+
+def checked_batch(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
+    try:
+        return batch_of(parts)
+    except ValueError:
+        shapes = ", ".join(str(x.shape[: x.ndim - event]) for x, event in parts)
+        cure = "Batch dimensions come first in every parameter."
+        raise invalid("batch", expected="leading dimensions that broadcast", got=shapes, cure=cure) from None
+
+
+def check_event(name: str, value: Array, event_shape: tuple[int, ...]) -> None:
+    if value.shape[-1:] != event_shape:
+        expected = f"shape (*batch, {event_shape[0]})"
+        raise invalid(name, expected=expected, got=f"shape {value.shape}", cure="Time, if any, is last.")
+
+
+def check_positive(name: str, scale: Array) -> None:
+    scale = known(scale)
+    if scale is not None and (scale <= 0).any():  # a NaN passes, and propagates
+        got, cure = f"a least of {np.nanmin(scale)}", "It is a standard deviation."
+        raise invalid(name, expected="positive numbers", got=got, cure=cure)
+
+
+# --- one at a time --------------------------------------------------------------------------------------------
+
+# So many integrals are held in memory at once.
+_CHUNK = 64
+
+
+@eqx.filter_jit
+def over_batch(function: Callable, *items):
+    """`function` of unbatched things, over all their batch dimensions together; compiled.
+
+    `function` is one of a module's own: a new closure each time would be compiled each time. Each item is a module
+    with `leaf_ranks`, or a pair (array, event rank).
+    """
+    arrays = [parts_of(x) if isinstance(x, eqx.Module) else [x] for x in items]
+    batch = checked_batch([part for parts in arrays for part in parts])
+    size = int(np.prod(batch))
+    flat = [fill(x, batch) if isinstance(x, eqx.Module) else broadcast([x], batch)[0] for x in items]
+    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[len(batch) :]), flat)
+    if size <= _CHUNK:
+        result = jax.vmap(function)(*flat)
+    else:
+        result = lax.map(lambda x: function(*x), flat, batch_size=_CHUNK)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), result)

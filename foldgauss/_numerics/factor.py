@@ -1,0 +1,124 @@
+"""The factor of a space covariance from whichever matrix the caller has."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float
+
+from foldgauss._numerics.batch import check_positive, known
+from foldgauss._runtime.checks import invalid
+
+
+def given_factor(given: dict[str, ArrayLike | None], *, dim: int, dtype, validate: bool) -> Array:
+    """The lower-triangular factor L of Sigma = L L^T, from the one matrix (or scales) that is given."""
+    name, matrix = _the_one_given(given)
+    matrix = jnp.asarray(matrix, dtype)
+    if name == "scale":
+        return _diagonal(matrix, dim, validate)
+    check_matrix(name, matrix, dim)
+    if name == "scale_tril":
+        if validate:
+            check_tril(matrix)
+        return matrix
+    if name == "covariance_matrix":
+        return checked_cholesky(name, matrix, validate)
+    # P = U^T U with U lower is a Cholesky factorisation from the last coordinate on; then L = U^-1.
+    upper = checked_cholesky(name, matrix[..., ::-1, ::-1], validate)[..., ::-1, ::-1]
+    identity = jnp.broadcast_to(jnp.eye(dim, dtype=dtype), matrix.shape)
+    return jnp.tril(lax.linalg.triangular_solve(jnp.swapaxes(upper, -1, -2), identity, left_side=True, lower=True))
+
+
+def _the_one_given(given: dict[str, ArrayLike | None]) -> tuple[str, ArrayLike]:
+    present = [(name, x) for name, x in given.items() if x is not None]
+    if len(present) != 1:
+        names = ", ".join(given)
+        got = " and ".join(name for name, _ in present) or "none"
+        raise invalid(names, expected="exactly one of them", got=got, cure="Sigma is one matrix, given one way.")
+    return present[0]
+
+
+def check_space(loc: Array, name: str, matrix: Array) -> None:
+    check_loc(loc)
+    check_matrix(name, matrix, loc.shape[-1])
+
+
+def check_loc(loc: Array) -> None:
+    if loc.ndim < 1 or loc.shape[-1] < 1:
+        cure = "A single space coordinate still needs its own axis."
+        raise invalid("loc", expected="shape (*batch, d-1)", got=f"shape {loc.shape}", cure=cure)
+
+
+def check_matrix(name: str, matrix: Array, dim: int) -> None:
+    if matrix.ndim < 2 or matrix.shape[-2:] != (dim, dim):
+        cure = "Its size must be that of loc; scales per coordinate are `scale`."
+        raise invalid(name, expected=f"shape (*batch, {dim}, {dim})", got=f"shape {matrix.shape}", cure=cure)
+
+
+def _diagonal(scale: Array, dim: int, validate: bool) -> Array:
+    if scale.ndim < 1 or scale.shape[-1] != dim:
+        cure = "It is a standard deviation for each coordinate of loc."
+        raise invalid("scale", expected=f"shape (*batch, {dim})", got=f"shape {scale.shape}", cure=cure)
+    if validate:
+        check_positive("scale", scale)
+    # Where, not times: an infinite scale must not put NaN off the diagonal.
+    return jnp.where(jnp.eye(dim, dtype=bool)[(None,) * (scale.ndim - 1)], scale[..., None], 0)
+
+
+def check_tril(tril: Array) -> None:
+    tril = known(tril)
+    if tril is None:
+        return
+    if (np.triu(tril, 1) != 0).any():
+        cure = "Take jnp.tril of it, or pass covariance_matrix."
+        got = "entries above the diagonal"
+        raise invalid("scale_tril", expected="lower-triangular matrices", got=got, cure=cure)
+    diagonal = np.diagonal(tril, axis1=-2, axis2=-1)
+    if (diagonal <= 0).any():
+        got, cure = (
+            f"a least entry of {np.nanmin(diagonal)}",
+            "Flip the sign of its column: Sigma stays the same.",
+        )
+        raise invalid("scale_tril", expected="a positive diagonal", got=got, cure=cure)
+
+
+def checked_cholesky(name: str, covariance: Array, validate: bool) -> Array:
+    tril, value = jnp.linalg.cholesky(covariance), known(covariance)
+    if not validate or value is None:
+        return tril
+    # Rounding of the user's own arithmetic is no asymmetry.
+    tolerance = 1e3 * np.finfo(value.dtype).eps * np.abs(value).max((-1, -2), initial=0, keepdims=True)
+    if (np.abs(value - np.swapaxes(value, -1, -2)) > tolerance).any():
+        cure = "For a factor use scale_tril; against rounding use (C + C.T) / 2."
+        raise invalid(name, expected="symmetric matrices", got="another", cure=cure)
+    # NaN in, NaN out: only a NaN of Cholesky's own is an error.
+    if (np.isnan(np.asarray(tril)).any((-1, -2)) & ~np.isnan(value).any((-1, -2))).any():
+        cure = "Add a small multiple of the identity, or drop a coordinate that the others determine."
+        raise invalid(name, expected="positive definite matrices", got="another", cure=cure)
+    return tril
+
+
+def restricted_tril(tril: Float[Array, "*batch dim dim"], indices: tuple[int, ...]) -> Float[Array, "*batch kept kept"]:
+    """Factor of the covariance of some coordinates, in any order, by QR: the covariance is never formed."""
+    if indices == tuple(range(len(indices))):
+        return tril[..., : len(indices), : len(indices)]
+    rows = tril[..., np.array(indices), :]
+    upper = jnp.linalg.qr(jnp.swapaxes(rows, -1, -2), mode="r")
+    sign = jnp.where(jnp.diagonal(upper, axis1=-2, axis2=-1) < 0, -1, 1).astype(upper.dtype)
+    return jnp.tril(jnp.swapaxes(upper * sign[..., :, None], -1, -2))
+
+
+def checked_indices(indices, dim: int) -> tuple[int, ...]:
+    """Coordinates counted from 0, each once, from any integers (negative ones count from the end)."""
+    cure = f"The coordinates are 0 to {dim - 1}, time is {dim - 1} (or -1)."
+    try:
+        given = [int(i) for i in np.atleast_1d(np.asarray(indices)) if i == int(i)]
+    except (TypeError, ValueError):
+        given = None
+    if given is None or len(given) != np.size(indices) or not given:
+        raise invalid("indices", expected="whole numbers, at least one", got=repr(indices), cure=cure)
+    if any(not -dim <= i < dim for i in given):
+        raise invalid("indices", expected=f"numbers from {-dim} to {dim - 1}", got=repr(indices), cure=cure)
+    result = tuple(i % dim for i in given)
+    if len(set(result)) != len(result):
+        raise invalid("indices", expected="each coordinate once", got=repr(indices), cure=cure)
+    return result

@@ -1,0 +1,348 @@
+"""Vectors of 16 float32 for Numba kernels, spelled out instead of left to the loop vectoriser.
+
+A value of type `VECTOR` is one LLVM vector: one AVX-512 register, or two or four narrower ones where a machine has no
+wider. What a kernel keeps in local variables then stays in registers over any loops, and how many channels or
+sums there are does not decide whether LLVM finds a vector loop. Arithmetic between vectors is `+`, `-`, `*`, `/`;
+comparisons give a `MASK` of 16 bits. Numba's own fast-math flags hold here too.
+
+Kernels that use these are kept on disk under their own file's date: after a change here, remove the kept code.
+"""
+
+import math
+import operator
+
+import numba as nb
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, models, overload, register_model
+
+from foldgauss._runtime.kernels import inline
+
+LANES = 16
+_FLOATS, _INTS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
+
+
+class _Vector(types.Type):
+    """16 float32."""
+
+
+class _Mask(types.Type):
+    """16 bits."""
+
+
+VECTOR, MASK = _Vector("floats16"), _Mask("bits16")
+
+
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, fe_type):
+        super().__init__(manager, fe_type, _FLOATS)
+
+
+@register_model(_Mask)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager, fe_type):
+        super().__init__(manager, fe_type, ir.VectorType(ir.IntType(1), LANES))
+
+
+def _place(context, builder, array_type, array, index, vector=_FLOATS):
+    """Pointer to 16 numbers of a contiguous array of four-byte ones, from `index` on."""
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+
+
+def _broadcast(builder, scalar, vector=_FLOATS):
+    empty = ir.Constant(vector, ir.Undefined)
+    one = builder.insert_element(empty, scalar, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, empty, ir.Constant(_INTS, [0] * LANES))
+
+
+@intrinsic
+def every(typing_context, scalar):
+    """A vector of one float32, 16 times."""
+    return VECTOR(types.float32), lambda context, builder, signature, args: _broadcast(builder, args[0])
+
+
+def _constant(numbers):
+    def generate(context, builder, signature, args):
+        return ir.Constant(_FLOATS, numbers)
+
+    return VECTOR(), generate
+
+
+@intrinsic
+def lanes(typing_context):
+    """The vector (0, 1, ..., 15)."""
+    return _constant([float(k) for k in range(LANES)])
+
+
+@intrinsic
+def columns_of_cell(typing_context):
+    """The vector (0, 1, 2, 3, 0, 1, ...): the pixels' columns in a cell of 4 x 4, row by row."""
+    return _constant([float(k % 4) for k in range(LANES)])
+
+
+@intrinsic
+def rows_of_cell(typing_context):
+    """The vector (0, 0, 0, 0, 1, 1, ...): likewise their rows."""
+    return _constant([float(k // 4) for k in range(LANES)])
+
+
+@intrinsic
+def load(typing_context, array, index):
+    """16 floats of a contiguous float32 array, from `index` on; no bounds are checked."""
+
+    def generate(context, builder, signature, args):
+        return builder.load(_place(context, builder, signature.args[0], *args), align=4)
+
+    return VECTOR(array, types.uint64), generate
+
+
+@intrinsic
+def store(typing_context, array, index, vector):
+    """Write 16 floats into a contiguous float32 array, from `index` on; no bounds are checked."""
+
+    def generate(context, builder, signature, args):
+        builder.store(args[2], _place(context, builder, signature.args[0], *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, types.uint64, VECTOR), generate
+
+
+def _arithmetic(name):
+    @intrinsic
+    def operation(typing_context, a, b):
+        return VECTOR(VECTOR, VECTOR), lambda context, builder, signature, args: getattr(builder, name)(*args)
+
+    return operation
+
+
+def _comparison(sign):
+    @intrinsic
+    def operation(typing_context, a, b):
+        """False where a number is NaN."""
+        return MASK(VECTOR, VECTOR), lambda context, builder, signature, args: builder.fcmp_ordered(sign, *args)
+
+    return operation
+
+
+@intrinsic
+def _both(typing_context, a, b):
+    return MASK(MASK, MASK), lambda context, builder, signature, args: builder.and_(*args)
+
+
+def _on_operator(symbol, kind, operation):
+    @overload(symbol, inline="always")
+    def implement(a, b):
+        if isinstance(a, kind) and isinstance(b, kind):
+            return lambda a, b: operation(a, b)
+        return None
+
+
+for _symbol, _name in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _on_operator(_symbol, _Vector, _arithmetic(_name))
+for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.lt, "<")):
+    _on_operator(_symbol, _Vector, _comparison(_sign))
+_on_operator(operator.and_, _Mask, _both)
+
+
+@intrinsic
+def choose(typing_context, mask, a, b):
+    """`a` where the mask is set, else `b`."""
+    return VECTOR(MASK, VECTOR, VECTOR), lambda context, builder, signature, args: builder.select(*args)
+
+
+@intrinsic
+def any_of(typing_context, mask):
+    """Whether any bit is set."""
+
+    def generate(context, builder, signature, args):
+        bits = builder.bitcast(args[0], ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+    return types.boolean(MASK), generate
+
+
+@intrinsic
+def between(typing_context, first, last, index, number):
+    """The 16 lowest bits: in which of the 16 places from `index` on first <= number < last; int32 arrays and number."""
+
+    def generate(context, builder, signature, args):
+        ends = (_place(context, builder, signature.args[k], args[k], args[2], _INTS) for k in (0, 1))
+        low, high = (builder.load(end, align=4) for end in ends)
+        wanted = _broadcast(builder, args[3], _INTS)
+        bits = builder.and_(builder.icmp_signed("<=", low, wanted), builder.icmp_signed("<", wanted, high))
+        return builder.zext(builder.bitcast(bits, ir.IntType(LANES)), ir.IntType(64))
+
+    return types.uint64(first, last, types.uint64, types.int32), generate
+
+
+@intrinsic
+def lowest_bit(typing_context, bits):
+    """The place of the lowest bit that is set; there must be one."""
+
+    def generate(context, builder, signature, args):
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), generate
+
+
+@intrinsic
+def split(typing_context, x):
+    """(whole, part): x rounded to whole, moved to the place of a float's exponent, and what is left, in [-0.5, 0.5]."""
+
+    def generate(context, builder, signature, args):
+        rint = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), "llvm.rint.v16f32")
+        near = builder.call(rint, args)
+        whole = builder.shl(builder.fptosi(near, _INTS), ir.Constant(_INTS, [23] * LANES))
+        part = builder.fsub(args[0], near)
+        return context.make_tuple(builder, signature.return_type, (builder.bitcast(whole, _FLOATS), part))
+
+    return types.UniTuple(VECTOR, 2)(VECTOR), generate
+
+
+@intrinsic
+def scale(typing_context, value, whole):
+    """`value` times 2 to the power of the `whole` that `split` gave; no meaning beyond float32's normal range."""
+
+    def generate(context, builder, signature, args):
+        total = builder.add(*(builder.bitcast(arg, _INTS) for arg in args))
+        return builder.bitcast(total, _FLOATS)
+
+    return VECTOR(VECTOR, VECTOR), generate
+
+
+@intrinsic
+def root(typing_context, x):
+    """The square root."""
+
+    def generate(context, builder, signature, args):
+        kind = ir.FunctionType(_FLOATS, [_FLOATS])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), args)
+
+    return VECTOR(VECTOR), generate
+
+
+_f = nb.float32
+
+
+@inline
+def exp2(x):
+    """2^x within 2e-7: a polynomial of the part in [-0.5, 0.5], the whole part into the exponent.
+
+    For x in [-126, 127]; anything else gives numbers without meaning, for the caller to drop.
+    """
+    whole, part = split(x)
+    y = every(_f(1.3264727e-3))
+    y = y * part + every(_f(9.671513e-3))
+    y = y * part + every(_f(5.5507336e-2))
+    y = y * part + every(_f(0.24022242))
+    y = y * part + every(_f(0.693147))
+    y = y * part + every(_f(1.0))
+    return scale(y, whole)
+
+
+@inline
+def exp(x):
+    """e^x: within 4e-7 for |x| < 5, 1e-5 for |x| < 87.3; beyond it stays at the ends of these."""
+    y, most = x * every(_f(math.log2(math.e))), every(_f(126.0))
+    y = choose(y < most, y, most)
+    y = choose(y > every(_f(-126.0)), y, every(_f(-126.0)))
+    return choose(x >= x, exp2(y), x)  # NaN stays what it is
+
+
+@inline
+def sigmoid(x):
+    """1 / (1 + e^-x)."""
+    one = every(_f(1.0))
+    return one / (one + exp(every(_f(0.0)) - x))
+
+
+@inline
+def cos_and_sin(turns):
+    """Cosine and sine of 2 pi x within 5e-7: the series of pi x, to its 12th power, then the angle doubled."""
+    _, part = split(turns)
+    square = part * part
+    y = every(_f(-0.00737043094571435))
+    y = y * square + every(_f(0.08214588661112823))
+    y = y * square + every(_f(-0.5992645293207921))
+    y = y * square + every(_f(2.550164039877345))
+    y = y * square + every(_f(-5.16771278004997))
+    y = y * square + every(_f(3.141592653589793))
+    sine = y * part
+    y = every(_f(0.0019295743094039))
+    y = y * square + every(_f(-0.02580689139001406))
+    y = y * square + every(_f(0.2353306303588935))
+    y = y * square + every(_f(-1.3352627688545893))
+    y = y * square + every(_f(4.058712126416768))
+    y = y * square + every(_f(-4.934802200544679))
+    y = y * square + every(_f(1.0))
+    return (y - sine) * (y + sine), every(_f(2.0)) * sine * y
+
+
+def _shuffled(builder, a, b, picks):
+    return builder.shuffle_vector(a, b, ir.Constant(_INTS, picks))
+
+
+@intrinsic
+def columns_of_rows(typing_context, array, indices, start):
+    """The 8 columns of 16 rows of a contiguous float32 array (num, 8): of rows indices[start : start + 16], int32."""
+
+    def generate(context, builder, signature, args):
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        index = context.make_array(signature.args[1])(context, builder, args[1]).data
+        half, word = ir.VectorType(ir.FloatType(), 8), ir.IntType(64)
+        rows = []
+        for k in range(LANES):
+            place = builder.gep(index, [builder.add(args[2], ir.Constant(word, k))])
+            row = builder.mul(builder.sext(builder.load(place), word), ir.Constant(word, 8))
+            rows.append(builder.load(builder.bitcast(builder.gep(data, [row]), half.as_pointer()), align=4))
+        pairs = [_shuffled(builder, rows[k], rows[k + 8], [*range(LANES)]) for k in range(8)]
+        for bit in (1, 2, 4):  # lanes and rows change places, one bit of their numbers after another
+            for k in (k for k in range(8) if not k & bit):
+                low, high = pairs[k], pairs[k | bit]
+                from_low = [lane if not lane & bit else lane - bit + LANES for lane in range(LANES)]
+                from_high = [lane + bit if not lane & bit else lane + LANES for lane in range(LANES)]
+                pairs[k], pairs[k | bit] = (_shuffled(builder, low, high, picks) for picks in (from_low, from_high))
+        return context.make_tuple(builder, signature.return_type, pairs)
+
+    return types.UniTuple(VECTOR, 8)(array, indices, types.uint64), generate
+
+
+@intrinsic
+def turned(typing_context, a, b, c, d):
+    """Four vectors as a 4 x 4 matrix of groups of 4 lanes, transposed: four cells of pixels become four rows of 16."""
+
+    def generate(context, builder, signature, args):
+        low = [*range(4), *range(16, 20), *range(4, 8), *range(20, 24)]
+        high = [*range(8, 12), *range(24, 28), *range(12, 16), *range(28, 32)]
+        pairs = [[_shuffled(builder, *two, picks) for picks in (low, high)] for two in (args[:2], args[2:])]
+        left, right = [*range(8), *range(16, 24)], [*range(8, 16), *range(24, 32)]
+        rows = [_shuffled(builder, pairs[0][k], pairs[1][k], picks) for k in range(2) for picks in (left, right)]
+        return context.make_tuple(builder, signature.return_type, rows)
+
+    return types.UniTuple(VECTOR, 4)(VECTOR, VECTOR, VECTOR, VECTOR), generate
+
+
+@intrinsic(prefer_literal=True)
+def folded(typing_context, a, b, width):
+    """Halfway to the sums of many vectors at once: neighbouring groups of `width` lanes (1, 2, 4, 8) added.
+
+    Of each pair of groups, the sum for `a` takes the first one's place, that for `b` the second one's. After widths
+    1, 2, 4, 8 over a tree of 16 vectors, lane k of the last holds the sum of vector k.
+    """
+    number = width.literal_value
+
+    def generate(context, builder, signature, args):
+        first = [k for k in range(LANES) if not k & number]
+        even = sorted([(k, k) for k in first] + [(k + number, k + LANES) for k in first])
+        odd = sorted([(k, k + number) for k in first] + [(k + number, k + number + LANES) for k in first])
+        sides = [_shuffled(builder, *args[:2], [pick for _, pick in picks]) for picks in (even, odd)]
+        return builder.fadd(*sides)
+
+    return VECTOR(VECTOR, VECTOR, width), generate

@@ -1,0 +1,20 @@
+"""What notebooks show of an object: functions registered by name, so that no class imports what draws it.
+
+`foldgauss/__init__.py` registers them; a module is imported when a notebook first shows an object of its kind.
+"""
+
+import importlib
+from typing import Any
+
+_LOCATIONS: dict[str, str] = {}
+
+
+def register(kind: str, location: str) -> None:
+    """Show objects of `kind` with the function at `location`, as "package.module:function"."""
+    _LOCATIONS[kind] = location
+
+
+def show(kind: str, obj: Any) -> Any:
+    """What the function registered for `kind` makes of `obj`."""
+    module, _, function = _LOCATIONS[kind].partition(":")
+    return getattr(importlib.import_module(module), function)(obj)

@@ -1,0 +1,158 @@
+"""One pool of worker threads for the serial `nogil` kernels.
+
+Numba's own threading aborts after `fork` (OpenMP) and fails from two Python threads at once (workqueue).
+Plain kernels over ranges of work, handed to a pool of ours, have neither problem; since the ranges never
+depend on the number of threads, every result is the same to the bit for any number of them.
+"""
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+
+from foldgauss._runtime.checks import invalid
+
+_lock = threading.Lock()
+_pool: ThreadPoolExecutor | None = None
+_num_threads: int | None = None
+_forked = False  # from a process in which JAX had started
+
+
+def available_cores() -> int:
+    """Cores this process may run on (its affinity, where the system tells)."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        return os.cpu_count() or 1
+
+
+def num_threads() -> int:
+    """Threads the kernels use: what `set_num_threads` said, else FOLDGAUSS_NUM_THREADS, else the cores."""
+    if _num_threads is not None:
+        return _num_threads
+    said = os.environ.get("FOLDGAUSS_NUM_THREADS")
+    if said is None:
+        return available_cores()
+    if not said.isdecimal() or int(said) < 1:
+        raise invalid("FOLDGAUSS_NUM_THREADS", expected="a whole number >= 1", got=repr(said))
+    return int(said)
+
+
+def set_num_threads(count: int | None) -> None:
+    """Fix the number of kernel threads; None returns to the default."""
+    global _pool, _num_threads
+    if count is not None and count < 1:
+        raise invalid("count", expected="a whole number >= 1, or None", got=count)
+    with _lock:
+        _num_threads, _pool = count, None
+
+
+def check_process() -> None:
+    """Raise RuntimeError in a process that was forked from one in which JAX had started.
+
+    JAX's threads do not exist there, and what waits for them waits for ever. Our own kernels alone do work.
+    """
+    if _forked:
+        raise RuntimeError(
+            f"process {os.getpid()}: expected one with JAX's threads, got one that was forked after JAX had started, "
+            "where it would hang. Start processes by spawn: multiprocessing.get_context('spawn'), or "
+            "ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')); or fork before anything is computed."
+        )
+
+
+def _jax_has_started() -> bool:
+    """Whether JAX has threads. It has none while it is but imported, and no public way to tell."""
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    if bridge is None:
+        return False
+    started = getattr(bridge, "backends_are_initialized", None)
+    return started is None or started()
+
+
+def _begin_child() -> None:
+    """In a forked child the pool's threads do not exist: start afresh, with a lock nobody holds."""
+    global _pool, _lock, _forked
+    _pool, _lock = None, threading.Lock()
+    _forked = _forked or _jax_has_started()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_child)
+
+
+def _call(task: Callable[[int], object], item: int) -> None:
+    """`task(item)`; an interrupt that Numba met within its own Python code, and made a SystemError of, is one again."""
+    try:
+        task(item)
+    except SystemError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        raise KeyboardInterrupt from error
+
+
+def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:
+    """Call `task(item)` for every item on the pool, or all on this thread, and wait; the first error is raised here.
+
+    Tasks must not call `run_tasks` themselves. Where no more threads can be started, since the main thread has ended or
+    the system allows no more, fewer work.
+    """
+    global _pool
+    items = list(items)
+    if serial or len(items) <= 1 or num_threads() == 1:
+        for item in items:
+            _call(task, item)
+        return
+    threads = num_threads()
+    with _lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(threads, thread_name_prefix="foldgauss")
+        pool = _pool
+    # One queue entry per thread, not per item: a Python future costs about as much as a small tile.
+    pending = iter(items)
+    guard = threading.Lock()
+    errors: list[BaseException] = []
+    futures: list[Future] = []
+    in_work: list[None] = []  # one for each item
+
+    def drain() -> None:
+        while True:
+            with guard:
+                item = next(pending, None)
+                if item is None:
+                    return
+                in_work.append(None)
+            try:
+                _call(task, item)
+            except BaseException as error:
+                errors.append(error)
+                raise
+            finally:
+                in_work.pop()
+
+    all_known = True
+    try:
+        try:
+            for _ in range(min(threads, len(items)) - 1):
+                futures.append(pool.submit(drain))
+        except RuntimeError:  # what was to start the thread may be in the queue all the same, with no future
+            all_known = False
+        drain()  # the calling thread works too
+    finally:
+        # Not before all are done: what they read and write may be freed once this returns.
+        with guard:
+            pending = iter(())
+        for future in futures:
+            while not future.done():
+                try:
+                    wait([future])
+                except KeyboardInterrupt as error:
+                    errors.insert(0, error)
+        while in_work and not all_known:
+            time.sleep(1e-3)
+    if errors:
+        raise errors[0]

@@ -1,0 +1,1 @@
+"""Functionals of distributions: moments, conditional and marginal densities by quadrature, divergences, plots."""

@@ -1,0 +1,506 @@
+"""What leaves the family: a Folded-Gaussian without its time, or with space known and time not.
+
+Given t everything is Gaussian, so all of it is a mixture over time, and time is one-dimensional: it is integrated
+numerically, adaptively around the mass (`quadrature`), with an error estimate.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.special import log_ndtr, logsumexp
+from jaxtyping import Array, Float, Key
+
+from foldgauss._numerics.batch import as_value, batch_of, check_event, over_batch, parts_of
+from foldgauss._numerics.factor import checked_indices
+from foldgauss._runtime.checks import invalid
+from foldgauss.analysis.narrow_crossings import ROUNDING, centre_at, modes_of, spikes_of
+from foldgauss.analysis.quadrature import REACH, SEARCH_GRID, Panels, adaptive_panels, diverges, peaks, within_any
+from foldgauss.envelope import Constant, TimeLikelihood
+from foldgauss.gaussian import Gaussian, given_first
+
+__all__ = ["TimeDensity", "TimeMixture", "conditional_gaussian", "time_density", "time_mixture"]
+
+_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
+_CROSSINGS = 24  # points where the ridge comes near: looked at
+_BEST = 10  # and integrated around
+_MAXIMA = 6
+_MODES = 8
+
+
+class TimeDensity(eqx.Module):
+    """The density of t given (some of) space, p(t | s) = FN(s, t) / p(s), by quadrature.
+
+    Made by `FoldedGaussian.time_given_space`.
+
+    Where time is known more narrowly than floating-point times lie apart (one space coordinate and a small `scale_tril`
+    or a large |tau|), probabilities, quantiles and moments have its mass, as an atom of sorts; `pdf(t)` has what it is
+    at the very number t, which may be next to nothing on both sides of the peak.
+
+    **Shapes:** `event_shape == ()`: values have shape (*sample, *batch). `log_normalizer` (*batch,) is log p(s).
+    It is +inf where p(s) diverges (`power (d-1) >= 2` and s on a ridge that stands still). `error_estimate` (*batch,)
+    is the estimated relative error of p(s), and so of every density and probability: large where p(s) hangs on the
+    rounding of s, `inf` where it diverges or log p(s) is -inf, of which nothing follows: quantiles and moments are NaN.
+
+    **Example:** `dist.time_given_space([0.3, 0.1]).mean`
+
+    **Source:** Bayes' rule on eq:foldgauss.
+    """
+
+    parent: eqx.Module
+    values: Float[Array, "*#batch d-1"]
+    panels: Panels
+    log_normalizer: Float[Array, "*batch"]
+    error_estimate: Float[Array, "*batch"]
+
+    @property
+    def event_shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return self.log_normalizer.shape
+
+    def log_prob(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """log p(t | s)."""
+        t = as_value(t, self.values.dtype)
+        shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
+        t = jnp.broadcast_to(t, shape)[..., None]
+        joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), t], axis=-1))
+        return jnp.where(jnp.isneginf(joint), -jnp.inf, joint - jnp.broadcast_to(self.log_normalizer, shape))
+
+    def pdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """p(t | s)."""
+        return jnp.exp(self.log_prob(t))
+
+    def cdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """P(time <= t | s)."""
+        return self._elementwise(Panels.cdf, self._tau(as_value(t, self.values.dtype)))
+
+    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """The quantile: the inverse of `cdf`, -inf at 0 and +inf at 1."""
+        return self._time(self._elementwise(Panels.icdf, as_value(q, self.values.dtype)))
+
+    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Draws of shape (*sample_shape, *batch), by the quantile function."""
+        shape = (*sample_shape, *self.batch_shape)
+        smallest = float(jnp.finfo(self.values.dtype).tiny)  # not 0, whose quantile is -inf
+        return self.icdf(jax.random.uniform(key, shape, self.values.dtype, minval=smallest))
+
+    @property
+    def mean(self) -> Float[Array, "*batch"]:
+        """E[t | s]."""
+        return self._time(self._moments()[0])
+
+    @property
+    def variance(self) -> Float[Array, "*batch"]:
+        """Var[t | s]."""
+        return self._moments()[1] * jnp.broadcast_to(self.parent.time_scale, self.batch_shape) ** 2
+
+    def modes(self) -> Float[Array, "*batch modes"]:
+        """The local maxima of p(t | s), highest first, at most 8; NaN where there are fewer."""
+
+        return over_batch(_modes, self.parent, (self.values, 1), self.panels)
+
+    def _moments(self):
+        return over_batch(_tau_moments, self.panels)
+
+    def _elementwise(self, function, x):
+        """function(panels, x) for x of shape (*sample, *batch), without a copy of the panels for each sample."""
+        batch, rank = self.batch_shape, len(self.batch_shape)
+        shape = jnp.broadcast_shapes(x.shape, batch)
+        flat = jnp.broadcast_to(x, shape).reshape(-1, int(np.prod(batch)))
+        panels = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[rank:]), self.panels)
+        return _each(function, panels, flat).reshape(shape)
+
+    def _tau(self, t):
+        shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
+        loc, scale = (jnp.broadcast_to(x, shape) for x in (self.parent.time_loc, self.parent.time_scale))
+        return (jnp.broadcast_to(t, shape) - loc) / scale
+
+    def _time(self, tau):
+        loc, scale = (jnp.broadcast_to(x, tau.shape) for x in (self.parent.time_loc, self.parent.time_scale))
+        return loc + scale * tau
+
+
+class TimeMixture(eqx.Module):
+    """Some coordinates of a Folded-Gaussian, given none or some of its space coordinates, t integrated numerically.
+
+        p(y | g) = integral p(y | g, t) p(t | g) dt          (or without the integral, if t is one of y)
+
+    Made by `FoldedGaussian.marginal` (time dropped) and `FoldedGaussian.condition` (time not given).
+
+    **Shapes:** `event_shape == (n,)`, n coordinates kept, time (if kept) last.
+
+    **Example:** `dist.marginal([0]).cdf(jnp.array([0.3]))`
+
+    **Source:** eq:foldgauss, integrated. **Raises:** ValueError on a wrong shape, and from `cdf` unless n is 1.
+    """
+
+    parent: eqx.Module  # of (given, kept, time), in this order
+    values: Float[Array, "*#batch given"]
+    time: TimeDensity | None  # p(t | given); None if nothing is given, and t has its own normal
+    keeps_time: bool = eqx.field(static=True)
+
+    @property
+    def event_shape(self) -> tuple[int, ...]:
+        return (self._space_dim + int(self.keeps_time),)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return batch_of([*parts_of(self.parent), (self.values, 1)])
+
+    def log_prob(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
+        """log p(x | given)."""
+        x = self._checked(x)
+        if self.keeps_time:
+            log_joint = self.parent.log_prob(self._with_values(x))
+        else:
+            log_joint = self._space_integral(x)[0]
+        log_given = jnp.broadcast_to(self._log_normalizer, log_joint.shape)
+        return jnp.where(jnp.isneginf(log_joint), -jnp.inf, log_joint - log_given)
+
+    def pdf(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
+        """p(x | given)."""
+        return jnp.exp(self.log_prob(x))
+
+    def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
+        """Estimated relative error of `pdf(x)`: that of its integrals over time.
+
+        It is large where p hangs on the rounding of x. In two and more space coordinates, far out or with a small
+        `scale_tril`, that is so for points on the curve to rounding, where the curve is narrower still: the density
+        *of this very number* is computed; that of the point meant may be greater by any factor. In one, only at a
+        turning point of the curve: anywhere else the curve passes every number on its way, at any width.
+        """
+        x = self._checked(x)
+        shape = jnp.broadcast_shapes(x.shape[:-1], self.batch_shape)
+        given = jnp.zeros(shape, x.dtype) if self.time is None else jnp.broadcast_to(self.time.error_estimate, shape)
+        return given if self.keeps_time else given + self._space_integral(x)[1]
+
+    def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
+        """P(coordinate <= x | given), where there is only one coordinate."""
+        if self.event_shape != (1,):
+            raise invalid("cdf", expected="one coordinate", got=f"{self.event_shape[0]}", cure="Use marginal([i]).cdf.")
+        x = self._checked(x)
+        if self.keeps_time:
+            return self.time.cdf(x[..., 0])
+        infinite = jnp.isinf(x)
+        log_mass = over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, x)), 1))
+        mass = jnp.clip(jnp.exp(log_mass - jnp.broadcast_to(self._log_normalizer, log_mass.shape)), 0, 1)
+        infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, x))
+        return jnp.where(infinite, (last > 0).astype(mass.dtype), mass)
+
+    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
+        time_key, space_key = jax.random.split(key)
+        shape = (*sample_shape, *self.batch_shape)
+        if self.time is None:
+            noise = jax.random.normal(time_key, shape, self.values.dtype)
+            loc, scale = (jnp.broadcast_to(x, shape) for x in (self.parent.time_loc, self.parent.time_scale))
+            t = loc + scale * noise
+        else:
+            t = self.time.sample(time_key, sample_shape)
+        time = t[..., None]
+        if not self._space_dim:
+            return time
+        s = conditional_gaussian(self.parent, _over(self.values, shape), t).sample(space_key)
+        return jnp.concatenate([s, time], axis=-1) if self.keeps_time else s
+
+    @property
+    def mean(self) -> Float[Array, "*batch n"]:
+        """E[x | given]."""
+        return self._moments()[0]
+
+    @property
+    def variance(self) -> Float[Array, "*batch n"]:
+        """Var[x | given], per coordinate."""
+        return jnp.diagonal(self._moments()[1], axis1=-2, axis2=-1)
+
+    @property
+    def covariance_matrix(self) -> Float[Array, "*batch n n"]:
+        """Cov[x | given]."""
+        return self._moments()[1]
+
+    def marginal(self, indices) -> "TimeMixture":
+        """Some of the coordinates; the indices are kept."""
+        space, keeps_time = self._split(checked_indices(indices, self.event_shape[0]))
+        keep = (*range(self._num_given), *(self._num_given + i for i in space))
+        parent = self.parent.marginal((*keep, self.parent.event_shape[0] - 1))
+        return TimeMixture(parent, self.values, self.time, keeps_time)
+
+    def condition(self, indices, values) -> "TimeMixture | Gaussian":
+        """The other coordinates, given these: exact, a Gaussian, if time is among the given."""
+        indices = checked_indices(indices, self.event_shape[0])
+        offset = self._num_given
+        values = as_value(values, self.values.dtype)
+        check_event("values", values, (len(indices),))
+        shape = jnp.broadcast_shapes(values.shape[:-1], self.batch_shape)
+        both = jnp.concatenate([_over(self.values, shape), _over(values, shape)], axis=-1)
+        given = (*range(offset), *(offset + i for i in indices))
+        if self.keeps_time:
+            return self.parent.condition(given, both)
+        kept = tuple(i for i in range(offset + self._space_dim) if i not in given)
+        if not kept:
+            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+        return time_mixture(self.parent, kept, given, both, keeps_time=False)
+
+    @property
+    def _num_given(self) -> int:
+        return self.values.shape[-1]
+
+    @property
+    def _space_dim(self) -> int:
+        return self.parent.event_shape[0] - 1 - self._num_given
+
+    @property
+    def _log_normalizer(self) -> Array:
+        return jnp.zeros((), self.values.dtype) if self.time is None else self.time.log_normalizer
+
+    def _checked(self, x):
+        x = as_value(x, self.values.dtype)
+        check_event("x", x, self.event_shape)
+        return x
+
+    def _with_values(self, x):
+        shape = jnp.broadcast_shapes(x.shape[:-1], self.values.shape[:-1])
+        return jnp.concatenate([_over(self.values, shape), _over(x, shape)], axis=-1)
+
+    def _space_integral(self, x):
+        return over_batch(_log_space_density, self.parent, (self._with_values(x), 1))
+
+    def _split(self, indices):
+        keeps_time = self.keeps_time and self._space_dim in indices
+        if keeps_time and indices[-1] != self._space_dim:
+            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        return indices[: len(indices) - int(keeps_time)], keeps_time
+
+    def _moments(self):
+        if self.time is None:
+            mean, covariance = self.parent.moments()
+            return mean[..., :-1], covariance[..., :-1, :-1]
+        mean, covariance = over_batch(_mixture_moments, self.parent, (self.values, 1), self.time.panels)
+        end = self.event_shape[0]
+        return mean[..., :end], covariance[..., :end, :end]
+
+
+def time_density(parent, values: Float[Array, "*#batch d-1"]) -> TimeDensity:
+    """p(t | s = values) of a Folded-Gaussian."""
+    panels, log_normalizer, error = over_batch(_space_panels, parent, (values, 1))
+    values = _over(values, log_normalizer.shape)
+    return TimeDensity(parent, values, panels, log_normalizer, error)
+
+
+def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixture:
+    """Coordinates `kept` (and time) of a Folded-Gaussian given `values` of the space coordinates `given`."""
+    time = parent.event_shape[0] - 1
+    ordered = parent.marginal((*given, *kept, time))
+    density = time_density(parent.marginal((*given, time)), values) if given else None
+    return TimeMixture(ordered, values, density, keeps_time)
+
+
+def conditional_gaussian(parent, values: Float[Array, "*#batch given"], t: Float[Array, "*#batch"]) -> Gaussian:
+    """The later space coordinates given t and the first ones: exact, all of it is Gaussian given t."""
+    at = parent.condition_time(t)
+    return given_first(at, values) if values.shape[-1] else at
+
+
+@eqx.filter_jit
+def _each(function, panels: Panels, x: Float[Array, "sample batch"]) -> Float[Array, "sample batch"]:
+    return jax.vmap(jax.vmap(function, in_axes=(None, 0)), in_axes=(0, 1), out_axes=1)(panels, x)
+
+
+def _over(x: Array, batch: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(x, (*batch, x.shape[-1]))
+
+
+# --- one at a time: parents and values without batch --------------------------------------------------------
+
+
+def _centred(parent, s):
+    """The parent about 0 and the space coordinates s about there: integrals over tau without the offsets' rounding."""
+    offset = parent.loc[: s.size]
+    parent = eqx.tree_at(lambda dist: dist.loc, parent, jnp.zeros_like(parent.loc))
+    if isinstance(parent.envelope, Constant | TimeLikelihood):  # others may know more of t than its distance
+        parent = eqx.tree_at(lambda dist: dist.time_loc, parent, jnp.zeros_like(parent.time_loc))
+    return parent, s - offset
+
+
+def _log_joint(parent, s):
+    """tau -> log of the density of (s, tau), elementwise."""
+
+    def log_f(tau):
+        t = parent.time_loc + parent.time_scale * tau
+        x = jnp.concatenate([_over(s, t.shape), t[..., None]], axis=-1)
+        return parent.log_prob(x) + jnp.log(parent.time_scale)
+
+    return log_f
+
+
+def _log_joint_frozen(parent, s):
+    """The same without derivatives, and less to compile."""
+    parent, s = lax.stop_gradient((parent, s))
+    return lambda tau: centre_at(parent, tau).log_prob(_over(s, tau.shape)) - 0.5 * tau**2 - _HALF_LOG_2PI
+
+
+def _guides(parent, s, log_f):
+    """tau where mass may be: where the ridge comes near (peaks too narrow for a grid), and where the density peaks.
+
+    And all of the former, NaN where there are fewer, by their distance from 0.
+    """
+    grid = jnp.asarray(SEARCH_GRID, s.dtype)
+
+    def nearness(tau):
+        here = centre_at(parent, tau)
+        return Gaussian(here.loc, here.base_tril, validate_args=False).log_prob(_over(s, tau.shape))
+
+    near = peaks(nearness, grid, _CROSSINGS, score=lambda tau: -(tau**2))
+    # A square tells its minimum to half the digits; the residual itself, which is linear there, to all of them.
+    near = lax.fori_loop(0, 3, lambda _, tau: _nearer(parent, s, tau), near)
+    there = jnp.where(jnp.isnan(near), 0, near)
+    # A ridge far out is high because it is narrow: its mass goes without the factor a^(-(d-1)/2).
+    mass = jnp.where(jnp.isnan(near), -jnp.inf, log_f(there) + s.size * centre_at(parent, there).log_scale)
+    return jnp.concatenate([near[lax.top_k(mass, _BEST)[1]], peaks(log_f, grid, _MAXIMA)]), near
+
+
+def _nearer(parent, s, tau):
+    """A Gauss-Newton step from tau to where the ridge is nearest to s; no step that would be a long one."""
+    place, speed = jax.jvp(lambda tau: centre_at(parent, tau).loc[..., : s.size], (tau,), (jnp.ones_like(tau),))
+    tril = parent.scale_tril[: s.size, : s.size]
+    solve = lambda rows: lax.linalg.triangular_solve(tril, rows.T, left_side=True, lower=True)  # noqa: E731
+    residual, rate = solve(_over(s, tau.shape) - place), solve(speed)
+    step = (residual * rate).sum(0) / (rate * rate).sum(0)
+    return jnp.where(jnp.abs(step) < 1e-3 * (1 + jnp.abs(tau)), tau + step, tau)
+
+
+def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
+    """Panels of p(s, tau) over tau, log p(s), and its estimated relative error."""
+    parent, s = _centred(parent, s)
+    frozen, log_f = lax.stop_gradient((parent, s)), _log_joint_frozen(parent, s)
+    guides, near = _guides(*frozen, log_f)
+    spikes, log_unseen = spikes_of(parent, s) if s.size == 1 else (None, jnp.asarray(-jnp.inf, s.dtype))
+    panels = adaptive_panels(_log_joint(parent, s), guides, search=log_f, spikes=spikes)
+    log_total = panels.log_total
+    log_error = jnp.logaddexp(log_unseen, _log_rounding(*frozen, near, spikes))
+    error = panels.error_estimate + jnp.exp(log_error - jnp.where(jnp.isneginf(log_total), 0, log_total))
+    infinite = diverges(log_f, panels)
+    error = jnp.where(infinite | jnp.isneginf(log_total), jnp.inf, error)
+    return panels, jnp.where(infinite, jnp.inf, log_total), lax.stop_gradient(error)
+
+
+def _log_rounding(parent, s, near, spikes: Panels | None):
+    """log of the error of p(s) from the rounding of s - c(tau), where the ridge comes as close as that.
+
+    Whitened, the residual is z and its rounding q: a factor exp(-(z - q)^2 / 2) of the density at best, an error of
+    q (z + q) at most. A spike does not know of it: its mass is where the curve passes, whatever its width.
+    """
+    tau = jnp.where(jnp.isnan(near), 0, near)
+    eps, tril = jnp.finfo(s.dtype).eps, parent.scale_tril[: s.size, : s.size]
+
+    def curve(tau):
+        at = centre_at(parent, tau)
+        return at.loc[..., : s.size], at.log_scale
+
+    (place, log_scale), (speed, _) = jax.jvp(curve, (tau,), (jnp.ones_like(tau),))
+    inverse = lax.linalg.triangular_solve(tril, jnp.eye(s.size, dtype=s.dtype), left_side=True, lower=True)
+    length = lambda rows, matrix: jnp.sqrt(((rows @ matrix.T) ** 2).sum(-1))  # noqa: E731
+    sharp = jnp.exp(jnp.minimum(-log_scale, 0.4 * float(np.log(jnp.finfo(s.dtype).max))))
+    residual = _over(s, tau.shape) - place
+    size = jnp.abs(_over(s, tau.shape)) + jnp.abs(place) + jnp.abs(speed * tau[:, None])
+    z, q = length(residual, inverse) * sharp, eps * length(size, jnp.abs(inverse)) * sharp
+    rate = length(speed, inverse)
+    log_width = jnp.minimum(0, log_scale - jnp.log(jnp.where(rate > 0, rate, 1)))
+    log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + _HALF_LOG_2PI)
+    log_best = -0.5 * (tau**2 + jnp.maximum(z - q, 0) ** 2) - _HALF_LOG_2PI - log_det + log_width
+    log_error = log_best + jnp.log(q * (z + q))
+    counts = ~jnp.isnan(near) & jnp.isfinite(place).all(-1)
+    if spikes is not None:
+        counts = counts & ~within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)
+    return logsumexp(jnp.where(counts, log_error, -jnp.inf))
+
+
+def _modes(parent, values, panels: Panels):
+    own, s = _centred(parent, values)
+    log_f = _log_joint_frozen(own, s)
+    grid = jnp.unique(panels.nodes.ravel(), size=panels.nodes.size, fill_value=REACH)
+    found = peaks(log_f, grid, 2 * _MODES)
+    height = jnp.where(jnp.isnan(found), -jnp.inf, log_f(jnp.where(jnp.isnan(found), 0, found)))
+    if s.size == 1:
+        spikes, _ = spikes_of(own, s)
+        holes = spikes.left[:, 0], spikes.right[:, -1]
+        peak, peak_height = modes_of(own, s, spikes)
+        height = jnp.concatenate([jnp.where(within_any(holes, found), -jnp.inf, height), peak_height])
+        found = jnp.concatenate([found, peak])
+    height, order = lax.top_k(height, height.size)
+    found = jnp.where(jnp.isneginf(height), jnp.nan, found[order])
+    shown = jnp.isfinite(found) & ~_same_top(log_f, found, height)
+    best = lax.top_k(jnp.where(shown, height, -jnp.inf), _MODES)[1]
+    return parent.time_loc + parent.time_scale * jnp.where(shown, found, jnp.nan)[best]
+
+
+def _same_top(log_f, found, height):
+    """Which maxima (highest first) are a higher one's, seen twice: a top flat to rounding has many of its own."""
+    a, b = jnp.where(jnp.isnan(found), REACH, found)[:, None], found[None]
+    eps = jnp.finfo(found.dtype).eps
+    valley = log_f(0.5 * (a + b)) < height[None] - ROUNDING * eps * jnp.maximum(1, jnp.abs(height[None]))
+    close = jnp.abs(a - b) < eps**0.25 * (1 + jnp.abs(b))
+    earlier = jnp.arange(found.size)[:, None] < jnp.arange(found.size)[None]
+    return (close & ~valley & earlier).any(0)
+
+
+def _tau_moments(panels: Panels):
+    mean = panels.expectation(panels.nodes)
+    return mean, panels.expectation((panels.nodes - mean) ** 2)
+
+
+def _log_space_density(parent, s):
+    _, log_total, error = _space_panels(parent, s)
+    return log_total, error
+
+
+def _log_space_cdf(parent, s):
+    """log of p(first coordinates) P(last coordinate <= its value | the first)."""
+    parent, s = _centred(parent, s)
+    given, frozen = s.size - 1, lax.stop_gradient((parent, s))
+    keep = (*range(given), s.size)
+
+    def log_share(parent, s, tau):
+        t = parent.time_loc + parent.time_scale * tau
+        one = conditional_gaussian(parent, _over(s[:-1], t.shape), t)
+        residual = (s[-1] - one.loc[..., 0]) / parent.scale_tril[-1, -1]
+        return log_ndtr(residual * jnp.exp(jnp.minimum(-one.log_scale, 0.9 * float(np.log(jnp.finfo(s.dtype).max)))))
+
+    def make(log_joint, parent, s):
+        if not given:
+            return lambda tau: log_share(parent, s, tau) - 0.5 * tau**2 - _HALF_LOG_2PI
+        first = log_joint(parent.marginal(keep), s[:-1])
+        return lambda tau: log_share(parent, s, tau) + first(tau)
+
+    log_f, search = make(_log_joint, parent, s), make(_log_joint_frozen, *frozen)
+    spikes = None
+    if given == 1:
+        spikes, _ = spikes_of(parent.marginal(keep), s[:-1])
+        shares = log_share(parent, s, spikes.nodes)
+        spikes = eqx.tree_at(lambda panels: panels.log_values, spikes, spikes.log_values + shares)
+    guides, _ = _guides(*frozen, _log_joint_frozen(*frozen))
+    return adaptive_panels(log_f, guides, search=search, spikes=spikes).log_total
+
+
+def _mixture_moments(parent, values, panels: Panels):
+    """Mean and covariance of (kept, time) given the values, by the laws of total mean and covariance."""
+    offset = jnp.append(parent.loc[values.size :], parent.time_loc)
+    own, s = _centred(parent, values)
+    t = own.time_loc + own.time_scale * panels.nodes
+    offset = offset.at[-1].add(-own.time_loc)
+    dim = parent.event_shape[0] - 1 - values.size
+    if not dim:
+        y, within = t[..., None], jnp.zeros((1, 1), t.dtype)
+    else:
+        at = conditional_gaussian(own, _over(s, t.shape), t)
+        y = jnp.concatenate([at.loc, t[..., None]], axis=-1)
+        tril = parent.scale_tril[values.size :, values.size :]
+        mean_a = panels.expectation(jnp.exp(2 * at.log_scale))
+        within = jnp.pad(mean_a * tril @ tril.T, ((0, 1), (0, 1)))
+    mean = panels.expectation(y)
+    centred = y - mean[None, None]
+    return offset + mean, within + panels.expectation(centred[..., :, None] * centred[..., None, :])

@@ -1,0 +1,213 @@
+"""Folded-Gaussians as numpyro and as scipy objects. This is not the |X| folded normal of scipy and numpyro.
+
+Their `foldnorm` and `FoldedDistribution` reflect a variable at 0. Here a Gaussian's *centre* is bent along a curve
+in time, and nothing is reflected. Neither library is imported before it is asked for.
+"""
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.gaussian import Gaussian, Normal
+
+if TYPE_CHECKING:
+    import numpyro
+
+__all__ = ["FrozenDistribution", "to_numpyro", "to_scipy"]
+
+
+def to_numpyro(dist: Any) -> "numpyro.distributions.Distribution":
+    """`dist` as a numpyro distribution, differentiable in its parameters: for models, NUTS and SVI.
+
+    For anything here with `log_prob`, `sample`, `batch_shape` and `event_shape`. Parameters may be traced, so it
+    can be built inside a model out of other sample sites; pass `validate_args=False` to the distribution there if
+    its factor is assembled from them. As a *latent* site a time likelihood makes a funnel (space narrows as time
+    moves away), hard for NUTS as funnels are: sample a normal z there and use `dist.normal_to_fold(z)`.
+
+    **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d.
+
+    **Example:**
+
+        def model(x):
+            bend = numpyro.sample("bend", numpyro.distributions.Normal(0.0, 1.0))
+            fold = PolynomialFold(bend[None, None])
+            dist = FoldedGaussian([0.0], [[0.2]], time_loc=0.5, time_scale=0.3, fold=fold)
+            numpyro.sample("x", to_numpyro(dist), obs=x)
+
+    **Source:** eq:foldgauss. **Raises:** ImportError that names the extra if numpyro is missing.
+    """
+    return _numpyro_class()(dist)
+
+
+@functools.cache
+def _numpyro_class() -> type:
+    """The class, made on first use: numpyro must be imported to have its base."""
+    try:
+        from numpyro import distributions
+    except ImportError as error:
+        raise ImportError("to_numpyro needs numpyro: pip install 'foldgauss[numpyro]'.") from error
+
+    class NumpyroDistribution(distributions.Distribution):
+        """A foldgauss distribution in numpyro's clothes."""
+
+        pytree_data_fields = ("base",)
+
+        def __init__(self, base, *, validate_args=None):
+            self.base = base
+            super().__init__(base.batch_shape, base.event_shape, validate_args=validate_args)
+
+        @property
+        def support(self):
+            return distributions.constraints.real_vector if self.event_shape else distributions.constraints.real
+
+        def sample(self, key, sample_shape=()):
+            return self.base.sample(key, sample_shape)
+
+        def log_prob(self, value):
+            return self.base.log_prob(value)
+
+        @property
+        def mean(self):
+            return _mean(self.base)
+
+        @property
+        def variance(self):
+            return _variance(self.base)
+
+    return NumpyroDistribution
+
+
+def to_scipy(dist: Any) -> "FrozenDistribution":
+    """`dist` as a frozen distribution with the methods of `scipy.stats.multivariate_normal(...)`: NumPy in and out.
+
+    **Shapes:** no batch dimensions, as scipy's frozen objects have none.
+
+    **Example:** `to_scipy(dist).rvs(1000, random_state=0)  # (1000, d)`
+
+    **Source:** eq:foldgauss. **Raises:** ValueError if `dist` has batch dimensions.
+    """
+    if dist.batch_shape != ():
+        cure = "Take one element first: jax.tree.map(lambda leaf: leaf[0], dist)."
+        raise invalid("dist", expected="batch_shape ()", got=dist.batch_shape, cure=cure)
+    return FrozenDistribution(dist)
+
+
+class FrozenDistribution:
+    """A distribution as scipy would freeze it: `pdf`, `logpdf`, `rvs`, `entropy`, `marginal`, `mean`, `cov`.
+
+    **Shapes:** points (..., d) as NumPy arrays, time last; of one coordinate (...) will do. `rvs(size)` is (size, d).
+
+    **Example:** `to_scipy(dist).marginal([0]).pdf(0.3)`
+
+    **Source:** the interface of scipy's frozen multivariate distributions.
+    """
+
+    def __init__(self, base: Any):
+        self._base = base
+        self._event = base.event_shape
+
+    def __repr__(self) -> str:
+        return f"FrozenDistribution({type(self._base).__name__}, dim={self.dim})"
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates."""
+        return int(np.prod(self._event, dtype=int))
+
+    def logpdf(self, x) -> np.ndarray:
+        """Log-density at x (*points, d)."""
+        return _numpy(_LOG_PROB(self._base, self._points(x)))
+
+    def pdf(self, x) -> np.ndarray:
+        """Density at x (*points, d)."""
+        return np.exp(self.logpdf(x))
+
+    def rvs(self, size=1, random_state=None) -> np.ndarray:
+        """`size` draws, (*size, d); a single one comes as (d,). `random_state`: None, an int, or a NumPy generator."""
+        shape = (size,) if isinstance(size, int | np.integer) else tuple(size)
+        draws = np.asarray(self._base.sample(_key(random_state), shape))
+        return draws[0] if shape == (1,) else draws
+
+    def entropy(self) -> np.ndarray:
+        """Differential entropy in nats."""
+        return _numpy(_entropy(self._base))
+
+    def marginal(self, dimensions) -> "FrozenDistribution":
+        """The distribution of some coordinates alone, frozen too; time is the last one."""
+        if not hasattr(self._base, "marginal"):
+            cure = "Take all coordinates of interest from the joint distribution at once."
+            raise invalid("dimensions", expected="a distribution with marginals", got=repr(self), cure=cure)
+        indices = (dimensions,) if isinstance(dimensions, int | np.integer) else tuple(dimensions)
+        indices = tuple(int(i) % self.dim for i in indices)
+        return FrozenDistribution(self._base.marginal(indices))
+
+    @property
+    def mean(self) -> np.ndarray:
+        return _numpy(_mean(self._base))
+
+    @property
+    def cov(self) -> np.ndarray:
+        return _numpy(_covariance(self._base))
+
+    def _points(self, x):
+        """x as an array of events; a plain number is a point on the line, as in scipy."""
+        x = jnp.asarray(x, _dtype(self._base))
+        return x[..., None] if self._event == (1,) and x.shape[-1:] != (1,) else x
+
+
+# Jitted once: called eagerly, a density is a hundred small kernels.
+_LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
+
+
+def _dtype(dist):
+    leaves = (jnp.asarray(leaf) for leaf in jax.tree.leaves(dist))
+    floats = [leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.result_type(*floats) if floats else jnp.result_type(float)
+
+
+def _numpy(x) -> np.ndarray:
+    """As NumPy; a scalar as a NumPy scalar, like scipy's."""
+    return np.asarray(x)[()]
+
+
+def _key(random_state):
+    draws_ints = hasattr(random_state, "integers")
+    if draws_ints:
+        return jax.random.key(int(random_state.integers(2**31)))
+    if hasattr(random_state, "randint"):
+        return jax.random.key(int(random_state.randint(2**31 - 1)))
+    return jax.random.key(int(np.random.default_rng(random_state).integers(2**31)))
+
+
+def _mean(dist):
+    return dist.loc if isinstance(dist, Normal | Gaussian) else dist.mean
+
+
+def _variance(dist):
+    if isinstance(dist, Normal):
+        return dist.scale**2
+    return jnp.diagonal(dist.covariance_matrix, axis1=-2, axis2=-1) if isinstance(dist, Gaussian) else dist.variance
+
+
+def _covariance(dist):
+    """The matrix; for a distribution on the line, as in scipy's `norm`, the variance."""
+    if isinstance(dist, Normal):
+        return dist.scale**2
+    return dist.covariance_matrix if dist.event_shape else dist.variance
+
+
+def _entropy(dist):
+    """Nats; the Gaussians are written out, all else knows its own."""
+    if isinstance(dist, Normal):
+        return 0.5 * np.log(2 * np.pi * np.e) + jnp.log(dist.scale)
+    if isinstance(dist, Gaussian):
+        dim, diagonal = dist.loc.shape[-1], jnp.diagonal(dist.base_tril, axis1=-2, axis2=-1)
+        return 0.5 * dim * np.log(2 * np.pi * np.e) + jnp.log(diagonal).sum(-1) + dim * dist.log_scale
+    if not hasattr(dist, "entropy"):
+        cure = "Average -logpdf over rvs."
+        raise invalid("entropy", expected="a distribution that knows its entropy", got=type(dist).__name__, cure=cure)
+    return dist.entropy()

@@ -1,0 +1,139 @@
+"""Log-densities of many points under many components: one loop over pairs, which XLA turns into vector instructions.
+
+Values only: a derivative is that of the distributions' own `log_prob`, which reaches further (`_far`).
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from foldgauss._numerics.batch import expand, parts_of
+from foldgauss._numerics.triangular import UNROLLED_SIZE, solve_lower
+from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
+from foldgauss.gaussian import Gaussian
+
+__all__ = ["chunked", "components_first", "pair_log_prob"]
+
+_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
+
+
+class _QuickTimeLikelihood(AbstractEnvelope):
+    """`TimeLikelihood` to an *absolute* error of rounding in log a, by fewer and plainer functions."""
+
+    power: Float[Array, "*#batch"]
+    floor: Float[Array, "*#batch"] | None  # None is 0
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (0,) if self.floor is None else (0, 0)
+
+    def log_a(self, t, *, time_loc, time_scale):
+        largest = float(jnp.finfo(t.dtype).max) * 1e-3  # inf - inf and 0 * inf are kept out
+        tau = (t - time_loc) / time_scale
+        decay = -jnp.minimum(0.5 * self.power * jnp.minimum(tau * tau, largest), largest)
+        if self.floor is None:
+            return decay
+        decay, log_floor = jnp.log1p(-self.floor) + decay, jnp.log(self.floor)
+        share = jnp.exp(-jnp.abs(decay - log_floor))  # of the smaller term in the greater, at most 1
+        return jnp.maximum(decay, log_floor) + jnp.log(1 + share)
+
+
+def components_first(components, rank: int):
+    """Batch (*batch, k) to (k, 1, *batch), `rank` that of *batch: what points (n, *batch) broadcast against.
+
+    With the components in front, sums over them run over whole vectors of points.
+    """
+    in_front = lambda leaf: jnp.expand_dims(jnp.moveaxis(leaf, rank, 0), 1)  # noqa: E731
+    return jax.tree.map(in_front, expand(components, rank + 1))
+
+
+def pair_log_prob(first, rows: Float[Array, "n *batch d"]) -> Float[Array, "k n *batch"]:
+    """log p_k(x) of each point and component; `first` as `components_first` gives it."""
+    is_closed = isinstance(first, Gaussian) or (first.fold.is_closed and first.envelope.is_closed)
+    if not is_closed or rows.shape[-1] > UNROLLED_SIZE:
+        return first.log_prob(rows[None])
+    leaves, structure = jax.tree.flatten(first)
+    return _pairs(structure, rows, *leaves)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _pairs(structure, rows: Array, *leaves: Array) -> Array:
+    dist = jax.tree.unflatten(structure, leaves)
+    if isinstance(dist, Gaussian) or not isinstance(dist.envelope, TimeLikelihood):
+        return _values(dist, rows)
+    power, floor = dist.envelope.power, dist.envelope.floor
+
+    def having(floor):
+        return _values(eqx.tree_at(lambda dist: dist.envelope, dist, _QuickTimeLikelihood(power, floor)), rows)
+
+    # Without a floor log a is no logarithm at all: half of the time.
+    return lax.cond((floor == 0).all(), lambda: having(None), lambda: having(floor))
+
+
+def _values(dist, rows: Array) -> Array:
+    x = [rows[None, ..., i] for i in range(rows.shape[-1])]
+    if isinstance(dist, Gaussian):
+        at, log_rest = dist, jnp.zeros((), rows.dtype)
+    else:
+        at = dist.condition_time(x[-1])
+        tau = (x.pop() - dist.time_loc) / dist.time_scale
+        log_rest = 0.5 * tau * tau + jnp.log(dist.time_scale) + _HALF_LOG_2PI
+    residual = [(s - at.loc[..., i])[..., None] for i, s in enumerate(x)]
+    # Twice the root: the product may be in range where 1 / scale is not.
+    largest = 0.99 * float(np.log(jnp.finfo(rows.dtype).max))
+    root = jnp.exp(jnp.clip(-0.5 * at.log_scale, -largest, largest))[..., None]
+    z = [y * root * root for y in solve_lower(at.base_tril, residual)]
+    half_square = sum(0.5 * y * y for y in z)[..., 0]
+    log_det = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1) + len(x) * at.log_scale
+    log_density = -(half_square + log_rest) - (log_det + len(x) * _HALF_LOG_2PI)
+    # Neither inf - inf nor 0 * inf on the way is a NaN of the user's: it is far away. What was one stays one.
+    reached = jnp.where((half_square < jnp.inf) & (log_rest < jnp.inf), log_density, -jnp.inf)
+    return reached + _nan_of([(rows[None], 1)]) + _nan_of(parts_of(dist))
+
+
+def _nan_of(parts: list[tuple[Array, int]]) -> Array:
+    """NaN where one of the arrays has one, else 0."""
+    found = [jnp.isnan(x).any(tuple(range(x.ndim - rank, x.ndim))) for x, rank in parts]
+    return jnp.where(functools.reduce(jnp.logical_or, found), jnp.nan, 0).astype(parts[0][0].dtype)
+
+
+@functools.partial(_pairs.defjvp, symbolic_zeros=True)
+def _pairs_jvp(structure, primals, tangents):
+    moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
+
+    def own(*moved):
+        rows, *leaves = (moved[moving.index(i)] if i in moving else x for i, x in enumerate(primals))
+        return jax.tree.unflatten(structure, leaves).log_prob(rows[None])
+
+    tangent = jax.jvp(own, [primals[i] for i in moving], [tangents[i] for i in moving])[1]
+    return _pairs(structure, *primals), tangent
+
+
+def chunked(pairs, finish, rows: Float[Array, "n ..."], size: int) -> Array:
+    """`finish(pairs(rows))`, by `size` rows at a time; in a gradient a chunk is done again instead of kept.
+
+    `finish` puts the rows in front.
+    """
+    if len(rows) <= size:
+        return finish(pairs(rows))
+    chunks = -(-len(rows) // size)
+    padding = jnp.broadcast_to(rows[:1], (chunks * size - len(rows), *rows.shape[1:]))
+    pieces = jnp.concatenate([rows, padding]).reshape(chunks, size, *rows.shape[1:])
+    shape = jax.eval_shape(pairs, jax.ShapeDtypeStruct(pieces.shape[1:], rows.dtype))
+
+    @jax.checkpoint
+    def one(number, piece):
+        # The condition always holds. But no loop is fused across it: one that picks its piece itself, out of all of
+        # them, is not turned into vector instructions, and one that `finish` is part of is done twice (on the CPU,
+        # 3.9 instead of 1.1 ns a pair).
+        empty = lambda piece: jnp.zeros(shape.shape, shape.dtype)  # noqa: E731
+        return finish(lax.cond(number >= 0, pairs, empty, piece))
+
+    result = lax.map(lambda numbered: one(*numbered), (jnp.arange(chunks), pieces))
+    return result.reshape(chunks * size, *result.shape[2:])[: len(rows)]

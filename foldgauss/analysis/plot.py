@@ -1,0 +1,291 @@
+"""Pictures of a Folded-Gaussian, of a fit's history and of speed against accuracy; matplotlib is imported for one."""
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from foldgauss._runtime.checks import invalid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["Panel", "plot_density", "plot_history", "plot_tradeoff"]
+
+_RED = "#d1242f"
+_BLUE = "#1f4e79"
+_DENSITY = "Blues"
+_MASS = (0.3, 0.6, 0.9)  # probability inside the contour lines
+_GRID = 240
+_REACH = 3.2  # time shown, in time_scales on either side
+_MARKERS = "osD^vPX"  # of axes, colours being ten
+_SIDES = ((-1, 1), (0, 1), (-1, 0), (1, -1), (1, 0), (0, -1), (1, 1), (-1, -1))  # of a name, the best first
+_STEPS_DRAWN = 5000  # of a history: more than a picture has columns
+_LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
+
+
+def plot_density(
+    dist,
+    ax: "Axes | None" = None,
+    *,
+    slices: int | Sequence[float] = 3,
+    t_limits: tuple[float, float] | None = None,
+    s_limits: tuple[float, float] | None = None,
+) -> "Axes":
+    """The density of a Folded-Gaussian of d = 2, with conditional distributions s | t in red: the paper's figure.
+
+    Time runs to the right, space upwards; contour lines hold 30, 60 and 90% of the probability shown. A red bell
+    stands on each chosen time: `N(s | t)` drawn sideways, all to the same height (a narrow one would be tall), its
+    foot at that time, a dot at its centre `loc + f(time_loc - t)`.
+
+    **Shapes:** `dist` has `event_shape == (2,)` and no batch; `slices` is their number, or the times themselves.
+
+    **Units:** time and space of `dist`, for the limits as well.
+
+    **Example:** `plot_density(dist, ax).set_title("f(u) = u^2")`
+
+    **Source:** fig:2D_dist. **Raises:** ImportError that names the extra if matplotlib is missing; ValueError if
+    `dist` is not a single distribution in the plane.
+    """
+    _check_plane(dist)
+    pyplot = needed_pyplot("plot_density")
+    ax = pyplot.subplots()[1] if ax is None else ax
+    loc, scale = float(dist.time_loc), float(dist.time_scale)
+    t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
+    s_limits = _space_limits(dist, t_limits) if s_limits is None else s_limits
+    times = loc + scale * np.linspace(-1.5, 1.5, slices) if isinstance(slices, int) else np.asarray(slices, float)
+    _draw_density(dist, ax, t_limits, s_limits)
+    _draw_slices(dist, ax, times, s_limits, width=_bell_width(times, t_limits))
+    ax.set(xlim=t_limits, ylim=s_limits, xlabel="time t", ylabel="space s")
+    return ax
+
+
+class _Step(Protocol):
+    """What is drawn of a step of a fit: `foldgauss.video.FitInfo`, or anything with these."""
+
+    step: int
+    seconds: float
+    loss: float
+    psnr: float
+
+
+def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> np.ndarray:
+    """The course of a fit: PSNR above, loss below, against seconds on the left and steps on the right.
+
+    A step's loss is that of its few frames: it is drawn faint, with its running median over 2% of the history. It
+    changes its meaning where the fit turns to larger frames (by default at 20% and 60% of the plan) and to the squared
+    error (at 70%): jumps there are no accident.
+
+    **Shapes:** `history` has at least one step; `axes`, given or made, are (2, 2).
+
+    **Units:** dB, seconds of fitting, the loss on a logarithmic scale unless it is 0 throughout.
+
+    **Example:** `plot_history(fit(frames).history)[0, 0].figure.savefig("fit.png")`
+
+    **Raises:** ImportError that names the extra if matplotlib is missing; ValueError for an empty history.
+    """
+    if not len(history):
+        raise invalid("history", expected="at least one step", got="none")
+    if axes is None:
+        axes = needed_pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
+    drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
+    steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
+    for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
+        upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
+        lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3, label="each step")
+        lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6, label="running median")
+        lower.set(xlabel=name, yscale="log" if (loss > 0).any() else "linear")  # a black clip's is 0 from the start
+        lower.set_xlim(left=0)  # the start takes its seconds too
+        for ax in (upper, lower):
+            ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("PSNR (dB)")
+    axes[1, 0].set_ylabel("loss")
+    axes[1, 0].legend()
+    return axes
+
+
+class Panel(NamedTuple):
+    """One thing that quality costs: its label, of each point how much, indices of the front and of its knee."""
+
+    label: str
+    cost: Sequence[float]
+    front: Sequence[int]
+    knee: int | None
+
+
+def plot_tradeoff(
+    panels: Sequence[Panel],
+    quality: Sequence[float],
+    names: Sequence[tuple[str, str]],
+    axes: "np.ndarray | None" = None,
+) -> np.ndarray:
+    """Quality against what it costs, a panel for each cost: a colour for each axis, the front drawn, its knee ringed.
+
+    Points of a front are named where there is room for it, the knee always. A point of the axis "base" is a star.
+
+    **Shapes:** `quality` and every cost have one number per point, `names` its axis and value; `axes`, given or made,
+    are (len(panels),).
+
+    **Units:** dB; costs on logarithmic scales.
+
+    **Example:** `plot_tradeoff([Panel("seconds", [1, 2], [0, 1], None)], [30, 33], [("base", ""), ("time", "2")])`
+
+    **Raises:** ImportError that names the extra if matplotlib is missing.
+    """
+    if axes is None:
+        made = needed_pyplot("plot_tradeoff").subplots(1, len(panels), sharey=True, squeeze=False, layout="constrained")
+        axes = made[1][0]
+    axes = np.atleast_1d(axes)
+    groups = list(dict.fromkeys(axis for axis, _ in names))
+    quality = np.asarray(quality, float)
+    for panel, ax in zip(panels, axes, strict=True):
+        cost, chosen = np.asarray(panel.cost, float), list(panel.front)
+        ax.plot(cost[chosen], quality[chosen], "-", color="0.55", linewidth=1.2, zorder=1, label="_front")
+        for number, group in enumerate(groups):
+            own = [k for k, (axis, _) in enumerate(names) if axis == group]
+            marker, color = ("*", "black") if group == "base" else (_MARKERS[number % len(_MARKERS)], f"C{number % 10}")
+            size = 13 if group == "base" else 6.5
+            label = group if ax is axes[0] else f"_{group}"
+            ax.plot(cost[own], quality[own], marker, color=color, markersize=size, alpha=0.9, label=label, zorder=3)
+        if panel.knee is not None:
+            at = cost[panel.knee], quality[panel.knee]
+            ax.plot(*at, "o", color=_RED, markerfacecolor="none", markersize=17, markeredgewidth=2, zorder=2)
+        ax.set(xlabel=panel.label, xscale="log")
+        ax.xaxis.set_minor_formatter("")
+        _few_ticks(ax, cost)
+        ax.margins(x=0.16, y=0.1)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("PSNR (dB)")
+    figure = axes[0].figure
+    figure.legend(loc="outside lower center", ncols=min(len(groups), 6), frameon=False)
+    figure.draw_without_rendering()  # from here on places are known in pixels
+    for panel, ax in zip(panels, axes, strict=True):
+        _name_points(ax, panel, quality, [f"{axis} {value}".rstrip() for axis, value in names])
+    return axes
+
+
+def _few_ticks(ax, cost: np.ndarray) -> None:
+    """Numbers as one writes them; a span of less than a power of ten would show one alone."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    subs = (1, 2, 5) if cost.max() < 100 * cost.min() else (1,)
+    ax.xaxis.set_major_locator(LogLocator(subs=subs))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _short(x)))
+
+
+def _short(number: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:g} {letter}"
+    return f"{number:g}"
+
+
+def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) -> None:
+    """Names beside points of the front, none over another name or a point; the knee's first, and in any case."""
+    from matplotlib.text import Text
+    from matplotlib.transforms import Bbox
+
+    places = ax.transData.transform(np.stack([np.asarray(panel.cost, float), quality], 1))
+    taken = [Bbox.from_extents(*(place - 5), *(place + 5)) for place in places]
+    line = places[list(panel.front)]
+    for one, other in itertools.pairwise(line):
+        along = one + np.linspace(0, 1, 20)[1:-1, None] * (other - one)
+        taken += [Bbox.from_extents(*(place - 4), *(place + 4)) for place in along]
+    for k in sorted(panel.front, key=lambda k: (k != panel.knee, -quality[k])):
+        is_knee = k == panel.knee
+        text = f"knee: {names[k]}" if is_knee else names[k]
+        font = {"fontsize": 10, "color": _RED, "fontweight": "bold"} if is_knee else {"fontsize": 9, "color": "0.15"}
+        for distance, (x, y) in itertools.product((9, 15, 24, 36, 50), _SIDES):
+            how = font | {"ha": ("right", "center", "left")[x + 1], "va": ("top", "center", "bottom")[y + 1]}
+            if distance > 20:
+                how["arrowprops"] = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.7}
+            offset = (distance + 5 * is_knee) * np.array([x, y]) / np.hypot(x, y)
+            place = float(panel.cost[k]), float(quality[k])
+            note = ax.annotate(text, place, offset, textcoords="offset points", in_layout=False, zorder=5, **how)
+            note.get_window_extent()  # puts the text in its place; the note's extent holds its line, too
+            box = Text.get_window_extent(note)
+            if ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max) and not box.count_overlaps(taken):
+                taken.append(box)
+                break
+            note.remove()
+        else:
+            if is_knee:  # over something else, but named
+                ax.annotate(text, place, (0, 14), textcoords="offset points", in_layout=False, ha="center", **font)
+
+
+def _running_median(values: np.ndarray) -> np.ndarray:
+    """Of each value and those around it, 2% of them all; fewer at the ends."""
+    reach = max(len(values) // 100, 1)
+    padded = np.pad(values, reach, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    known = (window[~np.isnan(window)] for window in windows)
+    return np.array([np.median(window) if window.size else np.nan for window in known])
+
+
+def _draw_density(dist, ax, t_limits, s_limits) -> None:
+    t, s = (np.linspace(*limits, _GRID) for limits in (t_limits, s_limits))
+    points = np.stack(np.broadcast_arrays(s[:, None], t[None, :]), axis=-1)
+    density = np.exp(np.asarray(_LOG_PROB(dist, jnp.asarray(points, dist.loc.dtype)), float))
+    # The square root keeps the tails visible beside the peak.
+    shade = np.sqrt(density / density.max())
+    ax.pcolormesh(t, s, shade, cmap=_DENSITY, vmin=0, vmax=1.6, shading="gouraud", rasterized=True)
+    levels = _mass_levels(density)
+    if len(levels):
+        ax.contour(t, s, density, levels=levels, colors=_BLUE, linewidths=0.8, alpha=0.8)
+
+
+def _mass_levels(density: np.ndarray) -> np.ndarray:
+    """Densities above which the given shares of the probability lie, rising and distinct, as contours need them."""
+    ordered = np.sort(density.ravel())[::-1]
+    mass = np.cumsum(ordered) / ordered.sum()
+    return np.unique(ordered[np.searchsorted(mass, _MASS)])
+
+
+def _draw_slices(dist, ax, times, s_limits, width: float) -> None:
+    for t in times:
+        centre, scale = _conditional(dist, np.array([t]))
+        s = np.linspace(centre[0] - 3.5 * scale[0], centre[0] + 3.5 * scale[0], 201)
+        bell = t + width * np.exp(-0.5 * ((s - centre[0]) / scale[0]) ** 2)
+        ax.fill_betweenx(s, t, bell, color=_RED, alpha=0.25, linewidth=0, zorder=3)
+        ax.plot(bell, s, color=_RED, linewidth=1.4, zorder=4)
+        ax.plot([t, t], s_limits, color=_RED, linewidth=0.7, alpha=0.55, zorder=2)
+        ax.plot([t], centre, "o", color=_RED, markersize=3, zorder=5)
+
+
+def _bell_width(times, t_limits) -> float:
+    """Bells must not reach the next time."""
+    gap = np.diff(np.sort(times)).min() if len(times) > 1 else np.inf
+    return min(0.75 * gap, 0.16 * (t_limits[1] - t_limits[0]))
+
+
+def _conditional(dist, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and standard deviation of s | t."""
+    gaussian = dist.condition_time(jnp.asarray(t, dist.loc.dtype))
+    return np.asarray(gaussian.loc, float)[..., 0], np.asarray(gaussian.scale_tril, float)[..., 0, 0]
+
+
+def _space_limits(dist, t_limits) -> tuple[float, float]:
+    """Where s is with a probability of about 99%: the curve's far ends carry no mass and need no room."""
+    loc, scale = float(dist.time_loc), float(dist.time_scale)
+    t = np.linspace(max(t_limits[0], loc - 2.2 * scale), min(t_limits[1], loc + 2.2 * scale), 101)
+    centre, spread = _conditional(dist, t)
+    low, high = (centre - 3.2 * spread).min(), (centre + 3.2 * spread).max()
+    return float(low), float(high)
+
+
+def _check_plane(dist) -> None:
+    if dist.batch_shape != () or dist.event_shape != (2,):
+        got = f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}"
+        cure = "Take one element of a batch, or a marginal of one space coordinate and time."
+        raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
+
+
+def needed_pyplot(caller: str):
+    try:
+        from matplotlib import pyplot
+    except ImportError as error:
+        raise ImportError(f"{caller} needs matplotlib: pip install 'foldgauss[plot]'.") from error
+    return pyplot

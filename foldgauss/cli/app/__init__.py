@@ -1,0 +1,1 @@
+"""The application object, the registry of commands, help, completion and signal handling."""

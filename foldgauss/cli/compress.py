@@ -1,0 +1,173 @@
+"""The command that makes a model's file small: `compress`."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from foldgauss._runtime.checks import invalid, within
+from foldgauss.cli.app.completion import clip_files
+from foldgauss.cli.app.shared import (
+    ModelFile,
+    Overwrite,
+    WrongUse,
+    app,
+    clip_of_model,
+    err,
+    evaluate_with_progress,
+    is_other_clip,
+    print_figures,
+    refuse_existing,
+    refuse_input,
+    refuse_segments,
+    scores_of,
+)
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.media.video_file import Clip
+from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
+from foldgauss.io.models.video_model import (
+    MODEL_SUFFIX,
+    check_model_name,
+    load_video_model,
+    read_origin,
+    save_video_model,
+)
+from foldgauss.video.compression.search import Compressed, compress
+from foldgauss.video.models.metrics import Evaluation, evaluate
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.tradeoff import halved
+
+Score = Callable[[VideoModel], Evaluation]
+#: dB by which a compact file may be better than its model without a word.
+NEARER = 0.5
+
+
+@app.command(name="compress")
+def compress_command(
+    model_path: ModelFile,
+    video: Annotated[
+        Path | None,
+        typer.Argument(
+            help="The clip it was fitted to: for a smaller file, and a loss that is measured.",
+            autocompletion=clip_files,
+        ),
+    ] = None,
+    max_loss_db: Annotated[float, typer.Option(help="How much of the mean PSNR it may cost, in dB.")] = 0.2,
+    out_path: Annotated[
+        Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
+    ] = None,
+    passes: Annotated[
+        int, typer.Option(help="Passes over VIDEO that make up for what rounding costs; 0: only round.", min=0)
+    ] = 8,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
+    ] = None,
+    float16: Annotated[
+        bool,
+        typer.Option("--float16", help=f"Only round to 16 bits, into a {MODEL_SUFFIX} file of about half the size."),
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a model as a compact file: a fraction of its size.
+
+    It is rendered, evaluated, edited and exported as any other. Its pictures differ a little: by --max-loss-db at most.
+    See docs/format.md.
+    """
+    suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
+    target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
+    try:
+        check_model_name(target, "--out") if float16 else check_compact_name(target, "--out")
+    except ValueError as error:
+        raise WrongUse(str(error)) from error
+    if not within(max_loss_db, "(0, 60]"):
+        raise WrongUse(str(invalid("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)))
+    if frames is not None and video is None:
+        raise WrongUse(str(invalid("--frames", expected="a VIDEO to take them from", got="none")))
+    refuse_input(target, "model", model_path)
+    refuse_existing(target, overwrite)
+    check_writable(target)
+    refuse_segments(model_path)
+    model, about = load_video_model(model_path), read_origin(model_path)
+    if not isinstance(model, VideoModel):
+        cure = "Compress the model before it is edited, and edit that."
+        raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
+    clip = None if video is None else clip_of_model(model, model_path, video, frames)
+    if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
+        cure = "Give that clip, or none: numbers are then rounded only."
+        got = f"{str(video)!r}, which it does not show"
+        raise WrongUse(str(invalid("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)))
+    if float16:
+        figures = _only_rounded(target, model, about, clip)
+    else:
+        figures = _compressed(target, model, about, clip, max_loss_db, passes)
+    before, after = model_path.stat().st_size, target.stat().st_size
+    figures |= {
+        "bytes_before": before,
+        "file_bytes": after,
+        "ratio": before / after,
+        "bits_per_pixel": 8 * after / (model.num_frames * model.size[0] * model.size[1]),
+    }
+    print_figures(str(target), figures)
+
+
+def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
+    """Write a compact file with what is known of where it comes from, `about`; `known`: whether its PSNR is."""
+    about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
+    about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
+    save_compact(target, made.quantised, metadata=about | {"loss_db": round(made.loss_db, 4)})
+
+
+def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
+    """Write a model with 16-bit numbers, and the scores, if asked for, of what its reader will get."""
+    about = {name: value for name, value in about.items() if not name.startswith("mean_")}
+    small = halved(model)
+    save_video_model(target, small, metadata=about)
+    if score is None:
+        return None
+    scores = score(load_video_model(target))
+    save_video_model(target, small, metadata=about | scores_of(scores))
+    return scores
+
+
+def _only_rounded(target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None) -> dict[str, Any]:
+    def score(model: VideoModel) -> Evaluation:
+        return evaluate_with_progress(model, clip.frames)
+
+    before = None if clip is None else score(model)
+    scores = save_halved(target, model, about, None if clip is None else score)
+    lost = {} if scores is None else {"loss_db": before.mean_psnr - scores.mean_psnr}
+    return lost | {"num_gaussians": model.num_gaussians}
+
+
+def _compressed(
+    target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None, max_loss_db: float, passes: int
+) -> dict[str, Any]:
+    told = about.get("mean_psnr")
+    columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
+    with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
+        task = bar.add_task("Compressing", total=None)  # how often it must try nobody knows
+
+        def show(what: str, loss: float) -> None:
+            text = f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost")
+            bar.update(task, description=text)
+
+        given = None if clip is None else clip.frames
+        made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
+    if passes and made.loss_db < -NEARER:
+        err.print(
+            f"warning: the compact file is {-made.loss_db:.1f} dB nearer to the clip than the model was. Its fit had "
+            "not come to its end; or it was edited, and fitting anew has taken that back. --passes 0 only rounds.",
+            soft_wrap=True,
+        )
+    save_compressed(target, made, about, known=clip is not None or told is not None)
+    if clip is None:
+        source = "that is noted in the file" if told is not None else "that is assumed"
+        err.print(
+            f"note: without the clip the loss is estimated, from the model's own pictures and a PSNR of "
+            f"{made.psnr:.2f} dB {source}. Give VIDEO for a smaller file, and a loss that is measured.",
+            soft_wrap=True,
+        )
+    return {"loss_db": made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}

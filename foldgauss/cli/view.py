@@ -1,0 +1,99 @@
+"""The command that shows a model in the browser: `view`."""
+
+import webbrowser
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Annotated
+
+import typer
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.shared import ModelFile, WrongUse, app, clip_of_model, err, out
+from foldgauss.cli.edit import Original, OriginalQuality
+from foldgauss.io.models.video_model import load_video_model
+from foldgauss.io.page.html import QUALITY, html_page, warn_of_size
+
+_HOST = "127.0.0.1"
+
+
+@app.command(name="view")
+def view_command(
+    model_path: ModelFile,
+    original: Original = None,
+    original_quality: OriginalQuality = QUALITY,
+    port: Annotated[int, typer.Option(help="Serve at this port.", min=0, max=65535, show_default="a free one")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
+) -> None:
+    """Play a model in the browser; Ctrl-C ends it.
+
+    The page is served to this machine alone. To keep it: foldgauss export MODEL --format html.
+    """
+    frames = None
+    if original is not None:
+        frames = clip_of_model(load_video_model(model_path), model_path, original, None)
+    with err.status("Making the page"):
+        page = html_page(model_path, original=frames, quality=original_quality)
+    warn_of_size(page, original is not None)
+    try:
+        server = _Server(page.encode(), port)
+    except OSError as error:
+        expected, got = "a port that is free", f"{port} ({error.strerror})"
+        raise WrongUse(
+            str(
+                invalid(
+                    "--port", expected=expected, got=got, cure="Take another, or leave the option out for a free one."
+                )
+            )
+        ) from error
+    with server:
+        out.print(f"{model_path.name}, {len(page) / 1e6:.1f} MB, until Ctrl-C at {server.url}", soft_wrap=True)
+        if browser:
+            webbrowser.open(server.url)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            out.print("Ended.")
+
+
+class _Server(ThreadingHTTPServer):
+    """One page, for browsers of this machine alone."""
+
+    daemon_threads = True
+
+    def __init__(self, page: bytes, port: int):
+        self.page = page
+        super().__init__((_HOST, port), _Handler)
+        self.url = f"http://{_HOST}:{self.server_address[1]}/"
+        names, number = {_HOST, "localhost"}, self.server_address[1]
+        self.own_names = {f"{name}:{number}" for name in names} | (names if number == 80 else set())
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """The page at /, nothing else; and not to whom a foreign name has brought here."""
+
+    server: _Server
+
+    def do_GET(self) -> None:
+        self._answer(send=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(send=False)
+
+    def _answer(self, *, send: bool) -> None:
+        if self.headers.get("Host") not in self.server.own_names:
+            self.send_error(403)
+        elif self.path.partition("?")[0] != "/":
+            self.send_error(404)
+        else:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(self.server.page)))
+            self.send_header("Cache-Control", "no-store")
+            self.send_header("X-Content-Type-Options", "nosniff")
+            self.end_headers()
+            if send:
+                with suppress(ConnectionError):  # a tab that was closed meanwhile
+                    self.wfile.write(self.server.page)
+
+    def log_message(self, *message: object) -> None:
+        """Nothing: the console is the user's."""

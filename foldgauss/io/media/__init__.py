@@ -1,0 +1,1 @@
+"""Videos, images, masks and label maps in and out."""

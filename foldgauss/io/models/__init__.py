@@ -1,0 +1,1 @@
+"""Model files: safetensors, compact files, models in segments, selections."""

@@ -1,0 +1,250 @@
+"""Compact model files, .fgz: quantised, entropy-coded, checked, and decoded to the same bits everywhere.
+
+The layout is in docs/format.md. Files may come from strangers: a checksum finds damage, no number is trusted before it
+has been held against the bytes that are there, and nothing but `ModelFileError` is raised for what a file says.
+"""
+
+import dataclasses
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss.io._atomic import atomic_path, checked_path
+from foldgauss.io.models import range_coder
+from foldgauss.io.models.columns import Walk
+from foldgauss.io.models.model_file import ModelFileError, plain, to_json
+from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.compression.quantize import (
+    FEATURES,
+    MAX_DEGREE,
+    MOST_CELL_BITS,
+    MOST_SHARED,
+    Facts,
+    Quantised,
+    Rule,
+    column_names,
+    dequantise,
+    is_whole,
+)
+from foldgauss.video.models.video_model import VideoModel
+
+COMPACT_SUFFIX = ".fgz"
+#: As PNG's: a byte that no text has, line ends of both kinds that a careless transfer would change, an end of file.
+MAGIC = b"\x8bFGZ\r\n\x1a\n"
+VERSION = 2
+#: Magic, version, length of the header, checksum of all that follows.
+_FIXED = len(MAGIC) + 12
+#: No byte may hold more Gaussians or frames, so that a small file cannot ask for much memory: filled up with spaces.
+_MOST_PER_BYTE = 8
+_SIDE = 1 << 20  # no picture is longer: a decoder holds it in memory
+
+
+def save_compact(path: str | os.PathLike, quantised: Quantised, *, metadata: dict | None = None) -> Path:
+    """Write a quantised model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
+
+    Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
+    """
+    path = checked_path(path, "path, quantised")
+    check_compact_name(path)
+    data = packed(quantised, metadata)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return path
+
+
+def check_compact_name(path: Path, parameter: str = "path") -> None:
+    """Raise ValueError for a name that is not a compact file's."""
+    if path.suffix.lower() != COMPACT_SUFFIX:
+        raise invalid(parameter, expected=f"a name ending in {COMPACT_SUFFIX}", got=repr(str(path)))
+
+
+def packed(quantised: Quantised, metadata: dict | None = None) -> bytes:
+    """The bytes of the file."""
+    facts, walk = quantised.facts, Walk(quantised.rules, quantised.facts)
+    streams, described = [], []
+    for name in column_names(facts.degree, facts.shared):
+        numbers = quantised.columns[name]
+        column = walk.column(name)
+        streams.append(range_coder.encode(_steps(numbers, facts) if name == "cell" else numbers, column))
+        walk.add(name, numbers)
+        rule = quantised.rules.get(name)
+        own = [] if is_whole(name) else [rule.origin, rule.exponent, *rule.slopes]
+        described.append([len(streams[-1]), *own])
+    intervals = quantised.intervals
+    streams.append(range_coder.encode(intervals, range_coder.Column.plain(len(intervals))))
+    header = dataclasses.asdict(facts) | {
+        "num_frames": len(intervals) + 1,
+        "columns": described,
+        "intervals": len(streams[-1]),
+        "metadata": plain(metadata or {}),
+    }
+    text = to_json("header", header).encode()
+    data = b"".join(streams)
+    text += b" " * (-(-(facts.num_gaussians + header["num_frames"]) // _MOST_PER_BYTE) - len(text) - len(data))
+    body = text + data
+    numbers = (VERSION, len(text), zlib.crc32(body))
+    return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
+
+
+def _steps(cells: np.ndarray, facts: Facts) -> np.ndarray:
+    """From each cell to the next, around the end."""
+    return np.diff(cells, prepend=0) & ((1 << sum(facts.cells)) - 1)
+
+
+def _cells(steps: np.ndarray, facts: Facts) -> np.ndarray:
+    return (np.cumsum(steps, dtype=np.int64) & ((1 << sum(facts.cells)) - 1)).astype(np.int32)
+
+
+# ---------------------------------------------------------------------------------------------- reading
+
+
+def is_compact(path: str | os.PathLike) -> bool:
+    """Whether a file starts as compact ones do; False for one that is missing or cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(4) == MAGIC[:4]
+    except OSError:
+        return False
+
+
+def load_compact(path: str | os.PathLike) -> Quantised:
+    """The numbers in a compact file; `foldgauss.video.compression.quantize.dequantise` makes the model of them.
+
+    Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
+    """
+    path = checked_path(path)
+    return _unpacked(path, path.read_bytes())[0]
+
+
+def load_compact_model(path: str | os.PathLike) -> VideoModel:
+    """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
+    path = checked_path(path)
+    with np.errstate(over="ignore", invalid="ignore"):
+        model = dequantise(load_compact(path))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
+        raise _unreadable(path, "one with numbers beyond float32")
+    return model
+
+
+def compact_metadata(path: str | os.PathLike) -> dict:
+    """What `save_compact` was given as `metadata`. Raises as `load_compact`."""
+    path = checked_path(path)
+    return _header(path, path.read_bytes())[0]["metadata"]
+
+
+def _unpacked(path: Path, data: bytes) -> tuple[Quantised, dict]:
+    header, body = _header(path, data)
+    try:
+        return _decoded(header, body, len(data)), header["metadata"]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        text = " ".join(str(error).split())[:200]
+        raise _unreadable(path, f"one that does not fit together ({type(error).__name__}: {text})") from error
+
+
+def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
+    """The header and what follows it, once the file is known to be whole."""
+    if not data.startswith(MAGIC):
+        got = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
+        raise _unreadable(path, got)
+    if len(data) < _FIXED:
+        raise _unreadable(path, f"one cut off after {len(data)} bytes")
+    version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
+    if version != VERSION:
+        raise ModelFileError(
+            str(
+                invalid(
+                    "path",
+                    expected=f"a compact model of version {VERSION}, which this program reads",
+                    got=f"version {version} in {str(path)!r}",
+                    cure="Compress the model again." if version < VERSION else "Update foldgauss.",
+                )
+            )
+        )
+    body = data[_FIXED:]
+    if length > len(body) or zlib.crc32(body) != checksum:
+        raise _unreadable(path, "one that is cut off or damaged (its checksum is another)")
+    try:
+        header = json.loads(body[:length], parse_constant=_no_number)
+        if not isinstance(header, dict) or not isinstance(header["metadata"], dict):
+            raise ValueError("it is not an object")
+    except (ValueError, KeyError, RecursionError) as error:
+        raise _unreadable(path, "one whose header is not JSON of a model") from error
+    return header, body[length:]
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
+    facts = _facts(header)
+    num, num_frames = facts.num_gaussians, header["num_frames"]
+    _check(whole(num_frames, 1), "num_frames", num_frames)
+    _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
+    names = column_names(facts.degree, facts.shared)
+    described = header["columns"]
+    _check(isinstance(described, list) and len(described) == len(names), "columns", "others")
+    lengths = [own[0] for own in described] + [header["intervals"]]
+    _check(all(whole(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
+    rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_whole(name)}
+    _check(all(is_whole(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)), "rule", "none")
+    walk, columns, start = Walk(rules, facts), {}, 0
+    for name, length in zip(names, lengths[:-1], strict=True):
+        numbers = range_coder.decode(body[start : start + length], walk.column(name))
+        columns[name] = _cells(numbers, facts) if name == "cell" else numbers
+        _check_numbers(name, columns[name], facts)
+        walk.add(name, columns[name])
+        start += length
+    intervals = range_coder.decode(body[start:], range_coder.Column.plain(num_frames - 1))
+    return Quantised(facts, rules, columns, intervals)
+
+
+def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:
+    """Numbers that others are looked up by."""
+    most = {"without": 3, "degree": facts.degree, "shade": facts.shared - 1}.get(name)
+    if most is not None:
+        _check(numbers.min() >= 0 and numbers.max() <= most, name, "numbers out of range")
+
+
+def _facts(header: dict) -> Facts:
+    size, options = header["size"], header["options"]
+    _check(isinstance(size, list) and len(size) == 2 and all(whole(n, 1) and n <= _SIDE for n in size), "size", size)
+    _check(whole(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
+    _check(whole(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
+    cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
+    _check(isinstance(cells, list) and len(cells) == 3 and all(whole(n, 0) for n in cells), "cells", cells)
+    _check(sum(cells) <= MOST_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
+    _check(whole(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
+    bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
+    for name, interval in bounds.items():
+        _check(within(header[name], interval), name, header[name])
+    one_of("compositing", header["compositing"], COMPOSITINGS)
+    names = [field.name for field in dataclasses.fields(Facts)]
+    return Facts(
+        **{name: header[name] for name in names}
+        | {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**options)}
+    )
+
+
+def _rule(name: str, numbers: list) -> Rule:
+    known = FEATURES.index(name) if name in FEATURES else len(FEATURES)
+    _check(2 <= len(numbers) <= 2 + known and all(within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
+    return Rule(numbers[0], numbers[1], tuple(numbers[2:]))
+
+
+def _check(right: bool, name: str, got: Any) -> None:
+    if not right:
+        raise invalid(name, expected="what a compact model can have", got=got)
+
+
+def _unreadable(path: Path, got: str) -> ModelFileError:
+    error = invalid(
+        "path", expected="a compact model", got=f"{got}: {str(path)!r}", cure="Copy it again, or compress again."
+    )
+    return ModelFileError(str(error))

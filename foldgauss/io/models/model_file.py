@@ -1,0 +1,462 @@
+"""One model, one file: safetensors with a versioned header, every array leaf, exact to the bit."""
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import check_process
+from foldgauss.io._atomic import atomic_path
+
+FORMAT = "foldgauss-model"
+VERSION = "1"  # raised when a program of the version before could not read the file
+
+# NumPy's names for the element types of safetensors that a model may hold.
+_DTYPES = {
+    "float64": "F64", "float32": "F32", "float16": "F16", "bfloat16": "BF16", "bool": "BOOL",
+    "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8",
+    "uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8",
+}  # fmt: skip
+#: Bytes of an element of each.
+_ITEM_BYTES = {
+    "F64": 8, "F32": 4, "F16": 2, "BF16": 2, "BOOL": 1,
+    "I64": 8, "I32": 4, "I16": 2, "I8": 1, "U64": 8, "U32": 4, "U16": 2, "U8": 1,
+}  # fmt: skip
+_LONGEST_HEADER = 100_000_000  # bytes; the library reads no longer one
+_PREFIX = 8  # bytes: the length of the JSON header, little-endian, opens a safetensors file
+_RESERVED = "__metadata__"  # the one name that safetensors keeps for itself
+_MAGIC = {
+    b"\x89PNG": "a PNG image",
+    b"\xff\xd8\xff": "a JPEG image",
+    b"ply": "a PLY file",
+    b"PK": "a zip archive",
+}
+
+
+class ModelFileError(ValueError):
+    """A model cannot be saved to or loaded from this file; the message is one line."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    name: str
+    model_type: type
+    to_header: Callable[[Any], dict]
+    from_header: Callable[[dict], Any]
+    to_stored: Callable[[Any], Any]
+    from_stored: Callable[[Any], Any]
+
+
+def _as_it_is(model: Any) -> Any:
+    return model
+
+
+_KINDS: dict[str, _Kind] = {}
+
+
+def register_model(
+    kind: str,
+    model_type: type,
+    *,
+    to_header: Callable[[Any], dict],
+    from_header: Callable[[dict], Any],
+    to_stored: Callable[[Any], Any] = _as_it_is,
+    from_stored: Callable[[Any], Any] = _as_it_is,
+) -> None:
+    """Teach this module to save and load `model_type` under the name `kind`.
+
+    `to_header(model)` gives the static facts as a dict that JSON can hold. `from_header(dict)` gives the
+    skeleton: the same pytree with a `jax.ShapeDtypeStruct` for every array leaf and everything else in
+    place. It must allocate nothing in proportion to numbers in the dict: that may come from a stranger.
+
+    Where a model is stored in another form than it has in memory, `to_stored` gives that pytree, which `to_header` and
+    `from_header` are then about, and `from_stored` is its inverse. The latter raises ValueError for leaves that do not
+    fit each other, which have the skeleton's shapes but may hold anything.
+
+    Raises `ValueError` if `kind` already names another type.
+    """
+    known = _KINDS.get(kind)
+    if known is not None and known.model_type is not model_type:
+        raise invalid("kind", expected="a free name", got=f"{kind!r}, taken by {known.model_type.__name__}")
+    _KINDS[kind] = _Kind(kind, model_type, to_header, from_header, to_stored, from_stored)
+
+
+# ----------------------------------------------------------------------------------------------- saving
+
+
+def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = None) -> Path:
+    """Write `model` whole or not at all; returns the path. Equal models and metadata give equal bytes.
+
+    Every array leaf that a traversal of the pytree finds is stored, JAX or NumPy, under its path in the tree
+    ("splats.loc"). `metadata` is free provenance for `read_header` (clip, configuration, metrics); its
+    numbers that JSON lacks (NaN, infinities) become null.
+
+    Before anything is written, the header is turned back into a skeleton and compared with the model, so a
+    file that would not load is never made.
+
+    Raises `ModelFileError` for an unregistered type, a leaf that would be lost (a plain number, a PRNG key)
+    or a header that does not describe the model; `OutputError` where the path cannot be written.
+    """
+    kind = _kind_of(model)
+    model = kind.to_stored(model)
+    arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
+    header = kind.to_header(model)
+    _check_described(kind, model, to_json("header", header))
+    specs = {key: {"dtype": _DTYPES[one.dtype.name], "shape": list(one.shape)} for key, one in arrays.items()}
+    path = Path(path)
+    about = {"kind": kind.name, "header": header, "metadata": metadata or {}}
+    write_tensors(path, specs, lambda keys: (arrays[key] for key in keys), **about)
+    return path
+
+
+def write_tensors(
+    path: Path,
+    specs: Mapping[str, dict],
+    tensors: Callable[[list[str]], Iterable[np.ndarray]],
+    *,
+    kind: str,
+    header: dict,
+    metadata: dict,
+) -> None:
+    """Write a file of ours, whole or not at all: the tensors that `specs` describe, as `read_header` does.
+
+    `tensors(keys)` gives them one by one in that order, little-endian. Raises as `save_model`.
+    """
+    about = {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": kind,
+        "header": to_json("header", header),
+        "metadata": to_json("metadata", plain(metadata)),
+    }
+    # The library's writer orders its header at random: same model, other bytes.
+    order = sorted(specs, key=lambda key: (-_ITEM_BYTES[specs[key]["dtype"]], key))  # so every tensor is aligned
+    entries: dict[str, Any] = {_RESERVED: about}
+    end = 0
+    for key in order:
+        start, end = end, end + math.prod(specs[key]["shape"]) * _ITEM_BYTES[specs[key]["dtype"]]
+        entries[key] = {**specs[key], "data_offsets": [start, end]}
+    text = json.dumps(entries, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    if len(text) > _LONGEST_HEADER:
+        got = f"one of {len(text):,} bytes for {len(specs):,} tensors"
+        cure = "Write the clip as several files."
+        raise _error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(len(text).to_bytes(_PREFIX, "little") + text)
+        for array in tensors(order):
+            file.write(array.tobytes())
+
+
+def _array_leaves(tree: Any) -> dict[str, Any]:
+    """Array leaves, or their `ShapeDtypeStruct`s, by path. A leaf that would be lost in silence raises."""
+    found: dict[str, Any] = {}
+    for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        key = jax.tree_util.keystr(keys, simple=True, separator=".")
+        if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
+            raise _error(
+                key,
+                expected="an array or a static field",
+                got=f"the plain number {leaf!r}",
+                cure="Make it an array, or a static field that the header holds.",
+            )
+        if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
+            continue  # a function or a name: it has no bits to store, and the skeleton brings its own
+        if key in found or key == _RESERVED:
+            raise _error(key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key.")
+        found[key] = leaf
+    return found
+
+
+def _to_numpy(key: str, leaf: Any) -> np.ndarray:
+    """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
+    if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
+        raise _error(
+            key,
+            expected="a real, integer or boolean array",
+            got=f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}",
+            cure="Store complex numbers as two arrays and PRNG keys by jax.random.key_data.",
+        )
+    array = np.asarray(leaf)
+    if array.dtype.byteorder == ">":
+        array = array.astype(array.dtype.newbyteorder("<"))
+    return array  # tobytes gives C order whatever the strides
+
+
+def _kind_of(model: Any) -> _Kind:
+    for kind in _KINDS.values():
+        if type(model) is kind.model_type:
+            return kind
+    raise _error(
+        "model",
+        expected="one of the registered types " + (", ".join(sorted(_KINDS)) or "(none yet)"),
+        got=type(model).__name__,
+        cure="Register it with register_model.",
+    )
+
+
+def _check_described(kind: _Kind, model: Any, header: str) -> None:
+    """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
+    skeleton = kind.from_header(json.loads(header))
+    described = _specs(_array_leaves(skeleton))
+    _check_tensors(described, _widened(_specs(_array_leaves(model)), described), "header")
+    have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
+    if have != want:
+        raise _error(
+            "header",
+            expected=f"every static fact of the model of kind {kind.name!r}",
+            got="a skeleton of another structure",
+            cure="Let to_header and from_header carry each static field.",
+        )
+
+
+def to_json(parameter: str, value: Any) -> str:
+    """JSON, the same for the same value. Raises `ModelFileError` for what it cannot hold."""
+    try:
+        return json.dumps(value, allow_nan=False, sort_keys=True, default=_scalar)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise _error(
+            parameter, expected="a dict that JSON can hold", got=str(error), cure="Use plain types."
+        ) from error
+
+
+def _scalar(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(f"a {type(value).__name__}")
+
+
+def plain(value: Any) -> Any:
+    """Provenance in JSON's terms: an infinite PSNR (a perfect frame) must not cost the user the fit."""
+    if isinstance(value, dict):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+# ---------------------------------------------------------------------------------------------- loading
+
+
+def load_model(path: str | os.PathLike) -> Any:
+    """Read the model that `save_model` wrote, equal to the bit. Nothing in the file is executed.
+
+    Leaves come as JAX arrays; 64-bit ones stay NumPy arrays unless JAX's x64 mode is on, since JAX would
+    round them; those kept in half precision come in the type that the header describes. No more memory is taken than
+    twice the file's size, plus the skeleton and what `from_stored` adds.
+
+    Raises `FileNotFoundError` for a missing file, `ModelFileError` for one of another kind or version, a
+    damaged one, or one whose tensors differ from what its header describes.
+    """
+    path = Path(path)
+    about = read_header(path)
+    return load_part(path, about["kind"], about["header"], about["tensors"])
+
+
+def load_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict], prefix: str = "") -> Any:
+    """The model of that kind and header whose `tensors` stand in the file under `prefix` and their keys.
+
+    Raises `ModelFileError` as `load_model`.
+    """
+    kind, skeleton = _described(path, kind_name, header, tensors)
+    check_process()
+    filled = _filled(skeleton, path, prefix)
+    try:
+        return kind.from_stored(filled)
+    except ValueError as error:
+        got = f"others in {str(path)!r} ({_line(error)})"
+        raise _error("path", expected="tensors that fit each other", got=got) from error
+
+
+def check_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> None:
+    """Raise `ModelFileError` unless the header describes these tensors; none of them is read."""
+    _described(path, kind_name, header, tensors)
+
+
+def _described(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> tuple[_Kind, Any]:
+    """The kind, and the skeleton of a model of it that the header describes and that the tensors fit."""
+    kind = _KINDS.get(kind_name)
+    if kind is None:
+        raise _error(
+            "path",
+            expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
+            got=f"kind {kind_name!r} in {str(path)!r}",
+            cure="Load it with the program that wrote it.",
+        )
+    try:
+        skeleton = kind.from_header(header)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        raise _error(
+            "path",
+            expected=f"the header of a model of kind {kind.name!r}",
+            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_line(error)})",
+        ) from error
+    described = _specs(_array_leaves(skeleton))
+    _check_tensors(_widened(tensors, described), described, str(path))
+    return kind, skeleton
+
+
+def read_header(path: str | os.PathLike) -> dict:
+    """What the file says of itself, without reading its tensors.
+
+    Keys: `format`, `version`, `kind` (strings), `header` and `metadata` (dicts), and `tensors`, which maps
+    each key to `{"dtype": "F32", "shape": [..]}`.
+
+    Raises as `load_model` does, but takes a kind that is not registered.
+    """
+    path = Path(path)
+    _check_container(path)
+    with open_tensors(path) as file:
+        strings = file.metadata() or {}
+        tensors = {}
+        for key in file.keys():  # noqa: SIM118 - it is not a dict
+            part = file.get_slice(key)
+            tensors[key] = {"dtype": part.get_dtype(), "shape": list(part.get_shape())}
+    _check_version(path, strings)
+    about = {name: strings[name] for name in ("format", "version", "kind")}
+    return about | {name: _from_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
+
+
+def _check_container(path: Path) -> None:
+    """Judge the first bytes against the file's size, before a library allocates anything by them."""
+    if not os.path.exists(path):
+        raise FileNotFoundError(
+            f"path: expected a model file, got {str(path)!r}, which is missing. Check the spelling."
+        )
+    if not path.is_file():
+        raise _unreadable(path, "not a plain file")
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        first = file.read(_PREFIX + 1)
+    if size == 0:
+        raise _unreadable(path, "an empty file")
+    for magic, name in _MAGIC.items():
+        if first.startswith(magic):
+            raise _unreadable(path, name)
+    length = int.from_bytes(first[:_PREFIX], "little")
+    if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
+        raise _unreadable(path, "a file of another kind, or one cut off within its first bytes")
+    if length > size - _PREFIX:
+        raise _unreadable(path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged")
+
+
+def _check_version(path: Path, strings: dict[str, str]) -> None:
+    if strings.get("format") != FORMAT:
+        raise _unreadable(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
+    if strings.get("version") != VERSION:
+        raise _error(
+            "path",
+            expected=f"a model file of version {VERSION}, which this program reads",
+            got=f"version {strings.get('version')} in {str(path)!r}",
+            cure="Update foldgauss, or load it with the one that wrote it.",
+        )
+    for name in ("kind", "header", "metadata"):
+        if name not in strings:
+            raise _unreadable(path, f"one without the field {name!r}")
+
+
+def _from_json(path: Path, name: str, strings: dict[str, str]) -> dict:
+    try:
+        value = json.loads(strings[name])
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(path, f"one whose field {name!r} is not JSON ({_line(error)})") from error
+    if not isinstance(value, dict):
+        raise _unreadable(path, f"one whose field {name!r} is not a JSON object")
+    return value
+
+
+def _specs(leaves: dict[str, Any]) -> dict[str, dict]:
+    return {
+        key: {"dtype": _DTYPES.get(leaf.dtype.name, leaf.dtype.name), "shape": list(leaf.shape)}
+        for key, leaf in leaves.items()
+    }
+
+
+def _widened(kept: dict[str, dict], described: dict[str, dict]) -> dict[str, dict]:
+    """What is read of the tensors kept: those of single precision may be kept in half, with fewer digits."""
+    pairs = {key: (spec, described.get(key, spec)) for key, spec in kept.items()}
+    return {
+        key: want if (have["dtype"], want["dtype"]) == ("F16", "F32") and have["shape"] == want["shape"] else have
+        for key, (have, want) in pairs.items()
+    }
+
+
+def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> None:
+    """The tensors that are there against those that the header describes: same keys, shapes and types."""
+    for key in sorted(have.keys() | want.keys()):
+        if have.get(key) != want.get(key):
+            raise _error(
+                f"tensor {key!r} of {where!r}",
+                expected=_spec_text(want.get(key)),
+                got=_spec_text(have.get(key)),
+            )
+
+
+def _filled(skeleton: Any, path: Path, prefix: str) -> Any:
+    """The skeleton with each `ShapeDtypeStruct` replaced by its tensor."""
+    with open_tensors(path) as file:
+
+        def fill(keys: tuple, leaf: Any) -> Any:
+            if not isinstance(leaf, jax.ShapeDtypeStruct):
+                return leaf
+            key = jax.tree_util.keystr(keys, simple=True, separator=".")
+            array = file.get_tensor(prefix + key)
+            return _to_leaf(key, array.astype(np.float32) if _is_half(array, leaf) else array)
+
+        return jax.tree_util.tree_map_with_path(fill, skeleton)
+
+
+@contextmanager
+def open_tensors(path: Path) -> Iterator[Any]:
+    """The file as the library opens it: `get_tensor(key)` reads one. Raises `ModelFileError` for a damaged one."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            yield file
+    except SafetensorError as error:
+        raise _unreadable(path, f"a damaged or truncated file ({_line(error)})") from error
+
+
+def _is_half(array: np.ndarray, described: jax.ShapeDtypeStruct) -> bool:
+    return array.dtype == np.float16 and described.dtype == np.float32
+
+
+def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
+    if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
+        raise _error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
+    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
+        return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
+    return np.array(array)
+
+
+def _error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
+    return ModelFileError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
+
+
+def _unreadable(path: Path, got: str) -> ModelFileError:
+    return _error(
+        "path",
+        expected=f"a {FORMAT} file",
+        got=f"{got}: {str(path)!r}",
+        cure="Give a file that `foldgauss fit` wrote.",
+    )
+
+
+def _spec_text(spec: dict | None) -> str:
+    return "no such tensor" if spec is None else f"{spec['dtype']} of shape {spec['shape']}"
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]

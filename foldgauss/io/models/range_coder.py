@@ -1,0 +1,290 @@
+"""An adaptive binary range coder for columns of whole numbers: the same bits everywhere.
+
+A number becomes a zero flag, a sign and an exponential Golomb code of its magnitude. Flag, sign, exponent and the two
+leading bits below it are coded with probabilities that learn from what came before; further bits are as good as random
+and cost one bit each. Three *contexts* of a number, small numbers that both sides know, have a probability each, and
+the three are mixed as logits with weights that learn, too. The third context is what Gaussians nearby lead one to
+expect. All is arithmetic of whole numbers but for that expectation, which is float64 in a stated order.
+
+Source: G. N. N. Martin, "Range encoding" (1979); P. Elias' gamma code (1975), in exponential Golomb form; M. Mahoney,
+"Adaptive weighing of context models for lossless data compression" (2005).
+"""
+
+import dataclasses
+
+import numba as nb
+import numpy as np
+from jaxtyping import Bool, Float, Int32, UInt8
+
+from foldgauss._runtime.kernels import exact_kernel
+
+#: Magnitudes stay below 2^LARGEST_BITS.
+LARGEST_BITS = 30
+#: Probabilities of one context: zero flag, sign, unary exponent, and 1 + 2 for the leading bits of each exponent.
+NODES = 2 + 32 + 3 * 32
+#: Values of a context, and contexts of a number.
+CONTEXTS, MODELS = 256, 3
+#: Bytes that no number's code exceeds: 2 + 31 + 30 bits of four bytes each.
+ROOM = 256
+#: A probability is the share of ones so far, until so many bits were seen; from then on old ones are forgotten.
+MEMORY = 400
+#: Weights of the mixture, times 65536, at first; and how fast they learn, times 2^18.
+WEIGHT, RATE = 29491, 6
+#: Mixed probabilities, times 65536, stay so far from 0 and 1.
+MARGIN = 32
+#: Logits are whole multiples of 1/256 from -8 to 8. Knots of the logistic function every half, and lines between them.
+_KNOTS = [
+    22, 36, 60, 98, 162, 267, 439, 720, 1179, 1921, 3108, 4971, 7812, 11955, 17625, 24743, 32768,
+    40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097, 65269, 65374, 65438, 65476, 65500, 65514,
+]  # fmt: skip
+
+_i = nb.int64
+
+
+def _logistic() -> np.ndarray:
+    """Probability times 65536 of the logit (place - 2048) / 256."""
+    place = np.arange(4096)
+    k, part = place >> 7, place & 127
+    knots = np.array(_KNOTS)
+    return (knots[k] * (128 - part) + knots[k + 1] * part + 64) >> 7
+
+
+LOGISTIC = _logistic()
+#: Its inverse, for the upper 12 bits of a probability: the least logit that gives as much.
+LOGIT = np.minimum(np.searchsorted(LOGISTIC, np.arange(4096) * 16 + 8), 4095) - 2048
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """What both sides know of a column before its numbers.
+
+    `present`: which rows have a number; the others' is 0. `contexts` below 256. A number q is the value
+    `origin + q step`; that of the rows `near` (-1: none), divided by their own `scale` and multiplied by the row's,
+    leads to expect the row's own. Rows without a number count as `fill`.
+    """
+
+    present: Bool[np.ndarray, " num"]
+    contexts: UInt8[np.ndarray, "num 2"]
+    origin: Float[np.ndarray, " num"]
+    step: Float[np.ndarray, " num"]
+    scale: Float[np.ndarray, " num"]
+    near: Int32[np.ndarray, "num neighbours"]
+    fill: float = 0.0
+
+    @classmethod
+    def plain(cls, num: int) -> "Column":
+        """One of which nothing is known."""
+        one, none = np.ones(num), np.zeros((num, 0), np.int32)
+        return cls(np.ones(num, bool), np.zeros((num, 2), np.uint8), np.zeros(num), one, one, none)
+
+    def arrays(self) -> tuple:
+        floats = (np.ascontiguousarray(one, np.float64) for one in (self.origin, self.step, self.scale))
+        near = np.ascontiguousarray(self.near, np.int32)
+        return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near, float(self.fill)
+
+
+# ------------------------------------------------------------------------------------------ what both sides do
+
+
+@exact_kernel
+def _expected(i, near, seen, origin, step, scale):
+    """The context of what rows nearby lead to expect: 0 for nothing, else 16 and the sign times the size."""
+    total, count = 0.0, 0
+    for k in range(near.shape[1]):
+        if near[i, k] >= 0:
+            total += seen[near[i, k]]
+            count += 1
+    if count == 0:
+        return 0
+    ratio = (total / count * scale[i] - origin[i]) / step[i]
+    size, level, bound = abs(ratio), 0, 0.5
+    while level < 15 and size >= bound:
+        level += 1
+        bound = 1.5 if level == 1 else 2 * bound
+    return 16 + level if ratio >= 0 else 16 - level
+
+
+@exact_kernel
+def _mixed(node, own, chances, weights, logits, logistic, logit):
+    """The probability of a one at a node, times 65536; `own` are the contexts."""
+    total = 0
+    for m in range(MODELS):
+        logits[m] = logit[chances[m, own[m], node, 0] >> 4]
+        total += logits[m] * weights[node, m]
+    p = logistic[min(max(total >> 16, -2047), 2047) + 2048]
+    return min(max(p, MARGIN), 65536 - MARGIN)
+
+
+@exact_kernel
+def _learn(node, own, chances, weights, logits, p, bit):
+    """A chance is (probability of one times 65536, bits seen + 2)."""
+    error = (65536 if bit else 0) - p
+    for m in range(MODELS):
+        weights[node, m] += (logits[m] * error * RATE) >> 18
+        chance = chances[m, own[m], node]
+        if bit:
+            chance[0] += (65536 - chance[0]) // chance[1]
+        else:
+            chance[0] -= chance[0] // chance[1]
+        if chance[1] < MEMORY:
+            chance[1] += 1
+
+
+@exact_kernel
+def _middle(low, high, p):
+    """Where the interval is parted: below lie ones, of probability p / 65536."""
+    span = high - low
+    return low + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
+
+
+# ------------------------------------------------------------------------------------------ numbers to bytes
+
+
+@exact_kernel
+def _put(out, place, interval, p, bit):
+    middle = _middle(interval[0], interval[1], p)
+    if bit:
+        interval[1] = middle
+    else:
+        interval[0] = middle + 1
+    while (interval[0] ^ interval[1]) & 0xFF000000 == 0:
+        out[place] = interval[1] >> 24
+        place += 1
+        interval[0] = (interval[0] << 8) & 0xFFFFFFFF
+        interval[1] = ((interval[1] << 8) & 0xFFFFFFFF) | 255
+    return place
+
+
+@exact_kernel
+def _put_learned(out, place, interval, state, node, bit):
+    own, chances, weights, logits, logistic, logit = state
+    p = _mixed(node, own, chances, weights, logits, logistic, logit)
+    place = _put(out, place, interval, p, bit)
+    _learn(node, own, chances, weights, logits, p, bit)
+    return place
+
+
+@exact_kernel
+def _encode(values, present, contexts, origin, step, scale, near, fill, state, out):
+    interval, place, seen, own = np.zeros(2, np.int64), 0, np.full(len(values), fill), state[0]
+    interval[1] = 0xFFFFFFFF
+    for k in range(len(values)):
+        if not present[k]:
+            continue
+        if place + ROOM > len(out):
+            return 0
+        value = _i(values[k])
+        own[0], own[1] = contexts[k, 0], contexts[k, 1]
+        own[2] = _expected(k, near, seen, origin, step, scale)
+        seen[k] = (origin[k] + value * step[k]) / scale[k]
+        place = _put_learned(out, place, interval, state, 0, value == 0)
+        if value == 0:
+            continue
+        place = _put_learned(out, place, interval, state, 1, value < 0)
+        magnitude, exponent = abs(value), 0
+        while magnitude >> (exponent + 1):
+            place = _put_learned(out, place, interval, state, 2 + exponent, True)
+            exponent += 1
+        place = _put_learned(out, place, interval, state, 2 + exponent, False)
+        leading = 1
+        for b in range(exponent - 1, -1, -1):
+            bit = (magnitude >> b) & 1
+            if leading < 4:
+                place = _put_learned(out, place, interval, state, 34 + 3 * exponent + leading - 1, bit == 1)
+                leading = 2 * leading + bit
+            else:
+                place = _put(out, place, interval, 32768, bit == 1)
+    # The shortest run of bytes that points into the interval whatever follows: zeros are read after the end.
+    out[place] = (interval[0] >> 24) + (1 if interval[0] & 0xFFFFFF else 0)
+    return place + 1
+
+
+# ------------------------------------------------------------------------------------------ and back
+
+
+@exact_kernel
+def _get(data, reader, p):
+    """One bit; the reader is (low, high, code, next byte)."""
+    middle = _middle(reader[0], reader[1], p)
+    bit = reader[2] <= middle
+    if bit:
+        reader[1] = middle
+    else:
+        reader[0] = middle + 1
+    while (reader[0] ^ reader[1]) & 0xFF000000 == 0:
+        reader[0] = (reader[0] << 8) & 0xFFFFFFFF
+        reader[1] = ((reader[1] << 8) & 0xFFFFFFFF) | 255
+        byte = _i(data[reader[3]]) if reader[3] < len(data) else 0
+        reader[2] = ((reader[2] << 8) & 0xFFFFFFFF) | byte
+        reader[3] += 1
+    return bit
+
+
+@exact_kernel
+def _get_learned(data, reader, state, node):
+    own, chances, weights, logits, logistic, logit = state
+    p = _mixed(node, own, chances, weights, logits, logistic, logit)
+    bit = _get(data, reader, p)
+    _learn(node, own, chances, weights, logits, p, bit)
+    return bit
+
+
+@exact_kernel
+def _decode(data, present, contexts, origin, step, scale, near, fill, most, state, values):
+    """Whether the data is one that the encoder may have written."""
+    reader, seen, own = np.zeros(4, np.int64), np.full(len(values), fill), state[0]
+    reader[1] = 0xFFFFFFFF
+    for k in range(4):
+        reader[2] = (reader[2] << 8) | (_i(data[k]) if k < len(data) else 0)
+    reader[3] = 4
+    for k in range(len(values)):
+        values[k] = 0
+        if not present[k]:
+            continue
+        if reader[3] > len(data) + 4:
+            return False
+        own[0], own[1] = contexts[k, 0], contexts[k, 1]
+        own[2] = _expected(k, near, seen, origin, step, scale)
+        if not _get_learned(data, reader, state, 0):
+            negative = _get_learned(data, reader, state, 1)
+            exponent = 0
+            while _get_learned(data, reader, state, 2 + exponent):
+                exponent += 1
+                if exponent >= most:
+                    return False
+            magnitude, leading = 1, 1
+            for _ in range(exponent):
+                if leading < 4:
+                    bit = _get_learned(data, reader, state, 34 + 3 * exponent + leading - 1)
+                    leading = 2 * leading + bit
+                else:
+                    bit = _get(data, reader, 32768)
+                magnitude = 2 * magnitude + bit
+            values[k] = -magnitude if negative else magnitude
+        seen[k] = (origin[k] + values[k] * step[k]) / scale[k]
+    return reader[3] == len(data) + 3  # the encoder ends with one byte where four are looked at
+
+
+def encode(values: Int32[np.ndarray, " num"], column: Column) -> bytes:
+    """The bytes of a column; magnitudes below 2^30."""
+    room = 4 * len(values) + 2 * ROOM
+    while True:
+        out = np.empty(room, np.uint8)
+        if length := _encode(values, *column.arrays(), _state(), out):
+            return out[:length].tobytes()
+        room *= 4  # a column that is dearer than the numbers themselves: it jumps about
+
+
+def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
+    """The column that `encode` had; raises ValueError for bytes that it cannot have written."""
+    values = np.empty(len(column.present), np.int32)
+    if not _decode(np.frombuffer(data, np.uint8), *column.arrays(), LARGEST_BITS, _state(), values):
+        raise ValueError("a column of numbers is damaged")
+    return values
+
+
+def _state() -> tuple[np.ndarray, ...]:
+    chances = np.empty((MODELS, CONTEXTS, NODES, 2), np.int64)
+    chances[..., 0], chances[..., 1] = 32768, 2
+    weights = np.full((NODES, MODELS), WEIGHT, np.int64)
+    return np.zeros(MODELS, np.int64), chances, weights, np.zeros(MODELS, np.int64), LOGISTIC, LOGIT

@@ -1,0 +1,230 @@
+"""Models of a clip's segments in one file, each loaded when it is asked for. The layout is in docs/formats.md."""
+
+import math
+import os
+import re
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foldgauss._runtime.checks import invalid, one_of, short_repr, whole, within
+from foldgauss.io._atomic import check_writable, checked_path
+from foldgauss.io.models.compact import is_compact
+from foldgauss.io.models.model_file import (
+    ModelFileError,
+    check_part,
+    load_part,
+    open_tensors,
+    read_header,
+    save_model,
+    write_tensors,
+)
+from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import READY, Segment, SegmentedVideo
+
+SEGMENTED = "segmented-video"
+#: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`.
+PARTS = ("video", "edited-video")
+_KEY = re.compile(r"segments\.(0|[1-9][0-9]{0,8})\.(.+)", re.DOTALL)
+#: What a stranger's header may say of a degree: more has no meaning, and numbers beyond have no digits.
+_MAX_DEGREE = 1 << 20
+
+
+def join_segments(
+    path: str | os.PathLike, sources: Sequence[tuple[int, str | os.PathLike]], *, metadata: dict | None = None
+) -> Path:
+    """Write the models of a clip's segments into one file, whole or not at all; returns the path.
+
+    `sources` has (number of its first frame in the whole clip, model file) of each segment, in order. Their tensors are
+    copied one by one, to the bit, and their metadata kept; `metadata` are the whole file's. See `SegmentedVideo` for
+    what goes together.
+
+    Raises ValueError as `SegmentedVideo`; `FileNotFoundError`; `ModelFileError` for a file that is no ordinary model,
+    such as a compact one, or one that has segments itself; `OutputError` where the path cannot be written.
+
+    Example: `join_segments("long.safetensors", [(0, "a.safetensors"), (95, "b.safetensors")])`
+    """
+    path = checked_path(path, "path, sources")
+    files, entries, specs, segments = [], [], {}, []
+    for number, source in enumerate(sources):
+        first, file = _source(number, source)
+        about = read_header(file)
+        if about["kind"] not in PARTS:
+            raise _unfit(file, f"one of kind {about['kind']!r}", "Join the files that it was made of.")
+        check_part(file, about["kind"], about["header"], about["tensors"])
+        files.append(file)
+        entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
+        specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
+        try:
+            segments.append(_segment(entries[-1], about["tensors"], partial(_load, file)))
+        except (KeyError, TypeError, ValueError) as error:
+            raise _unfit(file, f"one with {error}", "Fit it again.") from error
+    SegmentedVideo(segments)  # they go together
+    check_writable(path)
+
+    def tensors(keys: list[str]) -> Iterator[np.ndarray]:
+        for number, some in groupby(keys, lambda key: int(_KEY.fullmatch(key)[1])):
+            with open_tensors(files[number]) as file:
+                for key in some:
+                    array = file.get_tensor(_KEY.fullmatch(key)[2])
+                    if list(array.shape) != specs[key]["shape"]:
+                        raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
+                    yield array
+
+    write_tensors(path, specs, tensors, kind=SEGMENTED, header={"segments": entries}, metadata=metadata or {})
+    return path
+
+
+def save_segmented(path: Path, video: SegmentedVideo, metadata: dict | None) -> Path:
+    """Write a video of segments, one after another: of models in memory, or edited since they were loaded.
+
+    Beside the file a folder holds the segments until it is whole. Raises as `join_segments`.
+    """
+    check_writable(path)
+    with tempfile.TemporaryDirectory(prefix=f".{path.stem[:40]}.tmp-", dir=path.parent) as folder:
+        sources = []
+        for number, segment in enumerate(video.segments):
+            file = Path(folder) / f"{number}.safetensors"
+            save_model(file, segment.model, metadata=dict(segment.metadata))
+            sources.append((segment.first, file))
+        return join_segments(path, sources, metadata=metadata)
+
+
+def _source(number: int, source: object) -> tuple[int, Path]:
+    try:
+        first, file = source
+    except (TypeError, ValueError):
+        expected = "(number of its first frame, model file)"
+        raise invalid(f"sources[{number}]", expected=expected, got=short_repr(source)) from None
+    if not whole(first, 0):
+        raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
+    file = checked_path(file, "path, sources")
+    if is_compact(file):
+        raise _unfit(file, "a compact one", "Join the models before they are compressed.")
+    return int(first), file
+
+
+def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
+    error = invalid("sources", expected="ordinary models", got=f"{got}, {str(file)!r}", cure=cure)
+    return ModelFileError(str(error))
+
+
+# ---------------------------------------------------------------------------------------------- loading
+
+
+def is_segmented(path: str | os.PathLike) -> bool:
+    """Whether a file holds a video in segments; no tensor is read. Raises as `load_video_model`."""
+    path = checked_path(path)
+    return not is_compact(path) and read_header(path)["kind"] == SEGMENTED
+
+
+def load_segmented(path: Path, about: dict) -> SegmentedVideo:
+    """The video in a file whose `read_header` is `about`: no tensor is read until a segment's model is asked for.
+
+    A segment's model is checked when it is loaded. Raises `ModelFileError`, then as now.
+    """
+    try:
+        return SegmentedVideo(_segments(path, about))
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        if isinstance(error, ModelFileError):
+            raise
+        text = " ".join(str(error).split())[:200]
+        got = f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {text})"
+        expected = f"the header of a model of kind {SEGMENTED!r}"
+        raise ModelFileError(str(invalid("path", expected=expected, got=got))) from error
+
+
+def _segments(path: Path, about: dict) -> list[Segment]:
+    entries = about["header"]["segments"]
+    if not isinstance(entries, list):
+        raise TypeError("no list of segments")
+    own: list[dict[str, dict]] = [{} for _ in entries]
+    for key, spec in about["tensors"].items():
+        found = _KEY.fullmatch(key)
+        if found is None or int(found[1]) >= len(own):
+            raise ValueError(f"tensor {key[:80]!r} is of no segment")
+        own[int(found[1])][found[2]] = spec
+    stamp = _stamp(path)
+
+    @lru_cache(maxsize=READY)
+    def load(number: int) -> VideoModel | EditedVideo:
+        if _stamp(path) != stamp:
+            cure = "Load it again."
+            error = invalid("path", expected="the file as it was opened", got=f"a changed {str(path)!r}", cure=cure)
+            raise ModelFileError(str(error))
+        entry = entries[number]
+        return load_part(path, entry["kind"], entry["header"], own[number], f"segments.{number}.")
+
+    return [_segment(entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    """What tells a file from another that took its name."""
+    found = path.stat()
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def _load(path: Path) -> VideoModel | EditedVideo:
+    about = read_header(path)
+    return load_part(path, about["kind"], about["header"], about["tensors"])
+
+
+def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
+    """What a header says of a segment, as far as it is told without loading the model.
+
+    Raises ValueError, KeyError or TypeError for what no header of ours says, and for more frames or Gaussians than
+    there are tensors of.
+    """
+    one_of("kind", entry["kind"], PARTS)
+    if not isinstance(entry["metadata"], dict):
+        raise TypeError("metadata that are no dict")
+    header = entry["header"]
+    if entry["kind"] == PARTS[0]:
+        models, lead = {"": header}, ""
+    else:
+        models = {f"layers.{number}.model.": layer["model"] for number, layer in enumerate(header["layers"])}
+        lead = list(models)[header["timeline"]]
+    for prefix, model in models.items():
+        num, num_frames = tensors[f"{prefix}splats.loc"]["shape"][0], _num_frames(tensors, prefix)
+        if not (whole(model["num_gaussians"], 1) and model["num_gaussians"] == num):
+            raise ValueError("another number of Gaussians than are stored")
+        if not (whole(model["num_frames"], 1) and model["num_frames"] == num_frames):
+            raise ValueError("another number of frames than are stored")
+        if not whole(model["degree"], 0) or model["degree"] > _MAX_DEGREE:
+            raise ValueError("a degree that no model has")
+    timeline = models[lead]
+    height, width = timeline["size"]
+    if not (whole(height, 1) and whole(width, 1)) or not within(timeline["fps"], "(0, inf)"):
+        raise ValueError("a size or a rate out of range")
+    compositing = timeline.get("compositing", "over")  # files from before there was another
+    one_of("compositing", compositing, COMPOSITINGS)
+    return Segment(
+        first=entry["first"],
+        num_frames=int(timeline["num_frames"]),
+        num_gaussians=sum(int(model["num_gaussians"]) for model in models.values()),
+        degree=max(int(model["degree"]) for model in models.values()),
+        num_floats=sum(_num_floats(spec) for key, spec in tensors.items() if key.startswith(tuple(models))),
+        size=(int(height), int(width)),
+        fps=float(timeline["fps"]),
+        options=RenderOptions(**timeline["options"]),
+        compositing=compositing,
+        load=load,
+        metadata=entry["metadata"],
+    )
+
+
+def _num_frames(tensors: dict[str, dict], prefix: str) -> int:
+    return tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
+
+
+def _num_floats(spec: dict) -> int:
+    """As `VideoModel.num_floats` counts a leaf."""
+    count = math.prod(spec["shape"])
+    return -(-count * int(spec["dtype"][1:]) // 32) if spec["dtype"].startswith("U") else count

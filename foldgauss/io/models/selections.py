@@ -1,0 +1,96 @@
+"""Selections on disk: which Gaussians, and of which model."""
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.io._atomic import checked_path
+from foldgauss.io.models.model_file import ModelFileError, load_model, read_header, register_model, save_model
+from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+from foldgauss.video.selection.selectors import Selection
+
+SELECTION = "selection"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Kept:
+    """What the file holds: the mask, and the digest of the model that it is for."""
+
+    mask: np.ndarray
+    digest: str = dataclasses.field(metadata={"static": True})
+
+
+def save_selection(path: str | os.PathLike, selection: Selection, model: VideoModel) -> Path:
+    """Write a selection of `model`'s Gaussians, whole or not at all: a safetensors file, a byte per Gaussian.
+
+    **Raises:** ValueError for a selection of another number of Gaussians, `OutputError` as `save_video_model`.
+
+    **Example:** `save_selection("bear.selection", by_mask(model, masks), model)`.
+    """
+    checked_path(path, "path, selection, model")
+    if not isinstance(selection, Selection):
+        cure = "The order is (path, selection, model); Selection(mask) makes one of a mask."
+        raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
+    if not isinstance(model, VideoModel):
+        cure = "Save the selection with the model that it was made in."
+        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+    num = model.splats.num_gaussians
+    if selection.num_gaussians != num:
+        raise invalid("selection", expected=f"one of the model's {num:,} Gaussians", got=f"{selection.num_gaussians:,}")
+    return save_model(path, _Kept(selection.mask, digest(model)))
+
+
+def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
+    """Read a selection of `model`'s Gaussians.
+
+    **Raises:** ValueError where it was made for another model, or for this one before a change: another number or
+    order of Gaussians, or other values; `FileNotFoundError`, and `ModelFileError` for a file of another kind, a
+    damaged or newer one.
+    """
+    checked_path(path, "path, model")
+    if not isinstance(model, VideoModel):
+        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else "The order is (path, model)."
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+    kind = read_header(path)["kind"]
+    if kind != SELECTION:
+        cure = "Give the file that save_selection wrote."
+        raise ModelFileError(str(invalid("path", expected="a selection", got=f"{kind!r} in {str(path)!r}", cure=cure)))
+    kept = load_model(path)
+    num, cure = model.splats.num_gaussians, "Load it with the model that it was made for, unchanged."
+    if len(kept.mask) != num:
+        got = f"one of {len(kept.mask):,} in {str(path)!r}"
+        raise invalid("path", expected=f"a selection of the model's {num:,} Gaussians", got=got, cure=cure)
+    if kept.digest != digest(model):
+        raise invalid("path", expected="a selection of this model", got=f"another's in {str(path)!r}", cure=cure)
+    return Selection(np.asarray(kept.mask))
+
+
+def digest(model: VideoModel) -> str:
+    """SHA-256 of the Gaussians: every leaf of the splats, by name, type, shape and value."""
+    summed = hashlib.sha256()
+    for keys, leaf in jax.tree_util.tree_flatten_with_path(model.splats)[0]:
+        array = np.asarray(leaf)
+        summed.update(f"{jax.tree_util.keystr(keys)} {array.dtype.name} {array.shape} ".encode())
+        summed.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return summed.hexdigest()
+
+
+def _describe(kept: _Kept) -> dict:
+    return {"num_gaussians": len(kept.mask), "digest": kept.digest}
+
+
+def _skeleton(header: dict) -> _Kept:
+    if not isinstance(header["digest"], str):
+        raise ValueError("the digest is no text")
+    return _Kept(jax.ShapeDtypeStruct((header["num_gaussians"],), np.bool_), header["digest"])
+
+
+register_model(SELECTION, _Kept, to_header=_describe, from_header=_skeleton)

@@ -1,0 +1,352 @@
+"""How the fitted video and the running fit are described in a model file's header, and what of them is stored."""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io._atomic import checked_path
+from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
+from foldgauss.io.models.model_file import ModelFileError, load_part, read_header, register_model, save_model
+from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
+from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
+from foldgauss.video.editing.chain import Edit
+from foldgauss.video.editing.edited_video import EditedVideo, Layer
+from foldgauss.video.editing.overlays import described, restored
+from foldgauss.video.fitting.codebook import Codebook
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.state import TIME_ADAM, FitState
+from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.row_layout import columns, unpack
+from foldgauss.video.models.sparse_storage import from_stored, stored_counts, stored_skeleton, to_stored
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+MODEL_SUFFIX = ".safetensors"
+VIDEO, EDITED = PARTS
+CHECKPOINT = "fit-checkpoint"
+
+
+def save_video_model(
+    path: str | os.PathLike, model: VideoModel | EditedVideo | SegmentedVideo, *, metadata: dict | None = None
+) -> Path:
+    """Write a fitted, an edited or a segmented video; `metadata` is free: where it came from, how good it is.
+
+    Segments are written one after another, each with its own metadata. See `save_model`.
+
+    The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
+    that hold code: `apply`, `apply_triangles`, a camera that is a function.
+    """
+    if isinstance(model, Edit):
+        raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
+    checked_path(path, "path, model")
+    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
+        expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
+        raise invalid("model", expected=expected, got=type(model).__name__)
+    check_model_name(path)
+    if isinstance(model, SegmentedVideo):
+        return save_segmented(Path(path), model, metadata)
+    return save_model(path, model, metadata=metadata)
+
+
+def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
+    """Raise ValueError for a name with an extension that is another format's."""
+    path = Path(path)
+    if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
+        cure = "Pictures: write_video, or foldgauss render; other programs' formats: export."
+        if path.suffix.lower() == COMPACT_SUFFIX:
+            cure = "A compact file: foldgauss compress, or foldgauss.video.compress and foldgauss.io.save_compact."
+        raise invalid(
+            parameter,
+            expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
+            got=repr(str(path)),
+            cure=cure,
+        )
+
+
+def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
+    """Read a fitted, an edited or a segmented video, or a compact file (told by its first bytes, not by its name).
+
+    Of segments no more than the header is read: see `SegmentedVideo`, which loads them as they are drawn.
+
+    Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
+    """
+    path = checked_path(path)
+    if is_compact(path):
+        return load_compact_model(path)
+    about = _header(path, VIDEO, EDITED, SEGMENTED)
+    if about["kind"] == SEGMENTED:
+        return load_segmented(path, about)
+    return load_part(path, about["kind"], about["header"], about["tensors"])
+
+
+def read_metadata(path: str | os.PathLike) -> dict:
+    """What was noted when a model's file was written, of either kind. Raises as `load_video_model`."""
+    path = checked_path(path)
+    return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
+
+
+def read_origin(path: str | os.PathLike) -> dict:
+    """`read_metadata`, without those of `fit`'s notes that are of another kind than `fit` writes: none are there.
+
+    A file may come from a stranger, and metadata are free.
+    """
+    return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_range(value: object) -> bool:
+    """Whether these are frames A up to, not including, B, as `read_video` takes them."""
+    if not isinstance(value, list) or len(value) != 2:
+        return False
+    if not all(end is None or whole(end, 0) for end in value):
+        return False
+    return value[1] is None or value[1] > (value[0] or 0)
+
+
+#: What `fit` and `compress` note of a model's clip and are asked for later, and how it is told.
+_NOTES: dict[str, Callable[[object], bool]] = {
+    "clip": _is_text,
+    "frames_digest": _is_text,
+    "clip_digest": _is_text,
+    "frames": _is_range,
+    "seed": lambda value: whole(value, 0),
+    "mean_psnr": lambda value: within(value, "(0, 100]"),
+}
+
+
+#: The one setting with which a fit may go on otherwise: no step depends on it while all is well.
+FREE = "on_divergence"
+
+
+def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
+    """Write a running fit with what it must be continued with: its settings and its frames."""
+    return save_model(path, state, metadata={"config": dataclasses.asdict(config), "source": source})
+
+
+def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict) -> FitState:
+    """Read a running fit. Raises ValueError if it was started with other settings or other frames."""
+    kept = read_header(path)["metadata"]
+    for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
+        before = kept.get(part)
+        before = before if isinstance(before, dict) else {}
+        now, before = ({name: value for name, value in held.items() if name != FREE} for held in (now, before))
+        changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
+        cure = f"Continue {str(path)!r} with the options it was started with, or start anew with --overwrite."
+        if part == "config" and now.keys() != before.keys():
+            cure = "Another version of foldgauss kept it: continue with that, or start anew with --overwrite."
+        if changed:
+            raise invalid(
+                "resume",
+                expected=", ".join(f"{name}={before.get(name)!r}" for name in changed),
+                got=", ".join(f"{name}={now.get(name)!r}" for name in changed),
+                cure=cure,
+            )
+    about = _header(path, CHECKPOINT)
+    state = load_part(Path(path), about["kind"], about["header"], about["tensors"])
+    return jax.tree.map(np.array, state)  # the fit updates its arrays in place: they must be its own
+
+
+def _header(path: str | os.PathLike, *kinds: str) -> dict:
+    """What a file of one of these kinds says of itself."""
+    about = read_header(path)
+    if about["kind"] not in kinds:
+        raise ModelFileError(
+            f"path: expected a model of kind {' or '.join(map(repr, kinds))}, got {about['kind']!r} in {str(path)!r}. "
+            "Give the file that `foldgauss fit` wrote to --out."
+        )
+    return about
+
+
+def _to_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
+    """The same tree, with the splats of each model in the form that they are stored in."""
+    return _with_splats(video, to_stored)
+
+
+def _from_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
+    return _with_splats(video, from_stored)
+
+
+def _with_splats(video: VideoModel | EditedVideo, change: Callable[[Any], Any]) -> VideoModel | EditedVideo:
+    if isinstance(video, VideoModel):
+        return dataclasses.replace(video, splats=change(video.splats))
+    layers = [dataclasses.replace(layer, model=_with_splats(layer.model, change)) for layer in video.layers]
+    return dataclasses.replace(video, layers=tuple(layers))
+
+
+def _describe_video(model: VideoModel) -> dict:
+    counts = stored_counts(model.splats)
+    about = {
+        "num_gaussians": model.splats.num_gaussians,
+        "degree": model.splats.degree,
+        "envelope": type(model.splats.envelope).__name__,
+        "num_frames": model.num_frames,
+        "size": list(model.size),
+        "fps": model.fps,
+        "options": dataclasses.asdict(model.options),
+        "compositing": model.compositing,
+        "scale_cutoff": model.scale_cutoff,
+    }
+    return about | {"stored": counts} if counts else about
+
+
+def _video_skeleton(header: dict) -> VideoModel:
+    if header["envelope"] != "TimeLikelihood":
+        raise ValueError(f"envelope {header['envelope']!r} is unknown here")
+    num, degree, num_frames = header["num_gaussians"], header["degree"], header["num_frames"]
+    height, width = header["size"]
+    if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
+        raise ValueError("a size, count or rate is out of range")
+    compositing = header.get("compositing", "over")  # files from before there was another
+    one_of("compositing", compositing, COMPOSITINGS)
+    if not within(header.get("scale_cutoff", 0.0), "[0, 1]"):
+        raise ValueError("the cutoff of scales is out of range")
+    row_width = columns(degree)["coefficients"].stop
+
+    def build() -> VideoModel:
+        return VideoModel(
+            splats=unpack(jnp.zeros((num, row_width), jnp.float32), degree, TimeLikelihood(np.float32(1))),
+            frame_times=FrameTimes(jnp.zeros(num_frames - 1, jnp.float32)),
+            size=(height, width),
+            fps=float(header["fps"]),
+            options=RenderOptions(**header["options"]),
+            compositing=compositing,
+            scale_cutoff=float(header.get("scale_cutoff", 0.0)),
+        )
+
+    model = jax.eval_shape(build)  # traced, not computed: nothing is allocated
+    return dataclasses.replace(model, splats=stored_skeleton(model.splats, **header.get("stored", {})))
+
+
+def _describe_edited(video: EditedVideo) -> dict:
+    try:
+        layers = [_describe_layer(layer) for layer in video.layers]
+    except ValueError as error:  # a function
+        raise ModelFileError(str(error)) from error
+    return {"layers": layers, "camera": _describe_camera(video.camera), "timeline": video.timeline}
+
+
+def _describe_layer(layer: Layer) -> dict:
+    return {
+        "model": _describe_video(layer.model),
+        "overlays": list(map(described, layer.overlays)),
+        "clocks": list(map(described, layer.clocks)),
+    }
+
+
+def _describe_camera(camera: Camera | Callable | None) -> dict | None:
+    if camera is None:
+        return None
+    if not isinstance(camera, Camera):
+        cure = "Write the pictures, or save with seen_from(None) and set the camera again."
+        error = invalid("camera", expected="a Camera, which can be written down", got="a function", cure=cure)
+        raise ModelFileError(str(error))
+    return {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
+
+
+def _edited_skeleton(header: dict) -> EditedVideo:
+    layers = tuple(_layer_skeleton(layer) for layer in header["layers"])
+    return EditedVideo(layers, _camera_skeleton(header["camera"]), timeline=header["timeline"])
+
+
+def _layer_skeleton(header: dict) -> Layer:
+    model = _video_skeleton(header["model"])
+    mask = jax.ShapeDtypeStruct((model.splats.num_gaussians,), np.bool_)
+    return Layer(model, *(tuple(restored(edit, mask) for edit in header[name]) for name in ("overlays", "clocks")))
+
+
+def _camera_skeleton(header: dict | None) -> Camera | None:
+    if header is None:
+        return None
+    one_of("camera's dtype", header["dtype"], ("float32", "float64"))
+    leaves = (jax.ShapeDtypeStruct(shape, np.dtype(header["dtype"])) for shape in ((3, 3), (3,), ()))
+    return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
+
+
+def _describe_checkpoint(state: FitState) -> dict:
+    num, width = state.rows.shape
+    return {
+        "num_gaussians": num,
+        "width": width,
+        "num_intervals": len(state.time_logits),
+        "growing": state.statistics is not None,
+        "colors": _counts(state.colors),
+        "shapes": _counts(state.shapes),
+        "step": state.step,
+        "plan": state.plan,
+        "seconds": state.seconds,
+        "error": state.error,
+        "best_error": state.best_error,
+        "backoffs": state.backoffs,
+        "settled": state.settled,
+        "should_be_better": state.should_be_better,
+        "start_errors": [list(pair) for pair in state.start_errors],
+        "sound": None if state.sound is None else _describe_checkpoint(state.sound),
+    }
+
+
+def _counts(palette: Codebook) -> list[int]:
+    return [len(palette.index), len(palette.counts)]
+
+
+def _palette_skeleton(counts: list[int], width: int) -> Codebook:
+    num, entries = counts
+    integers = [jax.ShapeDtypeStruct((count,), np.int32) for count in (num, entries)]
+    moments = jax.ShapeDtypeStruct((entries, width), np.float32)
+    return Codebook(integers[0], moments, moments, integers[1])
+
+
+def _checkpoint_skeleton(header: dict) -> FitState:
+    num, width, intervals = header["num_gaussians"], header["width"], header["num_intervals"]
+
+    def floats(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(shape, np.float32)
+
+    counts = jax.ShapeDtypeStruct((num,), np.int32)
+    return FitState(
+        rows=floats(num, width),
+        first=floats(num, width),
+        second=floats(num, width),
+        counts=counts,
+        kinds=jax.ShapeDtypeStruct((num,), np.uint8),
+        young=jax.ShapeDtypeStruct((num,), np.bool_),
+        colors=_palette_skeleton(header["colors"], 3),
+        shapes=_palette_skeleton(header["shapes"], 2),
+        frame_errors=floats(intervals + 1),
+        time_logits=floats(intervals),
+        time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
+        statistics=Statistics(floats(num), floats(num), counts) if header["growing"] else None,
+        step=int(header["step"]),
+        plan=int(header["plan"]),
+        seconds=float(header["seconds"]),
+        error=float(header["error"]),
+        best_error=float(header.get("best_error", 0.0)),
+        backoffs=int(header.get("backoffs", 0)),
+        sound=_checkpoint_skeleton(_sound_of(header)) if header.get("sound") else None,
+        settled=int(header.get("settled", 0)),
+        should_be_better=int(header.get("should_be_better", 0)),
+        start_errors=tuple((int(frame), float(error)) for frame, error in header.get("start_errors", ())),
+    )
+
+
+def _sound_of(header: dict) -> dict:
+    """The header of the last sound state, which has none of its own."""
+    return header["sound"] | {name: header[name] for name in ("width", "num_intervals")} | {"sound": None}
+
+
+_FORMS = {"to_stored": _to_stored, "from_stored": _from_stored}
+register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
+register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)
+register_model(CHECKPOINT, FitState, to_header=_describe_checkpoint, from_header=_checkpoint_skeleton)

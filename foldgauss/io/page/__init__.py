@@ -1,0 +1,1 @@
+"""The player: one HTML page that holds the model and renders it with WebGL."""

@@ -1,0 +1,353 @@
+// Decoder of compact model files (.fgz): see docs/format.md. The same bits as foldgauss.video.compression.quantize.dequantise, whose
+// operations it repeats in their order. Runs in browsers and elsewhere; no dependency.
+
+const FEATURES = ["class", "size", "stretch", "duration", "opacity"];
+const COLORS = ["luma", "blue", "green"];
+const WHOLE = ["cell", "class", "without", "degree", "shade"];
+const AXES = [
+  [0.5773502691896258, 0.5773502691896258, 0.5773502691896258],
+  [-0.7071067811865476, 0.0, 0.7071067811865476],
+  [-0.408248290463863, 0.8164965809277261, -0.408248290463863],
+];
+const WIDEST = { time: 0.125, angle: 0.125, size: 0.35, stretch: 0.5, duration: 0.5, opacity: 1.0 };
+const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a];
+const NODES = 130, CONTEXTS = 256, MODELS = 3, MEMORY = 400, LARGEST_BITS = 30, FARTHEST = 120;
+const WEIGHT = 29491, RATE = 6, MARGIN = 32;
+const KNOTS = [
+  22, 36, 60, 98, 162, 267, 439, 720, 1179, 1921, 3108, 4971, 7812, 11955, 17625, 24743, 32768,
+  40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097, 65269, 65374, 65438, 65476, 65500, 65514,
+];
+// Columns that a bit of `without` says a Gaussian has no number in: the bit, the value instead, what counts as a feature.
+const ABSENT = { duration: [1, Math.fround(6.931471824645996), 0], time: [1, 0.5, 0], opacity: [2, 8, 4] };
+const LN2 = 0.6931471805599453, SQRT2 = 1.4142135623730951;
+const NEIGHBOURS = 4, CANDIDATES = 16, TIME = 0.3;
+
+const LOGISTIC = Int32Array.from({ length: 4096 }, (_, place) => {
+  const k = place >> 7, part = place & 127;
+  return (KNOTS[k] * (128 - part) + KNOTS[k + 1] * part + 64) >> 7;
+});
+const LOGIT = Int32Array.from({ length: 4096 }, (_, p) => {
+  const found = LOGISTIC.findIndex((own) => own >= 16 * p + 8);
+  return (found < 0 ? 4095 : found) - 2048;
+});
+
+const clip = (x, low, high) => Math.min(Math.max(x, low), high);
+
+/** Sizes of numbers: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most. */
+function level(size) {
+  let found = 0;
+  for (let bound = 0.5; found < 15 && size >= bound; ) bound = ++found === 1 ? 1.5 : 2 * bound;
+  return found;
+}
+
+/** What is known of a column before its numbers, for one of which nothing is. */
+export function plain(num) {
+  return {
+    num, has: () => true, contexts: () => [0, 0], origin: () => 0, step: () => 1, scale: () => 1,
+    near: new Int32Array(0), width: 0,
+  };
+}
+
+const START = 32768 * 512 + 2;
+
+/** A node's state, p 512 + n, after it has seen a bit. */
+function after(state, one) {
+  const p = state >> 9, n = state & 511;
+  const next = one ? p + Math.floor((65536 - p) / n) : p - Math.floor(p / n);
+  return next * 512 + (n < MEMORY ? n + 1 : n);
+}
+
+/** A column's numbers, Int32Array, from its bytes and what is known of it. */
+export function decodeColumn(data, column) {
+  const size = CONTEXTS * NODES;
+  // Of each node in each context: the probability of a one times 512, and how many it has learned from.
+  const first = new Int32Array(size).fill(START), second = new Int32Array(size).fill(START);
+  const third = new Int32Array(size).fill(START);
+  const weights = new Float64Array(NODES * MODELS).fill(WEIGHT);
+  let atFirst = 0, atSecond = 0, atThird = 0; // where the contexts of a number begin
+  const range = Uint32Array.of(0, 0xffffffff, 0); // low, high, code; as an array, or each bit would make new numbers
+  let next = 0;
+  const byte = () => (next < data.length ? data[next++] : (next++, 0));
+  for (let k = 0; k < 4; k++) range[2] = (range[2] << 8) | byte();
+  const bit = (p) => {
+    const low = range[0], span = range[1] - low;
+    const middle = low + (span >>> 16) * p + (((span & 0xffff) * p) >>> 16), one = range[2] <= middle;
+    if (one) range[1] = middle; else range[0] = middle + 1;
+    while (((range[0] ^ range[1]) & 0xff000000) === 0) {
+      range[0] <<= 8;
+      range[1] = (range[1] << 8) | 255;
+      range[2] = (range[2] << 8) | byte();
+    }
+    return one;
+  };
+  const learned = (node) => {
+    const one = atFirst + node, other = atSecond + node, near = atThird + node, weight = MODELS * node;
+    const l0 = LOGIT[first[one] >> 13], l1 = LOGIT[second[other] >> 13], l2 = LOGIT[third[near] >> 13];
+    const total = Math.floor((l0 * weights[weight] + l1 * weights[weight + 1] + l2 * weights[weight + 2]) / 65536);
+    const held = LOGISTIC[(total < -2047 ? -2047 : total > 2047 ? 2047 : total) + 2048];
+    const mixed = held < MARGIN ? MARGIN : held > 65536 - MARGIN ? 65536 - MARGIN : held;
+    const found = bit(mixed), error = RATE * ((found ? 65536 : 0) - mixed);
+    weights[weight] += Math.floor((l0 * error) / 262144);
+    weights[weight + 1] += Math.floor((l1 * error) / 262144);
+    weights[weight + 2] += Math.floor((l2 * error) / 262144);
+    first[one] = after(first[one], found);
+    second[other] = after(second[other], found);
+    third[near] = after(third[near], found);
+    return found;
+  };
+  const values = new Int32Array(column.num), seen = new Float64Array(column.num);
+  const expected = (i) => {
+    let total = 0, found = 0;
+    for (let k = 0; k < column.width; k++) {
+      const j = column.near[column.width * i + k];
+      if (j >= 0) { total += seen[j]; found++; }
+    }
+    if (found === 0) return 0;
+    const ratio = ((total / found) * column.scale(i) - column.origin(i)) / column.step(i);
+    return ratio >= 0 ? 16 + level(ratio) : 16 - level(Math.abs(ratio));
+  };
+  for (let i = 0; i < column.num; i++) {
+    if (!column.has(i)) continue;
+    const [one, other] = column.contexts(i);
+    [atFirst, atSecond, atThird] = [one * NODES, other * NODES, expected(i) * NODES];
+    if (!learned(0)) {
+      const negative = learned(1);
+      let exponent = 0;
+      while (learned(2 + exponent)) if (++exponent >= LARGEST_BITS) throw new Error("a column is damaged");
+      let magnitude = 1, leading = 1;
+      for (let b = 0; b < exponent; b++) {
+        let one;
+        if (leading < 4) {
+          one = learned(34 + 3 * exponent + leading - 1) ? 1 : 0;
+          leading = 2 * leading + one;
+        } else one = bit(32768) ? 1 : 0;
+        magnitude = 2 * magnitude + one;
+      }
+      values[i] = negative ? -magnitude : magnitude;
+    }
+    seen[i] = (column.origin(i) + values[i] * column.step(i)) / column.scale(i);
+  }
+  if (next !== data.length + 3) throw new Error("a column is damaged");
+  return values;
+}
+
+function power(halves) {
+  let x = halves & 1 ? SQRT2 : 1;
+  for (let n = Math.floor(halves / 2); n !== 0; n += n > 0 ? -1 : 1) x = n > 0 ? x * 2 : x / 2;
+  return x;
+}
+
+const view = new DataView(new ArrayBuffer(8));
+function log(x) {
+  view.setFloat64(0, x);
+  const head = view.getInt32(0);
+  let e = ((head >> 20) & 0x7ff) - 1022;
+  view.setInt32(0, (head & 0x800fffff) | (1022 << 20));
+  let m = view.getFloat64(0);
+  if (m < 0.7071067811865476) { m = 2 * m; e -= 1; }
+  const s = (m - 1) / (m + 1), z = s * s;
+  let total = 0;
+  for (let k = 17; k > 0; k -= 2) total = total * z + 1 / k;
+  return e * LN2 + 2 * s * total;
+}
+const logit = (x) => log(x) - log(1 - x);
+const inClip = (x) => Math.min(Math.max(x, 2 ** -24), 1 - 2 ** -24);
+
+function legendre(degree) {
+  const comb = (n, k) => { let c = 1; for (let j = 1; j <= k; j++) c = (c * (n - k + j)) / j; return c; };
+  return Array.from({ length: degree + 1 }, (_, k) => {
+    const row = new Float64Array(degree + 1);
+    for (let j = 0; 2 * j <= k; j++) row[k - 2 * j] = ((j % 2 ? -1 : 1) * comb(k, j) * comb(2 * k - 2 * j, k)) / 2 ** k;
+    return row;
+  });
+}
+
+/** Middle and half-width of the span of time over which a path is described. */
+function spanOf(time, duration, reach) {
+  const halves = clip(Math.floor(2 * (duration * (1 / LN2)) + 0.5), -FARTHEST, FARTHEST);
+  const wide = reach * power(halves), first = Math.max(time - wide, 0), last = Math.min(time + wide, 1);
+  return [(first + last) * 0.5, Math.max((last - first) * 0.5, 2 ** -40)];
+}
+
+/** Index of a cell along x, y or time. */
+function along(cell, cells, axis) {
+  let index = 0, place = 0;
+  for (let k = 0; k < Math.max(...cells); k++)
+    for (let a = 0; a < 3; a++)
+      if (k < cells[a]) {
+        if (a === axis) index |= ((cell >> place) & 1) << k;
+        place++;
+      }
+  return index;
+}
+
+/** The last Gaussians before each in its cell, or the one before it: rows of four numbers, -1 for none. */
+function latestIn(cell, numCells) {
+  const last = new Int32Array(numCells).fill(-1), before = new Int32Array(cell.length);
+  const out = new Int32Array(NEIGHBOURS * cell.length).fill(-1);
+  for (let i = 0; i < cell.length; i++) {
+    let j = (before[i] = last[cell[i]]), count = 0;
+    for (; j >= 0 && count < NEIGHBOURS; j = before[j]) out[NEIGHBOURS * i + count++] = j;
+    if (count === 0) out[NEIGHBOURS * i] = i - 1;
+    last[cell[i]] = i;
+  }
+  return out;
+}
+
+/** The nearest Gaussians before each, among the last ones of its square of a grid and of those around. */
+function nearestOf(x, y, time, bits) {
+  const side = 2 ** bits, num = x.length, square = (v) => clip(Math.floor((v + 0.5) * side), 0, side - 1);
+  const last = new Int32Array(side * side).fill(-1), before = new Int32Array(num);
+  const out = new Int32Array(NEIGHBOURS * num).fill(-1), best = new Float64Array(NEIGHBOURS);
+  for (let i = 0; i < num; i++) {
+    const column = square(x[i]), row = square(y[i]);
+    best.fill(Infinity);
+    for (let c = Math.max(column - 1, 0); c < Math.min(column + 2, side); c++)
+      for (let r = Math.max(row - 1, 0); r < Math.min(row + 2, side); r++)
+        for (let j = last[c * side + r], count = 0; j >= 0 && count < CANDIDATES; j = before[j], count++) {
+          const dx = x[i] - x[j], dy = y[i] - y[j], dt = time[i] - time[j], far = dx * dx + dy * dy + dt * dt;
+          let place = NEIGHBOURS;
+          while (place > 0 && far < best[place - 1]) place--;
+          if (place === NEIGHBOURS) continue;
+          for (let k = NEIGHBOURS - 1; k > place; k--) {
+            best[k] = best[k - 1];
+            out[NEIGHBOURS * i + k] = out[NEIGHBOURS * i + k - 1];
+          }
+          best[place] = far;
+          out[NEIGHBOURS * i + place] = j;
+        }
+    before[i] = last[column * side + row];
+    last[column * side + row] = i;
+  }
+  return out;
+}
+
+/** The columns of a file in their order. */
+function columnNames(degree, shared) {
+  const path = Array.from({ length: 2 * degree + 2 }, (_, k) => "xy"[k % 2] + (k >> 1));
+  return [...WHOLE.slice(0, 4), ...FEATURES.slice(1), "time", ...path, "angle", ...(shared ? ["shade"] : []), ...COLORS];
+}
+
+/** Numbers q and values v of all columns. */
+function unrolled(header, streamOf, onColumn) {
+  const num = header.num_gaussians, { degree, shared, cells } = header, q = {}, v = {}, features = [];
+  const [height, width] = header.size, longer = Math.max(height, width);
+  const sides = [width / longer, height / longer, 1], middles = [0, 0, 0.5];
+  const half = new Float64Array(num), one = () => 1;
+  let inCell, nearest;
+  const names = columnNames(degree, shared);
+  names.forEach((name, column) => {
+    const [length, origin, exponent, ...slopes] = header.columns[column];
+    const common = shared > 0 && COLORS.includes(name), rows = common ? shared : num;
+    const k = /^[xy]\d+$/.test(name) ? Number(name.slice(1)) : -1, axis = ["x0", "y0", "time"].indexOf(name);
+    const has = k > 0 ? (i) => q.degree[i] >= k
+      : name in ABSENT ? (i) => (q.without[i] & ABSENT[name][0]) === 0 : () => true;
+    const halves = new Int32Array(rows), steps = new Float64Array(rows).fill(1), from = new Float64Array(rows);
+    if (!WHOLE.includes(name))
+      for (let i = 0; i < rows; i++) {
+        let total = exponent;
+        if (!common) for (let j = 0; j < slopes.length; j++) total = total + slopes[j] * features[j][i];
+        halves[i] = clip(Math.floor(2 * total + 0.5), -FARTHEST, FARTHEST);
+        const step = power(halves[i]);
+        steps[i] = name in WIDEST ? Math.min(step, WIDEST[name]) : step;
+        from[i] = origin;
+        if (axis >= 0 && cells[axis] > 0) {
+          const index = along(q.cell[i], cells, axis);
+          from[i] = middles[axis] + ((index + 0.5) / 2 ** cells[axis] - 0.5) * sides[axis];
+        }
+      }
+    const contexts = (i) => {
+      const first = (halves[i] >> 1) & 31, own = name === "class" ? 0 : q.class[i] & 31;
+      if (name === "class") return [first, own];
+      if (name === "without") return [first, own];
+      if (k > 0) {
+        const top = first + (q.degree[i] === k ? 32 : 0), size = (other) => level(Math.abs(q[other][i]));
+        const low = k > 1 ? size(name[0] + (k - 1)) : q.degree[i];
+        const high = name[0] === "y" ? size("x" + k) : k > 1 ? size("y" + (k - 1)) : q.degree[i];
+        return [top, 16 * high + low];
+      }
+      if (name === "blue") return [first, 16 * level(Math.abs(q.luma[i]))];
+      if (name === "green") return [first, 16 * level(Math.abs(q.luma[i])) + level(Math.abs(q.blue[i]))];
+      return [first, own + 32 * (q.without[i] & 1)];
+    };
+    let known = { ...plain(rows), origin: (i) => from[i], step: (i) => steps[i] };
+    if (common) known = { ...known, near: Int32Array.from({ length: rows }, (_, i) => i - 1), width: 1 };
+    else if (name !== "cell") {
+      const near = k > 0 || ["angle", "shade", ...COLORS].includes(name) ? nearest : inCell;
+      const scale = k > 0 ? (i) => { let s = half[i]; for (let n = 1; n < k; n++) s = s * half[i]; return s; } : one;
+      known = { ...known, has, contexts, scale, near, width: NEIGHBOURS };
+    }
+    const numbers = decodeColumn(streamOf(length), known);
+    onColumn((column + 1) / names.length);
+    if (name === "cell") {
+      let here = 0;
+      for (let i = 0; i < num; i++) numbers[i] = here = (here + numbers[i]) & (2 ** (cells[0] + cells[1] + cells[2]) - 1);
+      inCell = latestIn(numbers, 2 ** (cells[0] + cells[1] + cells[2]));
+    }
+    q[name] = numbers;
+    const value = (v[name] = new Float64Array(rows));
+    for (let i = 0; i < rows; i++) value[i] = from[i] + numbers[i] * steps[i];
+    for (let i = 0; i < rows; i++) if (!has(i)) value[i] = name in ABSENT ? ABSENT[name][1] : 0;
+    if (FEATURES.includes(name))
+      features.push(name in ABSENT ? value.map((own, i) => (has(i) ? own : ABSENT[name][2])) : value);
+    if (name === "y0") {
+      const middle = new Float64Array(num);
+      for (let i = 0; i < num; i++) [middle[i], half[i]] = spanOf(inClip(v.time[i]), v.duration[i], header.reach);
+      nearest = nearestOf(v.x0, v.y0, middle.map((own) => TIME * own), Math.max(cells[0], cells[1]) + 1);
+    }
+  });
+  if (shared) for (const name of COLORS) v[name] = Float64Array.from(q.shade, (own) => v[name][own]);
+  return v;
+}
+
+/**
+ * {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times.
+ * `onColumn` is told the share of columns that are done.
+ */
+export function decode(buffer, onColumn = () => {}) {
+  const bytes = new Uint8Array(buffer), fixed = new DataView(buffer);
+  if (bytes.length < 20 || MAGIC.some((own, k) => bytes[k] !== own)) throw new Error("not a compact model");
+  if (fixed.getUint32(8, true) !== 2) throw new Error("a compact model of another version");
+  let start = 20 + fixed.getUint32(12, true);
+  const header = JSON.parse(new TextDecoder().decode(bytes.subarray(20, start)));
+  const num = header.num_gaussians, degree = header.degree;
+  const stream = (length) => bytes.subarray(start, (start += length));
+  const v = unrolled(header, stream, onColumn);
+  const intervals = decodeColumn(stream(header.intervals), plain(header.num_frames - 1));
+  const leaves = {
+    loc: new Float32Array(2 * num), log_scale: new Float32Array(2 * num), angle_logit: new Float32Array(num),
+    time_loc_logit: new Float32Array(num), log_time_scale: new Float32Array(num),
+    coefficients: new Float32Array(2 * num * degree), opacity_logit: new Float32Array(num),
+    color_dc: new Float32Array(3 * num), frame_times: Float32Array.from(intervals, (q) => q * 2 ** -10),
+  };
+  const table = legendre(degree), powers = new Float64Array(degree + 1);
+  for (let i = 0; i < num; i++) {
+    const time = inClip(v.time[i]);
+    leaves.log_scale[2 * i] = v.size[i] + v.stretch[i];
+    leaves.log_scale[2 * i + 1] = v.size[i] - v.stretch[i];
+    leaves.angle_logit[i] = logit(inClip(v.angle[i]));
+    leaves.time_loc_logit[i] = logit(time);
+    leaves.log_time_scale[i] = v.duration[i];
+    leaves.opacity_logit[i] = v.opacity[i];
+    for (let c = 0; c < 3; c++)
+      leaves.color_dc[3 * i + c] = v.luma[i] * AXES[0][c] + v.blue[i] * AXES[1][c] + v.green[i] * AXES[2][c];
+    // The path: a Legendre series in w = (t - middle) / half, as powers of u = m_t - t.
+    const [middle, half] = spanOf(time, v.duration[i], header.reach);
+    const at = (time - middle) / half, scale = -1 / half;
+    for (let axis = 0; axis < 2; axis++) {
+      for (let j = 0; j <= degree; j++) {
+        powers[j] = 0;
+        for (let k = j; k <= degree; k += 2) powers[j] = powers[j] + table[k][j] * v["xy"[axis] + k][i];
+      }
+      for (let j = 0; j < degree; j++) for (let k = degree - 1; k >= j; k--) powers[k] = powers[k] + at * powers[k + 1];
+      let factor = 1;
+      for (let k = 0; k <= degree; k++) {
+        if (k === 0) leaves.loc[2 * i + axis] = powers[0] * factor;
+        else leaves.coefficients[2 * (degree * i + k - 1) + axis] = powers[k] * factor;
+        factor = factor * scale;
+      }
+    }
+  }
+  for (const leaf of Object.values(leaves)) for (let k = 0; k < leaf.length; k++) leaf[k] = leaf[k] + 0; // no -0
+  return { header, leaves };
+}

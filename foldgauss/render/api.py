@@ -1,0 +1,222 @@
+"""`render`: the one door to every engine, differentiable, usable inside jit and vmap."""
+
+import functools
+import math
+from collections.abc import Callable
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.threads import check_process, run_tasks
+from foldgauss.render import cpu, pallas
+from foldgauss.render.reference import render_reference
+from foldgauss.render.splats import RenderOptions, Splats2D, check_size
+from foldgauss.render.xla import render_xla
+
+try:
+    from jax.experimental.buffer_callback import buffer_callback
+except ImportError:  # it is experimental: where JAX has it no more, its slower sister does
+    buffer_callback = None
+
+ENGINES = ("auto", "cpu", "xla", "pallas", "reference")
+COMPOSITINGS = ("over", "sum")
+
+
+def render(
+    splats: Splats2D,
+    size: tuple[int, int],
+    *,
+    background: Float[Array, " channels"] | None = None,
+    compositing: str = "over",
+    engine: str = "auto",
+    options: RenderOptions | None = None,
+) -> Float[Array, "height width channels"]:
+    r"""Picture of two-dimensional splats.
+
+    $$ C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j) $$
+
+    - `splats`: in pixels (x right, y down, centres at +0.5), front to back in array order.
+    - `size`: (height, width) in pixels.
+    - `background`: one colour, (channels,); None is black.
+    - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all
+      T_i are 1 and the background is added whole.
+    - `engine`: "cpu" (Numba, float32 inside); "xla" (tiles in plain JAX, on CPU, GPU and TPU, float32 or float64);
+      "pallas" (a program of a GPU per tile, float32 inside; on a CPU interpreted, for tests only; never timed on a
+      GPU so far); "reference" (dense, slow); or "auto": "cpu" where JAX's default device is a CPU and the options are
+      those that "cpu" takes, else "xla".
+    - `options`: what may be left out, `RenderOptions`.
+
+    Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
+    `background`. A splat with a number that is not finite among its parameters is not drawn and gets no gradient.
+    Raises ValueError for an unknown option, a size below 1, shapes that do not fit or colours without a channel, and
+    RuntimeError in a process that was forked after JAX had started.
+
+    Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
+
+    Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 3; VeGaS, section 4.
+    """
+    check_process()
+    one_of("engine", engine, ENGINES)
+    one_of("compositing", compositing, COMPOSITINGS)
+    check_size(size)
+    if not isinstance(splats, Splats2D):
+        cure = "For Gaussians3D use foldgauss.render.project first."
+        raise invalid("splats", expected="Splats2D", got=type(splats).__name__, cure=cure)
+    if not isinstance(options, RenderOptions | None):
+        cure = "A preset is RenderOptions.fast(), with parentheses."
+        raise invalid("options", expected="RenderOptions or None", got=repr(options), cure=cure)
+    if splats.mean.ndim != 2:
+        raise invalid(
+            "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
+        )
+    if not jnp.issubdtype(splats.mean.dtype, jnp.floating):
+        raise invalid("splats.mean", expected="a floating dtype", got=splats.mean.dtype)
+    options = cpu.STANDARD if options is None else options
+    channels, dtype = splats.color.shape[-1], splats.mean.dtype
+    background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
+    if channels == 0:
+        raise invalid("splats.color", expected="at least one channel", got=f"shape {splats.color.shape}")
+    if background.shape != (channels,):
+        raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
+    if engine == "auto":
+        engine = "cpu" if jax.default_backend() == "cpu" and _cpu_takes(options) else "xla"
+    if engine == "cpu":
+        cpu.check_options(options)
+    if engine == "pallas":
+        pallas.check_options(options)
+    # Engine "xla" looks at the numbers themselves where it can, to size its lists.
+    rendered = _compiled if engine == "cpu" else _rendered
+    return rendered(splats, background, tuple(map(int, size)), compositing, engine, options)
+
+
+def _rendered(splats, background, size, compositing, engine, options):
+    """The picture, all arguments checked."""
+    dtype = splats.mean.dtype
+    if engine == "cpu":  # which leaves out what is not finite by itself
+        leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
+    else:
+        leaves = (*_finite_splats(splats), background)
+    if engine == "reference":
+        return render_reference(Splats2D(*leaves[:4]), size, background, compositing=compositing, options=options)
+    # Below single precision a sum of hundreds of splats has no digits left; float64 stays so in "xla".
+    inner = jnp.float32 if engine in ("cpu", "pallas") or dtype.itemsize < 4 else dtype
+    leaves = tuple(leaf.astype(inner) for leaf in leaves)
+    if engine == "xla":
+        image = render_xla(leaves, size, compositing=compositing, options=options)
+    elif engine == "pallas":
+        image = pallas.render_pallas(leaves, size, compositing=compositing, options=options)
+    else:
+        image = _render_cpu(size, compositing, options, *leaves)
+    return image.astype(dtype)
+
+
+_compiled = jax.jit(_rendered, static_argnums=(2, 3, 4, 5))
+
+
+def _cpu_takes(options: RenderOptions) -> bool:
+    try:
+        cpu.check_options(options)
+    except ValueError:
+        return False
+    return True
+
+
+@jax.jit
+def _finite_splats(splats: Splats2D) -> tuple[jax.Array, ...]:
+    """The leaves, with zeros in place of splats that hold NaN or an infinity: without opacity they are not drawn."""
+    leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
+    flat = [leaf.reshape(len(leaf), math.prod(leaf.shape[1:])) for leaf in leaves]
+    kept = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf), axis=1) for leaf in flat]), axis=0)
+    return tuple(
+        jnp.where(kept[:, None], leaf, jnp.zeros_like(leaf)).reshape(own.shape)
+        for leaf, own in zip(flat, leaves, strict=True)
+    )
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def _render_cpu(size, compositing, options, *leaves):
+    """The CPU engine as a JAX function of float32 leaves."""
+
+    def draw(image, *leaves):
+        trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
+        _interleave(trace.image, image)
+
+    shape = jax.ShapeDtypeStruct((*size, len(leaves[-1])), jnp.float32)
+    return _on_host(draw, shape, *leaves)
+
+
+def _render_cpu_fwd(size, compositing, options, *leaves):
+    return _render_cpu(size, compositing, options, *leaves), leaves
+
+
+def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
+    """Renders again, since a trace cannot travel through JAX: a third of the backward pass's own cost."""
+
+    def differentiate(gradients, grad_image, *leaves):
+        trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
+        for out, made in zip(gradients, cpu.backward(trace, _separated(grad_image)), strict=True):
+            out[...] = made
+
+    shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in leaves)
+    return _on_host(differentiate, shapes, grad_image, *leaves)
+
+
+_render_cpu.defvjp(_render_cpu_fwd, _render_cpu_bwd)
+
+
+def _on_host(function: Callable, shapes, *arrays: jax.Array):
+    """What `function(out, *arrays)` writes into `out`, of `shapes`: a call of NumPy code from compiled code.
+
+    On the CPU without copies; `jax.pure_callback` brings arrays in and out of JAX again, for a millisecond or more.
+    """
+
+    def in_place(_, out, *buffers):
+        function(jax.tree.map(np.asarray, out), *map(np.asarray, buffers))
+
+    def copied(*arrays):
+        out = jax.tree.map(lambda shape: np.empty(shape.shape, shape.dtype), shapes)
+        function(out, *(np.ascontiguousarray(array) for array in arrays))
+        return out
+
+    through_copies = functools.partial(jax.pure_callback, copied, shapes, vmap_method="sequential")
+    if buffer_callback is None:
+        return through_copies(*arrays)
+    directly = buffer_callback(in_place, shapes, vmap_method="sequential")
+    return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)
+
+
+STRIP = 1 << 17  # pixels per task
+
+
+def _interleave(planes: np.ndarray, image: np.ndarray) -> None:
+    """Write planes (channels, height, width) into an image (height, width, channels)."""
+
+    rows = -(-STRIP // image.shape[1])
+
+    def work(top: int) -> None:
+        own = planes[:, top : top + rows]
+        if 2 <= len(planes) <= 4:
+            cv2.merge(list(own), image[top : top + rows])
+        else:
+            image[top : top + rows] = np.moveaxis(own, 0, -1)
+
+    run_tasks(work, range(0, len(image), rows))
+
+
+def _separated(image: np.ndarray) -> np.ndarray:
+    """The planes (channels, height, width) of an image (height, width, channels)."""
+    planes, rows = np.empty((image.shape[2], *image.shape[:2]), np.float32), -(-STRIP // image.shape[1])
+
+    def work(top: int) -> None:
+        own = planes[:, top : top + rows]
+        if 2 <= len(planes) <= 4:
+            cv2.split(image[top : top + rows], list(own))
+        else:
+            own[...] = np.moveaxis(image[top : top + rows], -1, 0)
+
+    run_tasks(work, range(0, len(image), rows))
+    return planes

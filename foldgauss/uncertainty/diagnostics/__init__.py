@@ -1,0 +1,1 @@
+"""Irregular frames, calibration, plots and reports of a posterior."""

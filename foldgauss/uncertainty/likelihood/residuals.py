@@ -1,0 +1,146 @@
+"""Pictures of a model beside the frames of a video: squared errors and residuals."""
+
+import itertools
+from collections.abc import Iterable, Iterator
+
+import numba as nb
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._runtime.kernels import kernel
+from foldgauss._runtime.threads import run_tasks
+from foldgauss.render import cpu
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.background import BLACK, composited
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+_f, _d = nb.float32, nb.float64
+_level = np.float32(1 / 255)
+_behind = np.asarray(BLACK, np.float32)
+BINS = 512
+TOGETHER = 8  # pictures drawn at once: fewer waits for threads
+
+
+def _batched(times: Iterable[float]) -> Iterator[tuple[float, ...]]:
+    """`itertools.batched`, which Python 3.11 lacks."""
+    times = iter(times)
+    while some := tuple(itertools.islice(times, TOGETHER)):
+        yield some
+
+
+def check_model(model: VideoModel) -> None:
+    """ValueError for anything but a VideoModel."""
+    if isinstance(model, VideoModel):
+        return
+    cure = ""
+    if isinstance(model, EditedVideo):
+        cure = "Take the model that was edited, and the clip that it was fitted to; or fit one to what is now shown."
+    elif isinstance(model, SegmentedVideo):
+        cure = f"{ONE_SEGMENT} Its clip is that segment's frames."
+    raise invalid("model", expected="a VideoModel", got=short_repr(model), cure=cure)
+
+
+class Screen:
+    """A model and the frames it is compared with, both over black.
+
+    Pictures are drawn as the fit draws them: between two shots nothing is held, and no value is rounded or clipped.
+    `frames`: uint8 (num_frames, *model.size, 3), or with alpha (..., 4). Raises ValueError for anything else.
+    """
+
+    def __init__(self, model: VideoModel, frames: UInt8[np.ndarray, "num_frames height width channels"]):
+        check_model(model)
+        if not isinstance(frames, np.ndarray | list | tuple):
+            cure = "Of a file: read_video(path, size=model.size).frames."
+            raise invalid("video", expected="an array of frames", got=short_repr(frames), cure=cure)
+        frames = np.asarray(frames)
+        if (
+            frames.dtype != np.uint8
+            or frames.ndim != 4
+            or frames.shape[1:3] != model.size
+            or frames.shape[3] not in (3, 4)
+        ):
+            expected = (
+                f"uint8 (frames, {model.size[0]}, {model.size[1]}, 3), as the model was fitted to, or 4 with alpha"
+            )
+            fits = frames.ndim == 4 and frames.shape[1:3] == model.size
+            cure = "Make it 8-bit colour." if fits else "Read it at that size."
+            raise invalid("video", expected=expected, got=f"{frames.dtype} {frames.shape}", cure=cure)
+        if frames.shape[3] == 4:
+            frames = np.stack([composited(frame, np.zeros(3, np.float32)) for frame in frames])
+        self.model, self.frames = model, np.ascontiguousarray(frames)
+        self.playback = VideoRenderer(model)
+
+    @property
+    def num_values(self) -> int:
+        """Of a frame: pixels times channels."""
+        return int(np.prod(self.frames.shape[1:]))
+
+    def picture(self, t: float) -> Float32[np.ndarray, "3 height width"]:
+        """What the model shows at time t, about [0, 1]."""
+        return next(self.pictures([t]))
+
+    def pictures(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
+        """What the model shows at each of `times`, about [0, 1], one by one."""
+        drawn = {"compositing": self.model.compositing, "options": self.model.options}
+        for some in _batched(times):
+            alive = [self.playback.splats(float(t)) for t in some]
+            leaves = [(one.mean, one.factor, one.opacity, one.color, _behind) for one in alive]
+            for trace in cpu.forward_frames(leaves, self.model.size, **drawn):
+                yield trace.image
+
+    def squared_errors(
+        self, picture: Float32[np.ndarray, "3 height width"], which: Iterable[int]
+    ) -> Float64[np.ndarray, " which"]:
+        """Sums over pixels and channels of (frame - picture)^2, of the frames `which`."""
+        which = np.asarray(which)
+        sums = np.empty(len(which))
+
+        def compare(n: int) -> None:
+            sums[n] = _squared_error(picture, self.frames[which[n]])
+
+        run_tasks(compare, range(len(which)), serial=len(which) * self.num_values < 400_000)
+        return sums
+
+    def residual(self, k: int, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, "3 height width"]:
+        """Frame k less the picture."""
+        return np.moveaxis(self.frames[k], -1, 0) * _level - picture
+
+
+class Sketches:
+    """Short vectors whose distances are those of pictures, to some 6%: values summed into bins with random signs.
+
+    **Source:** count sketch, Charikar, Chen and Farach-Colton 2002.
+    """
+
+    def __init__(self, num_values: int):
+        rng = np.random.default_rng(0)
+        self._bins = rng.integers(0, BINS, num_values, dtype=np.int16)
+        self._signs = rng.choice(np.array([-1, 1], np.float32), num_values)
+
+    def of(self, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, " bins"]:
+        sketch = np.zeros(BINS)
+        _sum_into(sketch, picture.reshape(-1), self._bins, self._signs)
+        return sketch.astype(np.float32)
+
+
+@kernel
+def _sum_into(sketch, values, bins, signs):
+    for n in range(len(values)):
+        sketch[bins[n]] += values[n] * signs[n]
+
+
+@kernel
+def _squared_error(picture, frame):
+    channels, height, width = picture.shape
+    total = _d(0)
+    for y in range(height):
+        row = _f(0)
+        for x in range(width):
+            for c in range(channels):
+                miss = frame[y, x, c] * _level - picture[c, y, x]
+                row += miss * miss
+        total += row
+    return total

@@ -1,0 +1,1 @@
+"""Posterior of the frame times: exact passes, the Laplace approximation and emcee."""

@@ -1,0 +1,437 @@
+"""Overlays: edits that act on the conditioned Gaussians of each time, where no folded model could hold them.
+
+An overlay is a mask over a model's Gaussians, a span of time and a few plain numbers. It is given the selected ones
+that are alive at a time and returns them changed; all others stay as they are, to the bit.
+"""
+
+import dataclasses
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Bool, Float, Int
+
+from foldgauss._runtime.checks import invalid, one_of
+from foldgauss.render import Gaussians3D, Triangles
+from foldgauss.video.editing.clock import Clock, Span, checked_number, checked_numbers
+
+#: What each channel brings to lightness: Rec. 709.
+LIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
+#: Below this an object's lightness says nothing of its shading.
+DARKEST = 1e-4
+IDENTITY = ((1.0, 0.0), (0.0, 1.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class SelectedGaussians:
+    """Gaussians at one time, as an edit sees them: the selected ones alive then, in array order, in model space.
+
+    **Shapes:** `index` (num,), their numbers in the model; `mean` (num, dim), x right and y down (and z away); `factor`
+    (num, dim, 2), any F with covariance F F^T; `opacity` (num,) in [0, 1]; `color` (num, 3), not below 0. dim is 2, and
+    3 once an edit has placed Gaussians of the model in space. NumPy arrays.
+
+    **Units:** the frame's centre is the origin and its longer side 1.
+
+    **Example:** `dataclasses.replace(gaussians, mean=gaussians.mean + [0.1, 0.0])`.
+    """
+
+    index: Int[np.ndarray, " num"]
+    mean: Float[np.ndarray, "num dim"]
+    factor: Float[np.ndarray, "num dim 2"]
+    opacity: Float[np.ndarray, " num"]
+    color: Float[np.ndarray, "num 3"]
+
+    def __len__(self) -> int:
+        return len(self.opacity)
+
+    @property
+    def centre(self) -> Float[np.ndarray, " dim"]:
+        """Their own centre: the mean of the means, weighted by opacity times area.
+
+        By area too, since Gaussians far from their own time are small and must not pull: the centre then moves evenly.
+        """
+        weights = self.opacity * _areas(self.factor)
+        if not weights.sum() > 0:
+            weights = np.ones(len(self), np.float32)
+        return np.einsum("n,nd->d", weights, self.mean, dtype=np.float64) / weights.sum(dtype=np.float64)
+
+    def in_space(self) -> "SelectedGaussians":
+        """The same with dim 3: in the plane z = 0 where they were flat."""
+        if self.mean.shape[1] == 3:
+            return self
+        mean = np.concatenate([self.mean, np.zeros_like(self.mean[:, :1])], 1)
+        factor = np.concatenate([self.factor, np.zeros_like(self.factor[:, :1])], 1)
+        return dataclasses.replace(self, mean=mean, factor=factor)
+
+
+def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, " num"]:
+    """Of the parallelograms that the two columns span, in the plane or in space."""
+    first, second = np.moveaxis(factor, (2, 1), (0, 1))
+    pairs = [(0, 1)] if len(first) == 2 else [(1, 2), (2, 0), (0, 1)]
+    crosses = [first[i] * second[j] - first[j] * second[i] for i, j in pairs]
+    return np.abs(crosses[0]) if len(crosses) == 1 else np.linalg.norm(crosses, axis=0)
+
+
+def _mapped(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray, "num dim 2"]) -> np.ndarray:
+    """A F for many F, as one product of matrices."""
+    columns = np.swapaxes(factor, 1, 2)
+    rows = columns.reshape(-1, len(matrix)) @ matrix.T.astype(np.float32)
+    return np.swapaxes(rows.reshape(columns.shape), 1, 2)
+
+
+class AbstractOverlay(eqx.Module):
+    """An edit of the conditioned Gaussians.
+
+    To extend: fields beside `mask` are static, plain and hashable; checked when made; and `kind` stands in `KINDS`.
+
+    **Shapes:** `mask` bool (num_gaussians,).
+    """
+
+    mask: eqx.AbstractVar[Bool[np.ndarray, " num_gaussians"]]
+    span: eqx.AbstractVar[Span | None]
+
+    @abstractmethod
+    def __call__(self, gaussians: SelectedGaussians, t: float, progress: float) -> SelectedGaussians:
+        """The selected Gaussians of time t, `progress` of the way from untouched to edited."""
+
+    def progress(self, t: float) -> float:
+        """How far along it is at time t."""
+        return 1.0 if self.span is None else self.span.progress(t)
+
+
+class Affine(AbstractOverlay):
+    r"""An affine map of the plane about a point, or about the selection's own centre at each time.
+
+    $$ m' = c + A (m - c) + b, \quad F' = A F, \quad A = R(\theta) S $$
+
+    On the way, at progress s, the angle is s theta, S is I + s (S - I) and the offset s b: turns keep their sense, and
+    nothing shrinks that does not in the end, unless it is mirrored. What is placed in space keeps its depth.
+
+    **Units:** `angle` in radians, x towards y, so clockwise as one sees it; `offset` and `about` model space.
+    """
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    angle: float = eqx.field(static=True)
+    stretch: tuple[tuple[float, float], tuple[float, float]] = eqx.field(static=True)
+    offset: tuple[float, float] = eqx.field(static=True)
+    about: tuple[float, float] | None = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        checked_number("angle", self.angle)
+        for row in self.stretch:
+            checked_numbers("stretch", row, 2)
+        checked_numbers("offset", self.offset, 2)
+        if self.about is not None:
+            checked_numbers("about", self.about, 2)
+        if len(self.stretch) != 2 or self.stretch[0][1] != self.stretch[1][0]:
+            raise invalid("stretch", expected="a symmetric 2x2 matrix", got=self.stretch)
+        if np.linalg.det(self.stretch) == 0:
+            raise invalid("stretch", expected="a matrix that can be undone", got=self.stretch, cure="See vanish().")
+
+    @property
+    def moves_only(self) -> bool:
+        """Whether it shifts and does nothing else."""
+        return self.angle == 0 and self.stretch == IDENTITY
+
+    @property
+    def does_nothing(self) -> bool:
+        """Whether it is the identity."""
+        return self.moves_only and self.offset == (0.0, 0.0)
+
+    def matrix(self, progress: float = 1.0) -> Float[np.ndarray, "2 2"]:
+        """A at that progress."""
+        cos, sin = np.cos(progress * self.angle), np.sin(progress * self.angle)
+        return np.array([[cos, -sin], [sin, cos]]) @ (np.eye(2) + progress * (np.array(self.stretch) - np.eye(2)))
+
+    def __call__(self, gaussians, t, progress):
+        dim, shift = gaussians.mean.shape[1], progress * np.array(self.offset)
+        move = np.zeros(dim)
+        if self.moves_only:
+            move[:2] = shift
+            return dataclasses.replace(gaussians, mean=gaussians.mean + move.astype(np.float32))
+        matrix = np.eye(dim)
+        matrix[:2, :2] = self.matrix(progress)
+        centre = gaussians.centre[:2] if self.about is None else np.array(self.about)
+        move[:2] = centre - matrix[:2, :2] @ centre + shift
+        mean = gaussians.mean @ matrix.T.astype(np.float32) + move.astype(np.float32)
+        return dataclasses.replace(gaussians, mean=mean, factor=_mapped(matrix, gaussians.factor))
+
+
+class Opacity(AbstractOverlay):
+    """Opacity times `factor`, held at 1; outside the span times `before`, on the way between the two."""
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    factor: float = eqx.field(static=True)
+    before: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self) -> None:
+        for name in ("factor", "before"):
+            if checked_number(name, getattr(self, name)) < 0:
+                raise invalid(name, expected="a number >= 0", got=getattr(self, name))
+
+    def __call__(self, gaussians, t, progress):
+        by = self.before + progress * (self.factor - self.before)
+        return dataclasses.replace(gaussians, opacity=np.minimum(gaussians.opacity * by, 1.0))
+
+
+def acts(overlay: AbstractOverlay, progress: float) -> bool:
+    """Whether an overlay changes anything at that progress: at 0 only what is hidden outside its span does."""
+    return progress > 0 or (isinstance(overlay, Opacity) and overlay.before != 1)
+
+
+class Recolor(AbstractOverlay):
+    """A linear map of colours, or a hue: c' = max(M c + b, 0), on the way c + s (c' - c).
+
+    With `hue` in turns (0 red, 1/3 green, 2/3 blue) lightness (Rec. 709) and colourfulness, the distance from grey, are
+    kept and the direction is that of the pure hue.
+    """
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    matrix: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
+    offset: tuple[float, float, float] = eqx.field(static=True)
+    hue: float | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if len(self.matrix) != 3:
+            raise invalid("matrix", expected="a 3x3 matrix", got=self.matrix)
+        for row in (*self.matrix, self.offset):
+            checked_numbers("matrix, offset", row, 3)
+        if self.hue is not None:
+            checked_number("hue", self.hue)
+
+    def recolored(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
+        """The colours when it has wholly acted, float64."""
+        color = np.asarray(color, np.float64)
+        if self.hue is not None:
+            color = _with_hue(color, self.hue)
+        return np.maximum(color @ np.array(self.matrix).T + np.array(self.offset), 0.0)
+
+    def __call__(self, gaussians, t, progress):
+        color = gaussians.color
+        return dataclasses.replace(gaussians, color=color + progress * (self.recolored(color) - color))
+
+
+def _with_hue(color: Float[np.ndarray, "num 3"], hue: float) -> Float[np.ndarray, "num 3"]:
+    grey = (color @ LIGHTNESS)[:, None]
+    pure = np.clip(np.abs((hue + np.array([0, 2 / 3, 1 / 3])) % 1 * 6 - 3) - 1, 0, 1)
+    direction = pure - pure @ LIGHTNESS
+    return grey + np.linalg.norm(color - grey, axis=1, keepdims=True) * direction / np.linalg.norm(direction)
+
+
+class Place(AbstractOverlay):
+    """A motion in space: the selection, flat in its picture, is turned about a point and moved in depth.
+
+    Seen by the video's camera, the front one by default: depth makes it smaller (away, > 0) or larger, turns show it in
+    perspective.
+
+    **Units:** `rotation` is an axis times an angle in radians, about x (right), y (down), z (away from the viewer);
+    `depth` model space; `about` (x, y), or None for the selection's own centre.
+
+    **Source:** MiraGe, flat Gaussians in space; VeGaS eq:mirage.
+    """
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    depth: float = eqx.field(static=True)
+    rotation: tuple[float, float, float] = eqx.field(static=True)
+    about: tuple[float, float] | None = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        checked_number("depth", self.depth)
+        checked_numbers("rotation", self.rotation, 3)
+        if self.about is not None:
+            checked_numbers("about", self.about, 2)
+
+    def __call__(self, gaussians, t, progress):
+        gaussians = gaussians.in_space()
+        mean, factor, move = gaussians.mean, gaussians.factor, np.array([0, 0, progress * self.depth])
+        if any(self.rotation):
+            centre = gaussians.centre if self.about is None else np.array([*self.about, 0.0])
+            turn = scipy.spatial.transform.Rotation.from_rotvec(progress * np.array(self.rotation)).as_matrix()
+            mean, factor, move = mean @ turn.T.astype(np.float32), _mapped(turn, factor), move + centre - turn @ centre
+        return dataclasses.replace(gaussians, mean=mean + move.astype(np.float32), factor=factor)
+
+
+class Function(AbstractOverlay):
+    """Any function of the conditioned Gaussians and the time. It cannot be saved."""
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    function: Callable[[SelectedGaussians, float], SelectedGaussians] = eqx.field(static=True)
+
+    def __call__(self, gaussians, t, progress):
+        after = _checked_result(gaussians, self.function(gaussians, t))
+        return after if progress == 1 else _between(gaussians, after, progress)
+
+
+class FaceFunction(AbstractOverlay):
+    """Any function of the Gaussians' triangles: vertices (num, 3, 3) and the time to vertices. It cannot be saved.
+
+    Source: GaMeS; VeGaS eq:traingle_face.
+    """
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
+
+    def __call__(self, gaussians, t, progress):
+        solid, room = gaussians.in_space(), room_for(len(gaussians))
+        vertices = np.asarray(_to_faces(padded(solid.mean, room), padded(solid.factor, room)))[: len(solid)]
+        given = vertices.copy()  # theirs to write to
+        moved = _checked_vertices(self.function(given, t), vertices.shape)
+        if np.array_equal(moved, vertices):
+            return gaussians
+        moved = vertices + progress * (moved - vertices)
+        mean, factor = (np.array(leaf)[: len(solid)] for leaf in _from_faces(padded(moved, room)))
+        _check_spanned(moved, factor)
+        if gaussians.mean.shape[1] == 2 and not moved[..., 2].any():
+            mean, factor = mean[:, :2], factor[:, :2]
+        return dataclasses.replace(gaussians, mean=mean, factor=factor)
+
+
+_SMALLEST_ROOM = 1024
+
+
+def room_for(num: int) -> int:
+    """The size that code is compiled for where there are `num`: powers of two, so that few are."""
+    return max(_SMALLEST_ROOM, 1 << (num - 1).bit_length())
+
+
+def padded(array: np.ndarray, room: int) -> Float[np.ndarray, "room ..."]:
+    """`array` with `room` rows, float32: those behind are 0, or unit matrices, which are sound factors and faces."""
+    wide = np.empty((room, *array.shape[1:]), np.float32)
+    wide[: len(array)] = array
+    wide[len(array) :] = np.eye(*array.shape[1:]) if array.ndim == 3 else 0.0
+    return wide
+
+
+@jax.jit
+def _to_faces(mean: Float[Array, "num 3"], factor: Float[Array, "num 3 2"]) -> Float[Array, "num 3 3"]:
+    """V = [m, m + s1 r1, m + s2 r2]; only the two axes in the plane are looked at."""
+    third = jnp.zeros_like(factor[..., :1])
+    solid = Gaussians3D(mean, jnp.concatenate([factor, third], -1), mean[:, 0], mean)
+    return Triangles.from_gaussians(solid).vertices
+
+
+@jax.jit
+def _from_faces(vertices: Float[Array, "num 3 3"]) -> tuple[Float[Array, "num 3"], Float[Array, "num 3 2"]]:
+    solid = Triangles.from_vertices(vertices, vertices[:, 0, 0], vertices[:, 0]).to_gaussians()
+    return solid.mean, solid.factor[..., :2]
+
+
+def _checked_vertices(vertices: object, shape: tuple[int, ...]) -> Float[np.ndarray, "num 3 3"]:
+    array = np.asarray(vertices)
+    if array.shape != shape or array.dtype.kind not in "fiu":
+        raise invalid("vertices", expected=f"numbers of shape {shape} again", got=f"{array.dtype} {array.shape}")
+    if not np.isfinite(array).all():
+        got = f"{int((~np.isfinite(array)).any((1, 2)).sum())} faces that have none"
+        raise invalid("vertices", expected="finite numbers", got=got)
+    return array
+
+
+def _check_spanned(vertices: Float[np.ndarray, "num 3 3"], factor: Float[np.ndarray, "num 3 2"]) -> None:
+    flat = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
+    if flat.size:
+        got = f"{flat.size} without area, the first at index {flat[0]}"
+        cure = "Move a vertex off the line through the other two."
+        raise invalid("vertices", expected="faces whose three vertices span a plane", got=got, cure=cure)
+
+
+def _checked_result(before: SelectedGaussians, after: object) -> SelectedGaussians:
+    if not isinstance(after, SelectedGaussians):
+        cure = "Return dataclasses.replace(gaussians, ...)."
+        raise invalid("function", expected="SelectedGaussians back", got=type(after).__name__, cure=cure)
+    if after.index is not before.index and not np.array_equal(after.index, before.index):
+        raise invalid("function", expected="the same Gaussians", got="others", cure="Set opacities to 0 to hide some.")
+    num, dim = len(before), np.shape(after.mean)[-1] if np.ndim(after.mean) else 0
+    shapes = {"mean": (num, dim), "factor": (num, dim, 2), "opacity": (num,), "color": (num, 3)}
+    for name, shape in shapes.items():
+        leaf = np.asarray(getattr(after, name))
+        if leaf.shape != shape or dim not in (2, 3) or leaf.dtype.kind not in "fiu" or not np.isfinite(leaf).all():
+            expected, got = f"finite numbers of shape {shape}, dim 2 or 3", f"{leaf.dtype} {leaf.shape}"
+            raise invalid(f"function's {name}", expected=expected, got=got)
+    if (
+        np.min(after.opacity, initial=0) < 0
+        or np.max(after.opacity, initial=0) > 1
+        or np.min(after.color, initial=0) < 0
+    ):
+        raise invalid("function", expected="opacity in [0, 1] and color >= 0", got="numbers outside")
+    return after
+
+
+def _between(before: SelectedGaussians, after: SelectedGaussians, progress: float) -> SelectedGaussians:
+    if before.mean.shape != np.shape(after.mean):
+        before, after = before.in_space(), after.in_space()
+    mixed = {}
+    for name in ("mean", "factor", "opacity", "color"):
+        old, new = getattr(before, name), getattr(after, name)
+        mixed[name] = old if new is old else old + progress * (np.asarray(new) - old)
+    return dataclasses.replace(before, **mixed)
+
+
+class Retimed(eqx.Module):
+    """Gaussians with a clock of their own, over a span or always: where progress is s, t + s (clock(t) - t)."""
+
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
+    clock: Clock = eqx.field(static=True)
+
+    def own_time(self, t: float) -> float:
+        """The time by which the Gaussians are conditioned at time t."""
+        progress = 1.0 if self.span is None else self.span.progress(t)
+        if progress in (0, 1):  # to the bit
+            return self.clock(t) if progress else t
+        return t + progress * (self.clock(t) - t)
+
+
+#: What can be written down, by name.
+KINDS: dict[str, type[eqx.Module]] = {
+    "affine": Affine,
+    "opacity": Opacity,
+    "recolor": Recolor,
+    "place": Place,
+    "retimed": Retimed,
+}
+
+
+def described(overlay: eqx.Module) -> dict:
+    """All of an overlay but its mask, in JSON's terms. Raises ValueError for functions, which cannot be written."""
+    names = {kind: name for name, kind in KINDS.items()}
+    if type(overlay) not in names:
+        cure = "Save what was before it, and apply the function again to what is loaded; or write the pictures."
+        raise invalid("overlays", expected="edits that can be written down", got=type(overlay).__name__, cure=cure)
+    fields = {name: getattr(overlay, name) for name in _plain_fields(type(overlay))}
+    fields = {name: dataclasses.asdict(x) if isinstance(x, Span | Clock) else x for name, x in fields.items()}
+    return {"kind": names[type(overlay)], **fields}
+
+
+def restored(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
+    """The inverse of `described`. Raises ValueError, KeyError or TypeError for what describes no overlay."""
+    one_of("kind", description["kind"], tuple(KINDS))
+    kind = KINDS[description["kind"]]
+    fields = {name: _tuples(description[name]) for name in _plain_fields(kind)}
+    if fields["span"] is not None:
+        fields["span"] = Span(**fields["span"])
+    if "clock" in fields:
+        fields["clock"] = Clock(**fields["clock"])
+    return kind(mask=mask, **fields)
+
+
+def _plain_fields(kind: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(kind) if field.name != "mask"]
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(map(_tuples, value))
+    if isinstance(value, dict):
+        return {name: _tuples(part) for name, part in value.items()}
+    return value

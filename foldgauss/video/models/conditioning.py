@@ -1,0 +1,326 @@
+"""Fused Numba twin of `FoldedSplats.at`, with its gradient, on packed rows of the Gaussians alive at one time.
+
+The fold equation's home is `FoldedGaussian.condition_time`; this is the one exception that the profile bought: it
+touches only the Gaussians alive, whose number changes with every frame, which compiled XLA shapes cannot follow. A test
+holds both to the same values and gradients. Only the polynomial fold and the time-likelihood envelope exist here.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+from foldgauss._numerics.simd import LANES, choose, cos_and_sin, every, exp, load, root, sigmoid, store
+from foldgauss._runtime.kernels import inline, kernel
+from foldgauss._runtime.threads import run_tasks
+from foldgauss.render import pixels_per_unit
+from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.splats import SH_C0, TAU_MAX
+
+CHUNK = 4096  # Gaussians per task
+
+_f, _u = nb.float32, nb.uint64
+#: Numbers that conditioning gives for each Gaussian: mean 2, factor 4, opacity, colour 3, kept 3.
+_NUM_OUT = 13
+
+
+class _Layout(NamedTuple):
+    """Columns of a row and constants of the model, handed to the kernels as arguments: see `_kernels.kernel`."""
+
+    loc: int
+    scale: int
+    color: int
+    angle: int
+    opacity: int
+    time: int
+    spread: int
+    fold: int
+    tau_max: np.float32
+    sh_c0: np.float32
+
+
+_place = {name: place.start for name, place in columns(0).items()}
+_LAYOUT = _Layout(
+    loc=_place["loc"],
+    scale=_place["log_scale"],
+    color=_place["color_dc"],
+    angle=_place["angle_logit"],
+    opacity=_place["opacity_logit"],
+    time=_place["time_loc_logit"],
+    spread=_place["log_time_scale"],
+    fold=_place["coefficients"],
+    tau_max=np.float32(TAU_MAX),
+    sh_c0=np.float32(SH_C0),
+)
+
+
+@inline
+def _sigmoid(x):
+    return _f(1.0) / (_f(1.0) + math.exp(-x))
+
+
+@kernel
+def _windows(at, start, stop, indices, rows, window):
+    """The span of time in which each of the named Gaussians is drawn."""
+    for k in range(start, stop):
+        i = indices[k]
+        centre, reach = _sigmoid(rows[i, at.time]), at.tau_max * math.exp(rows[i, at.spread])
+        window[i, 0] = centre - reach
+        window[i, 1] = centre + reach
+
+
+@kernel
+def _condition(
+    at,
+    start,
+    stop,
+    alive,
+    rows,
+    degree,
+    t,
+    unit,
+    cx,
+    cy,
+    power,
+    floor,
+    mean,
+    factor,
+    opacity,
+    color,
+    kept,
+):
+    """Sixteen Gaussians at a time: their rows become columns, vectors, and the results rows again."""
+    width = rows.shape[1]
+    columns, out = np.zeros(width * LANES, np.float32), np.empty(_NUM_OUT * LANES, np.float32)
+    for begin in range(start, stop, LANES):
+        num = _u(min(LANES, stop - begin))
+        for e in range(num):
+            row = rows[alive[begin + e]]
+            for c in range(_u(width)):
+                columns[c * _u(LANES) + e] = row[c]
+        _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out)
+        for e in range(num):
+            k = begin + e
+            mean[k, 0], mean[k, 1] = out[e], out[_u(LANES) + e]
+            factor[k, 0, 0], factor[k, 0, 1] = out[_u(2 * LANES) + e], out[_u(3 * LANES) + e]
+            factor[k, 1, 0], factor[k, 1, 1] = out[_u(4 * LANES) + e], out[_u(5 * LANES) + e]
+            opacity[k] = out[_u(6 * LANES) + e]
+            for c in range(_u(3)):
+                color[k, c], kept[k, c] = out[(_u(7) + c) * _u(LANES) + e], out[(_u(10) + c) * _u(LANES) + e]
+
+
+@inline
+def _column(columns, c):
+    return load(columns, _u(c) * _u(LANES))
+
+
+@kernel
+def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
+    none, scale = every(_f(0.0)), every(unit)
+    centre, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
+    u = centre - every(t)
+    x, y = none, none
+    for j in range(degree - 1, -1, -1):  # Horner
+        x = u * (x + _column(columns, at.fold + 2 * j))
+        y = u * (y + _column(columns, at.fold + 2 * j + 1))
+    store(out, _u(0), (_column(columns, at.loc) + x) * scale + every(cx))
+    store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + every(cy))
+    tau = u / spread
+    exponent = every(_f(-0.25) * power) * tau * tau  # of sqrt(a), but for the floor
+    if floor == _f(0.0):
+        first = exp(_column(columns, at.scale) + exponent) * scale
+        second = exp(_column(columns, at.scale + 1) + exponent) * scale
+    else:
+        shrink = root(every(floor) + every(_f(1.0) - floor) * exp(exponent + exponent)) * scale
+        first, second = exp(_column(columns, at.scale)) * shrink, exp(_column(columns, at.scale + 1)) * shrink
+    turn = sigmoid(_column(columns, at.angle))
+    cos, sin = cos_and_sin(turn)
+    store(out, _u(2 * LANES), cos * first)
+    store(out, _u(3 * LANES), none - sin * second)
+    store(out, _u(4 * LANES), sin * first)
+    store(out, _u(5 * LANES), cos * second)
+    store(out, _u(6 * LANES), sigmoid(_column(columns, at.opacity)))
+    for c in range(_u(3)):
+        value = every(_f(0.5)) + every(at.sh_c0) * _column(columns, at.color + c)
+        store(out, (_u(7) + c) * _u(LANES), choose(value < none, none, value))
+    store(out, _u(10 * LANES), centre)
+    store(out, _u(11 * LANES), spread)
+    store(out, _u(12 * LANES), turn)
+
+
+@kernel
+def _pull_back(
+    at,
+    start,
+    stop,
+    alive,
+    rows,
+    degree,
+    t,
+    unit,
+    power,
+    floor,
+    factor,
+    opacity,
+    color,
+    kept,
+    d_mean,
+    d_factor,
+    d_opacity,
+    d_color,
+    grad,
+):
+    """Add the gradient of each Gaussian's row to `grad`; returns dL/dt over start..stop."""
+    d_time = 0.0
+    for k in range(start, stop):
+        i = alive[k]
+        row, out = rows[i], grad[i]
+        gx, gy = d_mean[k, 0] * unit, d_mean[k, 1] * unit
+        out[at.loc] += gx
+        out[at.loc + 1] += gy
+        centre, spread, turn = kept[k, 0], kept[k, 1], kept[k, 2]
+        u = centre - t
+        # Fold: dL/dc_j = g u^j, and dL/du by the derivative of the polynomial.
+        d_u, u_power = _f(0.0), _f(1.0)
+        for j in range(degree):
+            d_u += _f(j + 1) * u_power * (gx * row[at.fold + 2 * j] + gy * row[at.fold + 2 * j + 1])
+            u_power *= u
+            out[at.fold + 2 * j] += gx * u_power
+            out[at.fold + 2 * j + 1] += gy * u_power
+        # Scales and angle, from the columns of F = R diag(scales).
+        by_first = d_factor[k, 0, 0] * factor[k, 0, 0] + d_factor[k, 1, 0] * factor[k, 1, 0]
+        by_second = d_factor[k, 0, 1] * factor[k, 0, 1] + d_factor[k, 1, 1] * factor[k, 1, 1]
+        out[at.scale] += by_first
+        out[at.scale + 1] += by_second
+        by_angle = d_factor[k, 1, 0] * factor[k, 0, 0] - d_factor[k, 0, 0] * factor[k, 1, 0]
+        by_angle += d_factor[k, 1, 1] * factor[k, 0, 1] - d_factor[k, 0, 1] * factor[k, 1, 1]
+        out[at.angle] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
+        # Envelope: -tau^2/2 moves with u and with the spread.
+        tau = u / spread
+        square, slope = tau * tau, _f(0.5) * power
+        if floor > _f(0.0):
+            decay = (_f(1.0) - floor) * math.exp(_f(-0.5) * power * square)
+            slope *= decay / (floor + decay)
+        by_exponent = (by_first + by_second) * slope
+        out[at.spread] += by_exponent * square
+        d_u -= by_exponent * tau / spread
+        out[at.time] += d_u * centre * (_f(1.0) - centre)
+        d_time -= d_u
+        out[at.opacity] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
+        for c in range(3):
+            if color[k, c] > _f(0.0):
+                out[at.color + c] += d_color[k, c] * at.sh_c0
+    return d_time
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditioned:
+    """Splats of one time in pixels, of the Gaussians `alive` (indices, in array order)."""
+
+    alive: np.ndarray
+    t: np.float32
+    unit: np.float32
+    mean: np.ndarray
+    factor: np.ndarray
+    opacity: np.ndarray
+    color: np.ndarray
+    kept: np.ndarray  # (num, 3), for the way back: m_t, sigma_t and the angle in turns
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the picture's size.
+
+    `aspect` is the model frame's height / width (default: the picture's own), see `Splats2D.to_pixels`.
+    """
+
+    degree: int
+    power: float
+    floor: float
+    size: tuple[int, int]
+    aspect: float | None = None
+
+
+def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
+    """Write the spans of time of the named rows into `window` (num, 2)."""
+    num = len(indices)
+    run_tasks(
+        lambda start: _windows(_LAYOUT, start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK)
+    )
+
+
+def narrow_windows(rows: np.ndarray, window: np.ndarray, shape: Shape, scale_cutoff: float) -> None:
+    """Leave out of the spans in `window` (num, 2) when a standard deviation is not above `scale_cutoff`, model units.
+
+    With s the smaller one: s^2 a > cutoff^2, that is (1 - floor) exp(-power tau^2 / 2) > (cutoff / s)^2 - floor.
+    """
+    if scale_cutoff <= 0:
+        return
+    places = columns(shape.degree)
+    centre, spread = (rows[:, places[name].start].astype(float) for name in ("time_loc_logit", "log_time_scale"))
+    smaller = rows[:, places["log_scale"]].min(axis=1).astype(float)
+    needed = np.exp(2 * (math.log(scale_cutoff) - smaller)) - shape.floor
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = 2 * (math.log1p(-shape.floor) - np.log(needed)) / shape.power  # tau^2 where both sides are equal
+    never, always = needed >= 1 - shape.floor, needed <= 0
+    reach = np.where(always, np.inf, np.sqrt(np.where(never | always, 0, square)))
+    reach = np.minimum(reach, TAU_MAX) * np.exp(spread)
+    middle = 1 / (1 + np.exp(-centre))
+    window[:, 0], window[:, 1] = np.maximum(window[:, 0], middle - reach), np.minimum(window[:, 1], middle + reach)
+
+
+def condition(
+    rows: np.ndarray, window: np.ndarray, t: float, shape: Shape, members: np.ndarray | None = None
+) -> Conditioned:
+    """The Gaussians whose window holds t, of those with `members` (num,) if given, conditioned on t, in pixels."""
+    t = np.float32(t)
+    near = (window[:, 0] < t) & (t < window[:, 1])
+    alive = np.flatnonzero(near if members is None else near & members)
+    num, (height, width) = len(alive), shape.size
+    unit = np.float32(pixels_per_unit(shape.size, aspect=shape.aspect))
+    mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
+    opacity, (color, kept) = np.empty(num, np.float32), np.empty((2, num, 3), np.float32)
+    constants = np.float32([width / 2, height / 2, shape.power, shape.floor])
+
+    def work(start: int) -> None:
+        stop = min(start + CHUNK, num)
+        splats = (mean, factor, opacity, color, kept)
+        _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, *splats)
+
+    run_tasks(work, range(0, num, CHUNK))
+    return Conditioned(alive, t, unit, mean, factor, opacity, color, kept)
+
+
+def pull_back(
+    rows: np.ndarray, done: Conditioned, gradients: tuple[np.ndarray, ...], shape: Shape, grad: np.ndarray
+) -> float:
+    """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt."""
+    num = len(done.alive)
+    by_time = np.zeros(-(-num // CHUNK))
+    power, floor = np.float32(shape.power), np.float32(shape.floor)
+
+    def work(start: int) -> None:
+        stop = min(start + CHUNK, num)
+        by_time[start // CHUNK] = _pull_back(
+            _LAYOUT,
+            start,
+            stop,
+            done.alive,
+            rows,
+            shape.degree,
+            done.t,
+            done.unit,
+            power,
+            floor,
+            done.factor,
+            done.opacity,
+            done.color,
+            done.kept,
+            *gradients,
+            grad,
+        )
+
+    run_tasks(work, range(0, num, CHUNK))
+    return float(by_time.sum())

@@ -1,0 +1,121 @@
+"""Learned occurrence times of the frames (eq:frame_fitting)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.threads import check_process
+from foldgauss.video.models.shots import is_cut
+
+
+class FrameTimes(eqx.Module):
+    r"""Times of n frames in [0, 1], learned through n - 1 softmax weights; one frame alone is at 0.
+
+    $$ t_k = \sum_{i \le k} \frac{e^{w_i}}{\sum_j e^{w_j}}, \qquad t_0 = 0,\; t_{n-1} = 1 $$
+
+    `logits` has shape (n - 1,); equal logits are equally spaced frames. The order of the frames cannot change.
+
+    Source: VeGaS, eq:frame_fitting.
+    """
+
+    logits: Float[Array, " intervals"]
+
+    @classmethod
+    def uniform(cls, num_frames: int) -> "FrameTimes":
+        """Equally spaced times. Raises ValueError for no frames."""
+        if num_frames < 1:
+            raise invalid("num_frames", expected="at least 1", got=num_frames)
+        return cls(np.zeros(num_frames - 1, np.float32))
+
+    @property
+    def num_frames(self) -> int:
+        return self.logits.shape[0] + 1
+
+    def times(self) -> Float[Array, "num_frames"]:
+        """The times t_k: 0 at the first frame, exactly 1 at the last, never decreasing.
+
+        Neighbours are equal only where a weight is too small for the dtype to show.
+        """
+        check_process()
+        summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
+        return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
+
+    def cut_after(self, k: int) -> bool:
+        """Whether between frames k and k + 1 nothing lies. Raises ValueError for a frame that is none, or the last."""
+        check_frame_before(k, self.num_frames)
+        return bool(is_cut(self.times())[k])
+
+
+def check_frame_before(k: object, num_frames: int) -> None:
+    """Raise unless `k` is the number of a frame that another one follows."""
+    if not whole(k, 0) or k > num_frames - 2:
+        raise invalid("k", expected=f"the number of a frame before the last of {num_frames}", got=short_repr(k))
+
+
+def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
+    """`upsample` frames per original interval, evenly spaced between t_k and t_{k+1}, and the last frame.
+
+    At a cut nothing lies between: the first half of the frames there is the one before it, the rest the one after.
+    Shape ((n - 1) * upsample + 1,). Source: VeGaS, the sentence after eq:frame_fitting.
+    """
+    if upsample < 1:
+        raise invalid("upsample", expected="a whole number >= 1", got=upsample)
+    return times_at(times, np.arange((len(times) - 1) * upsample + 1) / upsample)
+
+
+def times_at(
+    times: Float[np.ndarray, " num_frames"], positions: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch"]:
+    """The times of continuous frame positions: 2.5 is half way from frame 2 to frame 3.
+
+    Positions are held within the clip. At a cut nothing lies between: the nearer frame's time. Shapes: as `positions`.
+    """
+    times, positions = np.asarray(times), np.clip(np.asarray(positions, np.float64), 0, len(times) - 1)
+    cut = np.append(np.asarray(is_cut(times)), False)  # after the last frame nothing comes
+    positions = np.where(cut[positions.astype(int)], np.floor(positions + 0.5), positions)
+    return np.interp(positions, np.arange(len(times)), times).astype(times.dtype)
+
+
+def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Float[np.ndarray, " shown"]:
+    """Frame positions that are shown one after another, from the first frame to the last; backwards for speed < 0.
+
+    `rate` is that of the pictures over that of the frames, `speed` how fast time goes by: 0.25 is slow motion. The last
+    frame is shown only where the step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
+    """
+    _check_rate(rate)
+    if not (np.isfinite(speed) and speed != 0):
+        raise invalid("speed", expected="a number other than 0", got=speed, cure="0.25 is slow motion, -1 backwards.")
+    step = abs(speed) / rate
+    positions = np.arange(int(np.floor((num_frames - 1) / step + 1e-9)) + 1) * step
+    return positions if speed > 0 else num_frames - 1 - positions
+
+
+def remapped_positions(
+    remap: Float[ArrayLike, "points 2"], fps: float, rate: float = 1.0
+) -> Float[np.ndarray, " shown"]:
+    """Frame positions that are shown when the clip's time is a piecewise linear function of the pictures' time.
+
+    `remap` has rows (second shown, second of the clip), the first column rising from 0; `fps` is the clip's, `rate` as
+    in `played_positions`. Raises ValueError for anything else.
+    Example: `remapped_positions([[0, 0], [1, 1], [3, 1], [4, 2]], fps=25)` holds second 1 for two seconds.
+    """
+    _check_rate(rate)
+    points = np.asarray(remap, np.float64)
+    if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 2 or not np.isfinite(points).all():
+        expected = "at least two rows (second shown, second of the clip)"
+        raise invalid("remap", expected=expected, got=f"shape {points.shape}" if np.isfinite(points).all() else remap)
+    shown, of_clip = points.T
+    if shown[0] != 0 or (np.diff(shown) <= 0).any():
+        raise invalid("remap", expected="seconds shown that rise from 0", got=shown.tolist())
+    if of_clip.min() < 0:
+        raise invalid("remap", expected="seconds of the clip >= 0", got=of_clip.tolist())
+    seconds = np.arange(int(np.floor(shown[-1] * fps * rate + 1e-9)) + 1) / (fps * rate)
+    return np.interp(seconds, shown, of_clip) * fps
+
+
+def _check_rate(rate: float) -> None:
+    if not (np.isfinite(rate) and rate > 0):
+        raise invalid("rate", expected="a number > 0", got=rate)

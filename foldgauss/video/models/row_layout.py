@@ -1,0 +1,55 @@
+"""One row of numbers per Gaussian: the layout the optimiser works on.
+
+A Gaussian's parameters, moments and gradients each lie in one cache line or two, so that a step which touches
+only the Gaussians alive reads only them.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.models.splats import FoldedSplats
+
+
+def _leaf_names() -> list[str]:
+    """Trainable leaves, the fold last since its width varies with the degree."""
+    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name != "envelope"]
+    return sorted(names, key=lambda name: name == "coefficients")
+
+
+def columns(degree: int) -> dict[str, slice]:
+    """Where each leaf of `FoldedSplats` stands in a row."""
+    widths = {"loc": 2, "log_scale": 2, "color_dc": 3, "coefficients": 2 * degree}
+    place, start = {}, 0
+    for name in _leaf_names():
+        stop = start + widths.get(name, 1)
+        place[name], start = slice(start, stop), stop
+    return place
+
+
+def pack(splats: FoldedSplats) -> np.ndarray:
+    """Leaves to rows, float32 (num, 11 + 2 degree)."""
+    num = splats.num_gaussians
+    leaves = [np.asarray(getattr(splats, name), np.float32).reshape(num, -1) for name in _leaf_names()]
+    return np.ascontiguousarray(np.concatenate(leaves, axis=1))
+
+
+def unpack(rows: np.ndarray, degree: int, envelope: TimeLikelihood) -> FoldedSplats:
+    """Rows to leaves (copies), the inverse of `pack`."""
+    num = len(rows)
+    shapes = {"loc": (num, 2), "log_scale": (num, 2), "color_dc": (num, 3), "coefficients": (num, degree, 2)}
+    leaves = {name: rows[:, place].reshape(shapes.get(name, (num,))).copy() for name, place in columns(degree).items()}
+    return FoldedSplats(**leaves, envelope=envelope)
+
+
+def shift_path(
+    place: Float[np.ndarray, "num degree+1 2"], shift: Float[np.ndarray, " num"]
+) -> Float[np.ndarray, "num degree+1 2"]:
+    """The same path in powers of u + shift: its Gaussian's m_t is later by `shift`."""
+    place, degree = place.copy(), place.shape[1] - 1
+    for j in range(degree):
+        for k in range(degree - 1, j - 1, -1):
+            place[:, k] -= shift[:, None] * place[:, k + 1]
+    return place

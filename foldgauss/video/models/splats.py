@@ -1,0 +1,226 @@
+"""Folded splats: the trainable leaves of a video, as Folded-Gaussians with opacity and colour."""
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from foldgauss._numerics.batch import known
+from foldgauss._runtime.checks import invalid
+from foldgauss.distribution import FoldedGaussian
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
+from foldgauss.mixture import FoldedMixture
+from foldgauss.render import Splats2D
+
+if TYPE_CHECKING:
+    pass
+
+#: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
+SH_C0 = 0.28209479177387814
+#: A Gaussian is drawn only where exp(-tau^2 / 2) exceeds this, as in the published VeGaS.
+TIME_CUTOFF = 0.01
+#: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
+TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
+#: log sigma_t of a Gaussian that is there throughout the clip: with m_t = 0.5 its |tau| is at most 1/2048, and the
+#: envelope, of power 2 or less, is 1 to 3e-7. Neither is stored.
+LASTING = np.float32(np.log(1024))
+#: Logit of the opacity of a Gaussian that no light comes through, 0.9997. It is not stored.
+OPAQUE = np.float32(8)
+#: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
+PEAK_OPACITY = 0.99
+
+
+class FoldedSplats(eqx.Module):
+    """Folded Gaussians with opacity and colour: raw leaves, before activation, in model space.
+
+    Model space has its origin at the frame's centre, x right, y down, and the frame's longer side is 1; time is [0, 1].
+
+    | leaf | shape | becomes |
+    |---|---|---|
+    | `loc` | (num, 2) | m_s |
+    | `log_scale` | (num, 2) | the two standard deviations, by exp |
+    | `angle_logit` | (num,) | their rotation, by 2 pi sigmoid |
+    | `time_loc_logit` | (num,) | m_t, by sigmoid |
+    | `log_time_scale` | (num,) | sigma_t, by exp |
+    | `coefficients` | (num, degree, 2) | the fold's c_k |
+    | `opacity_logit` | (num,) | rho, by sigmoid |
+    | `color_dc` | (num, 3) | 0.5 + 0.282 color_dc, not below 0 |
+
+    Source: VeGaS eq:vegas_equiv and "Implementation Details"; array order is depth order.
+    """
+
+    loc: Float[Array, "num 2"]
+    log_scale: Float[Array, "num 2"]
+    angle_logit: Float[Array, " num"]
+    time_loc_logit: Float[Array, " num"]
+    log_time_scale: Float[Array, " num"]
+    coefficients: Float[Array, "num degree 2"]
+    opacity_logit: Float[Array, " num"]
+    color_dc: Float[Array, "num 3"]
+    envelope: TimeLikelihood
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.loc.shape[0]
+
+    @property
+    def degree(self) -> int:
+        return self.coefficients.shape[1]
+
+    @property
+    def degrees(self) -> Int[np.ndarray, " num"]:
+        """Of each Gaussian: its last power whose coefficients are not both 0. Higher ones are not stored.
+
+        A coefficient of -0 counts: it is not the bits that an absent one is restored with.
+        """
+        kept = _holds_bits(self.coefficients).any(axis=2)
+        return (kept * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
+
+    @property
+    def lasting(self) -> Bool[np.ndarray, " num"]:
+        """Who is there throughout the clip: m_t = 0.5 and log sigma_t = `LASTING` exactly. Neither is stored."""
+        return (np.asarray(self.log_time_scale) == LASTING) & ~_holds_bits(self.time_loc_logit)
+
+    @property
+    def solid(self) -> Bool[np.ndarray, " num"]:
+        """Whom no light comes through: an opacity's logit of `OPAQUE` exactly, which is not stored."""
+        return np.asarray(self.opacity_logit) == OPAQUE
+
+    def gaussians(self) -> FoldedGaussian:
+        """The batch of Folded-Gaussians, batch shape (num,), event shape (3,)."""
+        return FoldedGaussian(
+            self.loc,
+            rotated_scale_tril(jnp.exp(self.log_scale), 2 * jnp.pi * jax.nn.sigmoid(self.angle_logit)),
+            time_loc=jax.nn.sigmoid(self.time_loc_logit),
+            time_scale=jnp.exp(self.log_time_scale),
+            fold=PolynomialFold(self.coefficients),
+            envelope=self.envelope,
+        )
+
+    @classmethod
+    def from_mixture(cls, mixture: FoldedMixture, *, color: ArrayLike) -> "FoldedSplats":
+        """A mixture's components as splats, in their order: `gaussians()` is `mixture.components`.
+
+        Weights become opacities, `w_k / max w` times `PEAK_OPACITY`: in this model they scale what is seen. So
+        `to_mixture` is the inverse. The density itself, as a picture, is `density_image`.
+
+        Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
+        folds and a time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0.
+        Raises ValueError for any other mixture or colour.
+
+        Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.
+        """
+        components = mixture.components
+        if mixture.event_shape != (3,) or mixture.batch_shape != ():
+            got = f"event {mixture.event_shape}, batch {mixture.batch_shape}"
+            raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Index its leaves.")
+        time_loc, dtype, num = components.time_loc, components.loc.dtype, mixture.num_components
+        outside = known((time_loc <= 0) | (time_loc >= 1))
+        if outside is not None and outside.any():
+            cure = "A video's time is [0, 1]: move and scale the mixture's."
+            raise invalid("mixture.components.time_loc", expected="times in (0, 1)", got=known(time_loc), cure=cure)
+        log_scale, angle = _axes(components.scale_tril)
+        log_weights = mixture.log_weights
+        log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
+        return cls(
+            loc=components.loc,
+            log_scale=log_scale,
+            angle_logit=jax.scipy.special.logit(angle / (2 * jnp.pi)),
+            time_loc_logit=jax.scipy.special.logit(time_loc),
+            log_time_scale=jnp.log(components.time_scale),
+            coefficients=_coefficients(components.fold, num, dtype),
+            opacity_logit=log_opacity - jnp.log(-jnp.expm1(log_opacity)),
+            color_dc=(_checked_color(color, num, dtype) - 0.5) / SH_C0,
+            envelope=_as_time_likelihood(components.envelope),
+        )
+
+    def to_mixture(self) -> FoldedMixture:
+        """The splats as a mixture, in model space: their Folded-Gaussians with weights in proportion to opacity.
+
+        Colours are left out. Example: `model.splats.to_mixture().log_prob(jnp.array([0.0, 0.1, 0.5]))`.
+        """
+        return FoldedMixture(self.gaussians(), logits=jax.nn.log_sigmoid(self.opacity_logit))
+
+    def at(self, t: Float[Array, ""], *, scale_cutoff: float = 0.0) -> Splats2D:
+        """The splats of time t, in model space: every Gaussian conditioned on t (eq:vegas_equiv_cond).
+
+        A Gaussian too far away in time (`TIME_CUTOFF`), or with a standard deviation not above `scale_cutoff` by then,
+        keeps its place with opacity 0.
+        """
+        folded = self.gaussians()
+        conditional = folded.condition_time(t)
+        near = jnp.abs(t - folded.time_loc) < TAU_MAX * folded.time_scale
+        if scale_cutoff > 0:
+            log_a = self.envelope.log_a(t, time_loc=folded.time_loc, time_scale=folded.time_scale)
+            near &= self.log_scale.min(axis=-1) + log_a / 2 > float(np.log(scale_cutoff))
+        opacity = jnp.where(near, jax.nn.sigmoid(self.opacity_logit), jnp.zeros_like(self.opacity_logit))
+        color = jnp.maximum(0.5 + SH_C0 * self.color_dc, 0.0)
+        return Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
+
+
+def _holds_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
+    """Where a number has other bits than 0 has."""
+    leaf = np.asarray(leaf)
+    return (leaf != 0) | np.signbit(leaf)
+
+
+def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]) -> Float[Array, "num 2 2"]:
+    """Lower-triangular factor of R(angle) diag(scale)^2 R(angle)^T, in closed form.
+
+    The determinant is the product of the scales, so nothing is subtracted and the factor exists for any scales > 0.
+    Source: R and S of eq:mirage.
+    """
+    first, second = scale[:, 0], scale[:, 1]
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    top = jnp.hypot(first * cos, second * sin)
+    side = (first - second) * (first + second) * sin * cos / top
+    rows = [jnp.stack([top, jnp.zeros_like(top)], -1), jnp.stack([side, first * second / top], -1)]
+    return jnp.stack(rows, -2)
+
+
+def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
+    """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
+
+    Closed-form singular values of [[p, 0], [q, r]]. The angle counts modulo pi, and is from [pi/2, 3 pi/2].
+    """
+    p, q, r = tril[:, 0, 0], tril[:, 1, 0], tril[:, 1, 1]
+    first = 0.5 * (jnp.hypot(p + r, q) + jnp.hypot(p - r, q))
+    log_scale = jnp.stack([jnp.log(first), jnp.log(p) + jnp.log(r) - jnp.log(first)], axis=-1)
+    twice_cross, difference = 2 * p * q, (p - r) * (p + r) - q * q
+    round_one = (twice_cross == 0) & (difference == 0)  # any angle will do; a gradient there has no meaning
+    return log_scale, jnp.pi + 0.5 * jnp.arctan2(twice_cross, jnp.where(round_one, 1, difference))
+
+
+def _coefficients(fold: AbstractFold, num: int, dtype) -> Float[Array, "num degree 2"]:
+    if isinstance(fold, ZeroFold):
+        return jnp.zeros((num, 0, 2), dtype)
+    if not isinstance(fold, PolynomialFold):
+        cure = "Splats hold polynomial folds only."
+        raise invalid("mixture.components.fold", expected="a PolynomialFold", got=type(fold).__name__, cure=cure)
+    return fold.coefficients
+
+
+def _as_time_likelihood(envelope: AbstractEnvelope) -> TimeLikelihood:
+    if isinstance(envelope, Constant):
+        return TimeLikelihood(power=0.0)
+    if not isinstance(envelope, TimeLikelihood):
+        got, cure = type(envelope).__name__, "Splats hold these only."
+        expected = "a TimeLikelihood or Constant"
+        raise invalid("mixture.components.envelope", expected=expected, got=got, cure=cure)
+    return envelope
+
+
+def _checked_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
+    color = jnp.asarray(color, dtype)
+    if color.shape not in ((3,), (num, 3)):
+        raise invalid(
+            "color", expected=f"shape (3,) or ({num}, 3)", got=f"shape {color.shape}", cure="RGB about [0, 1]."
+        )
+    values = known(color)
+    if values is not None and not (values >= 0).all():
+        raise invalid("color", expected="numbers >= 0", got=values.tolist(), cure="Light is not taken away.")
+    return jnp.broadcast_to(color, (num, 3))

@@ -1,0 +1,145 @@
+"""The fitted video: folded splats, frame times and what rendering them depends on."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from foldgauss._numerics.batch import known
+from foldgauss._runtime import notebook_hooks
+from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._runtime.threads import check_process
+from foldgauss.render import RenderOptions, Splats2D, render
+from foldgauss.render.splats import check_size
+from foldgauss.video.models.background import BLACK, checked_background
+from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.shots import out_of_cuts
+from foldgauss.video.models.sparse_storage import to_stored
+from foldgauss.video.models.splats import FoldedSplats
+
+#: The cure where a video in segments is given and one model is wanted.
+ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
+
+
+def check_time(t: float) -> None:
+    """Raise unless t is a time of a video, where that is known."""
+    check_process()
+    try:
+        value = known(jnp.asarray(t))
+    except (TypeError, ValueError):
+        raise invalid("t", expected="a time in [0, 1]", got=short_repr(t)) from None
+    if value is not None and not ((value >= 0) & (value <= 1)).all():
+        cure = "Frame k is at frame_times.times()[k]."
+        raise invalid("t", expected="a time in [0, 1]", got=value, cure=cure)
+
+
+def check_model(model: object) -> None:
+    """Raise unless it is a `VideoModel`."""
+    if not isinstance(model, VideoModel):
+        cures = {
+            "EditedVideo": "Take each layer's own model, before layers and edits are put together.",
+            "Edit": "End the chain with .video().",
+            "SegmentedVideo": ONE_SEGMENT,
+        }
+        cure = cures.get(type(model).__name__, "The model comes first.")
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+
+
+class VideoModel(eqx.Module):
+    """A fitted video: what is stored in a model file.
+
+    `size` is (height, width) of the frames it was fitted to, `fps` their rate, `options` the constants and
+    `compositing` the blend ("over" or "sum") it was fitted with and must be drawn with. `scale_cutoff`: a Gaussian is
+    drawn only where its standard deviations exceed it, in model units; 0 but for imported VeGaS videos.
+
+    Units: time is [0, 1], frame k at `frame_times.times()[k]`; lengths are in model space, see `FoldedSplats`.
+    Example: `fit(frames).model.render(0.5)`. Source: VeGaS, section 4.
+    """
+
+    splats: FoldedSplats
+    frame_times: FrameTimes
+    size: tuple[int, int] = eqx.field(static=True)
+    fps: float = eqx.field(static=True)
+    options: RenderOptions = eqx.field(static=True)
+    compositing: str = eqx.field(static=True, default="over")
+    scale_cutoff: float = eqx.field(static=True, default=0.0)
+
+    @property
+    def num_frames(self) -> int:
+        return self.frame_times.num_frames
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.splats.num_gaussians
+
+    @property
+    def degree(self) -> int:
+        """Of the folds."""
+        return self.splats.degree
+
+    @property
+    def num_floats(self) -> int:
+        """Numbers stored: of each Gaussian what it has, see `StoredSplats`. Four bytes of kinds or indices are one."""
+        leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
+        return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
+
+    def with_options(self, options: RenderOptions) -> "VideoModel":
+        """The same, drawn with other constants."""
+        return dataclasses.replace(self, options=options)
+
+    def stage(self, size: tuple[int, int]) -> PreparedModel:
+        """Made ready to be conditioned many times, for pictures of `size`."""
+        return PreparedModel(self, size)
+
+    def at(self, t: Float[Array, ""], size: tuple[int, int] | None = None) -> Splats2D:
+        """The splats of time t, in pixels of a picture of `size` (default: the fitted one)."""
+        height, width = self.size
+        return self.splats.at(t, scale_cutoff=self.scale_cutoff).to_pixels(
+            self.size if size is None else size, aspect=height / width
+        )
+
+    def render(
+        self,
+        t: float,
+        size: tuple[int, int] | None = None,
+        *,
+        engine: str = "auto",
+        background: tuple[float, float, float] = BLACK,
+    ) -> Float[Array, "height width 3"]:
+        """The picture at any time t in [0, 1], values about [0, 1], over `background`; see `foldgauss.render.render`.
+
+        Between two shots it is the nearer shot's. Frame k is at `frame_times.times()[k]`.
+        """
+        size = self.size if size is None else size
+        check_size(size)
+        check_time(t)
+        t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
+        splats = _splats_in_pixels(self, t, tuple(size))
+        behind = jnp.asarray(checked_background(background, self.compositing), splats.mean.dtype)
+        drawn = {"compositing": self.compositing, "options": self.options}
+        return render(splats, size, background=behind, engine=engine, **drawn)
+
+    def frames(
+        self,
+        times: np.ndarray | None = None,
+        size: tuple[int, int] | None = None,
+        *,
+        background: tuple[float, float, float] = BLACK,
+    ) -> Iterator[np.ndarray]:
+        """Pictures at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
+        yield from VideoRenderer(self, size, background=background).frames(times)
+
+    def _repr_html_(self) -> str | None:
+        """The player, in a notebook: see docs/player.md. None where its page would be too large."""
+        return notebook_hooks.show("video", self)
+
+
+@eqx.filter_jit
+def _splats_in_pixels(model: VideoModel, t: Float[Array, ""], size: tuple[int, int]) -> Splats2D:
+    return model.at(t, size)

@@ -1,0 +1,1 @@
+"""Long videos as segments: one model per span of frames, rendered and edited as one video."""

@@ -1,0 +1,1 @@
+"""Selection of Gaussians: by region, colour, time or mask, followed through the clip."""

@@ -1,0 +1,70 @@
+"""Three tiny fits whose digests were recorded before the package was restructured: plain, economical and growing.
+
+python tests/recorded_fits.py   prints what test_recorded_fits.py compares with, as JSON
+"""
+
+import hashlib
+import json
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from foldgauss.video import Economy, FitConfig, Growth, compress, evaluate, fit
+
+SIZE, NUM_FRAMES = (32, 48), 5
+CONFIGS = {
+    "plain": FitConfig(num_gaussians=120, steps=60, seed=2),
+    "economical": FitConfig(num_gaussians=120, steps=120, seed=2, economy=Economy()),
+    "growing": FitConfig.preset(
+        "paper", num_gaussians=80, steps=120, seed=2, degree=3, growth=Growth(), final_rate=1.0, initialization="clip"
+    ),
+}
+
+
+def clip() -> np.ndarray:
+    """A disc that moves over a slanted pattern, uint8 (num_frames, height, width, 3); no decoder takes part."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.int64)
+    frames = []
+    for k in range(NUM_FRAMES):
+        ground = np.stack([(5 * x + 2 * k) % 256, (7 * y + x) % 256, (3 * x + 3 * y) % 256], axis=-1)
+        inside = (x - 12 - 5 * k) ** 2 + (y - 16) ** 2 < 64
+        frames.append(np.where(inside[..., None], np.array([240, 200, 40]), ground))
+    return np.stack(frames).astype(np.uint8)
+
+
+def digest(tree) -> str:
+    """blake2b over all leaves: dtype, shape and bits."""
+    state = hashlib.blake2b(digest_size=16)
+    for leaf in jax.tree.leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        state.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return state.hexdigest()
+
+
+def machine() -> dict[str, str]:
+    """What the bits of a fit depend on besides the code."""
+    cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")), "")
+    packages = {
+        name: version(name)
+        for name in ("jax", "jaxlib", "numba", "llvmlite", "numpy", "opencv-contrib-python-headless")
+    }
+    flags = hashlib.blake2b(cpu.encode(), digest_size=8).hexdigest()
+    return {"cpu_flags": flags, "machine": platform.machine(), "python": platform.python_version(), **packages}
+
+
+def record() -> dict:
+    frames = clip()
+    models = {name: fit(frames, config).model for name, config in CONFIGS.items()}
+    small = compress(models["plain"], frames, max_loss_db=0.5)
+    return {
+        "machine": machine(),
+        "digests": {name: digest(model) for name, model in models.items()} | {"compact": digest(small.model)},
+        "psnr": {name: round(evaluate(model, frames).mean_psnr, 3) for name, model in models.items()},
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(record(), indent=1))

@@ -1,0 +1,94 @@
+"""The structure of the package: no import circle, small folders and modules, no function that shadows a module."""
+
+import ast
+import importlib
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+import foldgauss
+
+ROOT = Path(foldgauss.__file__).parent
+#: Kernels: one compiled function calls many small ones, and they are read together.
+LONG = {"foldgauss.render._cpu_kernels"}
+MAX_LINES, MAX_MODULES, MAX_TOP = 600, 15, 15
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+SOURCES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
+PACKAGES = [name for name, path in SOURCES.items() if path.name == "__init__.py"]
+
+
+def imported_modules(source: str, known=SOURCES) -> set[str]:
+    """All modules of the package that a source imports: inside functions and under TYPE_CHECKING, too."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                found.add(inner if inner in known else node.module)
+    return found & set(known)
+
+
+def circles(graph: dict[str, set[str]]) -> list[set[str]]:
+    """The strongly connected components of more than one module: each reaches each."""
+
+    def reached(start: str) -> set[str]:
+        seen, left = set(), [start]
+        while left:
+            for name in graph[left.pop()] - seen:
+                seen.add(name)
+                left.append(name)
+        return seen
+
+    reach = {name: reached(name) for name in graph}
+    mutual = {frozenset(b for b in reach[a] if a in reach[b]) for a in graph if a in reach[a]}
+    return [set(circle) for circle in mutual]
+
+
+def test_no_import_circle():
+    graph = {name: imported_modules(path.read_text()) - {name} for name, path in SOURCES.items()}
+    assert circles(graph) == []
+
+
+def test_an_import_circle_would_be_found():
+    hidden = "def f():\n    from foldgauss.b import c\n"
+    known = {"foldgauss.a": None, "foldgauss.b": None}
+    assert imported_modules(hidden, known) == {"foldgauss.b"}
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]
+
+
+def test_top_level_is_small():
+    entries = [path.name for path in ROOT.iterdir() if not path.name.startswith("__")]
+    assert len(entries) <= MAX_TOP, sorted(entries)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_folder_is_small_and_says_what_it_is_for(package):
+    folder = SOURCES[package].parent
+    modules = [path.stem for path in folder.glob("*.py") if not path.stem.startswith("__")]
+    assert len(modules) <= MAX_MODULES, sorted(modules)
+    assert ast.get_docstring(ast.parse(SOURCES[package].read_text())), f"{package} has no docstring"
+
+
+@pytest.mark.parametrize("module", SOURCES)
+def test_module_is_short(module):
+    lines = SOURCES[module].read_text().count("\n")
+    assert module in LONG or lines <= MAX_LINES, f"{module} has {lines} lines"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_name_shadows_a_module(package):
+    loaded = importlib.import_module(package)
+    for module in pkgutil.iter_modules(loaded.__path__):
+        if module.name.startswith("__"):
+            continue
+        importlib.import_module(f"{package}.{module.name}")
+        assert getattr(loaded, module.name) is importlib.import_module(f"{package}.{module.name}")
