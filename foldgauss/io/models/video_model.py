@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import checked_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
@@ -106,7 +106,7 @@ def _is_range(value: object) -> bool:
     """Whether these are frames A up to, not including, B, as `read_video` takes them."""
     if not isinstance(value, list) or len(value) != 2:
         return False
-    if not all(end is None or whole(end, 0) for end in value):
+    if not all(end is None or is_integer(end, 0) for end in value):
         return False
     return value[1] is None or value[1] > (value[0] or 0)
 
@@ -117,8 +117,8 @@ _NOTES: dict[str, Callable[[object], bool]] = {
     "frames_digest": _is_text,
     "clip_digest": _is_text,
     "frames": _is_range,
-    "seed": lambda value: whole(value, 0),
-    "mean_psnr": lambda value: within(value, "(0, 100]"),
+    "seed": lambda value: is_integer(value, 0),
+    "mean_psnr": lambda value: is_within(value, "(0, 100]"),
 }
 
 
@@ -173,8 +173,8 @@ def _video_skeleton(header: dict) -> VideoModel:
     if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
-    one_of("compositing", compositing, COMPOSITINGS)
-    if not within(header.get("scale_cutoff", 0.0), "[0, 1]"):
+    check_one_of("compositing", compositing, COMPOSITINGS)
+    if not is_within(header.get("scale_cutoff", 0.0), "[0, 1]"):
         raise ValueError("the cutoff of scales is out of range")
     row_width = columns(degree)["coefficients"].stop
 
@@ -233,7 +233,7 @@ def _layer_skeleton(header: dict) -> Layer:
 def _camera_skeleton(header: dict | None) -> Camera | None:
     if header is None:
         return None
-    one_of("camera's dtype", header["dtype"], ("float32", "float64"))
+    check_one_of("camera's dtype", header["dtype"], ("float32", "float64"))
     leaves = (jax.ShapeDtypeStruct(shape, np.dtype(header["dtype"])) for shape in ((3, 3), (3,), ()))
     return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.media.video_file import Clip
 from foldgauss.io.models.compact import is_compact, packed
@@ -92,7 +92,7 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
 
     Example: `html_page(model, title="holiday")`.
     """
-    if not (whole(quality, 1) and quality <= 100):
+    if not (is_integer(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _loaded(model)
     pictures = [] if original is None else _pictures(original, plain, quality)

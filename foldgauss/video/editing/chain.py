@@ -12,7 +12,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from foldgauss._runtime.checks import check_takes, invalid, short_repr, warn_of_degrees, whole, within
+from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_within, short_repr, warn_if_degrees
 from foldgauss.render import Camera
 from foldgauss.video.editing import bake as baking
 from foldgauss.video.editing.clip_window import Part
@@ -146,7 +146,7 @@ class Edit:
     def _layer_numbers(self, layer: int | None) -> Sequence[int]:
         """Of one layer, or of all."""
         num = len(self._video.layers)
-        if layer is not None and not (whole(layer, 0) and layer < num):
+        if layer is not None and not (is_integer(layer, 0) and layer < num):
             raise invalid("layer", expected=f"a whole number in [0, {num - 1}]", got=layer)
         return range(num) if layer is None else [layer]
 
@@ -170,7 +170,7 @@ class Edit:
         if selection is None:
             return [np.ones(count, bool) for count in counts]
         if callable(selection):  # it is asked now, so it answers for now
-            check_takes("selection", selection, "video")
+            check_signature("selection", selection, "video")
             selection, before = selection(self.video()), counts
             sources = [np.arange(count) for count in counts]
         if isinstance(selection, str | os.PathLike):
@@ -216,7 +216,7 @@ class Edit:
         `about`: the point (x, y) that stays; baked then, without a span. None: the selection's own centre at each time.
         """
         angle = checked_number("angle", angle)
-        warn_of_degrees("angle", angle)
+        warn_if_degrees("angle", angle)
         about = None if about is None else self._point("about", about)
         return self._map(angle, IDENTITY, (0.0, 0.0), about, when)
 
@@ -282,7 +282,7 @@ class Edit:
             raise invalid("scale", expected="numbers > 0", got=scale, cure="Mirror with transform().")
         if not isinstance(originals, bool | np.bool_):
             raise invalid("originals", expected="True or False", got=short_repr(originals))
-        warn_of_degrees("angle", *each["angle"])
+        warn_if_degrees("angle", *each["angle"])
         for delay in each["delays"]:
             _warn_of_frames("delays", delay, 1.0, 0.0, self._num_frames)
         span = self._span(when)
@@ -389,7 +389,7 @@ class Edit:
         linear = any(x is not None for x in (gain, offset, matrix))
         if (color is not None) + (hue is not None) + linear != 1:
             raise invalid("color, hue, gain", expected="one way to recolour", got="none, or several")
-        if hue is not None and not within(hue, "[0, 1]"):
+        if hue is not None and not is_within(hue, "[0, 1]"):
             raise invalid("hue", expected="turns in [0, 1]", got=repr(hue), cure="Degrees over 360.")
         if color is not None:
             target = checked_color(color)
@@ -505,7 +505,7 @@ class Edit:
     def _apply_function(self, kind: type[AbstractOverlay], function: object, of: str, when: When) -> "Edit":
         if not callable(function):
             raise invalid("function", expected="a function", got=type(function).__name__)
-        check_takes("function", function, of, "t")
+        check_signature("function", function, of, "t")
         if self._part is not None:
             function = self._part.by_clip_time(function)
         return self._apply(partial(kind, function=function), when)
@@ -532,7 +532,7 @@ class Edit:
             "rotation": checked_numbers("rotate", rotate, 3),
             "about": None if about is None else self._point("about", about),
         }
-        warn_of_degrees("rotate", *fields["rotation"])
+        warn_if_degrees("rotate", *fields["rotation"])
         return self._apply(partial(Place, **fields), when, skip=not fields["depth"] and not any(fields["rotation"]))
 
     def seen_from(self, camera: Camera | Callable[[float], Camera] | None) -> "Edit":
@@ -543,7 +543,7 @@ class Edit:
         if camera is not None and not isinstance(camera, Camera) and not callable(camera):
             raise invalid("camera", expected="a Camera, a function of t or None", got=type(camera).__name__)
         if camera is not None and not isinstance(camera, Camera):
-            check_takes("camera", camera, "t")
+            check_signature("camera", camera, "t")
         if isinstance(camera, Camera) and camera.position.ndim != 1:
             raise invalid("camera", expected="one camera", got=f"positions of shape {camera.position.shape}")
         if self._part is not None and camera is not None and not isinstance(camera, Camera):

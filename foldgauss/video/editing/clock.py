@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid, one_of, short_repr, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
 
 CURVES = ("linear", "smooth")
 OUTSIDE = ("hold", "continue")
@@ -35,7 +35,7 @@ class Span:
     curve: str = "linear"
 
     def __post_init__(self) -> None:
-        one_of("curve", self.curve, CURVES)
+        check_one_of("curve", self.curve, CURVES)
         for name in ("start", "stop"):
             value = getattr(self, name)
             if value is not None:
@@ -44,7 +44,7 @@ class Span:
             raise invalid("start, stop", expected="a start before the stop", got=f"{self.start}, {self.stop}")
         object.__setattr__(self, "times", checked_numbers("times", self.times))
         object.__setattr__(self, "values", checked_numbers("values", self.values))
-        if len(self.times) != len(self.values) or not all(within(value, "[0, 1]") for value in self.values):
+        if len(self.times) != len(self.values) or not all(is_within(value, "[0, 1]") for value in self.values):
             raise invalid("values", expected=f"{len(self.times)} numbers in [0, 1]", got=self.values)
         _check_rising(self.times)
 
@@ -118,7 +118,7 @@ def stretch_of(
 ) -> Stretch | None:
     """As `span_of`, among the frames."""
     knots, one_of_them = np.asarray(frame_times, np.float64), [x for x in (frame, frames, times) if x is not None]
-    one_of("curve", curve, CURVES)
+    check_one_of("curve", curve, CURVES)
     if len(one_of_them) > 1:
         raise invalid("frame, frames, times", expected="one of them at most", got=f"{len(one_of_them)} of them")
     lengths = _checked_ease(ease)
@@ -140,18 +140,18 @@ def _positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
     last = len(knots) - 1
     if times is not None:
         first, stop = _pair("times", times)
-        if not (within(first, "[0, 1]") and within(stop, "[0, 1]") and first < stop):
+        if not (is_within(first, "[0, 1]") and is_within(stop, "[0, 1]") and first < stop):
             raise invalid("times", expected="(start, stop), rising, in [0, 1]", got=times)
         begin, end = (float(np.interp(t, knots, np.arange(last + 1))) for t in (first, stop))
         return -math.inf if begin <= 0 else begin, math.inf if end >= last else end
     if frame is not None:
-        if not (whole(frame, 0) and frame <= last):
+        if not (is_integer(frame, 0) and frame <= last):
             raise invalid("frame", expected=f"a whole number in [0, {last}]", got=frame)
         frames = (frame, frame + 1)
     first, stop = (
         end if given is None else given for given, end in zip(_pair("frames", frames), (0, last + 1), strict=True)
     )
-    if not (whole(first, 0) and whole(stop, 1) and first < stop <= last + 1):
+    if not (is_integer(first, 0) and is_integer(stop, 1) and first < stop <= last + 1):
         expected = f"(first, stop), whole, 0 <= first < stop <= {last + 1}"
         raise invalid("frames", expected=expected, got=frames, cure="None is the clip's own end.")
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
@@ -207,7 +207,7 @@ class Clock:
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", checked_numbers("times", self.times))
         object.__setattr__(self, "own_times", checked_numbers("own_times", self.own_times))
-        one_of("outside", self.outside, OUTSIDE)
+        check_one_of("outside", self.outside, OUTSIDE)
         least = 2 if self.outside == "continue" else 1
         if len(self.times) < least or len(self.times) != len(self.own_times):
             got = f"{len(self.times)} and {len(self.own_times)}"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.editing.overlays import AbstractOverlay, Retimed, SelectedGaussians, acts, padded, room_for
 from foldgauss.video.models.background import BLACK
@@ -195,7 +195,7 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
 
 def _numbers_one(number: object, num: int) -> bool:
     """Whether `number` says which of `num`, from the front or, below 0, from the back."""
-    return whole(number, -num) and number < num
+    return is_integer(number, -num) and number < num
 
 
 def _check_fitting(models: list[VideoModel]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.render import Gaussians3D, Triangles
 from foldgauss.video.editing.clock import Clock, Span, checked_number, checked_numbers
 
@@ -415,7 +415,7 @@ def described(overlay: eqx.Module) -> dict:
 
 def restored(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
     """The inverse of `described`. Raises ValueError, KeyError or TypeError for what describes no overlay."""
-    one_of("kind", description["kind"], tuple(KINDS))
+    check_one_of("kind", description["kind"], tuple(KINDS))
     kind = KINDS[description["kind"]]
     fields = {name: _tuples(description[name]) for name in _plain_fields(kind)}
     if fields["span"] is not None:

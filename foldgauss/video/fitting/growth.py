@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.video.models.row_layout import columns
 
@@ -68,7 +68,7 @@ class Growth:
     def __post_init__(self) -> None:
         for name, least in {"from_step": 0, "until_step": 0, "every": 1, "big_from": 0, "reset_every": 1}.items():
             value = getattr(self, name)
-            if not whole(value, least):
+            if not is_integer(value, least):
                 raise invalid(f"growth.{name}", expected=f"a whole number >= {least}", got=repr(value))
             object.__setattr__(self, name, int(value))
         ranges = dict.fromkeys(
@@ -77,7 +77,7 @@ class Growth:
         ranges |= {"shrinking": "[1, inf)", "prune_opacity": "(0, 1)", "reset_opacity": "(0, 1)"}
         for name, bounds in ranges.items():
             value = getattr(self, name)
-            if not within(value, bounds):
+            if not is_within(value, bounds):
                 raise invalid(f"growth.{name}", expected=f"a number in {bounds}", got=repr(value))
             object.__setattr__(self, name, float(value))
         if self.reset_opacity < self.prune_opacity:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss._runtime.threads import check_process
 from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam
@@ -342,9 +342,9 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
 
     Example: `for state, info in fit_steps(frames, config, start_from(model, config, 300, 0.7)): ...`
     """
-    if not whole(steps, 1):
+    if not is_integer(steps, 1):
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
-    if not within(progress, "[0, 1)"):
+    if not is_within(progress, "[0, 1)"):
         raise invalid("progress", expected="a number in [0, 1)", got=repr(progress))
     _check_config(model, config)
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.video.editing.chain import gathered
 from foldgauss.video.editing.clock import NEVER, Clock, Span
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, stacked
@@ -43,7 +43,7 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
     """
     if not any(isinstance(video, SegmentedVideo) for video in videos):
         return stacked(*videos, timeline=timeline)
-    if not (whole(timeline, -len(videos)) and timeline < len(videos)):
+    if not (is_integer(timeline, -len(videos)) and timeline < len(videos)):
         raise invalid("timeline", expected=f"the number of one of {len(videos)} videos", got=timeline)
     timeline %= len(videos)
     lead = videos[timeline]

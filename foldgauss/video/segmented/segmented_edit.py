@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float32
 
-from foldgauss._runtime.checks import check_takes, invalid, short_repr, whole
+from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.editing.chain import Edit, When, begun, checked_color, edit, mean_lightness
 from foldgauss.video.editing.clip_window import Part
@@ -215,7 +215,7 @@ class SegmentedEdit:
         if selection is not None and criteria:
             got = f"{type(selection).__name__} and {', '.join(criteria)}"
             raise invalid("selection", expected="a selection or criteria for one", got=got)
-        if layer is not None and not whole(layer, 0):
+        if layer is not None and not is_integer(layer, 0):
             raise invalid("layer", expected="a whole number >= 0", got=layer)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
@@ -223,7 +223,7 @@ class SegmentedEdit:
         if selection is None:
             return self._selecting(lambda one, number: one.select(layer=layer), None)
         if callable(selection):
-            check_takes("selection", selection, "video")
+            check_signature("selection", selection, "video")
             return self._chosen(self._checked(selection(self.video())))
         self._checked(selection)
         known = selection if self._as_begun and layer is None else None

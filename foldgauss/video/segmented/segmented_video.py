@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK
@@ -292,7 +292,7 @@ def _check_segments(segments: tuple[Segment, ...]) -> None:
         if not isinstance(segment, Segment):
             cure = "Of models: SegmentedVideo.of([(first, model), ...])."
             raise invalid(f"segments[{number}]", expected="a Segment", got=short_repr(segment), cure=cure)
-        if not whole(segment.first, 0):
+        if not is_integer(segment.first, 0):
             expected = "the number of a frame of the whole clip"
             raise invalid(f"segments[{number}].first", expected=expected, got=short_repr(segment.first))
     if segments[0].first != 0:
@@ -341,15 +341,15 @@ def plan_segments(num_frames: int, cuts: Sequence[int], *, length: int, overlap:
     **Raises:** ValueError for no frames, a length below 2, cuts outside the clip, and an overlap that is not from 1 to
     half of the length.
     """
-    if not whole(num_frames, 1):
+    if not is_integer(num_frames, 1):
         raise invalid("num_frames", expected="a whole number >= 1", got=short_repr(num_frames))
-    if not whole(length, 2):
+    if not is_integer(length, 2):
         raise invalid("length", expected="a whole number of frames >= 2", got=short_repr(length))
-    if not (whole(overlap, 1) and 2 * overlap <= length):
+    if not (is_integer(overlap, 1) and 2 * overlap <= length):
         expected = f"a whole number of frames from 1 to {length // 2}, half of the length"
         raise invalid("overlap", expected=expected, got=short_repr(overlap))
     for cut in cuts:
-        if not (whole(cut, 1) and cut < num_frames):
+        if not (is_integer(cut, 1) and cut < num_frames):
             expected = f"frames from 1 to {num_frames - 1} that begin a shot"
             raise invalid("cuts", expected=expected, got=short_repr(cut), cure="Count from the clip's first frame.")
     num_frames, length, overlap = int(num_frames), int(length), int(overlap)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.video.fitting.pruning.scores import ROUNDING, PruningScores
 from foldgauss.video.models.kinds import (
     LASTS,
@@ -79,10 +79,10 @@ class Economy:
         if self.psnr is not None:
             bounds["psnr"] = "(0, 100]"
         for name, interval in bounds.items():
-            if not within(getattr(self, name), interval):
+            if not is_within(getattr(self, name), interval):
                 raise invalid(f"economy.{name}", expected=f"a number in {interval}", got=repr(getattr(self, name)))
             object.__setattr__(self, name, float(getattr(self, name)))
-        if not whole(self.rounds, 1):
+        if not is_integer(self.rounds, 1):
             raise invalid("economy.rounds", expected="a whole number >= 1", got=repr(self.rounds))
         object.__setattr__(self, "rounds", int(self.rounds))
         if not isinstance(self.grows, bool):
