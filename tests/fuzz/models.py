@@ -208,7 +208,7 @@ def _video_seeds() -> list[bytes]:
         (2, dataclasses.replace(_edited(), camera=None)),
         (5, tiny_model(8, 3, plain=False)),
     ]
-    models += [SegmentedVideo.of(joined), SegmentedVideo.of([(0, tiny_model(degree=0, frames=1))])]
+    models += [SegmentedVideo.from_models(joined), SegmentedVideo.from_models([(0, tiny_model(degree=0, frames=1))])]
     return [
         written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]}))
         for one in models
