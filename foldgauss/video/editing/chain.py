@@ -87,7 +87,7 @@ class Edit:
     own centre, clocks, functions, depth. `video()` is a plain `VideoModel` where all could be baked. What an edit
     leaves alone keeps its bits, and an edit that changes nothing (a factor 1, an angle 0) is none.
 
-    Every edit takes `frame=`, `frames=` or `times=`, with `ease=` and `curve=`, see `make_span`: without, it acts always.
+    Every edit takes `frame=`, `frames=` or `times=`, `ease=` and `curve=`, as in `make_span`; without, it acts always.
     Frame numbers are those of `video().frame_times`. Spans are of the video's time, whatever clocks its objects have.
 
     **Units:** model space: the frame's centre is the origin, x right, y down, the frame's longer side 1; [0, 1] is the
