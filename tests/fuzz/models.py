@@ -30,7 +30,7 @@ from foldgauss.video.compression.quantize import Rule, column_names, describe, i
 from foldgauss.video.editing.chain import edit
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import TIME_ADAM, FitState
 from foldgauss.video.models.splats import LASTING, OPAQUE
 from foldgauss.video.selection.selectors import Selection
@@ -208,7 +208,7 @@ def _video_seeds() -> list[bytes]:
         (2, dataclasses.replace(_edited(), camera=None)),
         (5, tiny_model(8, 3, plain=False)),
     ]
-    models += [SegmentedVideo.of(joined), SegmentedVideo.of([(0, tiny_model(degree=0, frames=1))])]
+    models += [SegmentedVideo.from_models(joined), SegmentedVideo.from_models([(0, tiny_model(degree=0, frames=1))])]
     return [
         written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]}))
         for one in models
@@ -267,7 +267,7 @@ def _checkpoint_seeds() -> list[bytes]:
     shared = Codebook(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
     plain = Codebook(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
     kept, state = [], None
-    for statistics in (None, Statistics(floats(num), floats(num), counts)):
+    for statistics in (None, GradientStatistics(floats(num), floats(num), counts)):
         state = FitState(
             floats(num, width), floats(num, width), floats(num, width), counts, np.zeros(num, np.uint8),
             np.zeros(num, bool), shared, plain, floats(3), floats(2), TIME_ADAM.init(floats(2)), statistics,

@@ -16,8 +16,8 @@ from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook, averaged, shared
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import fit_steps, start, to_model
-from foldgauss.video.fitting.pruning.economy import MOST_SOLID, frame_weights
-from foldgauss.video.fitting.pruning.economy import cut as cut_rows
+from foldgauss.video.fitting.pruning.description_length import MOST_SOLID, frame_weights
+from foldgauss.video.fitting.pruning.description_length import cut as cut_rows
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
 from foldgauss.video.fitting.pruning.scores import PruningScores, measured
 from foldgauss.video.models.conditioning import Shape, condition, update_windows
