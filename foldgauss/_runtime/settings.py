@@ -35,9 +35,9 @@ class Setting:
     group: str = ""
 
 
-def setting(help: str, **more: Any) -> dict[str, Setting]:
+def setting(help: str, details: str = "", **more: Any) -> dict[str, Setting]:
     """Metadata for `dataclasses.field`; `more` are the other fields of `Setting`."""
-    return {_KEY: Setting(help, **more)}
+    return {_KEY: Setting(help, details, **more)}
 
 
 def setting_of(field: dataclasses.Field) -> Setting:
@@ -83,13 +83,13 @@ def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
     return value
 
 
-def markdown_table(kind: type) -> str:
-    """The settings of a dataclass as a table in Markdown: name, default, meaning, option."""
+def markdown_table(settings: type) -> str:
+    """The fields of a settings dataclass as a table in Markdown."""
     rows = ["| field | default | meaning | option |", "|---|---|---|---|"]
-    for field in dataclasses.fields(kind):
-        about = setting_of(field)
-        default = about.unset or (f"`{field.default!r}`" if isinstance(field.default, int | float | str) else "")
-        meaning = f"{about.help}. {about.details}".strip()
+    for field in dataclasses.fields(settings):
+        about, is_plain = setting_of(field), isinstance(field.default, int | float | str | None)
+        default = f"`{field.default!r}`" if is_plain else f"`{type(field.default).__name__}(...)`"
+        default += f": {about.unset}" if about.unset else ""
         option = f"`{about.option}`" if about.option else ""
-        rows.append(f"| `{field.name}` | {default or '`None`'} | {meaning} | {option} |".replace("  ", " "))
-    return "\n".join(rows) + "\n"
+        rows.append(f"| `{field.name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
+    return "\n".join(rows)

@@ -1,4 +1,4 @@
-"""The configuration of a fit: Gaussians, budgets, learning rates, loss; its presets and the defaults that depend on a clip."""
+"""The configuration of a fit, its presets, and the defaults that depend on the clip."""
 
 import dataclasses
 import math
@@ -108,7 +108,7 @@ class FitConfig:
     seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so the gradients equal
     those of the front view up to rounding, and a pass takes twice as long. It exists for fidelity to the paper.
 
-    The fields' documentation, valid values and command-line options are their metadata, see `foldgauss._runtime.settings`.
+    Documentation, valid values and command-line options of the fields are their metadata, see `_runtime.settings`.
     """
 
     num_gaussians: int | None = field(
@@ -149,7 +149,7 @@ class FitConfig:
     )
     minutes: float | None = field(
         default=None,
-        metadata=setting("Time to fit, in minutes", bounds="(0, inf)", unset="none", option="--minutes", group=BUDGET),
+        metadata=setting("Time to fit, in minutes", bounds="(0, inf)", option="--minutes", group=BUDGET),
     )
     target_psnr: float | None = field(
         default=None,
@@ -157,7 +157,6 @@ class FitConfig:
             "Stop once the mean PSNR over all frames reaches this, in dB",
             "Frames are then fitted at full size only.",
             bounds="(0, inf)",
-            unset="none",
             option="--target-psnr",
             group=BUDGET,
         ),
@@ -167,7 +166,6 @@ class FitConfig:
         metadata=setting(
             "Largest model file, in 10^6 bytes; limits the number of Gaussians",
             bounds="(0, inf)",
-            unset="none",
             option="--max-size-mb",
             group=MODEL,
         ),
