@@ -27,7 +27,7 @@ from foldgauss.io.models.model_file import (
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.segmented_video import READY, Segment, SegmentedVideo
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
 
 SEGMENTED = "segmented-video"
 #: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`.
@@ -153,7 +153,7 @@ def _segments(path: Path, about: dict) -> list[Segment]:
         own[int(found[1])][found[2]] = spec
     stamp = _stamp(path)
 
-    @lru_cache(maxsize=READY)
+    @lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> VideoModel | EditedVideo:
         if _stamp(path) != stamp:
             cure = "Load it again."

@@ -27,7 +27,7 @@ from foldgauss.video.compression.quantize import Quantized, Rule, column_names, 
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.flatten import flattened
+from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 HTML_SUFFIX = ".html"
@@ -141,12 +141,12 @@ def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
-        yield _block("model", packed(_fine(flattened(loaded))))
+        yield _block("model", packed(_fine(flatten_video(loaded))))
 
 
 def _flattened(number: int, model: VideoModel | EditedVideo) -> VideoModel:
     try:
-        return flattened(model)
+        return flatten_video(model)
     except ValueError as error:
         raise ValueError(f"segment {number}: {error}") from error
 
