@@ -581,7 +581,7 @@ class _Stepper:
         if mirrored:
             d_mean, d_factor = _mirrored(d_mean, d_factor, 0)
         if views is not None:
-            seen = trace.seen
+            seen = trace.visible
             half = np.float32(shape.size[::-1]) / 2
             views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
         return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), shape, self.grad)
