@@ -10,19 +10,19 @@ import numpy as np
 
 from foldgauss._numerics.simd import (
     LANES,
-    any_of,
-    between,
-    choose,
-    columns_of_cell,
-    columns_of_rows,
-    every,
+    add_lanes,
+    any_set,
+    broadcast,
+    cell_columns,
+    cell_rows,
     exp2,
-    folded,
+    gather_columns,
     load,
     lowest_bit,
-    rows_of_cell,
+    range_mask,
+    select,
     store,
-    turned,
+    transpose_cells,
 )
 from foldgauss._runtime.kernels import inline, kernel
 
@@ -188,9 +188,9 @@ def _load_geometry(geometry, num, which, left, top, block):
     for e in range(num, (num + LANES - 1) // LANES * LANES):
         which[e] = which[num - 1]
     for e in range(_u(0), _u(num), _u(LANES)):
-        columns = columns_of_rows(geometry, which, e)
-        store(block, _u(_X * BLOCK) + e, columns[_X] - every(left))
-        store(block, _u(_Y * BLOCK) + e, columns[_Y] - every(top))
+        columns = gather_columns(geometry, which, e)
+        store(block, _u(_X * BLOCK) + e, columns[_X] - broadcast(left))
+        store(block, _u(_Y * BLOCK) + e, columns[_Y] - broadcast(top))
         store(block, _u(_P * BLOCK) + e, columns[_P])
         store(block, _u(_Q * BLOCK) + e, columns[_Q])
         store(block, _u(_R * BLOCK) + e, columns[_R])
@@ -309,7 +309,7 @@ def _load_block(geometry, color, background, entries, listed, left, top, block, 
 @inline
 def _offsets(block, e, x, y):
     """P dx + Q dy and R dy of 16 splats of a block, from e on, at the pixel (x, y) of their tile."""
-    dx, dy = every(x) - load(block, _u(_X * BLOCK) + e), every(y) - load(block, _u(_Y * BLOCK) + e)
+    dx, dy = broadcast(x) - load(block, _u(_X * BLOCK) + e), broadcast(y) - load(block, _u(_Y * BLOCK) + e)
     across = load(block, _u(_P * BLOCK) + e) * dx + load(block, _u(_Q * BLOCK) + e) * dy
     return across, load(block, _u(_R * BLOCK) + e) * dy
 
@@ -322,16 +322,16 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
     turn; `shear` and `rise` are room for P dx + Q dy and R dy at its first pixel.
     `marks`: None, or room for two vectors for each splat, to add its weights and to keep its largest alphas in.
     """
-    share, highest = every(_f(1.0) if over else _f(0.0)), every(ceiling)
-    stop, none = every(finished), every(_f(0.0))
-    x, y = columns_of_cell(), rows_of_cell()
+    share, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
+    stop, none = broadcast(finished), broadcast(_f(0.0))
+    x, y = cell_columns(), cell_rows()
     channels, color = _u(len(background)), _u(_COLOR * BLOCK)
     for cell in range(_u(CELLS * CELLS)):
         base, band, column, left = cell * _u(LANES), cell // _u(CELLS), cell % _u(CELLS), _u(0)
         for e in range(_u(0), _u(num), _u(LANES)):
-            left |= between(first, end, band * _u(BLOCK) + e, _i(column)) << e
+            left |= range_mask(first, end, band * _u(BLOCK) + e, _i(column)) << e
         light = load(scratch, base)
-        if left == _u(0) or not any_of(light > stop):
+        if left == _u(0) or not any_set(light > stop):
             continue
         for e in range(_u(0), _u(num), _u(LANES)):
             across, along = _offsets(block, e, _f(_i(column * _u(CELL))), _f(_i(band * _u(CELL))))
@@ -348,30 +348,32 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
         while left != _u(0):
             e = lowest_bit(left)
             left &= left - _u(1)
-            across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[e]))
-            along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[e])
-            power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
+            across = broadcast(block[_u(_P * BLOCK) + e]) * x + (
+                broadcast(block[_u(_Q * BLOCK) + e]) * y + broadcast(shear[e])
+            )
+            along = broadcast(block[_u(_R * BLOCK) + e]) * y + broadcast(rise[e])
+            power = broadcast(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
             alpha = exp2(power)
-            alpha = choose(alpha < highest, alpha, highest)
-            alpha = choose(power >= every(block[_u(_LEAST * BLOCK) + e]), alpha, none)
-            weight = alpha * choose(light > stop, light, none)
+            alpha = select(alpha < highest, alpha, highest)
+            alpha = select(power >= broadcast(block[_u(_LEAST * BLOCK) + e]), alpha, none)
+            weight = alpha * select(light > stop, light, none)
             if marks is not None:
                 place = e * _u(2 * LANES)
                 store(marks, place, load(marks, place) + weight)
                 place += _u(LANES)
-                drawn, most = choose(light > stop, alpha, none), load(marks, place)
-                store(marks, place, choose(drawn > most, drawn, most))
+                drawn, most = select(light > stop, alpha, none), load(marks, place)
+                store(marks, place, select(drawn > most, drawn, most))
             light = light - share * weight
-            c_0th = c_0th + weight * every(block[color + e])
+            c_0th = c_0th + weight * broadcast(block[color + e])
             if channels > _u(1):
-                c_1st = c_1st + weight * every(block[color + _u(BLOCK) + e])
+                c_1st = c_1st + weight * broadcast(block[color + _u(BLOCK) + e])
             if channels > _u(2):
-                c_2nd = c_2nd + weight * every(block[color + _u(2 * BLOCK) + e])
+                c_2nd = c_2nd + weight * broadcast(block[color + _u(2 * BLOCK) + e])
             if channels > _u(3):
-                c_3rd = c_3rd + weight * every(block[color + _u(3 * BLOCK) + e])
+                c_3rd = c_3rd + weight * broadcast(block[color + _u(3 * BLOCK) + e])
             if channels > _u(FEW):
                 for c in range(_u(FEW), channels):
-                    own = weight * every(block[color + c * _u(BLOCK) + e])
+                    own = weight * broadcast(block[color + c * _u(BLOCK) + e])
                     store(scratch, plane + c * _u(PIXELS), load(scratch, plane + c * _u(PIXELS)) + own)
         store(scratch, base, light)
         store(scratch, plane, c_0th)
@@ -399,10 +401,10 @@ def _add_marks(listed, marks, statistics):
 @kernel
 def _dark(scratch, finished):
     """Whether no pixel of the tile has light left."""
-    stop = every(finished)
+    stop = broadcast(finished)
     lit = False
     for row in range(_u(TILE)):
-        lit |= any_of(load(scratch, row * _u(TILE)) > stop)
+        lit |= any_set(load(scratch, row * _u(TILE)) > stop)
     return not lit
 
 
@@ -424,7 +426,7 @@ def _rows_of_band(scratch, at):
     """Four rows of pixels, of the four cells that stand in a plane of the scratch from `at` on."""
     first, second = load(scratch, at), load(scratch, at + _u(LANES))
     third, fourth = load(scratch, at + _u(2 * LANES)), load(scratch, at + _u(3 * LANES))
-    return turned(first, second, third, fourth)
+    return transpose_cells(first, second, third, fourth)
 
 
 @kernel
@@ -473,7 +475,7 @@ def _write_whole_tile(scratch, background, image, light, height, width, top, lef
         store(light, out + _u(2) * width, lit[2])
         store(light, out + _u(3) * width, lit[3])
         for c in range(_u(len(background))):
-            behind = every(background[c])
+            behind = broadcast(background[c])
             rows = _rows_of_band(scratch, (c + _u(1)) * _u(PIXELS) + at)
             store(image, out, rows[0] + lit[0] * behind)
             store(image, out + width, rows[1] + lit[1] * behind)
@@ -590,18 +592,20 @@ def _list_cells(num, block, first, end, items, stop, shear, rise):
 @kernel
 def _note(num_items, items, shear, rise, block, scratch, notes, over, ceiling, finished):
     """Walk forward through a block once more, noting alpha and weight of every item; scratch: the light."""
-    highest, stop, none = every(ceiling), every(finished), every(_f(0.0))
-    x, y = columns_of_cell(), rows_of_cell()
+    highest, stop, none = broadcast(ceiling), broadcast(finished), broadcast(_f(0.0))
+    x, y = cell_columns(), cell_rows()
     for n in range(_u(num_items)):
         e, base, note = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(LANES), n * _u(_NOTES)
-        across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[n]))
-        along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[n])
-        power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
+        across = broadcast(block[_u(_P * BLOCK) + e]) * x + (
+            broadcast(block[_u(_Q * BLOCK) + e]) * y + broadcast(shear[n])
+        )
+        along = broadcast(block[_u(_R * BLOCK) + e]) * y + broadcast(rise[n])
+        power = broadcast(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
         light = load(scratch, base)
         alpha = exp2(power)
-        alpha = choose(alpha < highest, alpha, highest)
-        seen = (power >= every(block[_u(_LEAST * BLOCK) + e])) & (light > stop)
-        alpha = choose(seen, alpha, none)
+        alpha = select(alpha < highest, alpha, highest)
+        seen = (power >= broadcast(block[_u(_LEAST * BLOCK) + e])) & (light > stop)
+        alpha = select(seen, alpha, none)
         weight = alpha * light
         if over:
             store(scratch, base, light - weight)
@@ -617,10 +621,10 @@ def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, backgroun
     dL/dalpha = T (c . g - B): nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha that `_note` capped
     at, from which on it does not follow the exponent. `many`: room for the sums of the channels beyond FEW.
     """
-    num, limit, none = _u(len(background)), every(flat), every(_f(0.0))
-    x, y, color = columns_of_cell(), rows_of_cell(), _u(_COLOR * BLOCK) + e
-    slant = every(block[_u(_P * BLOCK) + e]) * x + every(block[_u(_Q * BLOCK) + e]) * y
-    slope_y = every(block[_u(_R * BLOCK) + e]) * y
+    num, limit, none = _u(len(background)), broadcast(flat), broadcast(_f(0.0))
+    x, y, color = cell_columns(), cell_rows(), _u(_COLOR * BLOCK) + e
+    slant = broadcast(block[_u(_P * BLOCK) + e]) * x + broadcast(block[_u(_Q * BLOCK) + e]) * y
+    slope_y = broadcast(block[_u(_R * BLOCK) + e]) * y
     s_1, s_v, s_w, s_vv, s_vw, s_ww = none, none, none, none, none, none
     s_0th, s_1st, s_2nd, s_3rd = none, none, none, none
     if num > _u(FEW):
@@ -629,34 +633,34 @@ def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, backgroun
     for n in range(begin, end):
         base, note = _u(items[n] >> _i(8)) * _u(LANES), n * _u(_NOTES)
         alpha, weight = load(notes, note), load(notes, note + _u(LANES))
-        across, along = slant + every(shear[n]), slope_y + every(rise[n])
+        across, along = slant + broadcast(shear[n]), slope_y + broadcast(rise[n])
         plane = base + _u(_G)
         grad = load(scratch, plane)
-        own = every(block[color]) * grad
+        own = broadcast(block[color]) * grad
         s_0th = s_0th + weight * grad
         if num > _u(1):
             grad = load(scratch, plane + _u(PIXELS))
-            own = own + every(block[color + _u(BLOCK)]) * grad
+            own = own + broadcast(block[color + _u(BLOCK)]) * grad
             s_1st = s_1st + weight * grad
         if num > _u(2):
             grad = load(scratch, plane + _u(2 * PIXELS))
-            own = own + every(block[color + _u(2 * BLOCK)]) * grad
+            own = own + broadcast(block[color + _u(2 * BLOCK)]) * grad
             s_2nd = s_2nd + weight * grad
         if num > _u(3):
             grad = load(scratch, plane + _u(3 * PIXELS))
-            own = own + every(block[color + _u(3 * BLOCK)]) * grad
+            own = own + broadcast(block[color + _u(3 * BLOCK)]) * grad
             s_3rd = s_3rd + weight * grad
         if num > _u(FEW):
             for c in range(num - _u(FEW)):
                 grad = load(scratch, plane + (c + _u(FEW)) * _u(PIXELS))
-                own = own + every(block[color + (c + _u(FEW)) * _u(BLOCK)]) * grad
+                own = own + broadcast(block[color + (c + _u(FEW)) * _u(BLOCK)]) * grad
                 store(many, c * _u(LANES), load(many, c * _u(LANES)) + weight * grad)
         gain = own
         if over:
             behind = load(scratch, base + _u(_BEHIND))
             gain = own - behind
             store(scratch, base + _u(_BEHIND), behind + alpha * gain)
-        slope = choose(alpha < limit, weight * gain, none)
+        slope = select(alpha < limit, weight * gain, none)
         by_v, by_w = slope * across, slope * along
         s_1 = s_1 + slope
         s_v = s_v + by_v
@@ -664,10 +668,15 @@ def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, backgroun
         s_vv = s_vv + by_v * across
         s_vw = s_vw + by_v * along
         s_ww = s_ww + by_w * along
-    pairs = folded(s_1, s_v, 1), folded(s_w, s_vv, 1), folded(s_vw, s_ww, 1), folded(s_0th, s_1st, 1)
-    first = folded(folded(pairs[0], pairs[1], 2), folded(pairs[2], pairs[3], 2), 4)
-    second = folded(folded(folded(s_2nd, s_3rd, 1), none, 2), none, 4)
-    store(slot, _u(0), load(slot, _u(0)) + folded(first, second, 8))
+    pairs = (
+        add_lanes(s_1, s_v, 1),
+        add_lanes(s_w, s_vv, 1),
+        add_lanes(s_vw, s_ww, 1),
+        add_lanes(s_0th, s_1st, 1),
+    )
+    first = add_lanes(add_lanes(pairs[0], pairs[1], 2), add_lanes(pairs[2], pairs[3], 2), 4)
+    second = add_lanes(add_lanes(add_lanes(s_2nd, s_3rd, 1), none, 2), none, 4)
+    store(slot, _u(0), load(slot, _u(0)) + add_lanes(first, second, 8))
     if num > _u(FEW):
         for c in range(num - _u(FEW)):
             total = _f(0.0)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import check_one_of, invalid, short_repr, warn_if_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
@@ -109,7 +109,7 @@ class Camera(eqx.Module):
             raise invalid("rotation, position, fov", expected=expected, got=got)
         if self.aspect is not None:
             check_aspect(self.aspect)
-        fov = known(self.fov)
+        fov = concrete_value(self.fov)
         if fov is not None and not ((fov > 0) & (fov < math.pi)).all():
             raise invalid("fov", expected="radians in (0, pi)", got=fov, cure="For degrees use math.radians.")
 
@@ -155,7 +155,7 @@ class Camera(eqx.Module):
         across = jnp.cross(forward, _unit(up))
         # A sine of rounding size says nothing about a direction.
         blind = ~(_length(across) > 8 * jnp.finfo(across.dtype).eps)
-        if known(blind) is not None and blind.any() and not jnp.isnan(eye + target + up).any():
+        if concrete_value(blind) is not None and blind.any() and not jnp.isnan(eye + target + up).any():
             got = f"eye {eye}, target {target}, up {up}"
             cure = "Looking straight up or down, choose another up, such as (0, 0, 1)."
             raise invalid("eye, target, up", expected="two points, and up not along their line", got=got, cure=cure)
@@ -307,7 +307,7 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
 def _check_angle(parameter: str, angle: ArrayLike) -> None:
     """Raise for what is no number, warn of degrees; nothing can be said under tracing."""
     try:
-        value = known(jnp.asarray(angle))
+        value = concrete_value(jnp.asarray(angle))
     except (TypeError, ValueError):
         raise invalid(parameter, expected="an angle in radians", got=short_repr(angle)) from None
     if value is not None:

@@ -6,7 +6,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import invalid
 from foldgauss.render.camera import THICKNESS, Gaussians3D
 from foldgauss.render.splats import check_shapes
@@ -100,7 +100,7 @@ class Triangles(eqx.Module):
 
 
 def _check_across(factor: Float[Array, "*num 3 3"]) -> None:
-    factor = known(factor)
+    factor = concrete_value(factor)
     if factor is None:
         return
     third = factor[..., 2:]
@@ -113,7 +113,7 @@ def _check_across(factor: Float[Array, "*num 3 3"]) -> None:
 
 
 def _check_faces(edges: Float[Array, "*num 2 3"], sound: Bool[Array, "*num 1"]) -> None:
-    edges, sound = known(edges), known(sound)
+    edges, sound = concrete_value(edges), concrete_value(sound)
     if edges is None or sound is None:
         return
     bad = ~sound[..., 0] & np.isfinite(edges).all((-1, -2))  # NaN in, NaN out

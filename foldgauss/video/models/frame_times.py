@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.video.models.shots import is_cut
 
 
@@ -39,7 +39,7 @@ class FrameTimes(eqx.Module):
 
         Neighbours are equal only where a weight is too small for the dtype to show.
         """
-        check_process()
+        check_not_forked()
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 
