@@ -21,8 +21,9 @@ from foldgauss.io import (
     save_video_model,
 )
 from foldgauss.io.models import compact
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.model_file import load_model
-from foldgauss.io.models.video_model import load_checkpoint, read_origin, save_checkpoint
+from foldgauss.io.models.video_model import read_origin
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
 from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantise
@@ -236,10 +237,8 @@ VIDEO = Target(
     _MODEL_FILE
     | {
         "foldgauss.io.models.video_model": (
-            "save_video_model", "check_model_name", "save_checkpoint", "load_checkpoint", "_to_stored",
-            "_describe_video", "_describe_edited",
-            "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
-            "_palette_skeleton", "_checkpoint_skeleton",
+            "save_video_model", "check_model_name", "_to_stored",
+            "_describe_video", "_describe_edited", "_describe_layer", "_describe_camera",
         ),
         "foldgauss.io.models.segmented": (
             "join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "_load",
@@ -287,12 +286,12 @@ CHECKPOINT = Target(
     _MODEL_FILE
     | {
         "foldgauss.io.models.video_model": (
-            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint",
-            "read_origin", "_is_text", "_is_range", "_to_stored",
+            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "read_origin",
+            "_is_text", "_is_range", "_to_stored",
             "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
-            "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton", "_describe_checkpoint",
-            "_counts",
-        )
+            "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton",
+        ),
+        "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe_checkpoint", "_counts"),
     },
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,

@@ -16,7 +16,8 @@ from commands import run
 
 from benchmarks import gpu
 from foldgauss.io import write_image
-from foldgauss.io.models.video_model import load_checkpoint, load_video_model, save_checkpoint
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import RenderOptions
 from foldgauss.video import (
     DivergenceWarning,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes_of_motion import SIZE, cut, disc, noise, still
 
-from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.compression.finetune import refitted

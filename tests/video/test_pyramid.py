@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import Economy, FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.pyramid import level_at, levels, shrunk, work_done

@@ -83,13 +83,8 @@ from foldgauss.io.datasets import sample_clip
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.pictures import comparison
 from foldgauss.io.media.video_file import Clip, read_video, write_image, write_video
-from foldgauss.io.models.video_model import (
-    MODEL_SUFFIX,
-    check_model_name,
-    load_checkpoint,
-    save_checkpoint,
-    save_video_model,
-)
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name, save_video_model
 from foldgauss.jobs.fitting import CHECKPOINT_SECONDS
 from foldgauss.jobs.long import kept_seconds
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
