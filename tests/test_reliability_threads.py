@@ -609,7 +609,7 @@ MADE = """
         for engine in ("cpu", "xla", "reference"):
             say(engine, np.asarray(shown.render(0.4, (200, 300), engine=engine)).tobytes())
         made = compress(shown, frames, max_loss_db=0.5, passes=1)
-        say("fgz", save_compact(folder / "model.fgz", made.quantised).read_bytes())
+        say("fgz", save_compact(folder / "model.fgz", made.quantized).read_bytes())
         rng = np.random.default_rng(0)
         points = rng.uniform(0, 1, (6000, 3)).astype(np.float32)
         with warnings.catch_warnings():

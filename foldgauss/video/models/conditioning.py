@@ -216,7 +216,7 @@ def _pull_back(
 
 
 @dataclasses.dataclass(frozen=True)
-class Conditioned:
+class ConditionedSplats:
     """Splats of one time in pixels, of the Gaussians `alive` (indices, in array order)."""
 
     alive: np.ndarray
@@ -230,7 +230,7 @@ class Conditioned:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class ConditioningSpec:
     """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the picture's size.
 
     `aspect` is the model frame's height / width (default: the picture's own), see `Splats2D.to_pixels`.
@@ -251,7 +251,7 @@ def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) ->
     )
 
 
-def narrow_windows(rows: np.ndarray, window: np.ndarray, shape: Shape, scale_cutoff: float) -> None:
+def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, shape: ConditioningSpec, scale_cutoff: float) -> None:
     """Leave out of the spans in `window` (num, 2) when a standard deviation is not above `scale_cutoff`, model units.
 
     With s the smaller one: s^2 a > cutoff^2, that is (1 - floor) exp(-power tau^2 / 2) > (cutoff / s)^2 - floor.
@@ -272,8 +272,8 @@ def narrow_windows(rows: np.ndarray, window: np.ndarray, shape: Shape, scale_cut
 
 
 def condition(
-    rows: np.ndarray, window: np.ndarray, t: float, shape: Shape, members: np.ndarray | None = None
-) -> Conditioned:
+    rows: np.ndarray, window: np.ndarray, t: float, shape: ConditioningSpec, members: np.ndarray | None = None
+) -> ConditionedSplats:
     """The Gaussians whose window holds t, of those with `members` (num,) if given, conditioned on t, in pixels."""
     t = np.float32(t)
     near = (window[:, 0] < t) & (t < window[:, 1])
@@ -290,11 +290,15 @@ def condition(
         _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, *splats)
 
     run_tasks(work, range(0, num, CHUNK))
-    return Conditioned(alive, t, unit, mean, factor, opacity, color, kept)
+    return ConditionedSplats(alive, t, unit, mean, factor, opacity, color, kept)
 
 
-def pull_back(
-    rows: np.ndarray, done: Conditioned, gradients: tuple[np.ndarray, ...], shape: Shape, grad: np.ndarray
+def backpropagate(
+    rows: np.ndarray,
+    done: ConditionedSplats,
+    gradients: tuple[np.ndarray, ...],
+    shape: ConditioningSpec,
+    grad: np.ndarray,
 ) -> float:
     """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt."""
     num = len(done.alive)
