@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._common import Scene
-from foldgauss._numerics.simd import choose, every, exp2, lanes, load, store
+from foldgauss._numerics.simd import broadcast, exp2, lane_indices, load, select, store
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, _cpu_kernels, cpu
@@ -68,7 +68,7 @@ def _plain(start, listed, geometry, color, background, ceiling, finished, image,
     width = light.shape[1]
     across = (width + _TILE - 1) // _TILE
     scratch = _aligned(4 * _PIXELS)
-    highest, stop, none, columns = every(ceiling), every(finished), every(_f(0.0)), lanes()
+    highest, stop, none, columns = broadcast(ceiling), broadcast(finished), broadcast(_f(0.0)), lane_indices()
     for tile in range(len(start) - 1):
         left, top = tile % across * _TILE, tile // across * _TILE
         scratch[:_PIXELS] = 1.0
@@ -77,18 +77,18 @@ def _plain(start, listed, geometry, color, background, ceiling, finished, image,
             i = listed[k]
             x, y = geometry[i, 0] - _f(left) - _f(0.5), geometry[i, 1] - _f(top) - _f(0.5)
             p, q, r = geometry[i, 2], geometry[i, 3], geometry[i, 4]
-            log, least = geometry[i, 5], every(geometry[i, 6])
+            log, least = geometry[i, 5], broadcast(geometry[i, 6])
             for row in range(_u(_TILE)):
                 base, dy = row * _u(_TILE), _f(_i(row)) - y
-                along = every(p) * columns + every(q * dy - p * x)
-                power = every(log - r * dy * r * dy) - along * along
+                along = broadcast(p) * columns + broadcast(q * dy - p * x)
+                power = broadcast(log - r * dy * r * dy) - along * along
                 alpha, here = exp2(power), load(scratch, base)
-                alpha = choose(power >= least, choose(alpha < highest, alpha, highest), none)
-                weight = alpha * choose(here > stop, here, none)
+                alpha = select(power >= least, select(alpha < highest, alpha, highest), none)
+                weight = alpha * select(here > stop, here, none)
                 store(scratch, base, here - weight)
                 for c in range(_u(3)):
                     plane = base + (c + _u(1)) * _u(_PIXELS)
-                    store(scratch, plane, load(scratch, plane) + weight * every(color[i, c]))
+                    store(scratch, plane, load(scratch, plane) + weight * broadcast(color[i, c]))
         _write_rows(scratch, background, image, light, top, left)
 
 

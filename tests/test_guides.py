@@ -189,7 +189,7 @@ def _rendering(names, folder):
 
 
 def _results(names, folder):
-    assert names["control"].num_floats <= names["model"].num_floats
+    assert names["control"].num_parameters <= names["model"].num_parameters
     assert names["gain"] > 0
 
 

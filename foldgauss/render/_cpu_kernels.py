@@ -10,19 +10,19 @@ import numpy as np
 
 from foldgauss._numerics.simd import (
     LANES,
-    any_of,
-    between,
-    choose,
-    columns_of_cell,
-    columns_of_rows,
-    every,
+    add_lanes,
+    any_set,
+    broadcast,
+    cell_columns,
+    cell_rows,
     exp2,
-    folded,
+    gather_columns,
     load,
     lowest_bit,
-    rows_of_cell,
+    range_mask,
+    select,
     store,
-    turned,
+    transpose_cells,
 )
 from foldgauss._runtime.kernels import inline, kernel
 
@@ -188,9 +188,9 @@ def _load_geometry(geometry, num, which, left, top, block):
     for e in range(num, (num + LANES - 1) // LANES * LANES):
         which[e] = which[num - 1]
     for e in range(_u(0), _u(num), _u(LANES)):
-        columns = columns_of_rows(geometry, which, e)
-        store(block, _u(_X * BLOCK) + e, columns[_X] - every(left))
-        store(block, _u(_Y * BLOCK) + e, columns[_Y] - every(top))
+        columns = gather_columns(geometry, which, e)
+        store(block, _u(_X * BLOCK) + e, columns[_X] - broadcast(left))
+        store(block, _u(_Y * BLOCK) + e, columns[_Y] - broadcast(top))
         store(block, _u(_P * BLOCK) + e, columns[_P])
         store(block, _u(_Q * BLOCK) + e, columns[_Q])
         store(block, _u(_R * BLOCK) + e, columns[_R])
@@ -306,7 +306,7 @@ def _load_block(geometry, color, background, entries, listed, left, top, block, 
 @inline
 def _offsets(block, e, x, y):
     """P dx + Q dy and R dy of 16 splats of a block, from e on, at pixel (x, y) of their tile."""
-    dx, dy = every(x) - load(block, _u(_X * BLOCK) + e), every(y) - load(block, _u(_Y * BLOCK) + e)
+    dx, dy = broadcast(x) - load(block, _u(_X * BLOCK) + e), broadcast(y) - load(block, _u(_Y * BLOCK) + e)
     across = load(block, _u(_P * BLOCK) + e) * dx + load(block, _u(_Q * BLOCK) + e) * dy
     return across, load(block, _u(_R * BLOCK) + e) * dy
 
@@ -319,16 +319,16 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
     composited in turn; `shear` and `rise` are buffers for P dx + Q dy and R dy at its first pixel.
     `marks`: None, or two vectors for each splat that collect its sum of weights and its largest alphas.
     """
-    attenuation, highest = every(_f(1.0) if over else _f(0.0)), every(ceiling)
-    stop, none = every(finished), every(_f(0.0))
-    x, y = columns_of_cell(), rows_of_cell()
+    attenuation, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
+    stop, none = broadcast(finished), broadcast(_f(0.0))
+    x, y = cell_columns(), cell_rows()
     channels, color = _u(len(background)), _u(_COLOR * BLOCK)
     for cell in range(_u(CELLS * CELLS)):
         base, band, column, remaining = cell * _u(LANES), cell // _u(CELLS), cell % _u(CELLS), _u(0)
         for e in range(_u(0), _u(num), _u(LANES)):
-            remaining |= between(first, end, band * _u(BLOCK) + e, _i(column)) << e
+            remaining |= range_mask(first, end, band * _u(BLOCK) + e, _i(column)) << e
         transmittance = load(scratch, base)
-        if remaining == _u(0) or not any_of(transmittance > stop):
+        if remaining == _u(0) or not any_set(transmittance > stop):
             continue
         for e in range(_u(0), _u(num), _u(LANES)):
             across, along = _offsets(block, e, _f(_i(column * _u(CELL))), _f(_i(band * _u(CELL))))
@@ -345,30 +345,32 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
         while remaining != _u(0):
             e = lowest_bit(remaining)
             remaining &= remaining - _u(1)
-            across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[e]))
-            along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[e])
-            power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
+            across = broadcast(block[_u(_P * BLOCK) + e]) * x + (
+                broadcast(block[_u(_Q * BLOCK) + e]) * y + broadcast(shear[e])
+            )
+            along = broadcast(block[_u(_R * BLOCK) + e]) * y + broadcast(rise[e])
+            power = broadcast(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
             alpha = exp2(power)
-            alpha = choose(alpha < highest, alpha, highest)
-            alpha = choose(power >= every(block[_u(_LEAST * BLOCK) + e]), alpha, none)
-            weight = alpha * choose(transmittance > stop, transmittance, none)
+            alpha = select(alpha < highest, alpha, highest)
+            alpha = select(power >= broadcast(block[_u(_LEAST * BLOCK) + e]), alpha, none)
+            weight = alpha * select(transmittance > stop, transmittance, none)
             if marks is not None:
                 place = e * _u(2 * LANES)
                 store(marks, place, load(marks, place) + weight)
                 place += _u(LANES)
-                drawn, most = choose(transmittance > stop, alpha, none), load(marks, place)
-                store(marks, place, choose(drawn > most, drawn, most))
+                drawn, most = select(transmittance > stop, alpha, none), load(marks, place)
+                store(marks, place, select(drawn > most, drawn, most))
             transmittance = transmittance - attenuation * weight
-            c_0th = c_0th + weight * every(block[color + e])
+            c_0th = c_0th + weight * broadcast(block[color + e])
             if channels > _u(1):
-                c_1st = c_1st + weight * every(block[color + _u(BLOCK) + e])
+                c_1st = c_1st + weight * broadcast(block[color + _u(BLOCK) + e])
             if channels > _u(2):
-                c_2nd = c_2nd + weight * every(block[color + _u(2 * BLOCK) + e])
+                c_2nd = c_2nd + weight * broadcast(block[color + _u(2 * BLOCK) + e])
             if channels > _u(3):
-                c_3rd = c_3rd + weight * every(block[color + _u(3 * BLOCK) + e])
+                c_3rd = c_3rd + weight * broadcast(block[color + _u(3 * BLOCK) + e])
             if channels > _u(FEW):
                 for c in range(_u(FEW), channels):
-                    own = weight * every(block[color + c * _u(BLOCK) + e])
+                    own = weight * broadcast(block[color + c * _u(BLOCK) + e])
                     store(scratch, plane + c * _u(PIXELS), load(scratch, plane + c * _u(PIXELS)) + own)
         store(scratch, base, transmittance)
         store(scratch, plane, c_0th)
@@ -396,10 +398,10 @@ def _reduce_marks(listed, marks, visibility):
 @kernel
 def _is_opaque(scratch, finished):
     """Whether every pixel of the tile is finished: its transmittance is not above the stop."""
-    stop = every(finished)
+    stop = broadcast(finished)
     unfinished = False
     for row in range(_u(TILE)):
-        unfinished |= any_of(load(scratch, row * _u(TILE)) > stop)
+        unfinished |= any_set(load(scratch, row * _u(TILE)) > stop)
     return not unfinished
 
 
@@ -421,7 +423,7 @@ def _load_rows(scratch, at):
     """The four rows of pixels of the four cells at `at` in a plane of the scratch."""
     first, second = load(scratch, at), load(scratch, at + _u(LANES))
     third, fourth = load(scratch, at + _u(2 * LANES)), load(scratch, at + _u(3 * LANES))
-    return turned(first, second, third, fourth)
+    return transpose_cells(first, second, third, fourth)
 
 
 @kernel
@@ -470,7 +472,7 @@ def _write_whole_tile(scratch, background, image, transmittance, height, width, 
         store(transmittance, out + _u(2) * width, transmitted[2])
         store(transmittance, out + _u(3) * width, transmitted[3])
         for c in range(_u(len(background))):
-            behind = every(background[c])
+            behind = broadcast(background[c])
             rows = _load_rows(scratch, (c + _u(1)) * _u(PIXELS) + at)
             store(image, out, rows[0] + transmitted[0] * behind)
             store(image, out + width, rows[1] + transmitted[1] * behind)
@@ -589,18 +591,20 @@ def _list_cells(num, block, first, end, items, stop, shear, rise):
 @kernel
 def _store_alphas(num_items, items, shear, rise, block, scratch, stored, over, ceiling, finished):
     """Traverse a block forward once more and store alpha and weight of every item; scratch: the transmittance."""
-    highest, stop, none = every(ceiling), every(finished), every(_f(0.0))
-    x, y = columns_of_cell(), rows_of_cell()
+    highest, stop, none = broadcast(ceiling), broadcast(finished), broadcast(_f(0.0))
+    x, y = cell_columns(), cell_rows()
     for n in range(_u(num_items)):
         e, base, note = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(LANES), n * _u(_STORED)
-        across = every(block[_u(_P * BLOCK) + e]) * x + (every(block[_u(_Q * BLOCK) + e]) * y + every(shear[n]))
-        along = every(block[_u(_R * BLOCK) + e]) * y + every(rise[n])
-        power = every(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
+        across = broadcast(block[_u(_P * BLOCK) + e]) * x + (
+            broadcast(block[_u(_Q * BLOCK) + e]) * y + broadcast(shear[n])
+        )
+        along = broadcast(block[_u(_R * BLOCK) + e]) * y + broadcast(rise[n])
+        power = broadcast(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
         transmittance = load(scratch, base)
         alpha = exp2(power)
-        alpha = choose(alpha < highest, alpha, highest)
-        seen = (power >= every(block[_u(_LEAST * BLOCK) + e])) & (transmittance > stop)
-        alpha = choose(seen, alpha, none)
+        alpha = select(alpha < highest, alpha, highest)
+        seen = (power >= broadcast(block[_u(_LEAST * BLOCK) + e])) & (transmittance > stop)
+        alpha = select(seen, alpha, none)
         weight = alpha * transmittance
         if over:
             store(scratch, base, transmittance - weight)
@@ -616,10 +620,10 @@ def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, ba
     nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha at which `_store_alphas` capped it; from there on
     it does not depend on the exponent. `many`: a buffer for the sums of the channels beyond FEW.
     """
-    num, limit, none = _u(len(background)), every(flat), every(_f(0.0))
-    x, y, color = columns_of_cell(), rows_of_cell(), _u(_COLOR * BLOCK) + e
-    slant = every(block[_u(_P * BLOCK) + e]) * x + every(block[_u(_Q * BLOCK) + e]) * y
-    slope_y = every(block[_u(_R * BLOCK) + e]) * y
+    num, limit, none = _u(len(background)), broadcast(flat), broadcast(_f(0.0))
+    x, y, color = cell_columns(), cell_rows(), _u(_COLOR * BLOCK) + e
+    slant = broadcast(block[_u(_P * BLOCK) + e]) * x + broadcast(block[_u(_Q * BLOCK) + e]) * y
+    slope_y = broadcast(block[_u(_R * BLOCK) + e]) * y
     s_1, s_v, s_w, s_vv, s_vw, s_ww = none, none, none, none, none, none
     s_0th, s_1st, s_2nd, s_3rd = none, none, none, none
     if num > _u(FEW):
@@ -628,34 +632,34 @@ def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, ba
     for n in range(begin, end):
         base, note = _u(items[n] >> _i(8)) * _u(LANES), n * _u(_STORED)
         alpha, weight = load(stored, note), load(stored, note + _u(LANES))
-        across, along = slant + every(shear[n]), slope_y + every(rise[n])
+        across, along = slant + broadcast(shear[n]), slope_y + broadcast(rise[n])
         plane = base + _u(_G)
         grad = load(scratch, plane)
-        own = every(block[color]) * grad
+        own = broadcast(block[color]) * grad
         s_0th = s_0th + weight * grad
         if num > _u(1):
             grad = load(scratch, plane + _u(PIXELS))
-            own = own + every(block[color + _u(BLOCK)]) * grad
+            own = own + broadcast(block[color + _u(BLOCK)]) * grad
             s_1st = s_1st + weight * grad
         if num > _u(2):
             grad = load(scratch, plane + _u(2 * PIXELS))
-            own = own + every(block[color + _u(2 * BLOCK)]) * grad
+            own = own + broadcast(block[color + _u(2 * BLOCK)]) * grad
             s_2nd = s_2nd + weight * grad
         if num > _u(3):
             grad = load(scratch, plane + _u(3 * PIXELS))
-            own = own + every(block[color + _u(3 * BLOCK)]) * grad
+            own = own + broadcast(block[color + _u(3 * BLOCK)]) * grad
             s_3rd = s_3rd + weight * grad
         if num > _u(FEW):
             for c in range(num - _u(FEW)):
                 grad = load(scratch, plane + (c + _u(FEW)) * _u(PIXELS))
-                own = own + every(block[color + (c + _u(FEW)) * _u(BLOCK)]) * grad
+                own = own + broadcast(block[color + (c + _u(FEW)) * _u(BLOCK)]) * grad
                 store(many, c * _u(LANES), load(many, c * _u(LANES)) + weight * grad)
         gain = own
         if over:
             behind = load(scratch, base + _u(_BEHIND))
             gain = own - behind
             store(scratch, base + _u(_BEHIND), behind + alpha * gain)
-        slope = choose(alpha < limit, weight * gain, none)
+        slope = select(alpha < limit, weight * gain, none)
         by_v, by_w = slope * across, slope * along
         s_1 = s_1 + slope
         s_v = s_v + by_v
@@ -663,10 +667,10 @@ def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, ba
         s_vv = s_vv + by_v * across
         s_vw = s_vw + by_v * along
         s_ww = s_ww + by_w * along
-    pairs = folded(s_1, s_v, 1), folded(s_w, s_vv, 1), folded(s_vw, s_ww, 1), folded(s_0th, s_1st, 1)
-    first = folded(folded(pairs[0], pairs[1], 2), folded(pairs[2], pairs[3], 2), 4)
-    second = folded(folded(folded(s_2nd, s_3rd, 1), none, 2), none, 4)
-    store(slot, _u(0), load(slot, _u(0)) + folded(first, second, 8))
+    pairs = add_lanes(s_1, s_v, 1), add_lanes(s_w, s_vv, 1), add_lanes(s_vw, s_ww, 1), add_lanes(s_0th, s_1st, 1)
+    first = add_lanes(add_lanes(pairs[0], pairs[1], 2), add_lanes(pairs[2], pairs[3], 2), 4)
+    second = add_lanes(add_lanes(add_lanes(s_2nd, s_3rd, 1), none, 2), none, 4)
+    store(slot, _u(0), load(slot, _u(0)) + add_lanes(first, second, 8))
     if num > _u(FEW):
         for c in range(num - _u(FEW)):
             total = _f(0.0)

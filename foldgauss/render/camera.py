@@ -15,8 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import known
-from foldgauss._runtime.checks import invalid, one_of, short_repr, warn_of_degrees
+from foldgauss._numerics.batch import concrete_value
+from foldgauss._runtime.checks import check_one_of, invalid, short_repr, warn_if_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: half of it has tangent 0.36.
@@ -109,7 +109,7 @@ class Camera(eqx.Module):
             raise invalid("rotation, position, fov", expected=expected, got=got)
         if self.aspect is not None:
             check_aspect(self.aspect)
-        fov = known(self.fov)
+        fov = concrete_value(self.fov)
         if fov is not None and not ((fov > 0) & (fov < math.pi)).all():
             raise invalid("fov", expected="radians in (0, pi)", got=fov, cure="For degrees use math.radians.")
 
@@ -155,7 +155,7 @@ class Camera(eqx.Module):
         across = jnp.cross(forward, _unit(up))
         # A sine of the size of rounding errors does not determine a direction.
         undetermined = ~(_length(across) > 8 * jnp.finfo(across.dtype).eps)
-        if known(undetermined) is not None and undetermined.any() and not jnp.isnan(eye + target + up).any():
+        if concrete_value(undetermined) is not None and undetermined.any() and not jnp.isnan(eye + target + up).any():
             got = f"eye {eye}, target {target}, up {up}"
             cure = "Looking straight up or down, choose another up, such as (0, 0, 1)."
             raise invalid("eye, target, up", expected="two points, and up not along their line", got=got, cure=cure)
@@ -220,7 +220,7 @@ def project(
     Source: Zwicker et al. 2001, EWA volume splatting (the local affine map); Kerbl et al. 2023, 3D Gaussian Splatting,
     eq. 5, and its published rasteriser for the 1.3.
     """
-    one_of("order", order, ORDERS)
+    check_one_of("order", order, ORDERS)
     for name, value, kind in (("gaussians", gaussians, Gaussians3D), ("camera", camera, Camera)):
         if not isinstance(value, kind):
             raise invalid(name, expected=kind.__name__, got=type(value).__name__)
@@ -306,11 +306,11 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
 def _check_angle(parameter: str, angle: ArrayLike) -> None:
     """Raise unless it is a number, warn of degrees; traced values are not checked."""
     try:
-        value = known(jnp.asarray(angle))
+        value = concrete_value(jnp.asarray(angle))
     except (TypeError, ValueError):
         raise invalid(parameter, expected="an angle in radians", got=short_repr(angle)) from None
     if value is not None:
-        warn_of_degrees(parameter, *value.ravel().tolist(), stacklevel=4)
+        warn_if_degrees(parameter, *value.ravel().tolist(), stacklevel=4)
 
 
 def _as_float(x: ArrayLike) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import invalid
 from foldgauss.render.camera import THICKNESS, Gaussians3D
 from foldgauss.render.splats import check_shapes
@@ -101,7 +101,7 @@ class Triangles(eqx.Module):
 
 
 def _check_perpendicular(factor: Float[Array, "*num 3 3"]) -> None:
-    factor = known(factor)
+    factor = concrete_value(factor)
     if factor is None:
         return
     third = factor[..., 2:]
@@ -114,7 +114,7 @@ def _check_perpendicular(factor: Float[Array, "*num 3 3"]) -> None:
 
 
 def _check_faces(edges: Float[Array, "*num 2 3"], valid: Bool[Array, "*num 1"]) -> None:
-    edges, valid = known(edges), known(valid)
+    edges, valid = concrete_value(edges), concrete_value(valid)
     if edges is None or valid is None:
         return
     bad = ~valid[..., 0] & np.isfinite(edges).all((-1, -2))  # NaN in, NaN out

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import atomic_folder, check_replaceable
 from foldgauss.io.exchange.ply import checked_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_format import facts_error, format_error
@@ -24,8 +24,8 @@ from foldgauss.io.media.video_file import DEFAULT_FPS, natural_order
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
-from foldgauss.video.models.background import BLACK, checked_background
-from foldgauss.video.models.renderer import Drawable, VideoRenderer, to_bytes
+from foldgauss.video.models.background import BLACK, check_background
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer, to_bytes
 
 #: What is not in an `.obj`: times of the frames, size and rate of the video, how it is drawn.
 NOTES = "pseudomesh.json"
@@ -89,7 +89,7 @@ class Pseudomesh:
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The picture of a frame over `background`. Raises ValueError for a size or a background that is none."""
         size = self.size if size is None else tuple(size)
-        splats, behind = self.splats(number, size), checked_background(background, self.compositing)
+        splats, behind = self.splats(number, size), check_background(background, self.compositing)
         leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
         drawn = {"compositing": self.compositing, "options": self.options}
         return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
@@ -115,7 +115,7 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 def write_pseudomesh(
     folder: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
     overwrite: bool = False,
@@ -207,7 +207,7 @@ def read_pseudomesh(
 
     **Source:** VeGaS eq:gaussrecons1, eq:gaussrecons2; GaMeS.
     """
-    one_of("axes", axes, ("y-up", "y-down"))
+    check_one_of("axes", axes, ("y-up", "y-down"))
     folder = Path(folder)
     if not os.path.exists(folder):
         raise FileNotFoundError(
@@ -247,7 +247,7 @@ def _checked_notes(folder: Path, notes: dict, num_frames: int) -> dict:
     try:
         times, size, fps = np.asarray(notes["times"], np.float64), tuple(notes["size"]), float(notes["fps"])
         options = RenderOptions(**notes["options"])
-        one_of("compositing", notes["compositing"], COMPOSITINGS)
+        check_one_of("compositing", notes["compositing"], COMPOSITINGS)
         check_size(size)
         if not 0 < fps < math.inf:
             raise invalid("fps", expected="a positive rate", got=fps)

@@ -17,7 +17,7 @@ import scipy
 from jaxtyping import Float
 from scipy.special import expit, logit
 
-from foldgauss._runtime.checks import invalid, one_of, short_repr, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import atomic_folder, check_replaceable
 from foldgauss.io.exchange.ply_format import Ply, facts_error, format_error, read_ply, write_ply
@@ -26,8 +26,8 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, pixels_per_unit
 from foldgauss.render.camera import FIELD_OF_VIEW, THICKNESS
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.renderer import Drawable, VideoRenderer
-from foldgauss.video.models.splats import LASTING, SH_C0, FoldedSplats
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
@@ -167,7 +167,9 @@ def _with_power(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
     """log sigma_t that gives an envelope of the `other` power the same values; what lasts is 1 with either."""
-    return np.where(log_time_scale == LASTING, log_time_scale, log_time_scale + 0.5 * np.log(other / power))
+    return np.where(
+        log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
+    )
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:
@@ -227,12 +229,12 @@ def _filled_in(
         fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
         check_size(size)
         cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
-        if not within(cutoff, "[0, 1]"):
+        if not is_within(cutoff, "[0, 1]"):
             raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
         power = note.get("power", VEGAS_POWER)
-        if not within(power, "(0, 1e30]"):
+        if not is_within(power, "(0, 1e30]"):
             raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
-        if not within(fps, f"(0, {MAX_FPS}]"):
+        if not is_within(fps, f"(0, {MAX_FPS}]"):
             raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
     except (TypeError, ValueError) as error:
         raise facts_error(ply.path, error) from error
@@ -292,7 +294,7 @@ def _float64(leaf: object) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- 3DGS
 
 
-def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
+def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
     """The Gaussians that a model draws at time t, flat in space, front first, for programs that sort by depth.
 
     A `VideoRenderer` in place of the model saves the making of one for each of many times. Where segments of a video
@@ -312,9 +314,9 @@ def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: fl
 
     **Source:** VeGaS eq:mirage (flat Gaussians), eq:vegas_equiv_cond (of one time).
     """
-    if not within(depth_step, "[0, 1]"):
+    if not is_within(depth_step, "[0, 1]"):
         raise invalid("depth_step", expected="a depth in [0, 1] of the frame's longer side", got=repr(depth_step))
-    if not within(float(t), "[0, 1]"):
+    if not is_within(float(t), "[0, 1]"):
         raise invalid("t", expected="a time in [0, 1]", got=repr(t))
     playback = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
     mean, factor, opacity, color = _alive(playback, float(t))
@@ -330,7 +332,7 @@ def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: fl
 
 def _alive(playback: VideoRenderer, t: float) -> tuple[np.ndarray, ...]:
     """(mean, factor, opacity, color) of what is drawn at time t (or near it, in a cut), in model space, float64."""
-    splats = playback.shown(t)
+    splats = playback.dominant_splats(t)
     seen = np.asarray(splats.opacity) > 0
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     mean, factor, opacity, color = (_float64(leaf)[seen] for leaf in leaves)
@@ -357,7 +359,7 @@ def write_gaussians_ply(
 
     **Source:** Kerbl et al. 2023, 3D Gaussian Splatting, and the file layout of its published code.
     """
-    one_of("axes", axes, AXES)
+    check_one_of("axes", axes, AXES)
     if sh_degree not in _NUM_REST:
         raise invalid("sh_degree", expected="0, 1, 2 or 3", got=repr(sh_degree))
     mean, factor, opacity, color = (_float64(leaf) for leaf in jax.tree.leaves(_turned(gaussians, axes)))
@@ -379,7 +381,7 @@ def write_gaussians_ply(
 
 def write_3dgs_ply(
     path: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     t: float,
     *,
     depth_step: float = DEPTH_STEP,
@@ -402,7 +404,7 @@ def write_3dgs_ply(
 
 def write_3dgs_frames(
     folder: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
     depth_step: float = DEPTH_STEP,
@@ -433,13 +435,13 @@ def write_3dgs_frames(
     return folder
 
 
-def _check_covers(model: Drawable) -> None:
+def _check_covers(model: RenderableVideo) -> None:
     if model.compositing != "over":
         cure = "Fit it with --compositing over."
         raise invalid("model's compositing", expected="over, as viewers blend", got=model.compositing, cure=cure)
 
 
-def checked_times(model: Drawable, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
+def checked_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)
@@ -461,7 +463,7 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
 
     **Source:** as `write_gaussians_ply`.
     """
-    one_of("axes", axes, AXES)
+    check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
     if not is_3dgs(ply):
         got = "properties " + ", ".join(ply.names("vertex")[:20]) if ply.names("vertex") else "no element 'vertex'"

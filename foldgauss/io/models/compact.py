@@ -1,4 +1,4 @@
-"""Compact model files, .fgz: quantised, entropy-coded, checked, and decoded to the same bits everywhere.
+"""Compact model files, .fgz: quantized, entropy-coded, checked, and decoded to the same bits everywhere.
 
 The layout is in docs/format.md. Files may come from strangers: a checksum finds damage, no number is trusted before it
 has been held against the bytes that are there, and nothing but `ModelFileError` is raised for what a file says.
@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.models import range_coder
 from foldgauss.io.models.columns import Walk
@@ -26,10 +26,10 @@ from foldgauss.video.compression.quantize import (
     MOST_CELL_BITS,
     MOST_SHARED,
     Facts,
-    Quantised,
+    Quantized,
     Rule,
     column_names,
-    dequantise,
+    dequantize,
     is_whole,
 )
 from foldgauss.video.models.video_model import VideoModel
@@ -45,14 +45,14 @@ _MOST_PER_BYTE = 8
 _SIDE = 1 << 20  # no picture is longer: a decoder holds it in memory
 
 
-def save_compact(path: str | os.PathLike, quantised: Quantised, *, metadata: dict | None = None) -> Path:
-    """Write a quantised model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
+def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
+    """Write a quantized model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
     """
-    path = checked_path(path, "path, quantised")
+    path = checked_path(path, "path, quantized")
     check_compact_name(path)
-    data = packed(quantised, metadata)
+    data = packed(quantized, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -64,19 +64,19 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
         raise invalid(parameter, expected=f"a name ending in {COMPACT_SUFFIX}", got=repr(str(path)))
 
 
-def packed(quantised: Quantised, metadata: dict | None = None) -> bytes:
+def packed(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    facts, walk = quantised.facts, Walk(quantised.rules, quantised.facts)
+    facts, walk = quantized.facts, Walk(quantized.rules, quantized.facts)
     streams, described = [], []
     for name in column_names(facts.degree, facts.shared):
-        numbers = quantised.columns[name]
+        numbers = quantized.columns[name]
         column = walk.column(name)
         streams.append(range_coder.encode(_steps(numbers, facts) if name == "cell" else numbers, column))
         walk.add(name, numbers)
-        rule = quantised.rules.get(name)
+        rule = quantized.rules.get(name)
         own = [] if is_whole(name) else [rule.origin, rule.exponent, *rule.slopes]
         described.append([len(streams[-1]), *own])
-    intervals = quantised.intervals
+    intervals = quantized.intervals
     streams.append(range_coder.encode(intervals, range_coder.Column.plain(len(intervals))))
     header = dataclasses.asdict(facts) | {
         "num_frames": len(intervals) + 1,
@@ -113,8 +113,8 @@ def is_compact(path: str | os.PathLike) -> bool:
         return False
 
 
-def load_compact(path: str | os.PathLike) -> Quantised:
-    """The numbers in a compact file; `foldgauss.video.compression.quantize.dequantise` makes the model of them.
+def load_compact(path: str | os.PathLike) -> Quantized:
+    """The numbers in a compact file; `foldgauss.video.compression.quantize.dequantize` makes the model of them.
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
@@ -126,7 +126,7 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
     """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
     path = checked_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
-        model = dequantise(load_compact(path))
+        model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise _unreadable(path, "one with numbers beyond float32")
     return model
@@ -138,7 +138,7 @@ def compact_metadata(path: str | os.PathLike) -> dict:
     return _header(path, path.read_bytes())[0]["metadata"]
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[Quantised, dict]:
+def _unpacked(path: Path, data: bytes) -> tuple[Quantized, dict]:
     header, body = _header(path, data)
     try:
         return _decoded(header, body, len(data)), header["metadata"]
@@ -182,16 +182,16 @@ def _no_number(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
+def _decoded(header: dict, body: bytes, whole_length: int) -> Quantized:
     facts = _facts(header)
     num, num_frames = facts.num_gaussians, header["num_frames"]
-    _check(whole(num_frames, 1), "num_frames", num_frames)
+    _check(is_integer(num_frames, 1), "num_frames", num_frames)
     _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     names = column_names(facts.degree, facts.shared)
     described = header["columns"]
     _check(isinstance(described, list) and len(described) == len(names), "columns", "others")
     lengths = [own[0] for own in described] + [header["intervals"]]
-    _check(all(whole(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
+    _check(all(is_integer(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
     rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_whole(name)}
     _check(all(is_whole(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)), "rule", "none")
     walk, columns, start = Walk(rules, facts), {}, 0
@@ -202,7 +202,7 @@ def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
         walk.add(name, columns[name])
         start += length
     intervals = range_coder.decode(body[start:], range_coder.Column.plain(num_frames - 1))
-    return Quantised(facts, rules, columns, intervals)
+    return Quantized(facts, rules, columns, intervals)
 
 
 def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:
@@ -214,17 +214,19 @@ def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:
 
 def _facts(header: dict) -> Facts:
     size, options = header["size"], header["options"]
-    _check(isinstance(size, list) and len(size) == 2 and all(whole(n, 1) and n <= _SIDE for n in size), "size", size)
-    _check(whole(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
-    _check(whole(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
+    _check(
+        isinstance(size, list) and len(size) == 2 and all(is_integer(n, 1) and n <= _SIDE for n in size), "size", size
+    )
+    _check(is_integer(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
+    _check(is_integer(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
     cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
-    _check(isinstance(cells, list) and len(cells) == 3 and all(whole(n, 0) for n in cells), "cells", cells)
+    _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
     _check(sum(cells) <= MOST_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
-    _check(whole(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
+    _check(is_integer(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
-        _check(within(header[name], interval), name, header[name])
-    one_of("compositing", header["compositing"], COMPOSITINGS)
+        _check(is_within(header[name], interval), name, header[name])
+    check_one_of("compositing", header["compositing"], COMPOSITINGS)
     names = [field.name for field in dataclasses.fields(Facts)]
     return Facts(
         **{name: header[name] for name in names}
@@ -234,7 +236,7 @@ def _facts(header: dict) -> Facts:
 
 def _rule(name: str, numbers: list) -> Rule:
     known = FEATURES.index(name) if name in FEATURES else len(FEATURES)
-    _check(2 <= len(numbers) <= 2 + known and all(within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
+    _check(2 <= len(numbers) <= 2 + known and all(is_within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
     return Rule(numbers[0], numbers[1], tuple(numbers[2:]))
 
 

@@ -8,15 +8,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, within
+from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.posterior.exact import exact_times
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import drawn_log_likelihood
 from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import evaluate
-from foldgauss.video.models.shots import is_cut
 from foldgauss.video.models.video_model import VideoModel
 
 #: An increment is measured by the median of those up to this many intervals before and after it.
@@ -62,7 +62,7 @@ def intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementInt
     An increment between two frames whose times were held varies with the median alone. Raises ValueError for a level
     out of (0, 1).
     """
-    if not within(level, "(0, 1)"):
+    if not is_within(level, "(0, 1)"):
         raise invalid("level", expected="a number in (0, 1)", got=level)
     steps = np.diff(_some(posterior), axis=1)
     steps /= np.median(steps[:, ~cuts(posterior)], axis=1, keepdims=True)
@@ -88,7 +88,7 @@ def irregularities(
 
     Told are those that are so in at least the share `probability` of the draws. The local median is that of the `reach`
     intervals before and after, as far as the shot goes, in the same draw: a pace that changes smoothly, in the clip or
-    as learned, is even. Cuts (`shots.is_cut`) are not flagged, and end the neighbourhood. Intervals
+    as learned, is even. Cuts (`frame_times.is_cut`) are not flagged, and end the neighbourhood. Intervals
     between two frames whose times were held are not judged, nor are those of a frame that does not tell its time
     (`FrameTimePosterior.identified`).
 
@@ -96,11 +96,11 @@ def irregularities(
 
     **Example:** `[one.frames for one in irregularities(posterior) if one.kind == "duplicated"]`.
     """
-    if not within(duplicate, "(0, 1)"):
+    if not is_within(duplicate, "(0, 1)"):
         raise invalid("duplicate", expected="a number in (0, 1)", got=duplicate)
     if not (np.isfinite(dropped) and dropped > 1):
         raise invalid("dropped", expected="a number > 1", got=dropped)
-    if not within(probability, "(0, 1]"):
+    if not is_within(probability, "(0, 1]"):
         raise invalid("probability", expected="a number in (0, 1]", got=probability)
     if reach < 1:
         raise invalid("reach", expected="a whole number >= 1", got=reach)
@@ -186,7 +186,7 @@ def _some(posterior: FrameTimePosterior) -> Float64[np.ndarray, "draws num_frame
 
 
 def cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
-    """Which intervals are cuts, by the posterior means (`foldgauss.video.models.shots.is_cut`)."""
+    """Which intervals are cuts, by the posterior means (`foldgauss.video.models.frame_times.is_cut`)."""
     return np.asarray(is_cut(posterior.mean().astype(np.float32)))
 
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from foldgauss._runtime.checks import check_takes, invalid, short_repr, whole, within
-from foldgauss._runtime.file_lock import Held, alone
+from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.file_lock import LockHeld, hold_lock
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.posterior.exact import ExactTimes, exact_times
@@ -109,7 +109,7 @@ class FrameTimePosterior:
 
     def interval(self, level: float = 0.9) -> Float64[np.ndarray, "2 num_frames"]:
         """Ends of the central intervals that hold `level` of the draws."""
-        if not within(level, "(0, 1)"):
+        if not is_within(level, "(0, 1)"):
             raise invalid("level", expected="a number in (0, 1)", got=short_repr(level))
         ends = [(1 - level) / 2, (1 + level) / 2]
         return self._by_frames(lambda draws: np.quantile(draws, ends, axis=0))
@@ -259,22 +259,22 @@ def check_settings(
 
     at_once = num_free if together or num_free <= AT_ONCE else BLOCK
     found = max(32, 4 * at_once) if walkers is None else walkers
-    if not whole(found, max(2 * at_once, 4)) or found % 2:
+    if not is_integer(found, max(2 * at_once, 4)) or found % 2:
         expected = f"an even number, at least {max(2 * at_once, 4)}: twice the frames that move at once"
         cure = "Leave it out, or choose fewer frames."
         raise invalid("walkers", expected=expected, got=short_repr(walkers), cure=cure)
-    if not whole(ensembles, 2):
+    if not is_integer(ensembles, 2):
         expected = "at least 2 (a whole number), better 4: R-hat compares them"
         raise invalid("ensembles", expected=expected, got=short_repr(ensembles))
-    if not whole(thin_by, 1):
+    if not is_integer(thin_by, 1):
         raise invalid("thin_by", expected="a whole number >= 1", got=short_repr(thin_by))
-    if steps is not None and not whole(steps, int(thin_by)):
+    if steps is not None and not is_integer(steps, int(thin_by)):
         raise invalid("steps", expected=f"at least thin_by = {thin_by}, a whole number", got=short_repr(steps))
     return int(found)
 
 
 def _checked_seed(seed: int) -> int:
-    if not whole(seed, 0):
+    if not is_integer(seed, 0):
         raise invalid("seed", expected="a whole number >= 0", got=short_repr(seed))
     return int(seed)
 
@@ -306,7 +306,9 @@ def _is_move(value) -> bool:
 
 
 def _is_weighted(value) -> bool:
-    return isinstance(value, list | tuple) and len(value) == 2 and _is_move(value[0]) and within(value[1], "[0, inf)")
+    return (
+        isinstance(value, list | tuple) and len(value) == 2 and _is_move(value[0]) and is_within(value[1], "[0, inf)")
+    )
 
 
 def _checked_backend(backend) -> Path | None:
@@ -339,8 +341,8 @@ def only_run(backend: Path | None) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if backend is not None:
             try:
-                stack.enter_context(alone(_running(backend, ".lock")))
-            except Held as error:
+                stack.enter_context(hold_lock(_running(backend, ".lock")))
+            except LockHeld as error:
                 raise BlockingIOError(
                     f"backend: expected a file that no other run is writing, got {str(backend)!r}, which one is. "
                     "Wait for that one, or choose another file."
@@ -699,7 +701,9 @@ def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
         if not (plain and part.shape == want and part.id.get_storage_size() <= size):
             return False
     told = [group.attrs[fact] for fact in ("nwalkers", "ndim")]
-    numbers = whole(done, 0) and all(whole(fact, 0) for fact in told) and np.shape(group.attrs["has_blobs"]) == ()
+    numbers = (
+        is_integer(done, 0) and all(is_integer(fact, 0) for fact in told) and np.shape(group.attrs["has_blobs"]) == ()
+    )
     if not numbers or done > rows or told != [walkers, free] or bool(group.attrs["has_blobs"]):
         return False
     needs = 8 * int(done) * walkers * free, 8 * int(done) * walkers
@@ -711,7 +715,7 @@ def _is_whole(file, name: str, walkers: int, free: int, size: int) -> bool:
 def _is_random_state(attributes) -> bool:
     """Whether NumPy may be handed it: it trusts the place within its numbers."""
     kind, keys, place, has_one, one = (attributes[f"random_state_{k}"] for k in range(5))
-    numbers = whole(place, 0) and place <= 624 and whole(has_one, 0) and has_one <= 1
+    numbers = is_integer(place, 0) and place <= 624 and is_integer(has_one, 0) and has_one <= 1
     return (
         numbers
         and isinstance(one, float)
@@ -740,7 +744,7 @@ def _check_progress(progress) -> None:
         return
     if not callable(progress):
         raise invalid("progress", expected="True, False or a function", got=short_repr(progress))
-    check_takes("progress", progress, "what", "done", "total")
+    check_signature("progress", progress, "what", "done", "total")
 
 
 @contextlib.contextmanager
