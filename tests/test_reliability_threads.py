@@ -22,7 +22,7 @@ from soft_models import soft_model
 
 from foldgauss import FoldedMixture
 from foldgauss._runtime import threads as _threads
-from foldgauss._runtime.interrupts import leaving_at_once
+from foldgauss._runtime.interrupts import use_default_signals
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.render import ENGINES, render
 from foldgauss.render.pallas import HIGHEST_CEILING
@@ -548,12 +548,12 @@ def test_whoever_answers_interrupts_still_does():
     before = signal.getsignal(signal.SIGINT)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        with leaving_at_once():
+        with use_default_signals():
             assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         for other in (signal.SIG_IGN, lambda number, frame: None):
             signal.signal(signal.SIGINT, other)
-            with leaving_at_once():
+            with use_default_signals():
                 assert signal.getsignal(signal.SIGINT) is other
             assert signal.getsignal(signal.SIGINT) is other
     finally:

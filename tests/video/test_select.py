@@ -269,7 +269,7 @@ def test_nothing_is_followed_across_a_cut():
         (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask that is not empty"),
         ({}, {}, "^mask: expected a mask that is not empty"),
         (np.ones((48, 48), bool), {"frame": 0}, "^mask: expected the aspect of the model's 48x72, got 48x48"),
-        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* Of labels"),
+        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* From labels"),
         (np.full((48, 72), 1.5), {"frame": 0}, r"fractions in \[0, 1\]"),
         (np.full((48, 72), np.nan), {"frame": 0}, r"fractions in \[0, 1\]"),
         (np.ones((48, 72), bool), {}, "frame=k"),

@@ -11,7 +11,7 @@ import numpy as np
 
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
@@ -136,7 +136,7 @@ def fit_steps(
 
     `motion`: the frames' own, where it is known from before; finding it takes some hundredths of a second a frame.
     """
-    check_process()
+    check_not_forked()
     check_frames(frames)
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
@@ -597,7 +597,7 @@ class _Stepper:
         if mirrored:
             d_mean, d_factor = _mirrored(d_mean, d_factor, 0)
         if views is not None:
-            seen = trace.seen
+            seen = trace.visible
             half = np.float32(shape.size[::-1]) / 2
             views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
         return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from foldgauss._numerics.simd import LANES, choose, cos_and_sin, every, exp, load, root, sigmoid, store
+from foldgauss._numerics.simd import LANES, broadcast, cos_and_sin, exp, load, select, sigmoid, sqrt, store
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import pixels_per_unit
@@ -118,22 +118,22 @@ def _column(columns, c):
 
 @kernel
 def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
-    none, scale = every(_f(0.0)), every(unit)
+    none, scale = broadcast(_f(0.0)), broadcast(unit)
     centre, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
-    u = centre - every(t)
+    u = centre - broadcast(t)
     x, y = none, none
     for j in range(degree - 1, -1, -1):  # Horner
         x = u * (x + _column(columns, at.fold + 2 * j))
         y = u * (y + _column(columns, at.fold + 2 * j + 1))
-    store(out, _u(0), (_column(columns, at.loc) + x) * scale + every(cx))
-    store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + every(cy))
+    store(out, _u(0), (_column(columns, at.loc) + x) * scale + broadcast(cx))
+    store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + broadcast(cy))
     tau = u / spread
-    exponent = every(_f(-0.25) * power) * tau * tau  # of sqrt(a) without the floor
+    exponent = broadcast(_f(-0.25) * power) * tau * tau  # of sqrt(a) without the floor
     if floor == _f(0.0):
         first = exp(_column(columns, at.scale) + exponent) * scale
         second = exp(_column(columns, at.scale + 1) + exponent) * scale
     else:
-        shrink = root(every(floor) + every(_f(1.0) - floor) * exp(exponent + exponent)) * scale
+        shrink = sqrt(broadcast(floor) + broadcast(_f(1.0) - floor) * exp(exponent + exponent)) * scale
         first, second = exp(_column(columns, at.scale)) * shrink, exp(_column(columns, at.scale + 1)) * shrink
     turn = sigmoid(_column(columns, at.angle))
     cos, sin = cos_and_sin(turn)
@@ -143,8 +143,8 @@ def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
     store(out, _u(5 * LANES), cos * second)
     store(out, _u(6 * LANES), sigmoid(_column(columns, at.opacity)))
     for c in range(_u(3)):
-        value = every(_f(0.5)) + every(at.sh_c0) * _column(columns, at.color + c)
-        store(out, (_u(7) + c) * _u(LANES), choose(value < none, none, value))
+        value = broadcast(_f(0.5)) + broadcast(at.sh_c0) * _column(columns, at.color + c)
+        store(out, (_u(7) + c) * _u(LANES), select(value < none, none, value))
     store(out, _u(10 * LANES), centre)
     store(out, _u(11 * LANES), spread)
     store(out, _u(12 * LANES), turn)

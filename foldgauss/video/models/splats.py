@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import invalid
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
@@ -111,10 +111,12 @@ class FoldedSplats(eqx.Module):
             got = f"event {mixture.event_shape}, batch {mixture.batch_shape}"
             raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Index its leaves.")
         time_loc, dtype, num = components.time_loc, components.loc.dtype, mixture.num_components
-        outside = known((time_loc <= 0) | (time_loc >= 1))
+        outside = concrete_value((time_loc <= 0) | (time_loc >= 1))
         if outside is not None and outside.any():
             cure = "A video's time is [0, 1]: shift and scale the mixture's."
-            raise invalid("mixture.components.time_loc", expected="times in (0, 1)", got=known(time_loc), cure=cure)
+            raise invalid(
+                "mixture.components.time_loc", expected="times in (0, 1)", got=concrete_value(time_loc), cure=cure
+            )
         log_scale, angle = _axes(components.scale_tril)
         log_weights = mixture.log_weights
         log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
@@ -211,7 +213,7 @@ def _check_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
     if color.shape not in ((3,), (num, 3)):
         got, cure = f"shape {color.shape}", "RGB in [0, 1]."
         raise invalid("color", expected=f"shape (3,) or ({num}, 3)", got=got, cure=cure)
-    values = known(color)
+    values = concrete_value(color)
     if values is not None and not (values >= 0).all():
         raise invalid("color", expected="values >= 0", got=values.tolist())
     return jnp.broadcast_to(color, (num, 3))

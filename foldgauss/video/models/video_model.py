@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, short_repr
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, check_background
@@ -28,9 +28,9 @@ ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 def check_time(t: float) -> None:
     """Raise unless t is a time in [0, 1], if its value is known."""
-    check_process()
+    check_not_forked()
     try:
-        value = known(jnp.asarray(t))
+        value = concrete_value(jnp.asarray(t))
     except (TypeError, ValueError):
         raise invalid("t", expected="a time in [0, 1]", got=short_repr(t)) from None
     if value is not None and not ((value >= 0) & (value <= 1)).all():

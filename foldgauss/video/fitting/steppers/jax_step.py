@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
-from foldgauss.render.tiles import on_screen
+from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, LASTING_TIME, UNBIAS
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import TIME_ADAM, frame_times, update_times
@@ -285,7 +285,7 @@ def _screen_gradient(plan: Plan, splats: Splats2D, by_splats: Splats2D, alive) -
     """Of `GradientStatistics.add`: the largest over the views; -1 where none shows a Gaussian."""
     half = np.float32(plan.size[::-1]) / 2
     size = jnp.hypot(by_splats.mean[..., 0] * half[0], by_splats.mean[..., 1] * half[1])
-    shows = jax.vmap(lambda own: on_screen(own.mean, own.factor, own.opacity, plan.size, plan.options))(splats)
+    shows = jax.vmap(lambda own: find_visible(own.mean, own.factor, own.opacity, plan.size, plan.options))(splats)
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
 
 
