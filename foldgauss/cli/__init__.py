@@ -4,11 +4,11 @@
 `fitting`, `viewing`, `editing` and `measuring` the commands. `main` is the entry point.
 """
 
-from foldgauss._runtime.interrupts import leaving_at_once
+from foldgauss._runtime.interrupts import use_default_signals
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command and exit: 0 success, 2 wrong usage, 1 failure, 143 SIGTERM; one-line errors unless --debug."""
-    with leaving_at_once():
+    with use_default_signals():
         from foldgauss.cli.app import main
     main.main(arguments)
