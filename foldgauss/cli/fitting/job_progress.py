@@ -1,205 +1,175 @@
-"""How many jobs at once are shown: one bar for all and one for each that runs, lines in a log, or JSON."""
+"""Runs jobs and displays their progress: a bar for all and one per running job, lines in a log, or JSON."""
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from importlib.util import find_spec
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from foldgauss._runtime.threads import available_cores
-from foldgauss.cli.app.application import Stopped, WrongUse, err
-from foldgauss.cli.app.shared import TIME_LEFT
-from foldgauss.cli.app.signals import noted_signals
-from foldgauss.cli.fitting.progress import Manner, print_json
-from foldgauss.jobs import FitJob, Outcome, WorkerPool, local_workers, run_here, run_on, running_cluster
-from foldgauss.jobs import Progress as Share
+from foldgauss.cli.app.application import Stopped, err
+from foldgauss.cli.app.signals import note_signals
+from foldgauss.cli.fitting.progress import Display, print_json
+from foldgauss.cli.shared.rendering import TIME_LEFT
+from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
+from foldgauss.jobs import Progress as JobProgress
 from foldgauss.jobs import Stopped as JobsStopped
 
-#: Seconds between two lines of a log; the first comes sooner, since something may be misspelt.
-FIRST_LINE, LINE = 10.0, 30.0
-#: Jobs of which each has a line in a log.
-FEW = 20
+#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
+FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
+#: Up to so many jobs, each has a line in a log.
+MAX_LINES = 20
 
 
-def tell_json(event: str, figures: dict[str, Any]) -> None:
-    """A line of JSON; that nobody listens any more is no reason to lose a fit."""
+def emit_json(event: str, figures: dict[str, Any]) -> None:
+    """Print a line of JSON; a closed standard output must not end the fits."""
     with suppress(OSError):
         print_json(event, figures)
 
 
 def run_jobs(
     jobs: Sequence[FitJob],
-    what: str,
-    manner: Manner,
-    crew: WorkerPool | None,
+    noun: str,
+    display: Display,
+    pool: WorkerPool | None,
     *,
     on_end: Callable[[Outcome], None] = lambda outcome: None,
     cure: str,
 ) -> list[Outcome]:
-    """Have the jobs done, by `crew` or here, and show how far they are; outcomes in the order of the jobs.
+    """Run the jobs, by the workers of `pool` or here, and display progress; outcomes in the order of the jobs.
 
-    Ctrl-C and SIGTERM end them, once what is done is kept: raises `Stopped`, which says how to go on, by `cure`.
+    After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message ends with `cure`.
     """
     ended: dict[str, Outcome] = {}
-    with noted_signals() as asked, _shown(what, len(jobs), manner) as view:
-        asked.stepping = True  # what comes is kept at any moment
-        how = {"asked_to_stop": lambda: bool(asked.name)}
-        outcomes = run_here(jobs, view.watch, **how) if crew is None else run_on(crew, jobs, view.watch, **how)
+    with note_signals() as request, _open_view(noun, len(jobs), display) as view:
+        request.stepping = True  # jobs may stop at any moment
+
+        def should_stop() -> bool:
+            return bool(request.signal)
+
+        if pool is None:
+            outcomes = run_here(jobs, view.update, should_stop=should_stop)
+        else:
+            outcomes = run_on(pool, jobs, view.update, should_stop=should_stop)
         try:
             for outcome in outcomes:
                 ended[outcome.job.target] = outcome
-                view.ended(outcome)
+                view.end(outcome)
                 on_end(outcome)
         except JobsStopped as error:
             done = sum(outcome.failure is None for outcome in ended.values())
-            told = f"stopped by {asked.name or 'the worker'}; {done} of {len(jobs)} {what} are done"
-            raise Stopped(f"{told}, what was begun is kept. {cure}") from error
+            text = f"stopped by {request.signal or 'the worker'}; {done} of {len(jobs)} {noun} are done"
+            raise Stopped(f"{text}, the others have checkpoints. {cure}") from error
     return [ended[job.target] for job in jobs]
 
 
-@dataclasses.dataclass(frozen=True)
-class WorkerOptions:
-    """Who is asked to do jobs: `workers` of this machine, each of so many `threads`, those of a `scheduler`, or nobody.
-
-    Raises WrongUse for options that do not go together.
-    """
-
-    workers: int | None
-    scheduler: str | None
-    threads: int | None
-
-    def __post_init__(self) -> None:
-        if self.scheduler is not None and (self.workers is not None or self.threads is not None):
-            other = "--workers" if self.workers is not None else "--threads"
-            raise WrongUse(f"{other}: expected no --scheduler beside it, which has workers of its own. Leave one out.")
-        if self.threads is not None and self.workers is None:
-            raise WrongUse("--threads: expected --workers beside it. Of this process: FOLDGAUSS_NUM_THREADS.")
-        if (self.workers is not None or self.scheduler is not None) and find_spec("distributed") is None:
-            option = "--workers" if self.scheduler is None else "--scheduler"
-            raise WrongUse(f"{option}: needs dask.distributed: pip install 'foldgauss[distributed]'.")
-        if self.workers is not None and self.threads is None:
-            object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
-
-    def __str__(self) -> str:
-        if self.scheduler is not None:
-            return f"the workers of {self.scheduler}"
-        if self.workers is None:
-            return "this process"
-        each = f"{self.threads} thread{'' if self.threads == 1 else 's'}"
-        return f"{self.workers} worker{'' if self.workers == 1 else 's'} of {each}"
-
-    def crew(self) -> AbstractContextManager[WorkerPool | None]:
-        if self.scheduler is not None:
-            return running_cluster(self.scheduler)
-        return nullcontext() if self.workers is None else local_workers(self.workers, threads=self.threads)
-
-
 class _View:
-    """What is told of jobs; by itself nothing."""
+    """The state of the jobs; it displays nothing itself."""
 
-    def __init__(self, what: str, total: int):
-        self.what, self.total, self.done, self.failed = what, total, 0, 0
-        self.shares: dict[str, Share] = {}
+    def __init__(self, noun: str, total: int):
+        self.noun, self.total, self.done, self.failed = noun, total, 0, 0
+        self.running: dict[str, JobProgress] = {}
 
-    def watch(self, share: Share) -> None:
-        self.shares[share.name] = share
+    def update(self, progress: JobProgress) -> None:
+        self.running[progress.name] = progress
 
-    def ended(self, outcome: Outcome) -> None:
-        self.shares.pop(outcome.job.name, None)
+    def end(self, outcome: Outcome) -> None:
+        self.running.pop(outcome.job.name, None)
         self.done += outcome.failure is None
         self.failed += outcome.failure is not None
 
     @property
     def completed(self) -> float:
-        return self.done + self.failed + sum(share.share for share in self.shares.values())
+        return self.done + self.failed + sum(job.fraction for job in self.running.values())
 
     @property
     def counts(self) -> str:
         failed = f", {self.failed} failed" if self.failed else ""
-        return f"{self.done} of {self.total} {self.what} done{failed}"
+        return f"{self.done} of {self.total} {self.noun} done{failed}"
 
 
-def _told(share: Share) -> str:
-    psnr = f"{share.psnr:.2f} dB" if math.isfinite(share.psnr) else ""
-    return f"{share.step} steps  {psnr}  {share.num_gaussians:,} Gaussians"
+def _describe(progress: JobProgress) -> str:
+    psnr = f"{progress.psnr:.2f} dB" if math.isfinite(progress.psnr) else ""
+    return f"{progress.step} steps  {psnr}  {progress.num_gaussians:,} Gaussians"
 
 
 class _Bars(_View):
-    def __init__(self, what: str, total: int, progress: Progress):
-        super().__init__(what, total)
-        self.progress = progress
-        self.all = progress.add_task(self.counts, total=total, told="")
+    """A bar for all jobs, and one for each that runs."""
+
+    def __init__(self, noun: str, total: int, bars: Progress):
+        super().__init__(noun, total)
+        self.bars = bars
+        self.all = bars.add_task(self.counts, total=total, text="")
         self.tasks: dict[str, TaskID] = {}
 
-    def watch(self, share: Share) -> None:
-        super().watch(share)
-        if share.name not in self.tasks:
-            self.tasks[share.name] = self.progress.add_task(f"  {share.name}", total=1.0, told="")
-        self.progress.update(self.tasks[share.name], completed=share.share, told=_told(share))
-        self._whole()
+    def update(self, progress: JobProgress) -> None:
+        super().update(progress)
+        if progress.name not in self.tasks:
+            self.tasks[progress.name] = self.bars.add_task(f"  {progress.name}", total=1.0, text="")
+        self.bars.update(self.tasks[progress.name], completed=progress.fraction, text=_describe(progress))
+        self._update_all()
 
-    def ended(self, outcome: Outcome) -> None:
-        super().ended(outcome)
+    def end(self, outcome: Outcome) -> None:
+        super().end(outcome)
         if outcome.job.name in self.tasks:
-            self.progress.remove_task(self.tasks.pop(outcome.job.name))
-        self._whole()
+            self.bars.remove_task(self.tasks.pop(outcome.job.name))
+        self._update_all()
 
-    def _whole(self) -> None:
-        self.progress.update(self.all, description=self.counts, completed=self.completed)
+    def _update_all(self) -> None:
+        self.bars.update(self.all, description=self.counts, completed=self.completed)
 
 
 class _Lines(_View):
-    """A line for each that ends, where these are few; else, and between, one now and then."""
+    """A line now and then, and one for each job that ends if there are few."""
 
-    def __init__(self, what: str, total: int):
-        super().__init__(what, total)
-        self.next = time.monotonic() + FIRST_LINE
+    def __init__(self, noun: str, total: int):
+        super().__init__(noun, total)
+        self.next = time.monotonic() + FIRST_LINE_SECONDS
 
-    def watch(self, share: Share) -> None:
-        super().watch(share)
+    def update(self, progress: JobProgress) -> None:
+        super().update(progress)
         if time.monotonic() >= self.next:
-            self.next = time.monotonic() + LINE
-            running = (f"{one.name} {one.share:.0%} ({one.psnr:.1f} dB)" for one in self.shares.values())
+            self.next = time.monotonic() + LINE_SECONDS
+            running = (f"{job.name} {job.fraction:.0%} ({job.psnr:.1f} dB)" for job in self.running.values())
             err.print(f"{self.counts}; {', '.join(running)}", soft_wrap=True)
 
-    def ended(self, outcome: Outcome) -> None:
-        super().ended(outcome)
-        if self.total <= FEW:
-            what = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
-            err.print(f"{self.counts}: {outcome.job.name}, {what}", soft_wrap=True)
+    def end(self, outcome: Outcome) -> None:
+        super().end(outcome)
+        if self.total <= MAX_LINES:
+            result = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
+            err.print(f"{self.counts}: {outcome.job.name}, {result}", soft_wrap=True)
 
 
 class _Json(_View):
-    def watch(self, share: Share) -> None:
-        super().watch(share)
-        finite = {name: value for name, value in share._asdict().items() if value == value and value != math.inf}
-        tell_json("progress", finite)
+    """Events as lines of JSON."""
 
-    def ended(self, outcome: Outcome) -> None:
-        super().ended(outcome)
+    def update(self, progress: JobProgress) -> None:
+        super().update(progress)
+        finite = {name: value for name, value in progress._asdict().items() if value == value and value != math.inf}
+        emit_json("progress", finite)
+
+    def end(self, outcome: Outcome) -> None:
+        super().end(outcome)
         if outcome.failure is not None:
-            tell_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
+            emit_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
         else:
             figures = {name: outcome.record[name] for name in ("mean_psnr", "mean_ssim", "seconds", "steps")}
-            tell_json("ended", {"name": outcome.job.name} | figures)
+            emit_json("ended", {"name": outcome.job.name} | figures)
 
 
 @contextmanager
-def _shown(what: str, total: int, manner: Manner) -> Iterator[_View]:
-    if manner != "bar":
+def _open_view(noun: str, total: int, display: Display) -> Iterator[_View]:
+    if display != "bar":
         kinds = {"lines": _Lines, "json": _Json, "quiet": _View}
-        yield kinds[manner](what, total)
+        yield kinds[display](noun, total)
         return
     columns = (
-        TextColumn("{task.description}", markup=False),  # names of files
+        TextColumn("{task.description}", markup=False),  # file names
         BarColumn(bar_width=20),
         TimeElapsedColumn(),
         *TIME_LEFT,
-        TextColumn("{task.fields[told]}"),
+        TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=err) as progress:
-        yield _Bars(what, total, progress)
+    with Progress(*columns, console=err) as bars:
+        yield _Bars(noun, total, bars)
