@@ -98,7 +98,7 @@ def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespac
             begun = time.perf_counter()
             made = compress(model, clip.frames, max_loss_db=options.loss, passes=passes)
             seconds = time.perf_counter() - begun
-            path = save_compact(folder / f"{what}.fgz", made.quantised)
+            path = save_compact(folder / f"{what}.fgz", made.quantized)
             lost = before - evaluate(load_video_model(path), clip.frames).mean_psnr
             row(what, path, lost, made.model.num_gaussians, seconds)
         if shutil.which("ffmpeg") is None:

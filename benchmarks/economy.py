@@ -59,7 +59,7 @@ class Sweep:
         return reached >= self.psnr
 
     def _note(self, what: str, model: VideoModel, reached: float, seconds: float) -> None:
-        self.rows.append((what, self.degree, model.num_gaussians, model.num_floats, reached, seconds))
+        self.rows.append((what, self.degree, model.num_gaussians, model.num_parameters, reached, seconds))
         console.print(*self.rows[-1])
 
     def search(self, first: int) -> int:
@@ -92,7 +92,9 @@ def main(arguments: list[str] | None = None) -> None:
     reached, steps = evaluate(model, clip.frames).mean_psnr, result.history[-1].step
     if options.model is not None:
         save_video_model(options.model, model)
-    rows.append((f"economy, {steps:,} steps", model.degree, model.num_gaussians, model.num_floats, reached, seconds))
+    rows.append(
+        (f"economy, {steps:,} steps", model.degree, model.num_gaussians, model.num_parameters, reached, seconds)
+    )
     console.print(*rows[0])
     first = options.first
     for degree in map(int, options.degrees.split(",")):

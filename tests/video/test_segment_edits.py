@@ -139,7 +139,7 @@ def test_one_segment_is_edited_as_the_model_to_the_bit(name):
     assert described == wanted_described
     for one, other in zip(leaves, wanted_leaves, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert (got.num_gaussians, got.num_floats) == (wanted.num_gaussians, wanted.num_floats)
+    assert (got.num_gaussians, got.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
     np.testing.assert_array_equal(drawn(got), drawn(wanted))
 
 
@@ -533,7 +533,7 @@ def test_edits_act_in_their_order_and_a_selection_goes_along():
         wanted = chain(edit(model), part).video()
         for one, other in zip(jax.tree.leaves(segment.model), jax.tree.leaves(wanted), strict=True):
             np.testing.assert_array_equal(one, other)
-        assert (segment.num_gaussians, segment.num_floats) == (wanted.num_gaussians, wanted.num_floats)
+        assert (segment.num_gaussians, segment.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
     copied = edit(video).select(parts).multiply([(0.2, 0)])
     assert len(copied.selection) == len(parts)
     assert len(copied.select_begun(parts).selection) == 2 * len(parts)

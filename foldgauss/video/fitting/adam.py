@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.kinds import DEGREES, LASTS, SOLID
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
 #: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
@@ -114,7 +114,7 @@ def sparse_adam(
     num = len(touched)
     if kinds is None:
         kinds = np.full(len(rows), (rows.shape[1] - at[-1]) // 2, np.uint8)
-    moments, bits, unit = (first, second, counts), (LASTS, SOLID, DEGREES), np.float32(unit_time)
+    moments, bits, unit = (first, second, counts), (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK), np.float32(unit_time)
 
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
@@ -147,9 +147,9 @@ def _has_parameter(kinds: UInt8[Array, " num"], degree: int) -> Bool[Array, "num
     kinds = kinds.astype(jnp.int32)[:, None]
     column = np.arange(place["coefficients"].stop, dtype=np.int32)[None, :]
     of_time = (column == place["time_loc_logit"].start) | (column == place["log_time_scale"].start)
-    absent = of_time & ((kinds & LASTS) > 0)
-    absent |= (column == place["opacity_logit"].start) & ((kinds & SOLID) > 0)
-    return ~(absent | (column >= place["coefficients"].start + 2 * (kinds & DEGREES)))
+    absent = of_time & ((kinds & STATIC_BIT) > 0)
+    absent |= (column == place["opacity_logit"].start) & ((kinds & OPAQUE_BIT) > 0)
+    return ~(absent | (column >= place["coefficients"].start + 2 * (kinds & DEGREE_MASK)))
 
 
 def _rate_factors(rows, kinds, degree: int, unit_time: float) -> Float[Array, "num width"]:
@@ -157,7 +157,7 @@ def _rate_factors(rows, kinds, degree: int, unit_time: float) -> Float[Array, "n
     factors, place = jnp.ones_like(rows), columns(degree)
     if unit_time == 0:
         return factors
-    static = (kinds.astype(jnp.int32) & LASTS) > 0
+    static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
     spread = jnp.exp(rows[:, place["log_time_scale"].start])
     wide = jnp.where(static, np.float32(STATIC_TIME_SCALE), spread) / np.float32(unit_time)
     factors, power = factors.at[:, place["time_loc_logit"].start].set(wide), jnp.ones_like(wide)

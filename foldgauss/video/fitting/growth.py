@@ -9,7 +9,6 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.render.camera import FIELD_OF_VIEW
-from foldgauss.video.models.row_layout import columns
 
 #: One unit of the published geometry in ours: there the image's half width is tan(FIELD_OF_VIEW / 2), here the longer
 #: side, which is taken for the width, is 1.
@@ -25,7 +24,7 @@ MIN_EVERY, MIN_RESET_EVERY = 10, 200
 
 @dataclasses.dataclass(frozen=True)
 class Growth:
-    """When Gaussians are cloned, split, pruned and reset. Steps are those of a fit of `PUBLISHED_STEPS`, see `for_plan`.
+    """When Gaussians are cloned, split, pruned and reset. For a fit of `PUBLISHED_STEPS`, see `for_plan`.
 
     After `from_step` and before `until_step`, on every `every`-th step: where the mean screen gradient or the mean time
     gradient of a Gaussian reaches its threshold, it is cloned if small and split in two if not; then Gaussians that are

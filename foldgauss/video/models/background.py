@@ -20,14 +20,14 @@ def random_background(seed: int, step: int) -> Float[np.ndarray, "3"]:
     return np.random.default_rng([seed, _STREAM, step]).random(3, np.float32)
 
 
-def composited(frame: UInt8[np.ndarray, "height width 4"], background: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, ""]:
+def composite(frame: UInt8[np.ndarray, "height width 4"], background: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, ""]:
     """One frame over `background`, values in [0, 1], as it is shown: uint8 (height, width, 3), rounded."""
     light = 1 - frame[..., 3:] * np.float32(1 / 255)
     behind = 255 * np.asarray(background, np.float32)
     return np.minimum(frame[..., :3] + light * behind + 0.5, 255).astype(np.uint8)
 
 
-def checked_background(background: object, compositing: str = "over") -> Float[np.ndarray, "3"]:
+def check_background(background: object, compositing: str = "over") -> Float[np.ndarray, "3"]:
     """As float32 (3,). Raises ValueError unless it is three numbers in [0, 1], and black for sums."""
     color = np.asarray(background)
     if color.shape != (3,) or color.dtype.kind not in "fiu" or not ((color >= 0) & (color <= 1)).all():

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from foldgauss._numerics.simd import LANES, choose, cos_and_sin, every, exp, load, root, sigmoid, store
+from foldgauss._numerics.simd import LANES, broadcast, cos_and_sin, exp, load, select, sigmoid, sqrt, store
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import pixels_per_unit
@@ -118,22 +118,22 @@ def _column(columns, c):
 
 @kernel
 def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
-    none, scale = every(_f(0.0)), every(unit)
+    none, scale = broadcast(_f(0.0)), broadcast(unit)
     centre, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
-    u = centre - every(t)
+    u = centre - broadcast(t)
     x, y = none, none
     for j in range(degree - 1, -1, -1):  # Horner
         x = u * (x + _column(columns, at.fold + 2 * j))
         y = u * (y + _column(columns, at.fold + 2 * j + 1))
-    store(out, _u(0), (_column(columns, at.loc) + x) * scale + every(cx))
-    store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + every(cy))
+    store(out, _u(0), (_column(columns, at.loc) + x) * scale + broadcast(cx))
+    store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + broadcast(cy))
     tau = u / spread
-    exponent = every(_f(-0.25) * power) * tau * tau  # of sqrt(a), but for the floor
+    exponent = broadcast(_f(-0.25) * power) * tau * tau  # of sqrt(a), but for the floor
     if floor == _f(0.0):
         first = exp(_column(columns, at.scale) + exponent) * scale
         second = exp(_column(columns, at.scale + 1) + exponent) * scale
     else:
-        shrink = root(every(floor) + every(_f(1.0) - floor) * exp(exponent + exponent)) * scale
+        shrink = sqrt(broadcast(floor) + broadcast(_f(1.0) - floor) * exp(exponent + exponent)) * scale
         first, second = exp(_column(columns, at.scale)) * shrink, exp(_column(columns, at.scale + 1)) * shrink
     turn = sigmoid(_column(columns, at.angle))
     cos, sin = cos_and_sin(turn)
@@ -143,8 +143,8 @@ def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
     store(out, _u(5 * LANES), cos * second)
     store(out, _u(6 * LANES), sigmoid(_column(columns, at.opacity)))
     for c in range(_u(3)):
-        value = every(_f(0.5)) + every(at.sh_c0) * _column(columns, at.color + c)
-        store(out, (_u(7) + c) * _u(LANES), choose(value < none, none, value))
+        value = broadcast(_f(0.5)) + broadcast(at.sh_c0) * _column(columns, at.color + c)
+        store(out, (_u(7) + c) * _u(LANES), select(value < none, none, value))
     store(out, _u(10 * LANES), centre)
     store(out, _u(11 * LANES), spread)
     store(out, _u(12 * LANES), turn)
@@ -216,7 +216,7 @@ def _pull_back(
 
 
 @dataclasses.dataclass(frozen=True)
-class Conditioned:
+class ConditionedSplats:
     """Splats of one time in pixels, of the Gaussians `alive` (indices, in array order)."""
 
     alive: np.ndarray
@@ -230,7 +230,7 @@ class Conditioned:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class ConditioningSpec:
     """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the picture's size.
 
     `aspect` is the model frame's height / width (default: the picture's own), see `Splats2D.to_pixels`.
@@ -251,7 +251,7 @@ def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) ->
     )
 
 
-def narrow_windows(rows: np.ndarray, window: np.ndarray, shape: Shape, scale_cutoff: float) -> None:
+def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, shape: ConditioningSpec, scale_cutoff: float) -> None:
     """Leave out of the spans in `window` (num, 2) when a standard deviation is not above `scale_cutoff`, model units.
 
     With s the smaller one: s^2 a > cutoff^2, that is (1 - floor) exp(-power tau^2 / 2) > (cutoff / s)^2 - floor.
@@ -272,8 +272,8 @@ def narrow_windows(rows: np.ndarray, window: np.ndarray, shape: Shape, scale_cut
 
 
 def condition(
-    rows: np.ndarray, window: np.ndarray, t: float, shape: Shape, members: np.ndarray | None = None
-) -> Conditioned:
+    rows: np.ndarray, window: np.ndarray, t: float, shape: ConditioningSpec, members: np.ndarray | None = None
+) -> ConditionedSplats:
     """The Gaussians whose window holds t, of those with `members` (num,) if given, conditioned on t, in pixels."""
     t = np.float32(t)
     near = (window[:, 0] < t) & (t < window[:, 1])
@@ -290,11 +290,15 @@ def condition(
         _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, *splats)
 
     run_tasks(work, range(0, num, CHUNK))
-    return Conditioned(alive, t, unit, mean, factor, opacity, color, kept)
+    return ConditionedSplats(alive, t, unit, mean, factor, opacity, color, kept)
 
 
-def pull_back(
-    rows: np.ndarray, done: Conditioned, gradients: tuple[np.ndarray, ...], shape: Shape, grad: np.ndarray
+def backpropagate(
+    rows: np.ndarray,
+    done: ConditionedSplats,
+    gradients: tuple[np.ndarray, ...],
+    shape: ConditioningSpec,
+    grad: np.ndarray,
 ) -> float:
     """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt."""
     num = len(done.alive)

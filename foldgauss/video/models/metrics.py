@@ -7,8 +7,8 @@ import numpy as np
 import skimage
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.video.models.background import BLACK, checked_background, composited
-from foldgauss.video.models.renderer import Drawable
+from foldgauss.video.models.background import BLACK, check_background, composite
+from foldgauss.video.models.renderer import RenderableVideo
 
 
 def psnr(target: np.ndarray, picture: np.ndarray) -> float:
@@ -65,7 +65,7 @@ class Evaluation:
 
 
 def evaluate(
-    model: Drawable,
+    model: RenderableVideo,
     frames: np.ndarray,
     on_frame: Callable[[np.ndarray], None] | None = None,
     *,
@@ -88,7 +88,7 @@ def evaluate(
     scores = []
     for k, picture in enumerate(model.frames(background=background)):
         target = np.asarray(frames[k])
-        target = target if target.shape[-1] == 3 else composited(target, checked_background(background))
+        target = target if target.shape[-1] == 3 else composite(target, check_background(background))
         scores.append((psnr(target, picture), ssim(target, picture)))
         if on_frame is not None:
             on_frame(picture)

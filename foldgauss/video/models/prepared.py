@@ -8,10 +8,15 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Splats2D
 from foldgauss.render.splats import check_size
-from foldgauss.video.models.conditioning import Conditioned, Shape, condition, narrow_windows, update_windows
-from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.conditioning import (
+    ConditionedSplats,
+    ConditioningSpec,
+    apply_scale_cutoff,
+    condition,
+    update_windows,
+)
+from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.row_layout import pack
-from foldgauss.video.models.shots import out_of_cuts
 from foldgauss.video.models.splats import FoldedSplats
 
 
@@ -43,10 +48,10 @@ class PreparedModel:
         self.shape = _shape_of(model.splats, tuple(size), height / width if aspect is None else aspect)
         self.window = np.empty((len(self.rows), 2), np.float32)
         update_windows(self.rows, np.arange(len(self.rows)), self.window)
-        narrow_windows(self.rows, self.window, self.shape, model.scale_cutoff)
+        apply_scale_cutoff(self.rows, self.window, self.shape, model.scale_cutoff)
         self._times = np.asarray(model.frame_times.times())
 
-    def at(self, t: float, members: np.ndarray | None = None) -> Conditioned:
+    def at(self, t: float, members: np.ndarray | None = None) -> ConditionedSplats:
         """The Gaussians alive at time t, any number; of `members`, bool (num_gaussians,), if given."""
         return condition(self.rows, self.window, t, self.shape, members)
 
@@ -55,9 +60,9 @@ class PreparedModel:
         done = self.at(t)
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
 
-    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
-        """One picture, see `foldgauss.video.models.renderer.Staged`."""
-        return [(1.0, self.splats(out_of_cuts(t, self._times)))]
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
+        """One picture, see `foldgauss.video.models.renderer.Prepared`."""
+        return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
 
 def _check_finite(rows: np.ndarray) -> None:
@@ -67,9 +72,9 @@ def _check_finite(rows: np.ndarray) -> None:
         raise invalid("model", expected="finite numbers", got=got, cure=cure)
 
 
-def _shape_of(splats: FoldedSplats, size: tuple[int, int], aspect: float) -> Shape:
+def _shape_of(splats: FoldedSplats, size: tuple[int, int], aspect: float) -> ConditioningSpec:
     power, floor = (_the_one(splats.envelope, name) for name in ("power", "floor"))
-    return Shape(splats.degree, power, floor, size, aspect=aspect)
+    return ConditioningSpec(splats.degree, power, floor, size, aspect=aspect)
 
 
 def _the_one(envelope: TimeLikelihood, name: str) -> float:

@@ -16,27 +16,27 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, Splats2D, cpu
 from foldgauss.render.splats import check_size
-from foldgauss.video.models.background import BLACK, checked_background
+from foldgauss.video.models.background import BLACK, check_background
 
 ROWS = 64  # of pixels per task
 
 _f, _byte = nb.float32, nb.uint8
 
 
-class Staged(Protocol):
-    """A video made ready for pictures of one size, as its `stage(size)` gives it."""
+class Prepared(Protocol):
+    """A video made ready for pictures of one size, as its `prepare(size)` gives it."""
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
 
-    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """The pictures whose weighted sum is seen at time t, each as weight and splats; the weights sum to 1.
 
         Between two shots they are the nearer one's.
         """
 
 
-class Drawable(Protocol):
+class RenderableVideo(Protocol):
     """What all videos have: `VideoModel`, `EditedVideo`, `SegmentedVideo`."""
 
     size: tuple[int, int]
@@ -45,7 +45,7 @@ class Drawable(Protocol):
     compositing: str
     num_frames: int
 
-    def stage(self, size: tuple[int, int]) -> Staged:
+    def prepare(self, size: tuple[int, int]) -> Prepared:
         """Made ready to be conditioned many times, for pictures of `size`."""
 
 
@@ -64,7 +64,7 @@ class VideoRenderer:
 
     def __init__(
         self,
-        model: Drawable,
+        model: RenderableVideo,
         size: tuple[int, int] | None = None,
         *,
         background: tuple[float, float, float] = BLACK,
@@ -73,16 +73,16 @@ class VideoRenderer:
         size = model.size if size is None else size
         check_size(size)
         self.size = tuple(size)
-        self._stage = model.stage(self.size)
-        self._background = checked_background(background, model.compositing)
+        self._prepared = model.prepare(self.size)
+        self._background = check_background(background, model.compositing)
 
     def splats(self, t: float) -> Splats2D:
         """The splats of the Gaussians alive at time t, in pixels of a picture of `size`; NumPy leaves."""
-        return self._stage.splats(t)
+        return self._prepared.splats(t)
 
-    def shown(self, t: float) -> Splats2D:
+    def dominant_splats(self, t: float) -> Splats2D:
         """As `splats`, of what is seen: between two shots the nearer one; in a fade, what is seen more of."""
-        return max(self._stage.parts(t), key=lambda part: part[0])[1]
+        return max(self._prepared.weighted_splats(t), key=lambda part: part[0])[1]
 
     def frame(self, t: float) -> UInt8[np.ndarray, "height width 3"]:
         """The picture at time t; between two shots the nearer one's."""
@@ -100,7 +100,7 @@ class VideoRenderer:
 
     def image(self, t: float) -> Float[np.ndarray, "3 height width"]:
         """The picture at time t before it is rounded to 8 bits: planar float32, about [0, 1]."""
-        (first, splats), *others = self._stage.parts(t)
+        (first, splats), *others = self._prepared.weighted_splats(t)
         image = self._drawn(splats)
         if others:
             image = np.float32(first) * image

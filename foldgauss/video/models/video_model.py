@@ -9,17 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, short_repr
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
-from foldgauss.video.models.background import BLACK, checked_background
-from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.background import BLACK, check_background
+from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import out_of_cuts
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.splats import FoldedSplats
 
@@ -29,9 +28,9 @@ ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 def check_time(t: float) -> None:
     """Raise unless t is a time of a video, where that is known."""
-    check_process()
+    check_not_forked()
     try:
-        value = known(jnp.asarray(t))
+        value = concrete_value(jnp.asarray(t))
     except (TypeError, ValueError):
         raise invalid("t", expected="a time in [0, 1]", got=short_repr(t)) from None
     if value is not None and not ((value >= 0) & (value <= 1)).all():
@@ -84,7 +83,7 @@ class VideoModel(eqx.Module):
         return self.splats.degree
 
     @property
-    def num_floats(self) -> int:
+    def num_parameters(self) -> int:
         """Numbers stored: of each Gaussian what it has, see `StoredSplats`. Four bytes of kinds or indices are one."""
         leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
         return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
@@ -93,7 +92,7 @@ class VideoModel(eqx.Module):
         """The same, drawn with other constants."""
         return dataclasses.replace(self, options=options)
 
-    def stage(self, size: tuple[int, int]) -> PreparedModel:
+    def prepare(self, size: tuple[int, int]) -> PreparedModel:
         """Made ready to be conditioned many times, for pictures of `size`."""
         return PreparedModel(self, size)
 
@@ -119,9 +118,9 @@ class VideoModel(eqx.Module):
         size = self.size if size is None else size
         check_size(size)
         check_time(t)
-        t = out_of_cuts(jnp.asarray(t, jnp.float32), self.frame_times.times())
+        t = snap_to_shots(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
-        behind = jnp.asarray(checked_background(background, self.compositing), splats.mean.dtype)
+        behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)
         drawn = {"compositing": self.compositing, "options": self.options}
         return render(splats, size, background=behind, engine=engine, **drawn)
 

@@ -176,7 +176,7 @@ class SegmentedEdit:
         if _same(edited._video, before._video):
             return segment
         made = edited.video()
-        facts = {name: getattr(made, name) for name in ("num_gaussians", "degree", "num_floats")}
+        facts = {name: getattr(made, name) for name in ("num_gaussians", "degree", "num_parameters")}
         return dataclasses.replace(segment, **facts, load=load)
 
     def __getattr__(self, name: str) -> object:

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.special import expit
 
 from foldgauss.render import cpu
-from foldgauss.video.models.conditioning import Conditioned, condition
+from foldgauss.video.models.conditioning import ConditionedSplats, condition
+from foldgauss.video.models.frame_times import snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.shots import out_of_cuts
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.selection.regions import Region
 
@@ -51,7 +51,7 @@ class Contributions:
 
     def at(self, t: float) -> "Light":
         """The light at time t; between two shots the nearer one's, as pictures are drawn."""
-        return Light(self, self.stage.at(float(out_of_cuts(t, self.times))))
+        return Light(self, self.stage.at(float(snap_to_shots(t, self.times))))
 
     def position(self, indices: Int[np.ndarray, " num"], t: float) -> Float32[np.ndarray, "num 2"]:
         """Centres of the named Gaussians, in pixels, at any time, alive or not."""
@@ -78,7 +78,7 @@ class Light:
     """One time of a model: the Gaussians alive, and the weights by which they make the picture."""
 
     lit: Contributions
-    splats: Conditioned
+    splats: ConditionedSplats
 
     @property
     def alive(self) -> Int[np.ndarray, " num_alive"]:

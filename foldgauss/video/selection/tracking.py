@@ -8,7 +8,7 @@ import scipy
 import skimage
 from jaxtyping import Bool, Float, Float32, Int, Int8
 
-from foldgauss.video.models.shots import is_cut
+from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.selection.contributions import Contributions, Light, weighted_mean
 
 #: A frame in which a Gaussian's weights sum to less than this share of what they come to in its best frame shows too

@@ -11,8 +11,8 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import update_frame_times
 from foldgauss.video.fitting.config import UNIT_TIME, FitConfig
 from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.optical_flow import Motion
-from foldgauss.video.fitting.pruning.description_length import frame_weights
+from foldgauss.video.fitting.optical_flow import Motion, motion_finder
+from foldgauss.video.fitting.pruning.description_length import weigh_frames
 from foldgauss.video.fitting.pruning.pruner import Pruner
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
@@ -27,7 +27,13 @@ from foldgauss.video.fitting.state import FitState, frame_times, update_rows
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
-from foldgauss.video.models.conditioning import Conditioned, Shape, condition, pull_back, update_windows
+from foldgauss.video.models.conditioning import (
+    ConditionedSplats,
+    ConditioningSpec,
+    backpropagate,
+    condition,
+    update_windows,
+)
 from foldgauss.video.models.row_layout import columns
 
 
@@ -39,13 +45,14 @@ class CpuStepper:
     ):
         """`find_motion` gives the optical flow of the frames, which is needed by a part of the settings only."""
         self.frames, self.config = frames, config
+        find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
         self.num_frames, height, width, _ = frames.shape
         self.levels, self.rates = plan_levels(config, (height, width)), RateSchedule(config)
         self.steps_per_pass = steps_per_pass(config, self.num_frames)
         own = config.degree, config.power, config.floor
-        self.shapes = [Shape(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
-        self.shapes.append(Shape(*own, (height, width)))
+        self.shapes = [ConditioningSpec(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
+        self.shapes.append(ConditioningSpec(*own, (height, width)))
         interpolates = config.interpolation_fraction > 0
         self.interpolation = _InterpolatedFrames(frames, config, find_motion()) if interpolates else None
         if config.economy is not None:
@@ -120,13 +127,13 @@ class CpuStepper:
         state: FitState,
         k: int,
         t: np.float32,
-        shape: Shape,
+        shape: ConditioningSpec,
         *,
         squared: bool,
         mirrored: bool,
         seen: list[tuple[np.ndarray, np.ndarray]] | None,
         fraction: float | None,
-    ) -> tuple[ImageLoss, Conditioned, float]:
+    ) -> tuple[ImageLoss, ConditionedSplats, float]:
         """The loss of frame k, or of the image interpolated at `fraction` of the way to the next, and dL/dt.
 
         Gradients by rows are added to `self.grad`. To the list `seen` is appended what `GradientStatistics.add` takes.
@@ -155,15 +162,15 @@ class CpuStepper:
             d_mean, d_factor = mirror(d_mean, d_factor, 0)
         if seen is not None:
             half = np.float32(shape.size[::-1]) / 2
-            seen.append((done.alive[trace.seen], cpu.screen_gradient(d_mean[trace.seen] * half)))
-        return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), shape, self.grad)
+            seen.append((done.alive[trace.visible], cpu.screen_gradient(d_mean[trace.visible] * half)))
+        return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad)
 
     def _weight(self, errors: np.ndarray, k: int) -> float:
         """The weight of frame k's loss. For a mean PSNR, each dB of each frame counts the same."""
         wanted = self.config.economy is not None and self.config.economy.psnr is not None
-        return float(frame_weights(errors)[k]) if wanted else 1.0
+        return float(weigh_frames(errors)[k]) if wanted else 1.0
 
-    def _render(self, done: Conditioned, shape: Shape) -> cpu.Trace:
+    def _render(self, done: ConditionedSplats, shape: ConditioningSpec) -> cpu.Trace:
         return cpu.forward(
             done.mean,
             done.factor,
@@ -181,7 +188,7 @@ class _InterpolatedFrames:
 
     def __init__(self, frames: np.ndarray, config: FitConfig, motion: Motion):
         self.frames, self.config, self.motion = np.ascontiguousarray(frames[..., :3]), config, motion
-        self.last_of_shots = {*(k - 1 for k in motion.cuts()), len(frames) - 1}
+        self.last_of_shots = {*(k - 1 for k in motion.find_cuts()), len(frames) - 1}
 
     def choose(self, step: int, k: int) -> float | None:
         """At which fraction of the way from frame k to the next the time of a step lies; None for the frame itself."""

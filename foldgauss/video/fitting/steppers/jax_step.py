@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
-from foldgauss.render.tiles import on_screen
+from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import masked_adam, update_frame_times
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
@@ -259,7 +259,7 @@ def _screen_gradient(program: Program, splats: Splats2D, by_splats: Splats2D, al
     """The largest screen gradient over the views, see `GradientStatistics`; -1 where no view shows the Gaussian."""
     half = np.float32(program.size[::-1]) / 2
     size = jnp.hypot(by_splats.mean[..., 0] * half[0], by_splats.mean[..., 1] * half[1])
-    shows = jax.vmap(lambda own: on_screen(own.mean, own.factor, own.opacity, program.size, program.options))(splats)
+    shows = jax.vmap(lambda own: find_visible(own.mean, own.factor, own.opacity, program.size, program.options))(splats)
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
 
 
