@@ -61,7 +61,7 @@ def weights(model) -> np.ndarray:
     lit = Contributions(model)
     out = np.zeros((model.num_frames, model.num_gaussians))
     for k in range(model.num_frames):
-        light = lit.frame(k)
+        light = lit.at_frame(k)
         out[k, light.alive] = light.total
     return out
 

@@ -41,7 +41,7 @@ def refitted(
     fit.
     """
     stage = PreparedModel(model, model.size)
-    rows, window, shape = stage.rows, stage.window, stage.shape
+    rows, window, shape = stage.rows, stage.window, stage.spec
     rates, own = np.zeros(rows.shape[1], np.float32), LearningRates()
     for name, place in columns(model.degree).items():
         rates[place] = getattr(own, name) if free is None or name in free else 0.0
