@@ -135,7 +135,7 @@ def test_frames_that_hold_none_say_where(value):
     frames = CLIP.astype(np.float32) / 255
     frames[2, 3, 5, 1] = frames[4, 0, 0, 0] = value
     with pytest.raises(
-        ValueError, match=r"float32.* 2 of its numbers are NaN or infinite, the first at frames\[2, 3, 5, 1\]"
+        ValueError, match=r"float32.* 2 of its values are NaN or infinite, the first at frames\[2, 3, 5, 1\]"
     ):
         fit(frames, CONFIG)
 

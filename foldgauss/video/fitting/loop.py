@@ -223,10 +223,8 @@ def _start(
         find_initial_kinds(rows, config.degree),
         logits,
         growing=config.growth is not None,
-        step=0,
         plan=0 if config.minutes is not None else planned_steps(config, num_frames),
         seconds=time.perf_counter() - begun,
-        error=0.0,
     )
 
 
@@ -247,7 +245,7 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
     done = round(steps * progress / (1 - progress))
     kinds = find_kinds(rows, config.degree)
-    return FitState.create(rows, kinds, logits, step=done, plan=done + steps, seconds=0.0, error=0.0)
+    return FitState.create(rows, kinds, logits, step=done, plan=done + steps)
 
 
 def _check_config(model: VideoModel, config: FitConfig) -> None:

@@ -150,6 +150,7 @@ def _decode_errors(pairs: Any) -> tuple[tuple[int, float], ...]:
 #: The metadata of fields that are no arrays: `decode` restores them from JSON.
 _COUNT, _NUMBER = ({"static": True, "decode": kind} for kind in (int, float))
 _ERRORS = {"static": True, "decode": _decode_errors}
+_ROW = PerGaussian(np.float32, ("width",))
 
 
 # --------------------------------------------------------------------------------------------------- state
@@ -180,38 +181,26 @@ class FitState:
     assigned is used from the next step on.
     """
 
-    rows: np.ndarray = field(metadata=_stored(PerGaussian(np.float32, ("width",))))  # parameters, see `row_layout`
-    first: np.ndarray = field(metadata=_stored(PerGaussian(np.float32, ("width",))))  # Adam's moments
-    second: np.ndarray = field(metadata=_stored(PerGaussian(np.float32, ("width",))))
+    rows: np.ndarray = field(metadata=_stored(_ROW))  # parameters, see `row_layout`
+    first: np.ndarray = field(metadata=_stored(_ROW))  # Adam's moments
+    second: np.ndarray = field(metadata=_stored(_ROW))
     counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
-    kinds: np.ndarray = field(
-        metadata=_stored(PerGaussian(np.uint8))
-    )  # which parameters each Gaussian has, see `sparse_storage`
+    kinds: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # its parameters, see `sparse_storage`
     newborn: np.ndarray = field(metadata=_stored(PerGaussian(np.bool_)))  # born in the last round of pruning
     colors: Codebook = field(metadata=_stored(Shared("colors", 3)))
     shapes: Codebook = field(metadata=_stored(Shared("shapes", 2)))  # of the two standard deviations
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
-    statistics: GradientStatistics | None = field(
-        metadata=_stored(OfGrowth())
-    )  # None where there is no densification, or no more
-    step: int = field(metadata=_COUNT)
-    plan: int = field(
-        metadata=_COUNT
-    )  # steps of the whole fit; 0 until the speed is known by which minutes are planned
-    seconds: float = field(metadata=_NUMBER)
-    error: float = field(metadata=_NUMBER)  # running mean of the squared error
+    statistics: GradientStatistics | None = field(metadata=_stored(OfGrowth()))  # None without densification to come
+    step: int = field(default=0, metadata=_COUNT)
+    plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
+    seconds: float = field(default=0.0, metadata=_NUMBER)
+    error: float = field(default=0.0, metadata=_NUMBER)  # running mean of the squared error
     # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
-    best_error: float = field(
-        default=0.0, metadata=_NUMBER
-    )  # the lowest one that others are compared with; 0: none yet
-    backoffs: int = field(
-        default=0, metadata=_COUNT
-    )  # how often the fit was reset to `last_finite`, and its rates lowered
-    compare_from: int = field(
-        default=0, metadata=_COUNT
-    )  # the step from which on errors are compared with the best one,
+    best_error: float = field(default=0.0, metadata=_NUMBER)  # the lowest one that others are compared with; 0: none
+    backoffs: int = field(default=0, metadata=_COUNT)  # how often the fit returned to `last_finite`, with lower rates
+    compare_from: int = field(default=0, metadata=_COUNT)  # the step from which on errors are compared with the best,
     improve_by: int = field(default=0, metadata=_COUNT)  # and with those of the start
     start_errors: tuple[tuple[int, float], ...] = field(default=(), metadata=_ERRORS)  # (frame, error) at the start
     last_finite: "FitState | None" = None  # the last state known to be good, which has none of its own

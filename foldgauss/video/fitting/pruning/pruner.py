@@ -54,7 +54,7 @@ class Pruner:
         self._find_motion = find_motion
 
     def prune(self, state: FitState) -> bool:
-        """A round, where one is due: drop what does not pay, add Gaussians where these do, share. Whether it was due."""
+        """A round of pruning, births and sharing, each where it pays, if one is due; returns whether one was."""
         config, economy = self._config, self._config.economy
         steps = self._plan_rounds(state.plan)
         if state.step not in steps:

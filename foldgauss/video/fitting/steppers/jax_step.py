@@ -21,7 +21,7 @@ from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import masked_adam, update_frame_times
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
-from foldgauss.video.fitting.steppers.jax_loss import losses
+from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.splats import TAU_MAX
 
@@ -204,7 +204,7 @@ def _differentiate(program: Program, rows, times, frames, control: Control) -> G
     images, to_splats = jax.vjp(functools.partial(_map_views, len(k), functools.partial(_render, program)), splats)
 
     def mean_loss(images):
-        own, errors = losses(images, target, control.squared, program.ssim_fraction)
+        own, errors = compute_losses(images, target, control.squared, program.ssim_fraction)
         return jnp.sum(own) / program.batch_size, errors
 
     (loss, errors), by_images = jax.value_and_grad(mean_loss, has_aux=True)(images)
