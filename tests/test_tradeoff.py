@@ -384,7 +384,7 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
     assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
     record = record_of(tmp_path / "r")
     assert [name_of(row) for row in record["points"]] == ["base", "precision float16"]
-    assert set(record["left_out"]) == {"precision compact", "precision compact, mended"}
+    assert set(record["left_out"]) == {"precision compact", "precision compact, finetuned"}
     quick = command.compress
     monkeypatch.setattr(command, "compress", lambda *given, **more: quick(*given, **more | {"passes": 0}))
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
