@@ -373,7 +373,7 @@ def test_sums_are_weighted_by_frames(scene):
     frames, rows, shape, times, drawn = scene
     parts = np.linspace(0.2, 1.8, len(times))
     all_scores = [_measured(rows, frames, shape, times, drawn, weights=w) for w in (parts, 2 - parts, None)]
-    for name in ("slope", "own", "by_path", "by_color", "by_axes", "by_size", "squared_error"):
+    for name in ("first_order", "second_order", "by_path", "by_color", "by_axes", "by_size", "squared_error"):
         first, second, plain = (np.asarray(getattr(scores, name)) for scores in all_scores)
         np.testing.assert_allclose(first + second, 2 * plain, rtol=1e-6, atol=1e-9 * np.abs(plain).max())
     assert not np.allclose(all_scores[0].second_order, all_scores[2].second_order, rtol=0.01)
@@ -614,7 +614,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
         again = load_checkpoint(path, config=config, source={})
         for state_again, _ in fit_steps(frames, config, again):
             pass
-        for name in ("rows", "first", "second", "counts", "kinds", "young", "frame_errors", "time_logits"):
+        for name in ("rows", "first", "second", "counts", "kinds", "newborn", "frame_errors", "time_logits"):
             np.testing.assert_array_equal(getattr(state_again, name), getattr(state, name))
         for one, other in ((state_again.colors, state.colors), (state_again.shapes, state.shapes)):
             jax.tree.map(np.testing.assert_array_equal, one, other)

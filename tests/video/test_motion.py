@@ -139,7 +139,7 @@ def test_maps_shrink_to_their_share_of_memory(monkeypatch):
     monkeypatch.setattr(motion, "MAP_BYTES", 0)  # as where the clip is long: then the share of the frames' bytes counts
     small = Motion.from_frames(frames)
     kept = small.small.nbytes + small.there.nbytes + small.back.nbytes
-    assert 0.1 * frames.nbytes < kept <= motion.MAP_SHARE * frames.nbytes
+    assert 0.1 * frames.nbytes < kept <= motion.MAP_FRACTION * frames.nbytes
     tracks = small.follow(np.full(20, 1), np.full((20, 2), [80.0, 48.0], np.float32))
     assert tracks.known[:, LONGEST + 1].all()
     np.testing.assert_allclose(tracks.shift[:, LONGEST + 1], np.tile([2.0, 0.0], (20, 1)), atol=0.5)
