@@ -61,7 +61,7 @@ NAMED = {
     "log_scale": ["no finite log_scale", "no finite log_scale"],
     "angle_logit": [None, None],
     "opacity_logit": [None, None],
-    "color_dc": ["color_dc moved most", "color_dc having moved most"],
+    "color_dc": ["color_dc moved most", "color_dc moved most"],
     "time_loc_logit": [None, None],
     "log_time_scale": ["no finite time_loc_logit", None],
     "frame_times": ["frame times moved", "frame times moved"],
