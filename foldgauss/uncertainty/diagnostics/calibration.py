@@ -14,10 +14,10 @@ import scipy.stats
 from jaxtyping import Bool, Float32, Float64, Int
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.uncertainty.likelihood.likelihood_profiles import Drawn
+from foldgauss.uncertainty.likelihood.likelihood_profiles import ProfileBuilder
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
-from foldgauss.uncertainty.likelihood.residuals import Screen
-from foldgauss.uncertainty.posterior.exact import exact_times
+from foldgauss.uncertainty.likelihood.residuals import Residuals
+from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
 from foldgauss.video.models.video_model import VideoModel
@@ -83,7 +83,7 @@ def simulated_ranks(
 
     Frames are what `model` shows plus Gaussian noise of standard deviation `noise.scale`: white, or smoothed by a
     Gaussian of `correlation` pixels' standard deviation, and the same afterwards. They are neither rounded nor clipped.
-    Profiles come about as `evidence` makes them, with `assumed_noise`: "effective", "score" or "independent", which
+    ProfileCurves come about as `evidence` makes them, with `assumed_noise`: "effective", "score" or "independent", which
     measure it, or a FrameNoise; default `noise`. Then `sampler`: "exact" passes, or "emcee" for `steps` steps.
 
     Pictures are kept between replicates, up to 1 GB: small models take milliseconds a replicate by exact passes.
@@ -97,22 +97,22 @@ def simulated_ranks(
     _check_simulation(num_frames, replicates, sampler, draws, correlation)
     if not isinstance(noise, FrameNoise):
         raise invalid("noise", expected="a FrameNoise", got=noise, cure="As FrameNoise(0.02, 1.0).")
-    noise = noise.of(num_frames)
+    noise = noise.for_frames(num_frames)
     assumed = noise if assumed_noise is None else assumed_noise
     if isinstance(assumed, FrameNoise):
-        assumed = assumed.of(num_frames)
+        assumed = assumed.for_frames(num_frames)
     elif assumed not in NOISES:
         raise invalid("assumed_noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=assumed_noise)
-    increments = Increments.among(np.linspace(0.0, 1.0, num_frames), None, concentration)
-    pictures = _KeptPictures(model)
+    increments = Increments.with_free(np.linspace(0.0, 1.0, num_frames), None, concentration)
+    pictures = _RenderCache(model)
     ranks, true, converged = [], [], 0
     for seeds in np.random.SeedSequence(seed).spawn(replicates):
         rng = np.random.default_rng(seeds)
         times = increments.draw_prior(rng, 1)[0]
         frames = pictures.noisy(times, noise.scale, correlation, rng)
-        drawn = Drawn(_Simulated(pictures, frames))
+        drawn = ProfileBuilder(_Simulated(pictures, frames))
         drawn.coarse()
-        log_prob = FrameTimeLogProb(drawn.evidence(assumed).profiles, increments)
+        log_prob = FrameTimeLogProb(drawn.likelihood_profiles(assumed).curves, increments)
         some, good = _posterior_draws(log_prob, sampler, draws, steps, int(rng.integers(2**31)))
         any_frame = int(rng.integers(1, num_frames - 1))
         ranks.append(_ranks(log_prob, times, some, any_frame))
@@ -172,18 +172,18 @@ def coverage(
     return ((ranks >= tail) & (ranks < num_ranks - tail)).mean(0)
 
 
-class _KeptPictures:
+class _RenderCache:
     """What a model shows, drawn once for each time asked for, as long as there is room."""
 
     def __init__(self, model: VideoModel):
-        self.screen = Screen(model, np.zeros((3, *model.size, 3), np.uint8))
+        self.residuals = Residuals(model, np.zeros((3, *model.size, 3), np.uint8))
         self.kept: dict[float, np.ndarray] = {}
         self.most = max(KEPT // (12 * model.size[0] * model.size[1]), 1)
 
     def __call__(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
         times = [float(t) for t in times]
         missing = [t for t in dict.fromkeys(times) if t not in self.kept]
-        new = dict(zip(missing, self.screen.pictures(missing), strict=True))
+        new = dict(zip(missing, self.residuals.render_at(missing), strict=True))
         for t in missing[: max(self.most - len(self.kept), 0)]:
             self.kept[t] = new[t]
         for t in times:
@@ -192,7 +192,7 @@ class _KeptPictures:
     def noisy(
         self, times: np.ndarray, scale: np.ndarray, correlation: float | None, rng: np.random.Generator
     ) -> Float32[np.ndarray, "num_frames 3 height width"]:
-        pictures = np.stack(list(self.screen.pictures(times)))
+        pictures = np.stack(list(self.residuals.render_at(times)))
         return pictures + scale[:, None, None, None].astype(np.float32) * _noise(pictures.shape, correlation, rng)
 
 
@@ -209,10 +209,10 @@ def _noise(shape: tuple[int, ...], correlation: float | None, rng: np.random.Gen
 
 
 class _Simulated:
-    """A Screen of pictures that are kept, and frames that are not of 8 bits."""
+    """A Residuals of pictures that are kept, and frames that are not of 8 bits."""
 
-    def __init__(self, pictures: _KeptPictures, frames: Float32[np.ndarray, "num_frames 3 height width"]):
-        self.pictures, self.frames, self.model = pictures, frames, pictures.screen.model
+    def __init__(self, pictures: _RenderCache, frames: Float32[np.ndarray, "num_frames 3 height width"]):
+        self.pictures, self.frames, self.model = pictures, frames, pictures.residuals.model
 
     def squared_errors(self, picture: np.ndarray, which: Iterable[int]) -> np.ndarray:
         misses = (self.frames[np.asarray(which)] - picture).reshape(len(which), -1)
@@ -226,7 +226,7 @@ def _posterior_draws(
     log_prob: FrameTimeLogProb, sampler: str, draws: int, steps: int, seed: int
 ) -> tuple[Float64[np.ndarray, "draws num_frames"], bool]:
     if sampler == "exact":
-        return exact_times(log_prob.profiles, log_prob.increments).sample(draws, seed), True
+        return exact_posterior(log_prob.curves, log_prob.increments).sample(draws, seed), True
     from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 
     found = frame_time_posterior(log_prob=log_prob, steps=steps, ensembles=2, seed=seed, progress=False)

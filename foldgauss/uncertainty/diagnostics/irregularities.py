@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from foldgauss._runtime.checks import invalid, within
-from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
+from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
-from foldgauss.uncertainty.posterior.exact import exact_times
+from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.log_prob import drawn_log_likelihood
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.uncertainty.posterior.log_prob import rendered_log_likelihood
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.shots import is_cut
 from foldgauss.video.models.video_model import VideoModel
@@ -33,9 +33,9 @@ class IncrementIntervals:
     out of the median.
     """
 
-    mean: Float64[np.ndarray, "intervals"]
-    low: Float64[np.ndarray, "intervals"]
-    high: Float64[np.ndarray, "intervals"]
+    mean: Float64[np.ndarray, " intervals"]
+    low: Float64[np.ndarray, " intervals"]
+    high: Float64[np.ndarray, " intervals"]
     level: float
 
 
@@ -56,7 +56,7 @@ class Irregularity:
     high: float
 
 
-def intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementIntervals:
+def increment_intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementIntervals:
     """Means and central intervals of all increments, each draw in units of its own median increment.
 
     An increment between two frames whose times were held varies with the median alone. Raises ValueError for a level
@@ -70,7 +70,7 @@ def intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementInt
     return IncrementIntervals(steps.mean(0), low, high, level)
 
 
-def judged(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
+def judged(posterior: FrameTimePosterior) -> Bool[np.ndarray, " intervals"]:
     """Intervals that `irregularities` looks at: no cuts, a free frame at an end, and ends that tell their time."""
     free, told = posterior.log_prob.increments.free, posterior.identified()
     return ~cuts(posterior) & (free[:-1] | free[1:]) & told[:-1] & told[1:]
@@ -118,7 +118,7 @@ def irregularities(
 
 
 @dataclasses.dataclass(frozen=True)
-class ComparedTimes:
+class TimesComparison:
     """What a video says of one model's frame times; log-likelihoods in nats, under the noise that all rows share.
 
     `at_own`: at the model's own times. `at_even`: the same splats at evenly spaced times. `log_evidence`: logarithm of
@@ -139,7 +139,7 @@ def compare_times(
     *,
     noise: str | FrameNoise = "score",
     concentration: float = 1.0,
-) -> list[ComparedTimes]:
+) -> list[TimesComparison]:
     """A row for each model of `video`, as of one fitted with learned and one with evenly spaced times.
 
     All likelihoods need the same noise to be compared: a `FrameNoise`, or that which `noise` names, estimated with the
@@ -154,26 +154,28 @@ def compare_times(
     for name, model in models.items():
         if model.num_frames != len(video):
             raise invalid(f"models[{name!r}]", expected=f"{len(video)} frames, as the video", got=model.num_frames)
-    seen = {name: evidence(model, video, noise=noise) for name, model in models.items()}
+    profiles = {name: likelihood_profiles(model, video, noise=noise) for name, model in models.items()}
     if not isinstance(noise, FrameNoise):
-        common = min(seen.values(), key=lambda one: float(np.mean(one.noise.scale**2))).noise
+        common = min(profiles.values(), key=lambda one: float(np.mean(one.noise.scale**2))).noise
         for name, model in models.items():
-            if seen[name].noise is not common:
-                seen[name] = evidence(model, video, noise=common)
-    return [_compared(name, model, video, seen[name], concentration) for name, model in models.items()]
+            if profiles[name].noise is not common:
+                profiles[name] = likelihood_profiles(model, video, noise=common)
+    return [_compared(name, model, video, profiles[name], concentration) for name, model in models.items()]
 
 
-def _compared(name: str, model: VideoModel, video, seen: LikelihoodProfiles, concentration: float) -> ComparedTimes:
+def _compared(
+    name: str, model: VideoModel, video, profiles: LikelihoodProfiles, concentration: float
+) -> TimesComparison:
     num_frames = len(video)
     even = np.linspace(0.0, 1.0, num_frames)
-    # Profiles are 0 at their modes; what they are there is drawn.
-    zero = float(drawn_log_likelihood(model, video, seen.profiles.modes(), seen.noise).sum())
-    found = exact_times(seen.profiles, Increments.among(even, None, concentration))
+    # ProfileCurves are 0 at their modes; what they are there is drawn.
+    zero = float(rendered_log_likelihood(model, video, profiles.curves.modes(), profiles.noise).sum())
+    found = exact_posterior(profiles.curves, Increments.with_free(even, None, concentration))
     own = np.asarray(model.frame_times.times(), np.float64)
-    return ComparedTimes(
+    return TimesComparison(
         name,
-        float(drawn_log_likelihood(model, video, own, seen.noise).sum()),
-        float(drawn_log_likelihood(model, video, even, seen.noise).sum()),
+        float(rendered_log_likelihood(model, video, own, profiles.noise).sum()),
+        float(rendered_log_likelihood(model, video, even, profiles.noise).sum()),
         found.log_evidence + zero,
         evaluate(model, np.asarray(video)).mean_psnr,
     )
@@ -185,12 +187,12 @@ def _some(posterior: FrameTimePosterior) -> Float64[np.ndarray, "draws num_frame
     return draws[np.unique(np.linspace(0, len(draws) - 1, ENOUGH).astype(int))]
 
 
-def cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
+def cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, " intervals"]:
     """Which intervals are cuts, by the posterior means (`foldgauss.video.models.shots.is_cut`)."""
     return np.asarray(is_cut(posterior.mean().astype(np.float32)))
 
 
-def even_pace(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, " num_frames"], float]:
+def even_times(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, " num_frames"], float]:
     """Evenly spaced times between the first and the last frame of every shot, and what one frame is: their mean step.
 
     Without cuts: k / (num_frames - 1), and 1 / (num_frames - 1).

@@ -12,10 +12,16 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.plot import needed_pyplot
-from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, cuts, even_pace, intervals, irregularities
+from foldgauss.uncertainty.diagnostics.irregularities import (
+    Irregularity,
+    cuts,
+    even_times,
+    increment_intervals,
+    irregularities,
+)
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +60,7 @@ def plot_times(
         pyplot = needed_pyplot("plot_times")
         axes = pyplot.subplots(2, 1, sharex=True, layout="constrained", figsize=(9, 6))[1]
     flagged = irregularities(posterior) if flagged is None else flagged
-    frames, (even, unit) = np.arange(num_frames), even_pace(posterior)
+    frames, (even, unit) = np.arange(num_frames), even_times(posterior)
     mean = (posterior.mean() - even) / unit
     inner, outer = ((posterior.interval(level) - even) / unit for level in (0.5, 0.9))
     upper, lower = axes
@@ -112,7 +118,7 @@ def plot_increments(
     """
     ax = _axes(ax, "plot_increments", (9, 4))
     flagged = irregularities(posterior) if flagged is None else flagged
-    found = intervals(posterior, level)
+    found = increment_intervals(posterior, level)
     shown = np.flatnonzero(~cuts(posterior))
     at = shown + 0.5
     ax.axhline(1, color=_GREY, linewidth=0.6)
@@ -154,7 +160,7 @@ def plot_pairs(
         pyplot = needed_pyplot("plot_pairs")
         size = max(1.9 * num, 3.5)
         axes = pyplot.subplots(num, num, sharex="col", layout="constrained", figsize=(size, size), squeeze=False)[1]
-    (_, unit), draws = even_pace(posterior), posterior.draws
+    (_, unit), draws = even_times(posterior), posterior.draws
     mean = posterior.mean()
     shown = (draws - mean)[np.unique(np.linspace(0, len(draws) - 1, _POINTS).astype(int))] / unit
     everything = (draws[:, frames] - mean[frames]) / unit
@@ -213,7 +219,7 @@ def plot_trace(
             len(frames), 2, sharex="col", sharey="row", layout="constrained", squeeze=False,
             figsize=(9, 0.6 + 2.2 * len(frames)), width_ratios=(4, 1),
         )[1]  # fmt: skip
-    (_, unit), mean = even_pace(posterior), posterior.mean()
+    (_, unit), mean = even_times(posterior), posterior.mean()
     order = posterior.free.tolist()
     for k, (left, right) in zip(frames, axes, strict=True):
         drawn = (posterior.times[..., k] - mean[k]) / unit
@@ -241,13 +247,13 @@ def plot_trace(
     return axes
 
 
-def plot_correlation(seen: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axes":
+def plot_correlation(profiles: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axes":
     """Correlation of residuals by distance, and what share of the pixels' values counts as independent for it.
 
     White noise would fall from 1 to 0 within a pixel; what lies above is counted once only. **Units:** pixels.
     """
     ax = _axes(ax, "plot_correlation", (6, 3.6))
-    correlation = np.asarray(seen.residual_correlation)
+    correlation = np.asarray(profiles.residual_correlation)
     below = np.flatnonzero(correlation < LAST_CORRELATION)
     reach = int(below[0]) if below.size else len(correlation) - 1
     last = min(len(correlation), max(3 * reach, 12) + 1)
@@ -256,7 +262,7 @@ def plot_correlation(seen: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axe
     ax.axhline(LAST_CORRELATION, color=_RED, linewidth=0.8, linestyle="--")
     ax.text(last - 1, LAST_CORRELATION, f"{LAST_CORRELATION:g}: taken for none", color=_RED, fontsize="small",
             ha="right", va="bottom")  # fmt: skip
-    told = seen.noise.told()
+    told = profiles.noise.describe()
     ax.set_title(told[0].upper() + told[1:], fontsize="medium")
     ax.set(xlabel="distance (pixels)", ylabel="correlation of residuals", xlim=(-0.02 * last, last - 1))
     ax.grid(alpha=0.25)

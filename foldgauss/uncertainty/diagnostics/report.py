@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, even_pace, irregularities, judged
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, even_times, irregularities, judged
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 
 def frame_table(
@@ -60,11 +60,11 @@ def summary(
     **Example:** `print(summary(posterior, model.frame_times.times()))`.
     """
     flagged = irregularities(posterior) if flagged is None else flagged
-    seen = posterior.seen
-    level = level or ("splats" if seen is None else seen.level)
+    profiles = posterior.profiles
+    level = level or ("splats" if profiles is None else profiles.level)
     parts = [
         posterior.message,
-        *(f"**Note:** {note}" for note in (() if seen is None else seen.notes)),
+        *(f"**Note:** {note}" for note in (() if profiles is None else profiles.notes)),
         _sampling(posterior),
         "## How sure\n\n" + _sureness(posterior),
         "## Pace\n\n" + _pace(posterior, flagged),
@@ -92,7 +92,7 @@ def _sampling(posterior: FrameTimePosterior) -> str:
 
 def _sureness(posterior: FrameTimePosterior) -> str:
     """Spreads in frames, and whether the three ways to find them agree."""
-    free, (_, unit) = posterior.free, even_pace(posterior)
+    free, (_, unit) = posterior.free, even_times(posterior)
     std = posterior.std()[free]
     drawn, exact, laplace = std / unit, posterior.exact.std()[free] / unit, posterior.laplace.std[free] / unit
     widest, apart = drawn.argmax(), np.abs(posterior.mean() - posterior.exact.mean())[free] / exact / unit
@@ -165,8 +165,8 @@ def _conditions(posterior: FrameTimePosterior, level: str) -> str:
         f"- The splats, held as they were fitted: places, folds, {held}. A warp of time that the folds have taken up "
         "does not show: intervals are those of times given the folds."
     ]
-    if posterior.seen is not None:
-        lines.append(f"- The noise: {posterior.seen.noise.told()}.")
+    if posterior.profiles is not None:
+        lines.append(f"- The noise: {posterior.profiles.noise.describe()}.")
     lines.append(f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.")
     held = np.flatnonzero(~increments.free)[1:-1]
     text = "- The first frame at 0 and the last at 1"

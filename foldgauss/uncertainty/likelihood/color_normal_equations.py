@@ -15,7 +15,7 @@ from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu
 from foldgauss.render.weights import weights
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.splats import SH_C0
@@ -44,20 +44,20 @@ class ColorEquations:
     """
 
     def __init__(
-        self, screen: Screen, noise: FrameNoise, times: Float64[np.ndarray, " num_frames"], prior_scale: float
+        self, residuals: Residuals, noise: FrameNoise, times: Float64[np.ndarray, " num_frames"], prior_scale: float
     ):
-        self.screen, self.times, self.variance = screen, times, 1 / (2 * noise.weight)
-        self.num = screen.model.num_gaussians
-        dc = np.asarray(screen.model.splats.color_dc, np.float64)
+        self.residuals, self.times, self.variance = residuals, times, 1 / (2 * noise.weight)
+        self.num = residuals.model.num_gaussians
+        dc = np.asarray(residuals.model.splats.color_dc, np.float64)
         self.colour = np.maximum(0.5 + SH_C0 * dc, 0.0)
-        self._stage = PreparedModel(screen.model, screen.model.size)
+        self._stage = PreparedModel(residuals.model, residuals.model.size)
         self._add_up(prior_scale)
 
     def weights(self, t: float) -> scipy.sparse.csr_array:
         """A(t): (pixels, num), in double precision; the picture at t is A(t) times the colours."""
         alive = self._stage.at(t)
         leaves = alive.mean, alive.factor, alive.opacity, alive.color, _behind
-        model = self.screen.model
+        model = self.residuals.model
         found = weights(cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options))
         indices = alive.alive.astype(np.int32)[found.indices]
         shape = (found.shape[0], self.num)
@@ -65,7 +65,7 @@ class ColorEquations:
 
     def residual(self, k: int, weights: scipy.sparse.csr_array) -> Float64[np.ndarray, "pixels 3"]:
         """Frame k less what the model's own colours show."""
-        return self.screen.frames[k].reshape(-1, 3) * _level - weights @ self.colour
+        return self.residuals.frames[k].reshape(-1, 3) * _level - weights @ self.colour
 
     def _add_up(self, prior_scale: float) -> None:
         half = scipy.sparse.csr_array((self.num, self.num))
@@ -90,7 +90,7 @@ class ColorEquations:
     @functools.cached_property
     def precondition(self) -> Callable[[np.ndarray], np.ndarray]:
         """The inverse of the matrix' blocks of neighbouring Gaussians, in single precision."""
-        blocks = _neighbours(np.asarray(self.screen.model.splats.loc, np.float64), BLOCK)
+        blocks = _neighbours(np.asarray(self.residuals.model.splats.loc, np.float64), BLOCK)
         order = np.concatenate(blocks)
         matrix = self.matrix[order][:, order]
         ends = np.cumsum([len(block) for block in blocks])
@@ -110,7 +110,9 @@ class ColorEquations:
     @functools.cached_property
     def solution(self) -> Float64[np.ndarray, "num 3"]:
         """Offsets of the colours given all frames at their times: where solving begins for others."""
-        return solved(lambda x: self.matrix @ x, self.precondition, self.rhs, np.zeros_like(self.rhs), 1e-4)
+        return solve_conjugate_gradient(
+            lambda x: self.matrix @ x, self.precondition, self.rhs, np.zeros_like(self.rhs), 1e-4
+        )
 
 
 class FrameAt:
@@ -134,7 +136,7 @@ class FrameAt:
         return self.equations.matrix.toarray() + changed.toarray() / self.variance
 
 
-def solved(
+def solve_conjugate_gradient(
     product: Callable[[np.ndarray], np.ndarray],
     precondition: Callable[[np.ndarray], np.ndarray],
     rhs: Float64[np.ndarray, "num columns"],

@@ -1,4 +1,4 @@
-"""Profiles of a model's frame times: which times are drawn, and what comes of it."""
+"""ProfileCurves of a model's frame times: which times are drawn, and what comes of it."""
 
 import dataclasses
 import itertools
@@ -14,12 +14,12 @@ from foldgauss.uncertainty.likelihood.noise import (
     FrameNoise,
     autocorrelation,
     covariances,
-    effective_share,
+    effective_fraction,
     rings,
-    score_share,
+    score_fraction,
 )
-from foldgauss.uncertainty.likelihood.profiles import Profiles
-from foldgauss.uncertainty.likelihood.residuals import Screen, Sketches
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
+from foldgauss.uncertainty.likelihood.residuals import Residuals, Sketches
 from foldgauss.video.models.video_model import VideoModel
 
 #: Coarse nodes in each interval between two frame times.
@@ -50,25 +50,25 @@ class LikelihoodProfiles:
     """What the pictures say of every frame's time: profiles, and the noise they were made with.
 
     `residual_correlation` (lags,): correlation of residuals by distance in pixels, mean over the frames.
-    `num_drawn`: pictures drawn for it. `level`: what is held, "splats" or, but for colours, "colors". `notes`: what was
+    `num_rendered`: pictures drawn for it. `level`: what is held, "splats" or, but for colours, "colors". `notes`: what was
     warned of.
     """
 
-    profiles: Profiles
+    curves: ProfileCurves
     noise: FrameNoise
     residual_correlation: Float64[np.ndarray, " lags"]
-    num_drawn: int
+    num_rendered: int
     level: str = "splats"
     notes: tuple[str, ...] = ()
 
 
-def evidence(
+def likelihood_profiles(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     *,
     noise: str | FrameNoise = "score",
     reach: int | None = None,
-    on_picture: Callable[[int, int], None] | None = None,
+    on_render: Callable[[int, int], None] | None = None,
 ) -> LikelihoodProfiles:
     """Draw the model at as many times as the profiles of all frames need.
 
@@ -76,55 +76,57 @@ def evidence(
     or only within `reach` frame times of its own (default for more than 400 frames: 100, or as many as are needed). But
     its first frame is the model's first, at time 0, and its last the last, at 1: where that looks wrong, a warning says
     so, and likewise where the video may be another one of the same place. `noise`: "effective" or "score" (see
-    `effective_share`, `score_share`), "independent", or a `FrameNoise`. `on_picture` is called with how many are drawn
+    `effective_fraction`, `score_fraction`), "independent", or a `FrameNoise`. `on_render` is called with how many are drawn
     and how many there will be, as far as is known.
 
     Raises ValueError for a video of another size, one that the model does not explain, one that shows nothing of its
     times, and best times at the ends of a given `reach`.
     """
-    screen = Screen(model, video)
-    num_frames = len(screen.frames)
+    residuals = Residuals(model, video)
+    num_frames = len(residuals.frames)
     if num_frames < 3:
         cure = "The first frame is at time 0 and the last at 1: others are needed."
         raise invalid("video", expected="at least 3 frames", got=num_frames, cure=cure)
     if isinstance(noise, FrameNoise):
-        noise = noise.of(num_frames)
+        noise = noise.for_frames(num_frames)
     elif not isinstance(noise, str) or noise not in NOISES:
         raise invalid("noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=noise)
-    _check_changes(screen.frames)
-    drawn = Drawn(screen, reach, on_picture)
+    _check_changes(residuals.frames)
+    drawn = ProfileBuilder(residuals, reach, on_render)
     drawn.coarse()
-    notes = _explained(screen.frames, drawn)
-    seen = drawn.evidence(noise)
-    _check_identified(seen.profiles)
-    notes += _ends(seen.profiles, drawn.model_times)
+    notes = _explained(residuals.frames, drawn)
+    profiles = drawn.likelihood_profiles(noise)
+    _check_identified(profiles.curves)
+    notes += _ends(profiles.curves, drawn.model_times)
     for note in notes:
         warnings.warn(note, UserWarning, stacklevel=2)
-    return dataclasses.replace(seen, notes=tuple(notes))
+    return dataclasses.replace(profiles, notes=tuple(notes))
 
 
-class Drawn:
+class ProfileBuilder:
     """Squared errors of every frame at the times drawn for it, and which times those are."""
 
-    def __init__(self, screen: Screen, reach: int | None = None, on_picture: Callable[[int, int], None] | None = None):
-        self.screen, self.on_picture, self.num_drawn, self.num_planned = screen, on_picture, 0, 0
-        num_frames = len(screen.frames)
-        self.model_times = np.asarray(screen.model.frame_times.times(), np.float64)
+    def __init__(
+        self, residuals: Residuals, reach: int | None = None, on_render: Callable[[int, int], None] | None = None
+    ):
+        self.residuals, self.on_render, self.num_rendered, self.num_planned = residuals, on_render, 0, 0
+        num_frames = len(residuals.frames)
+        self.model_times = np.asarray(residuals.model.frame_times.times(), np.float64)
         self.finest = FINEST / COARSE * float(np.median(np.diff(self.model_times)))
         self.own_reach = reach is None
         self.reach = (None if num_frames <= MOST_EVERYWHERE else REACH) if reach is None else reach
         if self.reach is not None and not whole(self.reach, 1):
             raise invalid("reach", expected="a whole number >= 1, or None", got=reach)
-        self.sketches = Sketches(3 * screen.model.size[0] * screen.model.size[1])
+        self.sketches = Sketches(3 * residuals.model.size[0] * residuals.model.size[1])
         self.samples = [_Samples() for _ in range(num_frames)]
 
     def _pictures(self, times):
         self.num_planned += len(times)
-        for t, picture in zip(times, self.screen.pictures(times), strict=True):
+        for t, picture in zip(times, self.residuals.render_at(times), strict=True):
             yield t, picture
-            self.num_drawn += 1
-            if self.on_picture is not None:
-                self.on_picture(self.num_drawn, self.num_planned)
+            self.num_rendered += 1
+            if self.on_render is not None:
+                self.on_render(self.num_rendered, self.num_planned)
 
     def coarse(self) -> None:
         """Compare all frames with pictures over all the time, or the time within reach."""
@@ -135,15 +137,15 @@ class Drawn:
 
     def _compared(self, times: np.ndarray) -> bool:
         """Compare; false where a frame's best time is at the end of a reach that may be widened."""
-        known, num_frames = self.model_times, len(self.screen.frames)
+        known, num_frames = self.model_times, len(self.residuals.frames)
         position = np.interp(times, known, np.arange(len(known))) * ((num_frames - 1) / (len(known) - 1))
         found = [([], [], []) for _ in range(num_frames)]
         for n, (t, picture) in enumerate(self._pictures(times)):
             near = np.arange(num_frames)
             if self.reach is not None:
                 near = near[np.abs(near - position[n]) <= self.reach]
-            sketch = self.sketches.of(picture)
-            for k, error in zip(near, self.screen.squared_errors(picture, near), strict=True):
+            sketch = self.sketches.sketch(picture)
+            for k, error in zip(near, self.residuals.squared_errors(picture, near), strict=True):
                 for each, value in zip(found[k], (t, error, sketch), strict=True):
                     each.append(value)
         for each, columns in zip(self.samples, found, strict=True):
@@ -156,21 +158,21 @@ class Drawn:
             raise invalid("reach", expected="enough for every frame", got=got, cure="Give more, or None.")
         return not edge
 
-    def evidence(self, kind: str | FrameNoise) -> LikelihoodProfiles:
+    def likelihood_profiles(self, kind: str | FrameNoise) -> LikelihoodProfiles:
         """After `coarse`: the noise, and profiles as fine as it asks for."""
         noise, correlation = self.noise(kind)
         self.refine(noise)
         if not isinstance(kind, FrameNoise):  # once more, with the residuals where they are least
             noise, correlation = self.noise(kind)
             self.refine(noise)
-        return LikelihoodProfiles(self.profiles(noise), noise, correlation, self.num_drawn)
+        return LikelihoodProfiles(self.curves(noise), noise, correlation, self.num_rendered)
 
     def refine(self, noise: FrameNoise) -> None:
         """Draw pictures between the nodes of every frame but the first and the last, whose times are fixed."""
         inner = range(1, len(self.samples) - 1)
         while wanted := [(t, k) for k in inner for t in self.samples[k].wanted(noise.weight[k], self.finest)]:
             drawn = [
-                (self.screen.squared_errors(picture, [k])[0], self.sketches.of(picture))
+                (self.residuals.squared_errors(picture, [k])[0], self.sketches.sketch(picture))
                 for (_, k), (_, picture) in zip(wanted, self._pictures([t for t, _ in wanted]), strict=True)
             ]
             first = 0
@@ -183,15 +185,15 @@ class Drawn:
         """Of the residuals of every frame where its error is least; and their correlation by distance."""
         num_frames = len(self.samples)
         modes = [each.mode for each in self.samples]
-        scale, share, together, correlations = np.empty(num_frames), np.ones(num_frames), 0.0, 0.0
+        scale, fraction, together, correlations = np.empty(num_frames), np.ones(num_frames), 0.0, 0.0
         for k, (_, picture) in enumerate(self._pictures(modes)):
-            residual = self.screen.residual(k, picture)
+            residual = self.residuals.residual(k, picture)
             scale[k] = max(float(np.sqrt(np.mean(np.square(residual, dtype=np.float64)))), LEAST_SCALE)
             covariance = covariances(residual)
             together = together + covariance / scale[k] ** 2
             correlations = correlations + rings(autocorrelation(covariance))
             if kind == "effective":
-                share[k] = effective_share(covariance)
+                fraction[k] = effective_fraction(covariance)
         if kind == "score":
             step = self.finest * SLOPE_STEP
             times = [np.clip([t - step, t, t + step], 0.0, 1.0) for t in modes]
@@ -199,13 +201,13 @@ class Drawn:
             for k, (before, _, after) in enumerate(times):
                 one, middle, other = (next(pictures)[1] for _ in range(3))
                 slope = (other - one) / np.float32(after - before)
-                share[k] = score_share(self.screen.residual(k, middle), slope, together)
-        found = kind if isinstance(kind, FrameNoise) else FrameNoise(scale, share)
+                fraction[k] = score_fraction(self.residuals.residual(k, middle), slope, together)
+        found = kind if isinstance(kind, FrameNoise) else FrameNoise(scale, fraction)
         return found, correlations / num_frames
 
-    def profiles(self, noise: FrameNoise) -> Profiles:
+    def curves(self, noise: FrameNoise) -> ProfileCurves:
         errors = [each.errors for each in self.samples]
-        return Profiles.of(
+        return ProfileCurves.from_nodes(
             [each.times for each in self.samples],
             [-weight * (error - error.min()) for weight, error in zip(noise.weight, errors, strict=True)],
         )
@@ -267,7 +269,7 @@ def _check_changes(frames: np.ndarray) -> None:
         raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
 
 
-def _explained(frames: np.ndarray, drawn: Drawn) -> list[str]:
+def _explained(frames: np.ndarray, drawn: ProfileBuilder) -> list[str]:
     """Raises by what is left of the frames' variance over space and time; notes by what is left of that over time."""
     mean = np.mean(frames, axis=0, dtype=np.float64)
     over_time = sum(float(np.square(frame - mean).sum()) for frame in frames) / 255**2
@@ -288,20 +290,20 @@ def _explained(frames: np.ndarray, drawn: Drawn) -> list[str]:
     ]
 
 
-def _check_identified(profiles: Profiles) -> None:
-    rises = np.nanmax(profiles.values, axis=1) - np.nanmin(profiles.values, axis=1)
+def _check_identified(curves: ProfileCurves) -> None:
+    rises = np.nanmax(curves.values, axis=1) - np.nanmin(curves.values, axis=1)
     if (rises[1:-1] < FLAT).all():
         got = f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times"
         cure = "The times are not identified: nothing changes, or the noise is too great (5 grey levels: 5 / 255)."
         raise invalid("video", expected="frames that tell their times", got=got, cure=cure)
 
 
-def _ends(profiles: Profiles, model_times: np.ndarray) -> list[str]:
+def _ends(curves: ProfileCurves, model_times: np.ndarray) -> list[str]:
     """Notes of a first or last frame that is better somewhere else than at 0 or 1."""
     step, notes = np.median(np.diff(model_times)), []
-    for k, end in ((0, 0.0), (profiles.num_frames - 1, 1.0)):
-        best = profiles.modes()[k]
-        lost = -float(profiles[k](np.array([end]))[0])
+    for k, end in ((0, 0.0), (curves.num_frames - 1, 1.0)):
+        best = curves.modes()[k]
+        lost = -float(curves[k](np.array([end]))[0])
         if lost > PINNED and abs(best - end) > AWAY * step:
             notes.append(
                 f"Frame {k} is held at time {end:g}, but {best:.4f}, {abs(best - end) / step:.1f} frames away, is"

@@ -23,13 +23,13 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from foldgauss._runtime.checks import invalid, one_of, whole, within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import EXPLAINED
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
 from foldgauss.video.fitting.loop import FitState, fit_steps, start_from, to_model
 from foldgauss.video.fitting.loop import start as start_anew
 from foldgauss.video.models.video_model import VideoModel
 
-WAYS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
+METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
 #: A fit that goes on from the model goes through the plan again from here: with the rates, and the loss, of its end.
 AGAIN_FROM = 0.7
 #: Streams of the seed's random numbers: one for pictures, one for the seeds of fits.
@@ -72,7 +72,7 @@ class RefitTimes:
     own: Float64[np.ndarray, " num_frames"]
 
     @classmethod
-    def of(cls, model: VideoModel, refits: Sequence[Refit]) -> "RefitTimes":
+    def from_refits(cls, model: VideoModel, refits: Sequence[Refit]) -> "RefitTimes":
         """From what `refits` gave. Raises ValueError for fewer than two, or one given twice."""
         numbers = [each.number for each in refits]
         if len(numbers) < 2 or len(set(numbers)) < len(numbers):
@@ -166,7 +166,7 @@ def refit_frame_times(
     config: FitConfig,
     *,
     replicates: int = 20,
-    of: str = "pixels",
+    method: str = "pixels",
     block: int = 16,
     place: str = "kept",
     seed: int = 0,
@@ -182,22 +182,22 @@ def refit_frame_times(
     if not whole(replicates, 2):
         raise invalid("replicates", expected="a whole number >= 2", got=repr(replicates))
     found = []
-    how = {"of": of, "block": block, "place": place, "seed": seed, "steps": steps, "start": start}
-    for each in refits(model, video, config, replicates=replicates, **how):
+    how = {"method": method, "block": block, "place": place, "seed": seed, "steps": steps, "start": start}
+    for each in iter_refits(model, video, config, replicates=replicates, **how):
         if on_replicate is not None:
             on_replicate(each)
         found.append(dataclasses.replace(each, model=model))  # of all those models one is kept
-    return RefitTimes.of(model, found)
+    return RefitTimes.from_refits(model, found)
 
 
-def refits(
+def iter_refits(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     config: FitConfig,
     *,
     replicates: int = 20,
     first: int = 0,
-    of: str = "pixels",
+    method: str = "pixels",
     block: int = 16,
     place: str = "kept",
     seed: int = 0,
@@ -208,7 +208,7 @@ def refits(
 
     Replicate i depends on `seed` and i only, so that what was saved need not be done again.
 
-    * of="pixels": to the model's own pictures with residuals put together anew, see `resampled`. Frames are the
+    * of="pixels": to the model's own pictures with residuals put together anew, see `resample_frames`. Frames are the
       bootstrap's "truth" exactly: the times spread around the model's own.
     * of="frames": without frames i + 1, i + 1 + replicates, ..., whose place in time is left open; their times are then
       those between their neighbours' at which these splats, that have never seen them, come nearest to them, which is
@@ -225,18 +225,18 @@ def refits(
     and 17. Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings
     out of range.
     """
-    one_of("of", of, WAYS)
+    one_of("method", method, METHODS)
     one_of("place", place, PLACES)
-    start = ("scratch" if of == "frames" else "model") if start is None else start
+    start = ("scratch" if method == "frames" else "model") if start is None else start
     one_of("start", start, STARTS)
-    if of == "frames" and start == "model":
+    if method == "frames" and start == "model":
         cure = "The model has seen the frames that are to be left out."
         raise invalid("start", expected="'scratch' for frames", got=repr(start), cure=cure)
     for name, value, least in (("replicates", replicates, 1), ("first", first, 0), ("seed", seed, 0)):
         if not whole(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
-    screen = _checked(model, video, of)
-    if of == "frames" and not 2 <= replicates <= len(video) - 2:
+    residuals = _checked(model, video, method)
+    if method == "frames" and not 2 <= replicates <= len(video) - 2:
         cure = "Each of the others is left out once."
         raise invalid("replicates", expected=f"from 2 to {len(video) - 2} for frames", got=replicates, cure=cure)
     if not whole(block, 1) or block > min(model.size):
@@ -245,43 +245,43 @@ def refits(
     start_from(model, config, 1)  # raises for a config that is not the model's
     for number in range(first, replicates):
         own = dataclasses.replace(config, seed=int(np.random.SeedSequence([seed, _FITS, number]).generate_state(1)[0]))
-        if of == "frames":
+        if method == "frames":
             yield _without_frames(model, video, own, number, replicates)
             continue
         frames = video
-        if of == "pixels":
-            frames = resampled(screen, block, np.random.default_rng([seed, _PICTURES, number]), place=place)
+        if method == "pixels":
+            frames = resample_frames(residuals, block, np.random.default_rng([seed, _PICTURES, number]), place=place)
         state = start_from(model, own, own.steps, AGAIN_FROM) if start == "model" else None
         fitted, psnr = _fitted(frames, own, model.fps, state)
         times = np.asarray(fitted.frame_times.times(), np.float64)
         yield Refit(number, times, np.zeros(len(times), bool), fitted, psnr)
 
 
-def _checked(model: VideoModel, video: np.ndarray, of: str) -> Screen:
-    screen = Screen(model, video)
+def _checked(model: VideoModel, video: np.ndarray, method: str) -> Residuals:
+    residuals = Residuals(model, video)
     if len(video) != model.num_frames:
         expected = f"the {model.num_frames} frames that the model was fitted to"
         raise invalid("video", expected=expected, got=f"{len(video)} frames")
     if len(video) < 3:
         cure = "The first frame is at time 0 and the last at 1: others are needed."
         raise invalid("video", expected="at least 3 frames", got=len(video), cure=cure)
-    if of == "pixels" and video.shape[3] == 4:
+    if method == "pixels" and video.shape[3] == 4:
         cure = "Fit it without alpha, or leave frames out."
         raise invalid(
             "video", expected="frames without alpha for pixels", got=f"{video.dtype} {video.shape}", cure=cure
         )
-    left = sum(float(np.square(each, dtype=np.float64).sum()) for each in _residuals(screen))
-    variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in screen.frames) * math.prod(model.size) / 255**2
+    left = sum(float(np.square(each, dtype=np.float64).sum()) for each in _residuals(residuals))
+    variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in residuals.frames) * math.prod(model.size) / 255**2
     if left > (1 - EXPLAINED) * variation:
         got = f"a model that explains {100 * (1 - left / variation) if variation else 0:.0f}% of their variance"
         expected = f"frames of which the model explains {100 * EXPLAINED:.0f}%"
         raise invalid("video", expected=expected, got=got, cure="Give the model of this video, at its size and crop.")
-    return screen
+    return residuals
 
 
-def _residuals(screen: Screen) -> Iterator[Float32[np.ndarray, "3 height width"]]:
-    for k, picture in enumerate(screen.pictures(np.asarray(screen.model.frame_times.times()))):
-        yield screen.residual(k, picture)
+def _residuals(residuals: Residuals) -> Iterator[Float32[np.ndarray, "3 height width"]]:
+    for k, picture in enumerate(residuals.render_at(np.asarray(residuals.model.frame_times.times()))):
+        yield residuals.residual(k, picture)
 
 
 def _with_steps(config: FitConfig, num_frames: int, start: str, steps: int | None) -> FitConfig:
@@ -300,8 +300,8 @@ def _with_steps(config: FitConfig, num_frames: int, start: str, steps: int | Non
     return dataclasses.replace(config, steps=steps, minutes=None, target_psnr=None, **own)
 
 
-def resampled(
-    screen: Screen, block: int, rng: np.random.Generator, *, place: str = "kept"
+def resample_frames(
+    residuals: Residuals, block: int, rng: np.random.Generator, *, place: str = "kept"
 ) -> UInt8[np.ndarray, "num_frames height width 3"]:
     """Frames that might have been seen: the model's pictures, and residuals in blocks with signs drawn anew.
 
@@ -310,21 +310,21 @@ def resampled(
     great, keep great ones. With "moved" they are those of another place of the same frame, drawn at random with the
     frame continued around its borders; so they are equally great everywhere. Either way the mean is the model's
     picture; the variance is the pixel's squared residual where they are kept, and the frame's mean one where they are
-    moved. The first is what `score_share` counts on, the second `effective_share`. Residuals of one frame have nothing
+    moved. The first is what `score_fraction` counts on, the second `effective_fraction`. Residuals of one frame have nothing
     to do with the next one's. Values are rounded to 8 bits and clipped, as a camera's are.
     """
-    frames = np.empty(screen.frames.shape, np.uint8)
-    times = np.asarray(screen.model.frame_times.times())
-    for k, picture in enumerate(screen.pictures(times)):
-        drawn = picture + blocks_of(screen.residual(k, picture), block, rng, place=place)
+    frames = np.empty(residuals.frames.shape, np.uint8)
+    times = np.asarray(residuals.model.frame_times.times())
+    for k, picture in enumerate(residuals.render_at(times)):
+        drawn = picture + resample_blocks(residuals.residual(k, picture), block, rng, place=place)
         frames[k] = np.moveaxis(np.clip(np.rint(255 * drawn), 0, 255), 0, -1)
     return frames
 
 
-def blocks_of(
+def resample_blocks(
     residual: Float[np.ndarray, "channels height width"], block: int, rng: np.random.Generator, *, place: str = "kept"
 ) -> Float[np.ndarray, "channels height width"]:
-    """Residuals in blocks with random signs, see `resampled`."""
+    """Residuals in blocks with random signs, see `resample_frames`."""
     _, height, width = residual.shape
     origin = rng.integers(0, block, 2)
     row, column = (np.arange(size) + shift for size, shift in zip((height, width), origin, strict=True))
@@ -343,12 +343,12 @@ def _without_frames(model: VideoModel, video: np.ndarray, config: FitConfig, num
     unseen = np.zeros(len(video), bool)
     unseen[number + 1 : -1 : folds] = True
     kept = np.ascontiguousarray(video[~unseen])
-    state = start_anew(kept, config, merged(np.asarray(model.frame_times.logits), unseen))
+    state = start_anew(kept, config, merge_logits(np.asarray(model.frame_times.logits), unseen))
     fitted, psnr = _fitted(kept, config, model.fps, state)
-    times, screen = np.empty(len(video)), Screen(fitted, video)
+    times, residuals = np.empty(len(video)), Residuals(fitted, video)
     times[~unseen] = np.asarray(fitted.frame_times.times(), np.float64)
     for k in np.flatnonzero(unseen):
-        times[k] = _nearest(screen, k, times[k - 1], times[k + 1])
+        times[k] = _nearest(residuals, k, times[k - 1], times[k + 1])
     return Refit(number, times, unseen, fitted, psnr)
 
 
@@ -357,7 +357,7 @@ def _fitted(frames: np.ndarray, config: FitConfig, fps: float, state: FitState |
     return to_model(state, config, frames.shape[1:3], fps), info.psnr
 
 
-def merged(
+def merge_logits(
     logits: Float[np.ndarray, " intervals"], unseen: Bool[np.ndarray, " num_frames"]
 ) -> Float32[np.ndarray, " fewer"]:
     """Softmax weights of the frames but the `unseen` ones, at the same times: the gaps they leave stay open."""
@@ -365,11 +365,11 @@ def merged(
     return np.logaddexp.reduceat(np.asarray(logits, np.float64), kept[:-1]).astype(np.float32)
 
 
-def _nearest(screen: Screen, k: int, low: float, high: float) -> float:
+def _nearest(residuals: Residuals, k: int, low: float, high: float) -> float:
     """The time from `low` to `high` whose picture has the least squared error to frame k; the middle of equal ones."""
     for _ in range(ROUNDS):
         times = np.linspace(low, high, LOOKS)
-        errors = np.array([screen.squared_errors(picture, [k])[0] for picture in screen.pictures(times)])
+        errors = np.array([residuals.squared_errors(picture, [k])[0] for picture in residuals.render_at(times)])
         ties = np.flatnonzero(errors == errors.min())
         best = ties[len(ties) // 2]
         low, high = times[max(best - 1, 0)], times[min(best + 1, LOOKS - 1)]

@@ -19,7 +19,7 @@ from scipy.special import gammaln
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.kernels import inline, kernel
-from foldgauss.uncertainty.likelihood.profiles import Profiles
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.posterior.increments import Increments
 
 #: Grid points between two nodes of a profile, where it is within NEAR nats of its maximum.
@@ -45,7 +45,7 @@ _NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8)[0] + 1) / 2, np.polynomia
 
 
 @dataclasses.dataclass(frozen=True)
-class ExactTimes:
+class ExactPosterior:
     """Marginals of the free frames' times, and the evidence.
 
     `grids` and `densities`: for each frame that is free, in order, times and the posterior density there.
@@ -69,11 +69,11 @@ class ExactTimes:
         found[self.increments.free] = [np.sqrt(_moment(grid, density, mean, 2)) for grid, density, mean in pairs]
         return found
 
-    def quantile(self, share: float) -> Float64[np.ndarray, " num_frames"]:
+    def quantile(self, fraction: float) -> Float64[np.ndarray, " num_frames"]:
         """The times below which each frame lies with probability `share`."""
-        if not 0 <= share <= 1:
-            raise invalid("share", expected="a number in [0, 1]", got=share)
-        return self._filled([_quantile(*each, share) for each in zip(self.grids, self.densities, strict=True)])
+        if not 0 <= fraction <= 1:
+            raise invalid("fraction", expected="a number in [0, 1]", got=fraction)
+        return self._filled([_quantile(*each, fraction) for each in zip(self.grids, self.densities, strict=True)])
 
     def interval(self, level: float) -> Float64[np.ndarray, "2 num_frames"]:
         """Ends of the central intervals that hold `level` of the probability."""
@@ -98,7 +98,7 @@ class ExactTimes:
         return found
 
 
-def exact_times(profiles: Profiles, increments: Increments) -> ExactTimes:
+def exact_posterior(curves: ProfileCurves, increments: Increments) -> ExactPosterior:
     r"""The exact posterior given profiles, to the precision of grids of some 300 to 800 points a frame.
 
     **Precision:** means and 5 % quantiles to 5e-3 of a standard deviation, standard deviations to 3e-3 of their own,
@@ -113,40 +113,40 @@ def exact_times(profiles: Profiles, increments: Increments) -> ExactTimes:
     grids, densities, forwards, log_evidence = [], [], [], 0.0
     for first, last in increments.runs:
         ends = increments.held[first - 1], increments.held[last + 1]
-        found = _run(profiles, range(first, last + 1), ends, increments.concentration)
+        found = _run(curves, range(first, last + 1), ends, increments.concentration)
         grids += found[0]
         densities += found[1]
         forwards += found[2]
         log_evidence += found[3]
     held = ~increments.free
-    log_evidence += float(profiles(increments.held)[held].sum())
-    return ExactTimes(increments, grids, densities, log_evidence, forwards)
+    log_evidence += float(curves(increments.held)[held].sum())
+    return ExactPosterior(increments, grids, densities, log_evidence, forwards)
 
 
-def _run(profiles: Profiles, frames: range, ends: tuple[float, float], alpha: float):
+def _run(curves: ProfileCurves, frames: range, ends: tuple[float, float], alpha: float):
     """Grids, marginal densities, forward messages and the log-evidence of a run between two held times.
 
     Again and again: where a pass finds next to nothing there is nothing to be looked at, and elsewhere it is finer.
     """
     grids = []
     for n, k in enumerate(frames):
-        grid = _thinned(profiles, k, profile_grid(profiles, k, *ends, finer=2))
+        grid = _thinned(curves, k, profile_grid(curves, k, *ends, finer=2))
         grids.append(_graded(grid, ends, alpha * (n + 1) < 1, alpha * (len(frames) - n) < 1))
-    densities, *_ = _passes(profiles, frames, grids, ends, alpha)
+    densities, *_ = _passes(curves, frames, grids, ends, alpha)
     for _ in range(ROUNDS):
         cut = [_regridded(*each) for each in zip(grids, densities, strict=True)]
         grids, coarse = _around(grids, densities, [each[0] for each in cut], alpha), [each[1] for each in cut]
-        densities, forward, log_evidence = _passes(profiles, frames, grids, ends, alpha)
+        densities, forward, log_evidence = _passes(curves, frames, grids, ends, alpha)
         if max(coarse) < COARSE:
             break
     return grids, densities, forward, log_evidence
 
 
-def _thinned(profiles: Profiles, k: int, grid: np.ndarray) -> np.ndarray:
+def _thinned(curves: ProfileCurves, k: int, grid: np.ndarray) -> np.ndarray:
     """Some FIRST points of a grid: half of them by the change of the likelihood, half by time."""
     if len(grid) <= FIRST:
         return grid
-    heights = _on_grid(profiles, k, grid)
+    heights = _on_grid(curves, k, grid)
     change = np.abs(np.diff(np.exp(heights - heights.max())))
     time = np.diff(grid) / (grid[-1] - grid[0])
     passed = np.concatenate([[0.0], np.cumsum(time + change / max(change.sum(), 1.0))])
@@ -201,10 +201,10 @@ def _around(
     return found
 
 
-def _passes(profiles: Profiles, frames: range, grids: list[np.ndarray], ends: tuple[float, float], alpha: float):
+def _passes(curves: ProfileCurves, frames: range, grids: list[np.ndarray], ends: tuple[float, float], alpha: float):
     """Marginal densities, forward messages and the log-evidence."""
     num, length = len(frames), ends[1] - ends[0]
-    heights = [_on_grid(profiles, k, grid) for k, grid in zip(frames, grids, strict=True)]
+    heights = [_on_grid(curves, k, grid) for k, grid in zip(frames, grids, strict=True)]
     forward = [heights[0]]
     for n in range(1, num):
         message = _Message(grids[n - 1] - ends[0], forward[-1], n, alpha)
@@ -254,17 +254,17 @@ def _density(grid: np.ndarray, told: np.ndarray, ends: tuple[float, float], shap
 
 
 def profile_grid(
-    profiles: Profiles, k: int, start: float, end: float, finer: int = FINER
+    curves: ProfileCurves, k: int, start: float, end: float, finer: int = FINER
 ) -> Float64[np.ndarray, " points"]:
     """Times from `start` to `end`, as dense as frame k's profile is known, and `finer` times as dense near its top."""
-    nodes, _ = profiles.one(k)
+    nodes, _ = curves.nodes_and_values(k)
     low, high = max(start, nodes[0]), min(end, nodes[-1])
     if not low < high:
         got = f"frame {k} known from {nodes[0]:.4g} to {nodes[-1]:.4g}, to lie between {start:.4g} and {end:.4g}"
         raise invalid("profiles", expected="profiles that reach between the frames that are held", got=got)
     inside = (nodes > low) & (nodes < high)
     here = np.concatenate([[low], nodes[inside], [high]])
-    heights = profiles[k](here[:, None])[:, 0]
+    heights = curves[k](here[:, None])[:, 0]
     if np.isnan(heights).any():
         raise invalid("profiles", expected="log-likelihoods that are numbers", got=f"NaN for frame {k}")
     some = np.flatnonzero(heights > heights.max() - UNDERFLOW)
@@ -281,8 +281,8 @@ def _cut(grid: np.ndarray, cuts: np.ndarray) -> np.ndarray:
     return np.concatenate([points, grid[-1:]])
 
 
-def _on_grid(profiles: Profiles, k: int, grid: np.ndarray) -> np.ndarray:
-    return profiles[k](grid[:, None])[:, 0]
+def _on_grid(curves: ProfileCurves, k: int, grid: np.ndarray) -> np.ndarray:
+    return curves[k](grid[:, None])[:, 0]
 
 
 class _Message:
@@ -307,8 +307,8 @@ class _Message:
     def ahead(self, here: np.ndarray) -> np.ndarray:
         """Log of the mean of exp(logs) at times `here` times B, for B of Beta(alpha gaps, alpha)."""
         if self.alpha == 1:
-            cell, share = self._last(here)
-            found = np.logaddexp(self.summed[cell], _log_sum(self._within(cell, share)[1]))
+            cell, fraction = self._last(here)
+            found = np.logaddexp(self.summed[cell], _log_sum(self._within(cell, fraction)[1]))
             found[here <= self.grid[0]] = -np.inf
         else:
             found = np.empty(len(here))
@@ -323,8 +323,8 @@ class _Message:
         """Times below `above` (num,), with densities in proportion to the message times (above - t)^(alpha - 1)."""
         chance = rng.random(len(above))
         if self.alpha == 1:
-            cell, share = self._last(above)
-            goal = np.log(chance) + np.logaddexp(self.summed[cell], _log_sum(self._within(cell, share)[1]))
+            cell, fraction = self._last(above)
+            goal = np.log(chance) + np.logaddexp(self.summed[cell], _log_sum(self._within(cell, fraction)[1]))
             cell = np.minimum(np.searchsorted(self.summed, goal, side="right") - 1, cell)
         else:
             cell = np.empty(len(above), np.int64)
@@ -357,19 +357,19 @@ class _Message:
             both = first & ~apart
             found[both] = above[both] * rng.beta(power + 1, alpha, both.sum())
             kept[both] = np.where(found <= high, 0.0, -np.inf)[both]
-            share = np.clip((found - low) / (self.grid[cell + 1] - low), 0.0, 1.0)
-            kept += _between(self.logs[cell], self.logs[cell + 1], share) - bound
+            fraction = np.clip((found - low) / (self.grid[cell + 1] - low), 0.0, 1.0)
+            kept += _between(self.logs[cell], self.logs[cell + 1], fraction) - bound
         return found, kept >= threshold
 
     def _last(self, above: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The cells that times are in, and how much of these is below them; beyond the grid: all of the last."""
         cell = np.clip(np.searchsorted(self.grid, above, side="left") - 1, 0, len(self.grid) - 2)
-        share = (above - self.grid[cell]) / (self.grid[cell + 1] - self.grid[cell])
-        return cell, np.clip(share, 0.0, 1.0)
+        fraction = (above - self.grid[cell]) / (self.grid[cell + 1] - self.grid[cell])
+        return cell, np.clip(fraction, 0.0, 1.0)
 
-    def _within(self, cell: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _within(self, cell: np.ndarray, fraction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes in the first `share` of cells, and the logarithms of what each adds to the integral."""
-        low, width = self.grid[cell][:, None], np.diff(self.grid)[cell][:, None] * share[:, None]
+        low, width = self.grid[cell][:, None], np.diff(self.grid)[cell][:, None] * fraction[:, None]
         first = low == 0
         inside = np.where(first, _NODES ** (1 / (self.power + 1)), _NODES)
         places = low + width * inside
@@ -379,7 +379,7 @@ class _Message:
                 (self.power + 1) * np.log(width) - np.log(self.power + 1),
                 np.log(width) + self.power * np.log(places),
             )
-            logs = _between(self.logs[cell][:, None], self.logs[cell + 1][:, None], share[:, None] * inside)
+            logs = _between(self.logs[cell][:, None], self.logs[cell + 1][:, None], fraction[:, None] * inside)
         return places, logs + measure + np.log(_WEIGHTS)
 
     def _tables(self) -> tuple:
@@ -387,11 +387,11 @@ class _Message:
         return *tables, float(self.power), float(self.alpha), _NODES, _WEIGHTS
 
 
-def _between(left: np.ndarray, right: np.ndarray, share: np.ndarray) -> np.ndarray:
+def _between(left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
     """Logarithms at a share of the way; where one of two is that of nothing, it is the numbers that are linear."""
-    logs = left * (1 - share) + right * share
-    logs = np.where(left == -np.inf, right + np.log(share), logs)
-    logs = np.where(right == -np.inf, left + np.log1p(-share), logs)
+    logs = left * (1 - fraction) + right * fraction
+    logs = np.where(left == -np.inf, right + np.log(fraction), logs)
+    logs = np.where(right == -np.inf, left + np.log1p(-fraction), logs)
     return np.where((left == -np.inf) & (right == -np.inf), -np.inf, logs)
 
 
@@ -403,12 +403,12 @@ def _log_sum(logs: np.ndarray) -> np.ndarray:
 
 
 @inline
-def _log_at(share, left, right):
+def _log_at(fraction, left, right):
     if left == -np.inf:
-        return right + np.log(share)
+        return right + np.log(fraction)
     if right == -np.inf:
-        return left + np.log1p(-share)
-    return left + share * (right - left)
+        return left + np.log1p(-fraction)
+    return left + fraction * (right - left)
 
 
 @kernel
@@ -422,8 +422,8 @@ def _piece(t, low, high, first, width, left, right, power, alpha, nodes, weights
         else:
             s = low + (high - low) * nodes[n]
             log = np.log((high - low) * weights[n]) + (alpha - 1) * np.log(t - s)
-        share = min(max((s - first) / width, 0.0), 1.0)
-        terms[n] = log + power * np.log(s) + _log_at(share, left, right)
+        fraction = min(max((s - first) / width, 0.0), 1.0)
+        terms[n] = log + power * np.log(s) + _log_at(fraction, left, right)
 
 
 @kernel
@@ -504,11 +504,11 @@ def _moment(grid: np.ndarray, density: np.ndarray, centre: float, power: int) ->
     return float(((ends[:-1] + ends[1:] + 4 * half * (middle - centre) ** power) / 6 * np.diff(grid)).sum())
 
 
-def _quantile(grid: np.ndarray, density: np.ndarray, share: float) -> float:
+def _quantile(grid: np.ndarray, density: np.ndarray, fraction: float) -> float:
     """The time below which `share` lies of a piecewise linear density."""
     masses = (density[1:] + density[:-1]) / 2 * np.diff(grid)
     summed = np.concatenate([[0.0], np.cumsum(masses)])
-    goal = share * summed[-1]
+    goal = fraction * summed[-1]
     piece = int(np.clip(np.searchsorted(summed, goal, side="right") - 1, 0, len(masses) - 1))
     left, right, width, rest = density[piece], density[piece + 1], grid[piece + 1] - grid[piece], goal - summed[piece]
     # rest = left x + (right - left) x^2 / (2 width); this form of the root holds for right = left, too.

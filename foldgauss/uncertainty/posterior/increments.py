@@ -68,7 +68,7 @@ class Increments:
             raise invalid("held", expected="rising times", got=got)
 
     @classmethod
-    def among(
+    def with_free(
         cls, held: Float[np.ndarray, "num_frames"], frames: Sequence[int] | None = None, concentration: float = 1.0
     ) -> "Increments":
         """With `frames` free, or all but the first and the last; ValueError for frames that are not between these."""

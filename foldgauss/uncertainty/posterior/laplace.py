@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float, Float64
 
-from foldgauss.uncertainty.likelihood.profiles import Profiles
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.posterior.increments import Increments
 
 STEPS, ENOUGH = 60, 1e-9
@@ -16,7 +16,7 @@ REACH = 1.5
 
 
 @dataclasses.dataclass(frozen=True)
-class LaplaceTimes:
+class LaplaceApproximation:
     """A Gaussian at the mode of the density of the log-ratios, carried over to times.
 
     **Shapes:** `mode`, `std` (num_frames,), `std` 0 for frames that are held. `precision`: for each run the main and
@@ -44,7 +44,9 @@ class LaplaceTimes:
         return times
 
 
-def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.ndarray, " num_frames"]) -> LaplaceTimes:
+def laplace_approximation(
+    curves: ProfileCurves, increments: Increments, start: Float[np.ndarray, " num_frames"]
+) -> LaplaceApproximation:
     """Newton's method from `start`, rising times, in the density of the log-ratios.
 
     Slopes and curvatures of profiles are differences over `REACH` standard deviations to both sides.
@@ -52,26 +54,26 @@ def laplace_times(profiles: Profiles, increments: Increments, start: Float[np.nd
     mode, std, precision = np.array(start, np.float64), np.zeros(len(start)), []
     for first, last in increments.runs:
         frames = np.arange(first, last + 1)
-        bands = _climb(profiles[frames], mode, first, last, increments.concentration)
+        bands = _climb(curves[frames], mode, first, last, increments.concentration)
         precision.append(bands)
         upper = scipy.linalg.cholesky_banded(_banded(bands))
         inverse = scipy.linalg.cho_solve_banded((upper, False), np.eye(len(frames)))
         std[frames] = np.sqrt(np.diag(inverse))
-    return LaplaceTimes(increments, mode, std, precision)
+    return LaplaceApproximation(increments, mode, std, precision)
 
 
-def _climb(profiles: Profiles, times: np.ndarray, first: int, last: int, alpha: float) -> np.ndarray:
+def _climb(curves: ProfileCurves, times: np.ndarray, first: int, last: int, alpha: float) -> np.ndarray:
     """Climb in place; returns the bands of the negative second derivative at the top."""
     part = slice(first, last + 1)
     step = np.diff(times)[first - 1 : last].copy() * 0.1
 
     def height(inner: np.ndarray) -> float:
         gaps = np.diff(np.concatenate([[times[first - 1]], inner, [times[last + 1]]]))
-        return float(profiles(inner).sum() + alpha * np.log(gaps).sum()) if (gaps > 0).all() else -np.inf
+        return float(curves(inner).sum() + alpha * np.log(gaps).sum()) if (gaps > 0).all() else -np.inf
 
     now = height(times[part])
     for _ in range(STEPS):
-        slope, bands = _derivatives(profiles, times, first, last, alpha, step)
+        slope, bands = _derivatives(curves, times, first, last, alpha, step)
         step = REACH / np.sqrt(bands[0])
         # Not `solveh_banded`, which SciPy cannot do for one unknown.
         move = scipy.linalg.cho_solve_banded((scipy.linalg.cholesky_banded(_banded(bands)), False), slope)
@@ -86,16 +88,16 @@ def _climb(profiles: Profiles, times: np.ndarray, first: int, last: int, alpha: 
         gained, now = raised - now, raised
         if gained < ENOUGH:
             break
-    return _derivatives(profiles, times, first, last, alpha, step)[1]
+    return _derivatives(curves, times, first, last, alpha, step)[1]
 
 
-def _derivatives(profiles: Profiles, times, first: int, last: int, alpha: float, step: np.ndarray):
+def _derivatives(curves: ProfileCurves, times, first: int, last: int, alpha: float, step: np.ndarray):
     """Slope and negative second derivative, which is held positive: each frame's own part is not below 0."""
     inner = times[first : last + 1]
     gaps = np.diff(times[first - 1 : last + 2])
-    low = np.maximum(inner - step, profiles.nodes[:, 0])
-    high = np.minimum(inner + step, profiles.nodes[np.arange(len(inner)), profiles.count - 1])
-    left, middle, right = profiles(np.stack([low, inner, high]))
+    low = np.maximum(inner - step, curves.nodes[:, 0])
+    high = np.minimum(inner + step, curves.nodes[np.arange(len(inner)), curves.count - 1])
+    left, middle, right = curves(np.stack([low, inner, high]))
     before, after = np.maximum(inner - low, 1e-300), np.maximum(high - inner, 1e-300)
     rise, fall = (middle - left) / before, (right - middle) / after
     slope = (rise * after + fall * before) / (before + after)

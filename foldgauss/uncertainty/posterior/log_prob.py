@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._runtime.checks import invalid, one_of, short_repr
-from foldgauss.uncertainty.likelihood.colors import evidence_without_colors
-from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
+from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_colors
+from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
-from foldgauss.uncertainty.likelihood.profiles import Profiles
-from foldgauss.uncertainty.likelihood.residuals import Screen, check_model
-from foldgauss.uncertainty.posterior.exact import exact_times
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
+from foldgauss.uncertainty.likelihood.residuals import Residuals, check_model
+from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.video.models.video_model import VideoModel
 
@@ -32,11 +32,11 @@ class FrameTimeLogProb:
     **Source:** VeGaS eq:frame_fitting. **Raises:** ValueError where the density is NaN, and for other shapes.
     """
 
-    def __init__(self, profiles: Profiles, increments: Increments):
-        if profiles.num_frames != increments.num_frames:
-            got = f"{profiles.num_frames} profiles, {increments.num_frames} times"
+    def __init__(self, curves: ProfileCurves, increments: Increments):
+        if curves.num_frames != increments.num_frames:
+            got = f"{curves.num_frames} profiles, {increments.num_frames} times"
             raise invalid("profiles", expected="as many as there are times", got=got)
-        self.profiles, self.increments = profiles, increments
+        self.curves, self.increments = curves, increments
 
     @property
     def num_free(self) -> int:
@@ -44,7 +44,7 @@ class FrameTimeLogProb:
 
     def __call__(self, coordinates: Float[np.ndarray, "*batch num_free"]) -> Float64[np.ndarray, "*batch"]:
         times = self.increments.times(coordinates)
-        found = self.profiles(times).sum(-1) + self.increments.log_prior(coordinates)
+        found = self.curves(times).sum(-1) + self.increments.log_prior(coordinates)
         if np.isnan(found).any():
             cure = "Look for NaN in profiles or coordinates."
             raise invalid("coordinates", expected="numbers with a log-density", got="NaN", cure=cure)
@@ -52,10 +52,10 @@ class FrameTimeLogProb:
 
     def log_likelihood(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch"]:
         """Of all frames at these times, looked up; 0 is every frame at its best."""
-        return self.profiles(times).sum(-1)
+        return self.curves(times).sum(-1)
 
 
-def drawn_log_likelihood(
+def rendered_log_likelihood(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     times: Float[np.ndarray, " num_frames"],
@@ -69,13 +69,13 @@ def drawn_log_likelihood(
     if not isinstance(noise, FrameNoise):
         cure = "`evidence(..).noise` is what it was drawn with."
         raise invalid("noise", expected="a FrameNoise", got=short_repr(noise), cure=cure)
-    screen = Screen(model, video)
-    num_frames, times = len(screen.frames), _numbers("times", times)
+    residuals = Residuals(model, video)
+    num_frames, times = len(residuals.frames), _numbers("times", times)
     if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
         got = f"shape {times.shape}" if times.shape != (num_frames,) else f"{times.min():.3g} to {times.max():.3g}"
         raise invalid("times", expected=f"{num_frames} times in [0, 1], one a frame", got=got)
-    noise = noise.of(num_frames)
-    errors = [screen.squared_errors(picture, [k])[0] for k, picture in enumerate(screen.pictures(times))]
+    noise = noise.for_frames(num_frames)
+    errors = [residuals.squared_errors(picture, [k])[0] for k, picture in enumerate(residuals.render_at(times))]
     return -noise.weight * np.array(errors)
 
 
@@ -83,20 +83,20 @@ def drawn_log_likelihood(
 LEVELS = ("splats", "colors")
 
 
-def at_level(
+def condition_on_level(
     level: str,
     model: VideoModel,
     video: np.ndarray | None,
-    seen: LikelihoodProfiles,
+    profiles: LikelihoodProfiles,
     frames: Sequence[int] | None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> LikelihoodProfiles:
     """What is seen given the splats, or with the colours of these integrated out."""
     check_level(level, video)
     if level == "splats":
-        return seen
-    profiles = evidence_without_colors(model, video, seen, frames=frames, on_frame=on_frame)
-    return dataclasses.replace(seen, profiles=profiles, level=level)
+        return profiles
+    curves = marginalize_colors(model, video, profiles, frames=frames, on_frame=on_frame)
+    return dataclasses.replace(profiles, curves=curves, level=level)
 
 
 def check_level(level: str, video: np.ndarray | None) -> None:
@@ -108,43 +108,45 @@ def check_level(level: str, video: np.ndarray | None) -> None:
         raise invalid("video", expected="frames, where colours are integrated out", got=None)
 
 
-def check_seen(seen: LikelihoodProfiles, video: np.ndarray | None, noise: str | FrameNoise = DEFAULT_NOISE) -> int:
+def check_profiles(
+    profiles: LikelihoodProfiles, video: np.ndarray | None, noise: str | FrameNoise = DEFAULT_NOISE
+) -> int:
     """The number of frames that were seen; ValueError where `video` or `noise` are not what was seen."""
-    if not isinstance(seen, LikelihoodProfiles):
-        raise invalid("seen", expected="what `evidence` gives", got=short_repr(seen))
-    num_frames = seen.profiles.num_frames
+    if not isinstance(profiles, LikelihoodProfiles):
+        raise invalid("profiles", expected="the result of `likelihood_profiles`", got=short_repr(profiles))
+    num_frames = profiles.curves.num_frames
     if video is not None and (shape := np.shape(video))[:1] != (num_frames,):
-        cure = "Give the video that was seen, or leave one of the two out."
-        raise invalid("video", expected=f"the {num_frames} frames that were `seen`", got=f"shape {shape}", cure=cure)
-    if noise is not seen.noise and not (isinstance(noise, str) and noise == DEFAULT_NOISE):
-        cure = "Noise is part of what was seen: give one to `evidence`, or scale the profiles."
-        raise invalid("noise", expected="none beside `seen`", got=short_repr(noise), cure=cure)
+        cure = "Give the video of these profiles, or leave one of the two out."
+        raise invalid("video", expected=f"the {num_frames} frames of `profiles`", got=f"shape {shape}", cure=cure)
+    if noise is not profiles.noise and not (isinstance(noise, str) and noise == DEFAULT_NOISE):
+        cure = "Profiles include their noise: give one to `likelihood_profiles`, or scale the curves."
+        raise invalid("noise", expected="none beside `profiles`", got=short_repr(noise), cure=cure)
     return num_frames
 
 
-def check_asked(
+def check_request(
     model: VideoModel,
     video: np.ndarray | None,
     noise: str | FrameNoise,
     level: str,
     frames: Sequence[int] | None,
     concentration: float,
-    seen: LikelihoodProfiles | None,
+    profiles: LikelihoodProfiles | None,
 ) -> Increments:
     """All that can be known to be wrong before any picture is drawn; which frames are free."""
     check_model(model)
     check_level(level, video)
-    if seen is not None:
-        num_frames = check_seen(seen, video, noise)
+    if profiles is not None:
+        num_frames = check_profiles(profiles, video, noise)
     elif video is None:
-        raise invalid("video", expected="frames, or what was `seen`", got=None)
+        raise invalid("video", expected="frames, or `profiles`", got=None)
     else:
         if not isinstance(noise, FrameNoise):
             one_of("noise", noise if isinstance(noise, str) else short_repr(noise), NOISES)
         if (num_frames := len(video) if np.ndim(video) else 0) < 3:
             cure = "The first frame is at time 0 and the last at 1: others are needed."
             raise invalid("video", expected="at least 3 frames", got=f"shape {np.shape(video)}", cure=cure)
-    return Increments.among(np.linspace(0.0, 1.0, num_frames), frames, concentration)
+    return Increments.with_free(np.linspace(0.0, 1.0, num_frames), frames, concentration)
 
 
 def frame_time_log_prob(
@@ -156,35 +158,35 @@ def frame_time_log_prob(
     frames: Sequence[int] | None = None,
     concentration: float = 1.0,
     held: Float[np.ndarray, " num_frames"] | None = None,
-    seen: LikelihoodProfiles | None = None,
-    on_picture: Callable[[int, int], None] | None = None,
+    profiles: LikelihoodProfiles | None = None,
+    on_render: Callable[[int, int], None] | None = None,
 ) -> FrameTimeLogProb:
     """The log-posterior of the times of `frames` (default: of all but the first and the last), given the splats.
 
     `video`: uint8 (num_frames, height, width, 3 or 4) at the model's size; it may be another cut of the same scene,
-    with another number of frames. `noise`, `on_picture`: see `evidence`, whose result may be handed in as `seen`.
+    with another number of frames. `noise`, `on_render`: see `evidence`, whose result may be handed in as `seen`.
     A `noise` beside `seen` is refused. `level`: what else is unknown: "splats" holds them all, "colors" integrates
-    their colours out (`evidence_without_colors`: minutes a frame for large models, so choose `frames`); refitting all
+    their colours out (`marginalize_colors`: minutes a frame for large models, so choose `frames`); refitting all
     of them is another thing, `refit_frame_times`. `concentration`: of the Dirichlet prior on increments. `held`: the
     times of all other frames (default: the posterior medians of all).
 
     Raises ValueError for a video of another size or scene, or not as long as what was seen; one that shows nothing of
     its times, frames out of the model's order, and settings out of range or that contradict what was seen.
     """
-    free = check_asked(model, video, noise, level, frames, concentration, seen)
+    free = check_request(model, video, noise, level, frames, concentration, profiles)
     if held is not None:
         held = _numbers("held", held)
         if held.shape != (free.num_frames,):
             raise invalid("held", expected=f"{free.num_frames} times", got=f"shape {held.shape}")
         free = Increments(held, free.free, concentration)
-    if seen is None:
-        seen = evidence(model, video, noise=noise, on_picture=on_picture)
-    seen = at_level(level, model, video, seen, frames)
+    if profiles is None:
+        profiles = likelihood_profiles(model, video, noise=noise, on_render=on_render)
+    profiles = condition_on_level(level, model, video, profiles, frames)
     if held is None and frames is not None:
-        everything = Increments.among(free.held, None, concentration)
-        held = _rising(exact_times(seen.profiles, everything).quantile(0.5))
+        everything = Increments.with_free(free.held, None, concentration)
+        held = _rising(exact_posterior(profiles.curves, everything).quantile(0.5))
         free = Increments(held, free.free, concentration)
-    return FrameTimeLogProb(seen.profiles, free)
+    return FrameTimeLogProb(profiles.curves, free)
 
 
 def _rising(times: Float64[np.ndarray, " num_frames"]) -> Float64[np.ndarray, " num_frames"]:

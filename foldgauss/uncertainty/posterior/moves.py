@@ -8,14 +8,13 @@ from emcee.moves import Move
 from emcee.state import State
 
 from foldgauss._runtime.kernels import inline, kernel
-from foldgauss.uncertainty.likelihood.profiles import Profiles, piece_of, value_at
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves, piece_of, value_at
 from foldgauss.uncertainty.posterior.exact import profile_grid
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
+from foldgauss.uncertainty.posterior.settings import BLOCK
 
 _d = nb.float64
 
-#: Frames in a block. Walkers must be at least twice as many.
-BLOCK = 6
 #: Share of stretch moves; the others go along the difference of two walkers (differential evolution).
 STRETCH = 0.3
 #: Share of the latter that go the whole difference: from one hill to another.
@@ -67,7 +66,7 @@ class BlockSweep(Move):
         """Move every frame of every walker by itself, in place; returns the share of its frames that each moved."""
         moved = np.zeros(len(times))
         free = np.flatnonzero(self.log_prob.increments.free)
-        tables, alpha = _tables(self.log_prob.profiles), self.log_prob.increments.concentration
+        tables, alpha = _tables(self.log_prob.curves), self.log_prob.increments.concentration
         for parity in (0, 1):
             frames = free[free % 2 == parity]
             chance = random.random_sample((2, len(times), len(frames)))
@@ -94,21 +93,21 @@ class BlockSweep(Move):
             threshold = np.log(random.random_sample(shape))
             moved[movers] += _sweep(
                 times, movers, others[first], others[second], stretched, factor, jitter, threshold, blocks,
-                log_prob.increments.concentration, *_tables(log_prob.profiles),
+                log_prob.increments.concentration, *_tables(log_prob.curves),
             )  # fmt: skip
         return moved
 
 
-def _tables(profiles: Profiles) -> tuple[np.ndarray, ...]:
-    return profiles.nodes, profiles.values, profiles.slopes, profiles.count
+def _tables(curves: ProfileCurves) -> tuple[np.ndarray, ...]:
+    return curves.nodes, curves.values, curves.slopes, curves.count
 
 
 def _proposals(log_prob: FrameTimeLogProb) -> tuple[np.ndarray, ...]:
     """Grids of every frame, likelihoods there, and their integrals: (num_frames, most) each; and how many there are."""
     found = []
-    for k in range(log_prob.profiles.num_frames):
-        grid = profile_grid(log_prob.profiles, k, 0.0, 1.0)
-        heights = log_prob.profiles[k](grid[:, None])[:, 0]
+    for k in range(log_prob.curves.num_frames):
+        grid = profile_grid(log_prob.curves, k, 0.0, 1.0)
+        heights = log_prob.curves[k](grid[:, None])[:, 0]
         likelihood = np.exp(heights - heights.max())
         masses = (likelihood[1:] + likelihood[:-1]) / 2 * np.diff(grid)
         found.append((grid, likelihood, np.concatenate([[0.0], np.cumsum(masses)])))

@@ -1,4 +1,4 @@
-"""Profiles of frame times with the colours of the splats integrated out: level (b), between splats held and a refit.
+"""ProfileCurves of frame times with the colours of the splats integrated out: level (b), between splats held and a refit.
 
 Given the splats, a frame's own imprint on their colours makes its time look surer than it is. Pictures are linear in
 colours, so these are integrated out in closed form, all of them, with every other frame at its most likely time.
@@ -13,13 +13,13 @@ import scipy.linalg
 from jaxtyping import Float64, UInt8
 
 from foldgauss._runtime.checks import invalid, whole, within
-from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, FrameAt, solved
+from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, FrameAt, solve_conjugate_gradient
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
-from foldgauss.uncertainty.likelihood.profiles import Profiles
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.models.video_model import VideoModel
 
-#: Profiles reach as far as the given ones fall by REACH nats, then until they have fallen by FALL nats themselves.
+#: ProfileCurves reach as far as the given ones fall by REACH nats, then until they have fallen by FALL nats themselves.
 REACH, FALL = 12.0, 8.0
 #: Nodes are put between two that differ by more than STEP nats, until there are MOST of them.
 STEP, MOST = 1.5, 13
@@ -28,7 +28,7 @@ STEP, MOST = 1.5, 13
 TOLERANCE, TRACE_TOLERANCE = 1e-5, 1e-3
 
 
-def evidence_without_colors(
+def marginalize_colors(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     base: LikelihoodProfiles,
@@ -39,8 +39,8 @@ def evidence_without_colors(
     probes: int = 4,
     seed: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
-) -> Profiles:
-    r"""Profiles of `frames` (default: all but the first and the last) with colours integrated out; of others, `base`'s.
+) -> ProfileCurves:
+    r"""ProfileCurves of `frames` (default: all but the first and the last) with colours integrated out; of others, `base`'s.
 
     $$
     \ell_k(t) = -\tfrac12 r^T C^{-1} r - \tfrac12 \log\det C, \quad C = s_k^2 I + A(t) P A(t)^T,
@@ -70,20 +70,20 @@ def evidence_without_colors(
     Where the base profile has nodes further out, the new one goes on as that does, scaled so that it falls as steeply
     at first, and is nowhere greater than where it is joined.
 
-    **Shapes and units:** as `Profiles`; nats, the greatest value of each new profile 0.
+    **Shapes and units:** as `ProfileCurves`; nats, the greatest value of each new profile 0.
 
     **Raises:** ValueError for a video, base or frames that do not fit, and numbers out of range.
 
     **Source:** linear Gaussian models; Woodbury's identity and Sylvester's for determinants; traces: Hutchinson 1990.
     """
-    screen = Screen(model, video)
-    num_frames = len(screen.frames)
+    residuals = Residuals(model, video)
+    num_frames = len(residuals.frames)
     _check(base, num_frames, prior_scale, most_dense, probes)
     chosen = _chosen(frames, num_frames)
-    times = base.profiles.modes()
+    times = base.curves.modes()
     times[[0, -1]] = np.asarray(model.frame_times.times(), np.float64)[[0, -1]]
-    equations = ColorEquations(screen, base.noise, times, float(prior_scale))
-    nodes, values = (list(each) for each in zip(*map(base.profiles.one, range(num_frames)), strict=True))
+    equations = ColorEquations(residuals, base.noise, times, float(prior_scale))
+    nodes, values = (list(each) for each in zip(*map(base.curves.nodes_and_values, range(num_frames)), strict=True))
     for done, k in enumerate(chosen):
         if equations.num <= most_dense:
             curve: _Dense | _Estimated = _Dense(equations, k)
@@ -94,14 +94,14 @@ def evidence_without_colors(
         nodes[k], values[k] = _joined(*curve.profile(), nodes[k], values[k])
         if on_frame is not None:
             on_frame(done + 1, len(chosen))
-    return Profiles.of(nodes, values)
+    return ProfileCurves.from_nodes(nodes, values)
 
 
 def _check(base: LikelihoodProfiles, num_frames: int, prior_scale: float, most_dense: int, probes: int) -> None:
     if not isinstance(base, LikelihoodProfiles):
         raise invalid("base", expected="an Evidence", got=type(base).__name__, cure="Call evidence(model, video).")
-    if base.profiles.num_frames != num_frames:
-        got, cure = f"one of {base.profiles.num_frames}", "Call evidence with this video."
+    if base.curves.num_frames != num_frames:
+        got, cure = f"one of {base.curves.num_frames}", "Call evidence with this video."
         raise invalid("base", expected=f"evidence of {num_frames} frames, as the video has", got=got, cure=cure)
     if not within(prior_scale, "(0, inf)"):
         cure = "Colours are about [0, 1]."
@@ -179,7 +179,7 @@ class _Estimated(_Curve):
         rhs = np.concatenate([at.rhs, seen], axis=1)
         tolerance = np.where(np.arange(rhs.shape[1]) < at.rhs.shape[1], TOLERANCE, TRACE_TOLERANCE)
         start = self._guess(at.t, place, rhs)
-        found = solved(at.__matmul__, self.equations.precondition, rhs, start, tolerance)
+        found = solve_conjugate_gradient(at.__matmul__, self.equations.precondition, rhs, start, tolerance)
         colours = found[:, : at.rhs.shape[1]]
         # A bound from below whose error is second order in the solution's, wherever solving began.
         explained = (colours * (2 * at.rhs - at @ colours)).sum()
@@ -195,8 +195,8 @@ class _Estimated(_Curve):
         if len(near) == 1:
             return self.points[near[0]].solution
         (one, first), (other, second) = ((self.times[n], self.points[n].solution) for n in near)
-        share = (t - one) / (other - one)
-        return first + share * (second - first) if abs(share) < 2 else first
+        fraction = (t - one) / (other - one)
+        return first + fraction * (second - first) if abs(fraction) < 2 else first
 
     def values(self) -> np.ndarray:
         # d log det H = tr(H^-1 dH), dH = (dA^T A + A^T dA) / s^2, E z z^T = I.
@@ -256,15 +256,15 @@ def _reached(times: np.ndarray, values: np.ndarray) -> float:
     if not beyond.size:
         return float(times[-1])
     n = beyond[0]
-    share = (values[n - 1] + REACH) / (values[n - 1] - values[n])
-    return float(times[n - 1] + share * (times[n] - times[n - 1]))
+    fraction = (values[n - 1] + REACH) / (values[n - 1] - values[n])
+    return float(times[n - 1] + fraction * (times[n] - times[n - 1]))
 
 
 def _joined(
     times: np.ndarray, values: np.ndarray, base_nodes: np.ndarray, base_values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The profile with what the base has beyond it, on both sides."""
-    base = Profiles.of([base_nodes], [base_values])
+    base = ProfileCurves.from_nodes([base_nodes], [base_values])
     sides = []
     for end, inward in ((0, 1), (-1, -2)):
         spacing = abs(times[inward] - times[end])
@@ -277,8 +277,8 @@ def _joined(
             first = -1 if end == 0 else 0
             steepness = max(values[inward] - values[end], 1.0) / spacing
             wanted = steepness * abs(nodes[first] - times[end])
-            share = min(1.0, wanted / falls[first]) if falls[first] > 0 else 1.0
-            sides.append((nodes, values[end] - np.maximum(share * falls, 0)))
+            fraction = min(1.0, wanted / falls[first]) if falls[first] > 0 else 1.0
+            sides.append((nodes, values[end] - np.maximum(fraction * falls, 0)))
         else:
             sides.append((nodes, falls))
     (before, low), (after, high) = sides
