@@ -12,10 +12,11 @@ from scipy import stats
 
 from foldgauss.io.datasets import bunny
 from foldgauss.io.media.video_file import Clip, write_video
-from foldgauss.io.models.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video import FitConfig, evaluate
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.loop import fit_steps, to_model
-from foldgauss.video.fitting.pruning.economy import Economy
 
 #: Frames and size of the clip, Gaussians and steps of each short fit.
 FRAMES, SIZE, GAUSSIANS, STEPS = (0, 16), (80, 160), 3000, 240

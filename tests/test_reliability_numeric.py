@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from soft_models import soft_model
 
-from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import ENGINES, RenderOptions
 from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit

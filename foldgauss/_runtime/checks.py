@@ -13,7 +13,7 @@ def invalid(parameter: str, *, expected: str, got: object, cure: str = "") -> Va
     return ValueError(f"{text} {cure}" if cure else text)
 
 
-def one_of(parameter: str, value: object, choices: tuple[str, ...]) -> None:
+def check_one_of(parameter: str, value: object, choices: tuple[str, ...]) -> None:
     """Raise unless `value` is one of `choices`; an unknown option never falls through to a default."""
     if value not in choices:
         raise invalid(parameter, expected="one of " + ", ".join(map(repr, choices)), got=short_repr(value))
@@ -25,7 +25,7 @@ def short_repr(value: object) -> str:
     return text if len(text) <= 60 else type(value).__name__
 
 
-def within(value: object, bounds: str) -> bool:
+def is_within(value: object, bounds: str) -> bool:
     """Whether `value` is a finite number in an interval written as "[0, 1)": "[" includes the bound, "(" does not."""
     if not isinstance(value, Real) or isinstance(value, bool) or not _is_finite(value):
         return False
@@ -38,16 +38,16 @@ def within(value: object, bounds: str) -> bool:
 def _is_finite(value: Real) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number beyond the floats
+    except OverflowError:  # an integer beyond the floats
         return False
 
 
-def whole(value: object, least: int) -> bool:
-    """Whether `value` is a whole number of at least `least`."""
+def is_integer(value: object, least: int) -> bool:
+    """Whether `value` is an integer of at least `least`."""
     return isinstance(value, Integral) and not isinstance(value, bool) and value >= least
 
 
-def check_takes(parameter: str, function: Callable, *arguments: str) -> None:
+def check_signature(parameter: str, function: Callable, *arguments: str) -> None:
     """Raise unless `function` can be called with so many arguments; what cannot be told is left alone."""
     try:
         signature = inspect.signature(function)
@@ -60,7 +60,7 @@ def check_takes(parameter: str, function: Callable, *arguments: str) -> None:
         raise invalid(parameter, expected=f"a function of ({', '.join(arguments)})", got=got) from None
 
 
-def warn_of_degrees(parameter: str, *angles: float, stacklevel: int = 3) -> None:
+def warn_if_degrees(parameter: str, *angles: float, stacklevel: int = 3) -> None:
     """Warn of angles that are hardly radians: whole or half numbers beyond a turn."""
     for angle in angles:
         if abs(angle) > 2 * math.pi and float(2 * angle).is_integer():

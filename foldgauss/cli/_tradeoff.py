@@ -13,7 +13,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from foldgauss._runtime.checks import short_repr, whole, within
+from foldgauss._runtime.checks import is_integer, is_within, short_repr
 from foldgauss._runtime.machine import machine
 from foldgauss.analysis.plot import Panel
 from foldgauss.cli.app.shared import WrongUse, err, out, write_json
@@ -112,9 +112,9 @@ class Record:
 
 #: What rows hold by column: in words, and how it is told.
 _TEXT = "a text", lambda value: isinstance(value, str)
-_NUMBER = "a number", lambda value: within(value, "(-inf, inf)")
-_SECONDS = "a number >= 0", lambda value: within(value, "[0, inf)")
-_COUNT = "a whole number >= 0", lambda value: whole(value, 0)
+_NUMBER = "a number", lambda value: is_within(value, "(-inf, inf)")
+_SECONDS = "a number >= 0", lambda value: is_within(value, "[0, inf)")
+_COUNT = "a whole number >= 0", lambda value: is_integer(value, 0)
 _CELLS: dict[str, tuple[str, Callable[[object], bool]]] = {
     "axis": _TEXT,
     "value": _TEXT,
@@ -123,10 +123,10 @@ _CELLS: dict[str, tuple[str, Callable[[object], bool]]] = {
     "ssim": _NUMBER,
     "seconds": _SECONDS,
     "cpu_seconds": _SECONDS,
-    "bytes": ("a whole number >= 1", lambda value: whole(value, 1)),
+    "bytes": ("a whole number >= 1", lambda value: is_integer(value, 1)),
     "floats": _COUNT,
     "gaussians": _COUNT,
-    "frames_per_second": ("a number > 0", lambda value: within(value, "(0, inf)")),
+    "frames_per_second": ("a number > 0", lambda value: is_within(value, "(0, inf)")),
     "command": _TEXT,
 }
 
@@ -147,12 +147,12 @@ def _check_row(number: int, row: object) -> None:
 def _check_rest(kept: dict[str, Any]) -> None:
     """Likewise for what else of it is used: the steps of the base, the seconds of its motion, the cores."""
     plan, motion = kept["plan"], kept["plan"].get("motion", {"wall": 0.0, "cpu": 0.0})
-    if plan and not whole(plan.get("steps"), 1):
+    if plan and not is_integer(plan.get("steps"), 1):
         raise ValueError(f"plan: 'steps' should be a whole number >= 1, not {short_repr(plan.get('steps'))}")
     known = isinstance(motion, dict) and motion.keys() == {"wall", "cpu"}
-    if not known or not all(within(value, "[0, inf)") for value in motion.values()):
+    if not known or not all(is_within(value, "[0, inf)") for value in motion.values()):
         raise ValueError(f"plan: 'motion' should be seconds, 'wall' and 'cpu', not {short_repr(motion)}")
-    if not within(kept["machine"].get("cores"), "(0, inf)"):
+    if not is_within(kept["machine"].get("cores"), "(0, inf)"):
         raise ValueError(f"machine: 'cores' should be a number > 0, not {short_repr(kept['machine'].get('cores'))}")
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from foldgauss._runtime.checks import invalid, within
+from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.cli.app.completion import clip_files
 from foldgauss.cli.app.shared import (
     ModelFile,
@@ -82,7 +82,7 @@ def compress_command(
         check_model_name(target, "--out") if float16 else check_compact_name(target, "--out")
     except ValueError as error:
         raise WrongUse(str(error)) from error
-    if not within(max_loss_db, "(0, 60]"):
+    if not is_within(max_loss_db, "(0, 60]"):
         raise WrongUse(str(invalid("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)))
     if frames is not None and video is None:
         raise WrongUse(str(invalid("--frames", expected="a VIDEO to take them from", got="none")))

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from foldgauss._runtime.checks import invalid, within
+from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.cli.app.completion import among
 from foldgauss.cli.app.shared import (
     MAX_SHOWN,
@@ -310,7 +310,7 @@ def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> N
         begins = "" if before is None else f"fading in over {shared:,}" if shared else "at a cut"
         quality = segment.metadata.get("mean_psnr")
         row = (f"{segment.first:,}:{segment.stop:,}", begins, f"{segment.num_gaussians:,}")
-        table.add_row(str(number), *row, f"{quality:.2f}" if within(quality, "(0, 100]") else "")
+        table.add_row(str(number), *row, f"{quality:.2f}" if is_within(quality, "(0, 100]") else "")
         before = segment
     out.print(table)
     if len(model.segments) > MOST_SEGMENTS:

@@ -15,7 +15,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss import __version__
-from foldgauss._runtime.checks import invalid, one_of, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_within
 from foldgauss._runtime.machine import load_average
 from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Commands, Record, report, settings_of
 from foldgauss.cli.app.completion import among, lists_of
@@ -114,12 +114,12 @@ def tradeoff_command(
     command that reproduces each point on it. Stopped, it goes on when it is run again. See docs/tradeoff.md.
     """
     try:
-        one_of("clock", clock, tuple(CLOCKS))
+        check_one_of("clock", clock, tuple(CLOCKS))
         chosen = tuple(AXES) if axes is None else check_axes([name.strip() for name in axes.split(",")])
         wanted = FitConfig(seed=seed)
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
-    if not within(minutes, "(0, inf)"):
+    if not is_within(minutes, "(0, inf)"):
         raise WrongUse(str(invalid("--minutes", expected="a number above 0", got=minutes)))
     out_dir = named_after(video, "-tradeoff") if out_dir is None else out_dir
     known = overwrite or os.path.exists(out_dir / RECORD)

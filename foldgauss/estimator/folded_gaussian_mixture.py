@@ -20,7 +20,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss._runtime.threads import check_process
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.estimator.chunks import Chunks, Piece, Survey, chunks_of, is_chunked, picked, survey, variances_of
@@ -532,7 +532,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
-        if not whole(n_samples, 1):
+        if not is_integer(n_samples, 1):
             raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
@@ -771,25 +771,25 @@ def _check_parameters(self) -> None:
     whole_or_auto = {"n_components": 1, "degree": 0}
     for name, least in whole_or_auto.items():
         value = getattr(self, name)
-        if value != "auto" and not whole(value, least):
+        if value != "auto" and not is_integer(value, least):
             raise invalid(name, expected=f'a whole number >= {least} or "auto"', got=repr(value))
     for name, least in {"max_components": 1, "max_degree": 0, "max_iter": 1, "n_init": 1, "devices": 1}.items():
-        if not whole(getattr(self, name), least):
+        if not is_integer(getattr(self, name), least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(getattr(self, name)))
     for name in ("tol", "reg_covar", "reg_relative"):
-        if not within(getattr(self, name), "[0, inf)"):
+        if not is_within(getattr(self, name), "[0, inf)"):
             raise invalid(name, expected="a number >= 0", got=repr(getattr(self, name)))
     if not isinstance(self.warm_start, bool | np.bool_):
         raise invalid("warm_start", expected="True or False", got=repr(self.warm_start))
-    if not isinstance(self.verbose, bool | np.bool_) and not whole(self.verbose, 0):
+    if not isinstance(self.verbose, bool | np.bool_) and not is_integer(self.verbose, 0):
         raise invalid("verbose", expected="a whole number >= 0", got=repr(self.verbose), cure="0 says nothing.")
-    if not within(self.annealing, "(0, 1]"):
+    if not is_within(self.annealing, "(0, 1]"):
         raise invalid("annealing", expected="a number in (0, 1]", got=repr(self.annealing), cure="1 is none.")
-    one_of("covariance_type", self.covariance_type, _COVARIANCES)
-    one_of("init_params", self.init_params, tuple(STARTS))
-    one_of("criterion", self.criterion, ("bic", "aic"))
+    check_one_of("covariance_type", self.covariance_type, _COVARIANCES)
+    check_one_of("init_params", self.init_params, tuple(STARTS))
+    check_one_of("criterion", self.criterion, ("bic", "aic"))
     if isinstance(self.envelope, str):
-        one_of("envelope", self.envelope, tuple(_ENVELOPES))
+        check_one_of("envelope", self.envelope, tuple(_ENVELOPES))
     elif not isinstance(self.envelope, AbstractEnvelope):
         raise invalid("envelope", expected="an envelope or its name", got=repr(self.envelope), cure="as_envelope(f).")
     if self.devices > len(jax.devices()):

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import check_process
 from foldgauss.envelope import CallableEnvelope
 from foldgauss.estimator.em.loop import EMStatus
@@ -71,7 +71,7 @@ def fit_gradient(
     """
     if not isinstance(mixture, FoldedMixture) or mixture.logits.ndim != 1:
         raise invalid("mixture", expected="one FoldedMixture", got=type(mixture).__name__, cure="No batch of mixtures.")
-    if not whole(steps, 1):
+    if not is_integer(steps, 1):
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
     check_process()
     dtype = mixture.logits.dtype
@@ -85,7 +85,7 @@ def fit_gradient(
     weights = jnp.ones(len(x), dtype) if sample_weight is None else jnp.asarray(sample_weight, dtype)
     if weights.shape != x.shape[:1] or not bool((weights >= 0).all()) or not bool(weights.sum() > 0):
         raise invalid("sample_weight", expected=f"{len(x)} numbers >= 0, not all 0", got=f"shape {weights.shape}")
-    if batch_size is not None and not whole(batch_size, 1):
+    if batch_size is not None and not is_integer(batch_size, 1):
         raise invalid("batch_size", expected="a whole number >= 1 or None", got=repr(batch_size))
     optimiser = optax.adam(_LEARNING_RATE) if optimiser is None else optimiser
     key = jax.random.key(0) if key is None else key

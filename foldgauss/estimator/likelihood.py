@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss._numerics.triangular import solve_upper_matrix
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.threads import check_process
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
@@ -232,8 +232,8 @@ class _Plan(eqx.Module):
 
 
 def _plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance) -> _Plan:
-    one_of("time", time, ("own", "joint"))
-    one_of("covariance", covariance, ("full", "diagonal"))
+    check_one_of("time", time, ("own", "joint"))
+    check_one_of("covariance", covariance, ("full", "diagonal"))
     x = _points(x)
     weights = _weights(weights, x)
     envelope = TimeLikelihood(power, floor) if envelope is None else envelope
@@ -480,7 +480,7 @@ def select_degree(
     **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on an unknown criterion, or if no
     degree can be fitted.
     """
-    one_of("criterion", criterion, (*_CRITERIA, "cv"))
+    check_one_of("criterion", criterion, (*_CRITERIA, "cv"))
     if "degree" in options:
         raise invalid("degree", expected="no such option", got=options["degree"], cure="It is what is selected.")
     defaults = {name: p.default for name, p in inspect.signature(fit).parameters.items() if name != "x"}

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from foldgauss._runtime.checks import invalid, one_of, whole
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer
 from foldgauss.estimator.chunks import is_chunked
 from foldgauss.estimator.folded_gaussian_mixture import EMStatus, FoldedGaussianMixture
 
@@ -51,11 +51,11 @@ def select_mixture(
     **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on empty or wrong choices, or if no
     fit is finite.
     """
-    one_of("criterion", criterion, ("bic", "aic", "cv"))
+    check_one_of("criterion", criterion, ("bic", "aic", "cv"))
     sizes, degrees = tuple(n_components), tuple(degrees)
-    if not sizes or not all(whole(k, 1) for k in sizes):
+    if not sizes or not all(is_integer(k, 1) for k in sizes):
         raise invalid("n_components", expected="whole numbers >= 1", got=sizes, cure="range(1, 6), say.")
-    if not degrees or not all(q == "auto" or whole(q, 0) for q in degrees):
+    if not degrees or not all(q == "auto" or is_integer(q, 0) for q in degrees):
         raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
     parts, least = None, np.inf
     if not is_chunked(X):
@@ -107,6 +107,6 @@ def _parts(num: int, folds: int, groups: np.ndarray | None) -> np.ndarray:
     names, which = np.unique(np.arange(num) if groups is None else groups, return_inverse=True)
     if which.shape != (num,):
         raise invalid("groups", expected=f"shape ({num},)", got=f"shape {np.shape(groups)}", cure="One per row of X.")
-    if not whole(folds, 2) or folds > len(names):
+    if not is_integer(folds, 2) or folds > len(names):
         raise invalid("folds", expected=f"a whole number from 2 to {len(names)}", got=folds, cure="Fewer parts.")
     return (np.random.default_rng(0).permutation(len(names)) % folds)[which]

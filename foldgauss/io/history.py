@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TextIO
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.analysis.plot import plot_history
 from foldgauss.io._atomic import atomic_path, not_writable
 from foldgauss.io.figures import write_figure
@@ -127,7 +127,7 @@ def _parsed(text: str) -> dict[str, Any] | None:
         line = json.loads(text)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(line, dict) or not whole(line.get("step"), 0):
+    if not isinstance(line, dict) or not is_integer(line.get("step"), 0):
         return None
     numbers = (line.get(name) for name in FitInfo._fields if name != "stopped_by")
     sound = all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in numbers)

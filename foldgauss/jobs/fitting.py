@@ -24,7 +24,8 @@ from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io._lock import only_writer
 from foldgauss.io.media.frame_index import FrameIndex, read_indexed
 from foldgauss.io.media.video_file import Clip, read_video
-from foldgauss.io.models.video_model import load_checkpoint, load_video_model, save_checkpoint, save_video_model
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint, provenance
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged

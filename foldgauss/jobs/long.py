@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.frame_index import FrameIndex, index_video, read_indexed
 from foldgauss.io.models.segmented import join_segments
@@ -142,7 +142,7 @@ def _video_of(sources: Sequence[tuple[int, str]]) -> SegmentedVideo:
     segments = []
     for first, file in sources:
         load = partial(load_video_model, file)
-        segments.append(dataclasses.replace(Segment.of(first, load()), load=load))
+        segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
     return SegmentedVideo(segments)
 
 
@@ -185,9 +185,9 @@ def plan_long_fit(
     Example: `plan_long_fit("long.mp4", "long.safetensors").jobs`, for `run_here` or `run_on`.
     """
     config = FitConfig() if config is None else config
-    if not within(segment_seconds, "(0, 1e9]"):
+    if not is_within(segment_seconds, "(0, 1e9]"):
         raise invalid("segment_seconds", expected="a number of seconds > 0, at most 1e9", got=repr(segment_seconds))
-    if not whole(overlap, 1):
+    if not is_integer(overlap, 1):
         raise invalid("overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
     folder = segments_folder(target)
@@ -293,7 +293,7 @@ def kept_seconds(target: str | os.PathLike) -> float | None:
         seconds = json.loads((segments_folder(target) / _PLAN).read_text())["asked"]["segment_seconds"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return seconds if within(seconds, "(0, 1e9]") else None
+    return seconds if is_within(seconds, "(0, 1e9]") else None
 
 
 def _make(folder: Path) -> None:

@@ -20,7 +20,7 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.fitting import FitJob, Progress, Stopped, finished, fit_job
 
@@ -168,7 +168,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
     Raises ValueError for counts that are none, ImportError where dask.distributed is not installed.
     """
     for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
-        if not whole(value, 1):
+        if not is_integer(value, 1):
             raise invalid(name, expected="a whole number >= 1", got=repr(value))
     distributed = _distributed("workers")
     import dask

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.threads import check_process, run_tasks
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
@@ -60,8 +60,8 @@ def render(
     Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 3; VeGaS, section 4.
     """
     check_process()
-    one_of("engine", engine, ENGINES)
-    one_of("compositing", compositing, COMPOSITINGS)
+    check_one_of("engine", engine, ENGINES)
+    check_one_of("compositing", compositing, COMPOSITINGS)
     check_size(size)
     if not isinstance(splats, Splats2D):
         cure = "For Gaussians3D use foldgauss.render.project first."

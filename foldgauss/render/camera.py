@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._numerics.batch import known
-from foldgauss._runtime.checks import invalid, one_of, short_repr, warn_of_degrees
+from foldgauss._runtime.checks import check_one_of, invalid, short_repr, warn_if_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.
@@ -220,7 +220,7 @@ def project(
     Source: Zwicker et al. 2001, EWA volume splatting (the local affine map); Kerbl et al. 2023, 3D Gaussian Splatting,
     eq. 5, and its published rasteriser for the 1.3.
     """
-    one_of("order", order, ORDERS)
+    check_one_of("order", order, ORDERS)
     for name, value, kind in (("gaussians", gaussians, Gaussians3D), ("camera", camera, Camera)):
         if not isinstance(value, kind):
             raise invalid(name, expected=kind.__name__, got=type(value).__name__)
@@ -311,7 +311,7 @@ def _check_angle(parameter: str, angle: ArrayLike) -> None:
     except (TypeError, ValueError):
         raise invalid(parameter, expected="an angle in radians", got=short_repr(angle)) from None
     if value is not None:
-        warn_of_degrees(parameter, *value.ravel().tolist(), stacklevel=4)
+        warn_if_degrees(parameter, *value.ravel().tolist(), stacklevel=4)
 
 
 def _as_float(x: ArrayLike) -> Array:

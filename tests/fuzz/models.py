@@ -21,15 +21,16 @@ from foldgauss.io import (
     save_video_model,
 )
 from foldgauss.io.models import compact
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.model_file import load_model
-from foldgauss.io.models.video_model import load_checkpoint, read_origin, save_checkpoint
+from foldgauss.io.models.video_model import read_origin
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
 from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantise
 from foldgauss.video.editing.chain import edit
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import TIME_ADAM, FitState
 from foldgauss.video.models.splats import LASTING, OPAQUE
 from foldgauss.video.selection.selectors import Selection
@@ -207,7 +208,7 @@ def _video_seeds() -> list[bytes]:
         (2, dataclasses.replace(_edited(), camera=None)),
         (5, tiny_model(8, 3, plain=False)),
     ]
-    models += [SegmentedVideo.of(joined), SegmentedVideo.of([(0, tiny_model(degree=0, frames=1))])]
+    models += [SegmentedVideo.from_models(joined), SegmentedVideo.from_models([(0, tiny_model(degree=0, frames=1))])]
     return [
         written(lambda path, one=one: save_video_model(path, one, metadata={"clip": "a", "frames": [0, 3]}))
         for one in models
@@ -236,10 +237,8 @@ VIDEO = Target(
     _MODEL_FILE
     | {
         "foldgauss.io.models.video_model": (
-            "save_video_model", "check_model_name", "save_checkpoint", "load_checkpoint", "_to_stored",
-            "_describe_video", "_describe_edited",
-            "_describe_layer", "_describe_camera", "_describe_checkpoint", "_counts",
-            "_palette_skeleton", "_checkpoint_skeleton",
+            "save_video_model", "check_model_name", "_to_stored",
+            "_describe_video", "_describe_edited", "_describe_layer", "_describe_camera",
         ),
         "foldgauss.io.models.segmented": (
             "join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "_load",
@@ -268,7 +267,7 @@ def _checkpoint_seeds() -> list[bytes]:
     shared = Codebook(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
     plain = Codebook(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
     kept, state = [], None
-    for statistics in (None, Statistics(floats(num), floats(num), counts)):
+    for statistics in (None, GradientStatistics(floats(num), floats(num), counts)):
         state = FitState(
             floats(num, width), floats(num, width), floats(num, width), counts, np.zeros(num, np.uint8),
             np.zeros(num, bool), shared, plain, floats(3), floats(2), TIME_ADAM.init(floats(2)), statistics,
@@ -287,12 +286,12 @@ CHECKPOINT = Target(
     _MODEL_FILE
     | {
         "foldgauss.io.models.video_model": (
-            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "save_checkpoint",
-            "read_origin", "_is_text", "_is_range", "_to_stored",
+            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "read_origin",
+            "_is_text", "_is_range", "_to_stored",
             "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
-            "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton", "_describe_checkpoint",
-            "_counts",
-        )
+            "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton",
+        ),
+        "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe_checkpoint", "_counts"),
     },
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,

@@ -539,7 +539,7 @@ def segmented(**how):
     logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5]).astype(np.float32)
     parts[1] = _with(parts[1], frame_times=FrameTimes(logits))  # of its own, learned times
     parts[3] = _with(parts[3], frame_times=FrameTimes(time_logits(4, (2,))))  # a cut within it
-    return SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    return SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
 
 
 def test_a_page_of_segments_has_a_model_of_each(tmp_path):
@@ -561,7 +561,7 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
 
 
 def test_segments_that_no_page_holds_are_told(monkeypatch):
-    late = SegmentedVideo.of([(0, soft_model()), (5, _late(soft_model()))])
+    late = SegmentedVideo.from_models([(0, soft_model()), (5, _late(soft_model()))])
     with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model holds"):
         html_page(late)
     assert late._repr_html_() is None
@@ -602,7 +602,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
 
 def test_few_segments_are_held_whatever_the_length(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
-    video = SegmentedVideo.of(parts)
+    video = SegmentedVideo.from_models(parts)
     page, play = opened(video, **SMALL), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
     page.page.evaluate("foldgauss.player.segments.most = 0")

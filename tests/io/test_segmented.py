@@ -89,7 +89,7 @@ def test_each_segment_is_the_model_of_its_file_to_the_bit(work):
 
 def test_what_is_played_is_what_was_in_memory(work):
     video, kept = load_video_model(work / "long.safetensors"), [load_video_model(file) for _, file in sources(work)]
-    expected = SegmentedVideo.of(list(zip(FIRSTS, kept, strict=True)))
+    expected = SegmentedVideo.from_models(list(zip(FIRSTS, kept, strict=True)))
     times = np.linspace(0, 1, 41)
     np.testing.assert_array_equal(list(video.frames(times)), list(expected.frames(times)))
 
@@ -109,7 +109,7 @@ def test_saved_again_it_has_the_same_bytes(work, tmp_path):
     join_segments(tmp_path / "joined.safetensors", sources(work), metadata={"clip": "long.mp4"})
     assert (tmp_path / "joined.safetensors").read_bytes() == long
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again.safetensors", "joined.safetensors"]
-    in_memory = SegmentedVideo.of(list(zip(FIRSTS, models(), strict=True)))
+    in_memory = SegmentedVideo.from_models(list(zip(FIRSTS, models(), strict=True)))
     save_video_model(tmp_path / "made.safetensors", in_memory)
     for one, other in zip(load_video_model(tmp_path / "made.safetensors").segments, video.segments, strict=True):
         same(one.model, other.model)
@@ -375,7 +375,7 @@ def test_cut_off_anywhere(work, tmp_path):
 
 def test_vegas_files_are_one_for_each_segment(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
-    video = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     export(video, "ply", tmp_path / "out")
     names = [f"segment-{number:03d}.ply" for number in range(3)]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
@@ -395,7 +395,7 @@ def test_vegas_files_are_one_for_each_segment(tmp_path):
 
 def test_frames_go_out_as_they_are_played(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
-    video = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     t = 15 / 17
     export(video, "obj", tmp_path / "mesh", times=[t])
     mesh = read_pseudomesh(tmp_path / "mesh")

@@ -8,8 +8,8 @@ import pytest
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.model_file import read_header, save_model
-from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit_steps
 from foldgauss.video.fitting.growth import Growth

@@ -16,7 +16,8 @@ from commands import run
 
 from benchmarks import gpu
 from foldgauss.io import write_image
-from foldgauss.io.models.video_model import load_checkpoint, load_video_model, save_checkpoint
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import RenderOptions
 from foldgauss.video import (
     DivergenceWarning,
@@ -31,11 +32,12 @@ from foldgauss.video import (
 )
 from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.loop import _Stepper, start
-from foldgauss.video.fitting.pyramid import levels
+from foldgauss.video.fitting.schedule import levels
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.steppers.engines import choose_engine
 from foldgauss.video.fitting.steppers.jax_loss import losses, similarity
 from foldgauss.video.fitting.steppers.jax_step import _splats, adam, alive_at, lowered
-from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper, OnDevice, chosen_engine
+from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper, OnDevice
 from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
 from foldgauss.video.models.conditioning import Shape, condition, update_windows
 from foldgauss.video.models.kinds import LASTS, SOLID
@@ -134,7 +136,7 @@ def test_a_step_of_growing_batches_is_that_of_the_cpu():
 
 @pytest.mark.slow
 def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
-    monkeypatch.setattr("foldgauss.video.fitting.pyramid.LEAST_SIDE", 16)
+    monkeypatch.setattr("foldgauss.video.fitting.schedule.LEAST_SIDE", 16)
     assert [level.size for level in levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
     compare_steps(CONFIG, 0.1, level=0)
 
@@ -437,12 +439,12 @@ def test_four_devices_are_as_one(tmp_path):
 
 
 def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
-    assert chosen_engine(FRAMES, FitConfig()) == "cpu"
+    assert choose_engine(FRAMES, FitConfig()) == "cpu"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert chosen_engine(FRAMES, FitConfig()) == "xla"
-    assert chosen_engine(FRAMES, FitConfig(economy=Economy())) == "cpu"
-    assert chosen_engine(FRAMES, FitConfig(engine="cpu")) == "cpu"
-    assert chosen_engine(FRAMES, FitConfig(engine="pallas")) == "pallas"
+    assert choose_engine(FRAMES, FitConfig()) == "xla"
+    assert choose_engine(FRAMES, FitConfig(economy=Economy())) == "cpu"
+    assert choose_engine(FRAMES, FitConfig(engine="cpu")) == "cpu"
+    assert choose_engine(FRAMES, FitConfig(engine="pallas")) == "pallas"
 
 
 @pytest.mark.parametrize(
@@ -458,7 +460,7 @@ def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
 def test_what_it_does_not_know_is_refused(changes, message):
     """Before anything is computed."""
     with pytest.raises(ValueError, match=message):
-        chosen_engine(FRAMES, dataclasses.replace(CONFIG, **changes))
+        choose_engine(FRAMES, dataclasses.replace(CONFIG, **changes))
 
 
 def test_a_fit_refuses_it(monkeypatch):

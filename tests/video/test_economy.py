@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes_of_motion import SIZE, cut, disc, noise, still
 
-from foldgauss.io.models.video_model import load_checkpoint, save_checkpoint
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
 from foldgauss.video.compression.finetune import refitted
@@ -16,8 +16,8 @@ from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook, averaged, shared
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import fit_steps, start, to_model
-from foldgauss.video.fitting.pruning.economy import MOST_SOLID, frame_weights
-from foldgauss.video.fitting.pruning.economy import cut as cut_rows
+from foldgauss.video.fitting.pruning.description_length import MOST_SOLID, frame_weights
+from foldgauss.video.fitting.pruning.description_length import cut as cut_rows
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
 from foldgauss.video.fitting.pruning.scores import PruningScores, measured
 from foldgauss.video.models.conditioning import Shape, condition, update_windows

@@ -371,9 +371,9 @@ def test_the_own_centre_is_where_most_of_it_is():
     mean, opacity = np.float32([[0, 0], [1, 2]]), np.float32([0.3, 0.9])
     flat = SelectedGaussians(np.arange(2), mean, factor, opacity, ones)
     for gaussians in (flat, flat.in_space()):
-        np.testing.assert_allclose(gaussians.centre[:2], [0.6, 1.2], rtol=1e-6)
+        np.testing.assert_allclose(gaussians.center[:2], [0.6, 1.2], rtol=1e-6)
     unseen = dataclasses.replace(flat, opacity=0 * opacity)
-    np.testing.assert_allclose(unseen.centre, [0.5, 1.0])
+    np.testing.assert_allclose(unseen.center, [0.5, 1.0])
 
 
 def test_what_is_left_stays_where_it_was():
@@ -391,7 +391,7 @@ def test_what_is_left_stays_where_it_was():
 
 def own_centre(video):
     found = []
-    edit(video).select(OBJECT).apply(lambda g, t: found.append(g.centre) or g).video().at(0.31)
+    edit(video).select(OBJECT).apply(lambda g, t: found.append(g.center) or g).video().at(0.31)
     return found[0]
 
 

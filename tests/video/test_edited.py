@@ -274,8 +274,8 @@ def test_a_folded_model_stays_one_on_disk(tmp_path):
 @pytest.mark.parametrize(
     ("make", "got"),
     [
-        (lambda e: e.apply(lambda g, t: g), "overlays: .* got Function"),
-        (lambda e: e.apply_triangles(lambda v, t: v), "overlays: .* got FaceFunction"),
+        (lambda e: e.apply(lambda g, t: g), "overlays: .* got GaussianFunction"),
+        (lambda e: e.apply_triangles(lambda v, t: v), "overlays: .* got TriangleFunction"),
         (lambda e: e.seen_from(lambda t: Camera.front(ASPECT)), "camera: .* got a function"),
     ],
 )

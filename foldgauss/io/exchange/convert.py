@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import OutputError, atomic_folder, check_replaceable, check_writable, checked_path
 from foldgauss.io.exchange.mesh import write_pseudomesh
 from foldgauss.io.exchange.ply import (
@@ -66,7 +66,7 @@ def export(
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
         cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
-    one_of("format", format, FORMATS)
+    check_one_of("format", format, FORMATS)
     out = checked_path(out, "model, format, out")
     of_scenes = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
     of_pages = {"original": original, "quality": quality, "title": title}

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import invalid, one_of
+from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import atomic_folder, check_replaceable
 from foldgauss.io.exchange.ply import checked_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_format import facts_error, format_error
@@ -207,7 +207,7 @@ def read_pseudomesh(
 
     **Source:** VeGaS eq:gaussrecons1, eq:gaussrecons2; GaMeS.
     """
-    one_of("axes", axes, ("y-up", "y-down"))
+    check_one_of("axes", axes, ("y-up", "y-down"))
     folder = Path(folder)
     if not os.path.exists(folder):
         raise FileNotFoundError(
@@ -247,7 +247,7 @@ def _checked_notes(folder: Path, notes: dict, num_frames: int) -> dict:
     try:
         times, size, fps = np.asarray(notes["times"], np.float64), tuple(notes["size"]), float(notes["fps"])
         options = RenderOptions(**notes["options"])
-        one_of("compositing", notes["compositing"], COMPOSITINGS)
+        check_one_of("compositing", notes["compositing"], COMPOSITINGS)
         check_size(size)
         if not 0 < fps < math.inf:
             raise invalid("fps", expected="a positive rate", got=fps)

@@ -17,7 +17,7 @@ import scipy
 from jaxtyping import Float
 from scipy.special import expit, logit
 
-from foldgauss._runtime.checks import invalid, one_of, short_repr, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import atomic_folder, check_replaceable
 from foldgauss.io.exchange.ply_format import Ply, facts_error, format_error, read_ply, write_ply
@@ -227,12 +227,12 @@ def _filled_in(
         fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
         check_size(size)
         cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
-        if not within(cutoff, "[0, 1]"):
+        if not is_within(cutoff, "[0, 1]"):
             raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
         power = note.get("power", VEGAS_POWER)
-        if not within(power, "(0, 1e30]"):
+        if not is_within(power, "(0, 1e30]"):
             raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
-        if not within(fps, f"(0, {MAX_FPS}]"):
+        if not is_within(fps, f"(0, {MAX_FPS}]"):
             raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
     except (TypeError, ValueError) as error:
         raise facts_error(ply.path, error) from error
@@ -312,9 +312,9 @@ def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: fl
 
     **Source:** VeGaS eq:mirage (flat Gaussians), eq:vegas_equiv_cond (of one time).
     """
-    if not within(depth_step, "[0, 1]"):
+    if not is_within(depth_step, "[0, 1]"):
         raise invalid("depth_step", expected="a depth in [0, 1] of the frame's longer side", got=repr(depth_step))
-    if not within(float(t), "[0, 1]"):
+    if not is_within(float(t), "[0, 1]"):
         raise invalid("t", expected="a time in [0, 1]", got=repr(t))
     playback = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
     mean, factor, opacity, color = _alive(playback, float(t))
@@ -357,7 +357,7 @@ def write_gaussians_ply(
 
     **Source:** Kerbl et al. 2023, 3D Gaussian Splatting, and the file layout of its published code.
     """
-    one_of("axes", axes, AXES)
+    check_one_of("axes", axes, AXES)
     if sh_degree not in _NUM_REST:
         raise invalid("sh_degree", expected="0, 1, 2 or 3", got=repr(sh_degree))
     mean, factor, opacity, color = (_float64(leaf) for leaf in jax.tree.leaves(_turned(gaussians, axes)))
@@ -461,7 +461,7 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
 
     **Source:** as `write_gaussians_ply`.
     """
-    one_of("axes", axes, AXES)
+    check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
     if not is_3dgs(ply):
         got = "properties " + ", ".join(ply.names("vertex")[:20]) if ply.names("vertex") else "no element 'vertex'"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.io._atomic import checked_path
 from foldgauss.io.media.labels import VOID, read_labels
 from foldgauss.io.media.video_file import IMAGE_SUFFIXES, aspect_window, image_paths, read_video
@@ -43,7 +43,7 @@ def read_masks(
     path = checked_path(path)
     if not os.path.exists(path):
         raise FileNotFoundError(f"path: expected an image, a folder or a video, got {str(path)!r}, which is missing.")
-    if label is not None and not (whole(label, 1) and label < VOID):
+    if label is not None and not (is_integer(label, 1) and label < VOID):
         raise invalid("label", expected=f"an object's number, 1 to {VOID - 1}", got=repr(label))
     masks = _read(path, label, frames, level)
     if size is None:
@@ -65,7 +65,7 @@ def _read(path: Path, label: int | None, frames: Range | None, level: float) -> 
     if label is not None:
         cure = "Leave label out, or give a folder of PNGs."
         raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
-    if not within(level, "(0, 1]"):
+    if not is_within(level, "(0, 1]"):
         raise invalid("level", expected="a share of white in (0, 1]", got=repr(level))
     return read_video(path, frames=frames).over_black.max(-1) >= 255 * level
 
@@ -74,7 +74,7 @@ def _images(folder: Path, frames: Range | None) -> list[Path]:
     images = image_paths(folder)
     start, stop = frames if frames is not None else (None, None)
     for name, k in (("start", start), ("stop", stop)):
-        if k is not None and not (whole(k, 0) and k <= len(images)):
+        if k is not None and not (is_integer(k, 0) and k <= len(images)):
             raise invalid("frames", expected=f"a range in {len(images)} images", got=f"{name} {k!r}")
     if not images[start:stop]:
         raise invalid("path", expected="a folder with images in it", got=f"{str(folder)!r}, {len(images)} images")

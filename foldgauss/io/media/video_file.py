@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_within
 from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_replaceable, checked_path, not_writable
 from foldgauss.io.media.containers import (
     FORMATS,
@@ -882,7 +882,7 @@ def write_video(
     if not isinstance(frames, Iterable):
         cure = "Of a model: model.frames()."
         raise video_error("frames", expected="pictures, one by one", got=type(frames).__name__, cure=cure)
-    one_of("image_format", image_format, IMAGE_FORMATS)
+    check_one_of("image_format", image_format, IMAGE_FORMATS)
     if path.is_dir() or not path.suffix:
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     suffix = path.suffix.lower()
@@ -917,7 +917,7 @@ def write_frames(
     Raises `VideoError` for no frames or frames of other kinds, `OutputError` where the folder is refused, ValueError
     for an unknown `image_format`.
     """
-    one_of("image_format", image_format, IMAGE_FORMATS)
+    check_one_of("image_format", image_format, IMAGE_FORMATS)
     folder, encode = Path(folder), _png if image_format == "png" else _webp
     check = partial(check_replaceable, folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)")
     check()
@@ -1121,7 +1121,7 @@ def checked_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple
 
 
 def check_fps(fps: float) -> None:
-    if not within(fps, f"(0, {MAX_FPS}]"):
+    if not is_within(fps, f"(0, {MAX_FPS}]"):
         raise video_error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
 
 

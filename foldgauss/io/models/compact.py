@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.models import range_coder
 from foldgauss.io.models.columns import Walk
@@ -185,13 +185,13 @@ def _no_number(name: str) -> None:
 def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
     facts = _facts(header)
     num, num_frames = facts.num_gaussians, header["num_frames"]
-    _check(whole(num_frames, 1), "num_frames", num_frames)
+    _check(is_integer(num_frames, 1), "num_frames", num_frames)
     _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     names = column_names(facts.degree, facts.shared)
     described = header["columns"]
     _check(isinstance(described, list) and len(described) == len(names), "columns", "others")
     lengths = [own[0] for own in described] + [header["intervals"]]
-    _check(all(whole(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
+    _check(all(is_integer(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
     rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_whole(name)}
     _check(all(is_whole(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)), "rule", "none")
     walk, columns, start = Walk(rules, facts), {}, 0
@@ -214,17 +214,19 @@ def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:
 
 def _facts(header: dict) -> Facts:
     size, options = header["size"], header["options"]
-    _check(isinstance(size, list) and len(size) == 2 and all(whole(n, 1) and n <= _SIDE for n in size), "size", size)
-    _check(whole(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
-    _check(whole(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
+    _check(
+        isinstance(size, list) and len(size) == 2 and all(is_integer(n, 1) and n <= _SIDE for n in size), "size", size
+    )
+    _check(is_integer(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
+    _check(is_integer(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
     cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
-    _check(isinstance(cells, list) and len(cells) == 3 and all(whole(n, 0) for n in cells), "cells", cells)
+    _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
     _check(sum(cells) <= MOST_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
-    _check(whole(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
+    _check(is_integer(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
-        _check(within(header[name], interval), name, header[name])
-    one_of("compositing", header["compositing"], COMPOSITINGS)
+        _check(is_within(header[name], interval), name, header[name])
+    check_one_of("compositing", header["compositing"], COMPOSITINGS)
     names = [field.name for field in dataclasses.fields(Facts)]
     return Facts(
         **{name: header[name] for name in names}
@@ -234,7 +236,7 @@ def _facts(header: dict) -> Facts:
 
 def _rule(name: str, numbers: list) -> Rule:
     known = FEATURES.index(name) if name in FEATURES else len(FEATURES)
-    _check(2 <= len(numbers) <= 2 + known and all(within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
+    _check(2 <= len(numbers) <= 2 + known and all(is_within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
     return Rule(numbers[0], numbers[1], tuple(numbers[2:]))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of, short_repr, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
 from foldgauss.io._atomic import check_writable, checked_path
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.model_file import (
@@ -27,7 +27,7 @@ from foldgauss.io.models.model_file import (
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.segmented_video import READY, Segment, SegmentedVideo
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
 
 SEGMENTED = "segmented-video"
 #: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`.
@@ -103,7 +103,7 @@ def _source(number: int, source: object) -> tuple[int, Path]:
     except (TypeError, ValueError):
         expected = "(number of its first frame, model file)"
         raise invalid(f"sources[{number}]", expected=expected, got=short_repr(source)) from None
-    if not whole(first, 0):
+    if not is_integer(first, 0):
         raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
     file = checked_path(file, "path, sources")
     if is_compact(file):
@@ -153,7 +153,7 @@ def _segments(path: Path, about: dict) -> list[Segment]:
         own[int(found[1])][found[2]] = spec
     stamp = _stamp(path)
 
-    @lru_cache(maxsize=READY)
+    @lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> VideoModel | EditedVideo:
         if _stamp(path) != stamp:
             cure = "Load it again."
@@ -182,7 +182,7 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     Raises ValueError, KeyError or TypeError for what no header of ours says, and for more frames or Gaussians than
     there are tensors of.
     """
-    one_of("kind", entry["kind"], PARTS)
+    check_one_of("kind", entry["kind"], PARTS)
     if not isinstance(entry["metadata"], dict):
         raise TypeError("metadata that are no dict")
     header = entry["header"]
@@ -193,18 +193,18 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         lead = list(models)[header["timeline"]]
     for prefix, model in models.items():
         num, num_frames = tensors[f"{prefix}splats.loc"]["shape"][0], _num_frames(tensors, prefix)
-        if not (whole(model["num_gaussians"], 1) and model["num_gaussians"] == num):
+        if not (is_integer(model["num_gaussians"], 1) and model["num_gaussians"] == num):
             raise ValueError("another number of Gaussians than are stored")
-        if not (whole(model["num_frames"], 1) and model["num_frames"] == num_frames):
+        if not (is_integer(model["num_frames"], 1) and model["num_frames"] == num_frames):
             raise ValueError("another number of frames than are stored")
-        if not whole(model["degree"], 0) or model["degree"] > _MAX_DEGREE:
+        if not is_integer(model["degree"], 0) or model["degree"] > _MAX_DEGREE:
             raise ValueError("a degree that no model has")
     timeline = models[lead]
     height, width = timeline["size"]
-    if not (whole(height, 1) and whole(width, 1)) or not within(timeline["fps"], "(0, inf)"):
+    if not (is_integer(height, 1) and is_integer(width, 1)) or not is_within(timeline["fps"], "(0, inf)"):
         raise ValueError("a size or a rate out of range")
     compositing = timeline.get("compositing", "over")  # files from before there was another
-    one_of("compositing", compositing, COMPOSITINGS)
+    check_one_of("compositing", compositing, COMPOSITINGS)
     return Segment(
         first=entry["first"],
         num_frames=int(timeline["num_frames"]),

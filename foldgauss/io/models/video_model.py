@@ -1,4 +1,4 @@
-"""How the fitted video and the running fit are described in a model file's header, and what of them is stored."""
+"""How fitted and edited videos are described in a model file's header, and which arrays of them are stored."""
 
 import dataclasses
 import os
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import checked_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
@@ -20,11 +20,7 @@ from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
-from foldgauss.video.editing.overlays import described, restored
-from foldgauss.video.fitting.codebook import Codebook
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import Statistics
-from foldgauss.video.fitting.state import TIME_ADAM, FitState
+from foldgauss.video.editing.overlays import describe_overlay, restore_overlay
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.sparse_storage import from_stored, stored_counts, stored_skeleton, to_stored
@@ -33,7 +29,6 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 MODEL_SUFFIX = ".safetensors"
 VIDEO, EDITED = PARTS
-CHECKPOINT = "fit-checkpoint"
 
 
 def save_video_model(
@@ -83,7 +78,7 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
     path = checked_path(path)
     if is_compact(path):
         return load_compact_model(path)
-    about = _header(path, VIDEO, EDITED, SEGMENTED)
+    about = read_header_of_kind(path, VIDEO, EDITED, SEGMENTED)
     if about["kind"] == SEGMENTED:
         return load_segmented(path, about)
     return load_part(path, about["kind"], about["header"], about["tensors"])
@@ -111,7 +106,7 @@ def _is_range(value: object) -> bool:
     """Whether these are frames A up to, not including, B, as `read_video` takes them."""
     if not isinstance(value, list) or len(value) != 2:
         return False
-    if not all(end is None or whole(end, 0) for end in value):
+    if not all(end is None or is_integer(end, 0) for end in value):
         return False
     return value[1] is None or value[1] > (value[0] or 0)
 
@@ -122,45 +117,13 @@ _NOTES: dict[str, Callable[[object], bool]] = {
     "frames_digest": _is_text,
     "clip_digest": _is_text,
     "frames": _is_range,
-    "seed": lambda value: whole(value, 0),
-    "mean_psnr": lambda value: within(value, "(0, 100]"),
+    "seed": lambda value: is_integer(value, 0),
+    "mean_psnr": lambda value: is_within(value, "(0, 100]"),
 }
 
 
-#: The one setting with which a fit may go on otherwise: no step depends on it while all is well.
-FREE = "on_divergence"
-
-
-def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
-    """Write a running fit with what it must be continued with: its settings and its frames."""
-    return save_model(path, state, metadata={"config": dataclasses.asdict(config), "source": source})
-
-
-def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict) -> FitState:
-    """Read a running fit. Raises ValueError if it was started with other settings or other frames."""
-    kept = read_header(path)["metadata"]
-    for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
-        before = kept.get(part)
-        before = before if isinstance(before, dict) else {}
-        now, before = ({name: value for name, value in held.items() if name != FREE} for held in (now, before))
-        changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
-        cure = f"Continue {str(path)!r} with the options it was started with, or start anew with --overwrite."
-        if part == "config" and now.keys() != before.keys():
-            cure = "Another version of foldgauss kept it: continue with that, or start anew with --overwrite."
-        if changed:
-            raise invalid(
-                "resume",
-                expected=", ".join(f"{name}={before.get(name)!r}" for name in changed),
-                got=", ".join(f"{name}={now.get(name)!r}" for name in changed),
-                cure=cure,
-            )
-    about = _header(path, CHECKPOINT)
-    state = load_part(Path(path), about["kind"], about["header"], about["tensors"])
-    return jax.tree.map(np.array, state)  # the fit updates its arrays in place: they must be its own
-
-
-def _header(path: str | os.PathLike, *kinds: str) -> dict:
-    """What a file of one of these kinds says of itself."""
+def read_header_of_kind(path: str | os.PathLike, *kinds: str) -> dict:
+    """The header of a file of one of these kinds; raises `ModelFileError` for another kind."""
     about = read_header(path)
     if about["kind"] not in kinds:
         raise ModelFileError(
@@ -210,8 +173,8 @@ def _video_skeleton(header: dict) -> VideoModel:
     if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
-    one_of("compositing", compositing, COMPOSITINGS)
-    if not within(header.get("scale_cutoff", 0.0), "[0, 1]"):
+    check_one_of("compositing", compositing, COMPOSITINGS)
+    if not is_within(header.get("scale_cutoff", 0.0), "[0, 1]"):
         raise ValueError("the cutoff of scales is out of range")
     row_width = columns(degree)["coefficients"].stop
 
@@ -241,8 +204,8 @@ def _describe_edited(video: EditedVideo) -> dict:
 def _describe_layer(layer: Layer) -> dict:
     return {
         "model": _describe_video(layer.model),
-        "overlays": list(map(described, layer.overlays)),
-        "clocks": list(map(described, layer.clocks)),
+        "overlays": list(map(describe_overlay, layer.overlays)),
+        "clocks": list(map(describe_overlay, layer.clocks)),
     }
 
 
@@ -264,89 +227,19 @@ def _edited_skeleton(header: dict) -> EditedVideo:
 def _layer_skeleton(header: dict) -> Layer:
     model = _video_skeleton(header["model"])
     mask = jax.ShapeDtypeStruct((model.splats.num_gaussians,), np.bool_)
-    return Layer(model, *(tuple(restored(edit, mask) for edit in header[name]) for name in ("overlays", "clocks")))
+    return Layer(
+        model, *(tuple(restore_overlay(edit, mask) for edit in header[name]) for name in ("overlays", "clocks"))
+    )
 
 
 def _camera_skeleton(header: dict | None) -> Camera | None:
     if header is None:
         return None
-    one_of("camera's dtype", header["dtype"], ("float32", "float64"))
+    check_one_of("camera's dtype", header["dtype"], ("float32", "float64"))
     leaves = (jax.ShapeDtypeStruct(shape, np.dtype(header["dtype"])) for shape in ((3, 3), (3,), ()))
     return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
-
-
-def _describe_checkpoint(state: FitState) -> dict:
-    num, width = state.rows.shape
-    return {
-        "num_gaussians": num,
-        "width": width,
-        "num_intervals": len(state.time_logits),
-        "growing": state.statistics is not None,
-        "colors": _counts(state.colors),
-        "shapes": _counts(state.shapes),
-        "step": state.step,
-        "plan": state.plan,
-        "seconds": state.seconds,
-        "error": state.error,
-        "best_error": state.best_error,
-        "backoffs": state.backoffs,
-        "settled": state.settled,
-        "should_be_better": state.should_be_better,
-        "start_errors": [list(pair) for pair in state.start_errors],
-        "sound": None if state.sound is None else _describe_checkpoint(state.sound),
-    }
-
-
-def _counts(palette: Codebook) -> list[int]:
-    return [len(palette.index), len(palette.counts)]
-
-
-def _palette_skeleton(counts: list[int], width: int) -> Codebook:
-    num, entries = counts
-    integers = [jax.ShapeDtypeStruct((count,), np.int32) for count in (num, entries)]
-    moments = jax.ShapeDtypeStruct((entries, width), np.float32)
-    return Codebook(integers[0], moments, moments, integers[1])
-
-
-def _checkpoint_skeleton(header: dict) -> FitState:
-    num, width, intervals = header["num_gaussians"], header["width"], header["num_intervals"]
-
-    def floats(*shape: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(shape, np.float32)
-
-    counts = jax.ShapeDtypeStruct((num,), np.int32)
-    return FitState(
-        rows=floats(num, width),
-        first=floats(num, width),
-        second=floats(num, width),
-        counts=counts,
-        kinds=jax.ShapeDtypeStruct((num,), np.uint8),
-        young=jax.ShapeDtypeStruct((num,), np.bool_),
-        colors=_palette_skeleton(header["colors"], 3),
-        shapes=_palette_skeleton(header["shapes"], 2),
-        frame_errors=floats(intervals + 1),
-        time_logits=floats(intervals),
-        time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
-        statistics=Statistics(floats(num), floats(num), counts) if header["growing"] else None,
-        step=int(header["step"]),
-        plan=int(header["plan"]),
-        seconds=float(header["seconds"]),
-        error=float(header["error"]),
-        best_error=float(header.get("best_error", 0.0)),
-        backoffs=int(header.get("backoffs", 0)),
-        sound=_checkpoint_skeleton(_sound_of(header)) if header.get("sound") else None,
-        settled=int(header.get("settled", 0)),
-        should_be_better=int(header.get("should_be_better", 0)),
-        start_errors=tuple((int(frame), float(error)) for frame, error in header.get("start_errors", ())),
-    )
-
-
-def _sound_of(header: dict) -> dict:
-    """The header of the last sound state, which has none of its own."""
-    return header["sound"] | {name: header[name] for name in ("width", "num_intervals")} | {"sound": None}
 
 
 _FORMS = {"to_stored": _to_stored, "from_stored": _from_stored}
 register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
 register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)
-register_model(CHECKPOINT, FitState, to_header=_describe_checkpoint, from_header=_checkpoint_skeleton)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.media.video_file import Clip
 from foldgauss.io.models.compact import is_compact, packed
@@ -27,7 +27,7 @@ from foldgauss.video.compression.quantize import Quantised, Rule, column_names, 
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK, composited
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.flatten import flattened
+from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 HTML_SUFFIX = ".html"
@@ -92,7 +92,7 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
 
     Example: `html_page(model, title="holiday")`.
     """
-    if not (whole(quality, 1) and quality <= 100):
+    if not (is_integer(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _loaded(model)
     pictures = [] if original is None else _pictures(original, plain, quality)
@@ -141,12 +141,12 @@ def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
-        yield _block("model", packed(_fine(flattened(loaded))))
+        yield _block("model", packed(_fine(flatten_video(loaded))))
 
 
 def _flattened(number: int, model: VideoModel | EditedVideo) -> VideoModel:
     try:
-        return flattened(model)
+        return flatten_video(model)
     except ValueError as error:
         raise ValueError(f"segment {number}: {error}") from error
 

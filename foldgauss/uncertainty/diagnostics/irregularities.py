@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, within
+from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.posterior.exact import exact_posterior
@@ -62,7 +62,7 @@ def increment_intervals(posterior: FrameTimePosterior, level: float = 0.9) -> In
     An increment between two frames whose times were held varies with the median alone. Raises ValueError for a level
     out of (0, 1).
     """
-    if not within(level, "(0, 1)"):
+    if not is_within(level, "(0, 1)"):
         raise invalid("level", expected="a number in (0, 1)", got=level)
     steps = np.diff(_some(posterior), axis=1)
     steps /= np.median(steps[:, ~cuts(posterior)], axis=1, keepdims=True)
@@ -96,11 +96,11 @@ def irregularities(
 
     **Example:** `[one.frames for one in irregularities(posterior) if one.kind == "duplicated"]`.
     """
-    if not within(duplicate, "(0, 1)"):
+    if not is_within(duplicate, "(0, 1)"):
         raise invalid("duplicate", expected="a number in (0, 1)", got=duplicate)
     if not (np.isfinite(dropped) and dropped > 1):
         raise invalid("dropped", expected="a number > 1", got=dropped)
-    if not within(probability, "(0, 1]"):
+    if not is_within(probability, "(0, 1]"):
         raise invalid("probability", expected="a number in (0, 1]", got=probability)
     if reach < 1:
         raise invalid("reach", expected="a whole number >= 1", got=reach)

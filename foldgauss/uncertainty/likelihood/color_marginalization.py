@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, FrameAt, solve_conjugate_gradient
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
@@ -103,11 +103,11 @@ def _check(base: LikelihoodProfiles, num_frames: int, prior_scale: float, most_d
     if base.curves.num_frames != num_frames:
         got, cure = f"one of {base.curves.num_frames}", "Call evidence with this video."
         raise invalid("base", expected=f"evidence of {num_frames} frames, as the video has", got=got, cure=cure)
-    if not within(prior_scale, "(0, inf)"):
+    if not is_within(prior_scale, "(0, inf)"):
         cure = "Colours are about [0, 1]."
         raise invalid("prior_scale", expected="a number > 0", got=prior_scale, cure=cure)
     for name, value, least in (("most_dense", most_dense, 0), ("probes", probes, 1)):
-        if not whole(value, least):
+        if not is_integer(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=value)
 
 
@@ -115,7 +115,7 @@ def _chosen(frames: Sequence[int] | None, num_frames: int) -> list[int]:
     if frames is None:
         return list(range(1, num_frames - 1))
     chosen = list(frames)
-    if not all(whole(k, 1) and k < num_frames - 1 for k in chosen) or len({*chosen}) < len(chosen):
+    if not all(is_integer(k, 1) and k < num_frames - 1 for k in chosen) or len({*chosen}) < len(chosen):
         cure = "The first and the last frame's times are fixed."
         raise invalid("frames", expected=f"different frames from 1 to {num_frames - 2}", got=chosen, cure=cure)
     return [int(k) for k in chosen]

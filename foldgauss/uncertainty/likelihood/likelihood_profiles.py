@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.uncertainty.likelihood.noise import (
     NOISES,
     FrameNoise,
@@ -115,7 +115,7 @@ class ProfileBuilder:
         self.finest = FINEST / COARSE * float(np.median(np.diff(self.model_times)))
         self.own_reach = reach is None
         self.reach = (None if num_frames <= MOST_EVERYWHERE else REACH) if reach is None else reach
-        if self.reach is not None and not whole(self.reach, 1):
+        if self.reach is not None and not is_integer(self.reach, 1):
             raise invalid("reach", expected="a whole number >= 1, or None", got=reach)
         self.sketches = Sketches(3 * residuals.model.size[0] * residuals.model.size[1])
         self.samples = [_Samples() for _ in range(num_frames)]

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import EXPLAINED
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -132,7 +132,7 @@ class RefitTimes:
 
         Raises ValueError for a level outside (0, 1).
         """
-        if not within(level, "(0, 1)"):
+        if not is_within(level, "(0, 1)"):
             raise invalid("level", expected="a number in (0, 1)", got=repr(level))
         reach = scipy.stats.t.ppf((1 + level) / 2, self.freedom) * self.std
         return np.clip(np.stack([self.own - reach, self.own + reach]), 0.0, 1.0)
@@ -179,7 +179,7 @@ def refit_frame_times(
     `on_replicate` is called with every `Refit` as it is ready. Example:
     `refit_frame_times(model, frames, config, replicates=8).ratio_to(std_given_the_splats)`.
     """
-    if not whole(replicates, 2):
+    if not is_integer(replicates, 2):
         raise invalid("replicates", expected="a whole number >= 2", got=repr(replicates))
     found = []
     how = {"method": method, "block": block, "place": place, "seed": seed, "steps": steps, "start": start}
@@ -225,21 +225,21 @@ def iter_refits(
     and 17. Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings
     out of range.
     """
-    one_of("method", method, METHODS)
-    one_of("place", place, PLACES)
+    check_one_of("method", method, METHODS)
+    check_one_of("place", place, PLACES)
     start = ("scratch" if method == "frames" else "model") if start is None else start
-    one_of("start", start, STARTS)
+    check_one_of("start", start, STARTS)
     if method == "frames" and start == "model":
         cure = "The model has seen the frames that are to be left out."
         raise invalid("start", expected="'scratch' for frames", got=repr(start), cure=cure)
     for name, value, least in (("replicates", replicates, 1), ("first", first, 0), ("seed", seed, 0)):
-        if not whole(value, least):
+        if not is_integer(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
     residuals = _checked(model, video, method)
     if method == "frames" and not 2 <= replicates <= len(video) - 2:
         cure = "Each of the others is left out once."
         raise invalid("replicates", expected=f"from 2 to {len(video) - 2} for frames", got=replicates, cure=cure)
-    if not whole(block, 1) or block > min(model.size):
+    if not is_integer(block, 1) or block > min(model.size):
         raise invalid("block", expected=f"a whole number from 1 to {min(model.size)}", got=repr(block))
     config = _with_steps(config, len(video), start, steps)
     start_from(model, config, 1)  # raises for a config that is not the model's

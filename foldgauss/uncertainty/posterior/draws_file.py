@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.file_lock import Held, alone
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
@@ -178,7 +178,9 @@ def _is_valid(file, name: str, walkers: int, free: int, size: int) -> bool:
         if not (plain and part.shape == want and part.id.get_storage_size() <= size):
             return False
     sizes = [group.attrs[name] for name in ("nwalkers", "ndim")]
-    integers = whole(done, 0) and all(whole(size, 0) for size in sizes) and np.shape(group.attrs["has_blobs"]) == ()
+    integers = (
+        is_integer(done, 0) and all(is_integer(size, 0) for size in sizes) and np.shape(group.attrs["has_blobs"]) == ()
+    )
     if not integers or done > rows or sizes != [walkers, free] or bool(group.attrs["has_blobs"]):
         return False
     needs = 8 * int(done) * walkers * free, 8 * int(done) * walkers
@@ -190,7 +192,7 @@ def _is_valid(file, name: str, walkers: int, free: int, size: int) -> bool:
 def _is_random_state(attributes) -> bool:
     """Whether NumPy can be given this state: it does not check the position within the keys."""
     kind, keys, position, has_gauss, gauss = (attributes[f"random_state_{k}"] for k in range(5))
-    integers = whole(position, 0) and position <= 624 and whole(has_gauss, 0) and has_gauss <= 1
+    integers = is_integer(position, 0) and position <= 624 and is_integer(has_gauss, 0) and has_gauss <= 1
     return (
         integers
         and isinstance(gauss, float)

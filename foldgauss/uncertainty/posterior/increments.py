@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from scipy.special import gammaln
 
-from foldgauss._runtime.checks import invalid, short_repr, within
+from foldgauss._runtime.checks import invalid, is_within, short_repr
 
 #: Increments of less than this share of a run count as that: float64 has lost the smaller ones.
 LEAST_SHARE = 1e-16
@@ -32,7 +32,7 @@ class Increments:
         self, held: Float[np.ndarray, "num_frames"], free: Bool[np.ndarray, "num_frames"], concentration: float = 1.0
     ):
         self.held, self.free = _times(held), np.asarray(free, bool)
-        if not within(concentration, "(0, inf)"):
+        if not is_within(concentration, "(0, inf)"):
             cure = "1 is uniform over all ordered times; more draws them towards equal spacing."
             raise invalid("concentration", expected="a number > 0", got=short_repr(concentration), cure=cure)
         self.concentration = float(concentration)

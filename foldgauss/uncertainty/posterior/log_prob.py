@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, one_of, short_repr
+from foldgauss._runtime.checks import check_one_of, invalid, short_repr
 from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_colors
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
@@ -142,7 +142,7 @@ def check_request(
         raise invalid("video", expected="frames, or `profiles`", got=None)
     else:
         if not isinstance(noise, FrameNoise):
-            one_of("noise", noise if isinstance(noise, str) else short_repr(noise), NOISES)
+            check_one_of("noise", noise if isinstance(noise, str) else short_repr(noise), NOISES)
         if (num_frames := len(video) if np.ndim(video) else 0) < 3:
             cure = "The first frame is at time 0 and the last at 1: others are needed."
             raise invalid("video", expected="at least 3 frames", got=f"shape {np.shape(video)}", cure=cure)

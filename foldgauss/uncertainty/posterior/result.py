@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid, short_repr, within
+from foldgauss._runtime.checks import invalid, is_within, short_repr
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import ExactPosterior
 from foldgauss.uncertainty.posterior.laplace import LaplaceApproximation
@@ -78,7 +78,7 @@ class FrameTimePosterior:
 
     def interval(self, level: float = 0.9) -> Float64[np.ndarray, "2 num_frames"]:
         """Bounds of the central intervals that contain the fraction `level` of the draws."""
-        if not within(level, "(0, 1)"):
+        if not is_within(level, "(0, 1)"):
             raise invalid("level", expected="a number in (0, 1)", got=short_repr(level))
         bounds = [(1 - level) / 2, (1 + level) / 2]
         return self._reduce(lambda draws: np.quantile(draws, bounds, axis=0))

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from foldgauss._runtime.checks import check_takes, invalid, short_repr, whole, within
+from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_within, short_repr
 from foldgauss.uncertainty.posterior.draws_file import read_fingerprint
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
@@ -47,22 +47,22 @@ def check_settings(
     """
     at_once = num_free if together or num_free <= AT_ONCE else BLOCK
     found = max(32, 4 * at_once) if walkers is None else walkers
-    if not whole(found, max(2 * at_once, 4)) or found % 2:
+    if not is_integer(found, max(2 * at_once, 4)) or found % 2:
         expected = f"an even number, at least {max(2 * at_once, 4)}: twice the frames that move at once"
         cure = "Leave it out, or choose fewer frames."
         raise invalid("walkers", expected=expected, got=short_repr(walkers), cure=cure)
-    if not whole(ensembles, 2):
+    if not is_integer(ensembles, 2):
         expected = "at least 2 (a whole number), better 4: R-hat compares them"
         raise invalid("ensembles", expected=expected, got=short_repr(ensembles))
-    if not whole(thin_by, 1):
+    if not is_integer(thin_by, 1):
         raise invalid("thin_by", expected="a whole number >= 1", got=short_repr(thin_by))
-    if steps is not None and not whole(steps, int(thin_by)):
+    if steps is not None and not is_integer(steps, int(thin_by)):
         raise invalid("steps", expected=f"at least thin_by = {thin_by}, a whole number", got=short_repr(steps))
     return int(found)
 
 
 def check_seed(seed: int) -> int:
-    if not whole(seed, 0):
+    if not is_integer(seed, 0):
         raise invalid("seed", expected="a whole number >= 0", got=short_repr(seed))
     return int(seed)
 
@@ -96,7 +96,9 @@ def _is_move(value) -> bool:
 
 
 def _is_weighted(value) -> bool:
-    return isinstance(value, list | tuple) and len(value) == 2 and _is_move(value[0]) and within(value[1], "[0, inf)")
+    return (
+        isinstance(value, list | tuple) and len(value) == 2 and _is_move(value[0]) and is_within(value[1], "[0, inf)")
+    )
 
 
 def _version(name: str) -> tuple[int, ...]:
@@ -128,4 +130,4 @@ def check_progress(progress) -> None:
         return
     if not callable(progress):
         raise invalid("progress", expected="True, False or a function", got=short_repr(progress))
-    check_takes("progress", progress, "what", "done", "total")
+    check_signature("progress", progress, "what", "done", "total")

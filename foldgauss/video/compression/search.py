@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.video.compression.finetune import COLOR, PATH_AND_COLOR, refitted
 from foldgauss.video.compression.quantize import (
     ABSENT,
@@ -126,11 +126,11 @@ def compress(
     Example: `save_compact("clip.fgz", compress(model, clip.frames).quantised)`.
     """
     check_model(model)
-    if not within(max_loss_db, "(0, 60]"):
+    if not is_within(max_loss_db, "(0, 60]"):
         raise invalid("max_loss_db", expected="a loss in (0, 60] dB", got=max_loss_db, cure="0.2 is hardly seen.")
-    if psnr is not None and not within(psnr, "(0, 100]"):
+    if psnr is not None and not is_within(psnr, "(0, 100]"):
         raise invalid("psnr", expected="a PSNR in (0, 100] dB", got=psnr)
-    if not whole(passes, 0):
+    if not is_integer(passes, 0):
         raise invalid("passes", expected="a whole number >= 0", got=passes)
     on_step("looking at what each number does", math.nan)
     loss = _Loss(model, frames, psnr)

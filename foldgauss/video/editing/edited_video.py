@@ -12,9 +12,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
-from foldgauss.video.editing.overlays import AbstractOverlay, Retimed, SelectedGaussians, acts, padded, room_for
+from foldgauss.video.editing.overlays import (
+    AbstractOverlay,
+    Retiming,
+    SelectedGaussians,
+    is_active,
+    pad_rows,
+    padded_size,
+)
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.prepared import PreparedModel
@@ -31,7 +38,7 @@ class Layer(eqx.Module):
 
     model: VideoModel
     overlays: tuple[AbstractOverlay, ...] = ()
-    clocks: tuple[Retimed, ...] = ()
+    clocks: tuple[Retiming, ...] = ()
 
     def __check_init__(self) -> None:
         num = getattr(self.model.splats.loc, "shape", (None,))[0]
@@ -126,9 +133,9 @@ class EditedVideo(eqx.Module):
         own = (dataclasses.replace(layer, model=layer.model.with_options(options)) for layer in self.layers)
         return dataclasses.replace(self, layers=tuple(own))
 
-    def stage(self, size: tuple[int, int]) -> "EditedStage":
+    def stage(self, size: tuple[int, int]) -> "PreparedEditedVideo":
         """Made ready to be conditioned many times, for pictures of `size`."""
-        return EditedStage(self, size)
+        return PreparedEditedVideo(self, size)
 
     def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, front to back, in pixels of a picture of `size` (default: its own); NumPy leaves."""
@@ -160,7 +167,7 @@ class EditedVideo(eqx.Module):
         return notebook_hooks.show("video", self)
 
 
-def stacked(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
+def stack_layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
     """Videos of one piece each one over another: see `foldgauss.video.layers`."""
     parts = [as_edited(video) for video in videos]
     if not parts:
@@ -195,7 +202,7 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
 
 def _numbers_one(number: object, num: int) -> bool:
     """Whether `number` says which of `num`, from the front or, below 0, from the back."""
-    return whole(number, -num) and number < num
+    return is_integer(number, -num) and number < num
 
 
 def _check_fitting(models: list[VideoModel]) -> None:
@@ -214,13 +221,13 @@ def _check_fitting(models: list[VideoModel]) -> None:
                 raise invalid("layers", expected=f"one {name} for all, {one!r}", got=repr(two), cure=cure)
 
 
-class EditedStage:
+class PreparedEditedVideo:
     """The splats of an edited video by time, in pixels of a picture of `size`, see `PreparedModel`."""
 
     def __init__(self, video: EditedVideo, size: tuple[int, int]):
         height, width = video.size
         self._size, self._camera = tuple(size), video.camera
-        self._layers = [_LayerStage(layer, self._size, height / width) for layer in video.layers]
+        self._layers = [_PreparedLayer(layer, self._size, height / width) for layer in video.layers]
         self._front = partial(Camera.front, height / width)
         self._times = np.asarray(video.frame_times.times())
 
@@ -254,12 +261,12 @@ class EditedStage:
         return seen
 
 
-def _together(moments: list["_Moment"]) -> Splats2D:
+def _together(moments: list["_ConditionedLayer"]) -> Splats2D:
     parts = [(moment.mean, moment.factor, moment.opacity, moment.color) for moment in moments]
     return Splats2D(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))))
 
 
-class _LayerStage:
+class _PreparedLayer:
     """A layer made ready: who goes by which clock is known."""
 
     def __init__(self, layer: Layer, size: tuple[int, int], aspect: float):
@@ -269,12 +276,12 @@ class _LayerStage:
         self._holds_frames = layer.holds_frames
         self._groups = _by_clocks(layer)
 
-    def at(self, t: float) -> "_Moment":
+    def at(self, t: float) -> "_ConditionedLayer":
         """The layer's Gaussians at the video's time t, edited."""
-        moment = _Moment(*self._conditioned(t), self._stage.shape.size, self._stage.shape.aspect)
+        moment = _ConditionedLayer(*self._conditioned(t), self._stage.shape.size, self._stage.shape.aspect)
         for overlay, mask in zip(self._layer.overlays, self._masks, strict=True):
             progress = overlay.progress(t)
-            if acts(overlay, progress):
+            if is_active(overlay, progress):
                 moment.edit(mask, partial(overlay, t=t, progress=progress))
         moment.drop_unseen()
         return moment
@@ -288,13 +295,13 @@ class _LayerStage:
         order = np.argsort(np.concatenate([part.alive for part in parts]), kind="stable")
         return tuple(np.take(np.concatenate(leaf), order, axis=0) for leaf in zip(*leaves, strict=True))
 
-    def _own_time(self, clocks: tuple[Retimed, ...], t: float) -> float:
+    def _own_time(self, clocks: tuple[Retiming, ...], t: float) -> float:
         for clock in reversed(clocks):  # the last edit is asked first: it retimes all that the others made
             t = clock.own_time(t)
         return float(out_of_cuts(t, self._times)) if self._holds_frames else t
 
 
-def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray, " num"] | None]]:
+def _by_clocks(layer: Layer) -> list[tuple[tuple[Retiming, ...], Bool[np.ndarray, " num"] | None]]:
     """Groups of Gaussians that go by the same clocks."""
     if not layer.clocks:
         return [((), None)]
@@ -305,7 +312,7 @@ def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray,
     return [(chain, group == k) for k, chain in enumerate(chains)]
 
 
-class _Moment:
+class _ConditionedLayer:
     """A layer's Gaussians at one time, in pixels, on the way through the edits; those in space also in model space."""
 
     def __init__(self, index, mean, factor, opacity, color, size: tuple[int, int], aspect: float):
@@ -392,8 +399,8 @@ class _Moment:
 def _project(camera: Camera, size: tuple[int, int], mean: np.ndarray, factor: np.ndarray, opacity: np.ndarray):
     """Mean, factor and opacity of what the camera sees, in pixels, in the order they come."""
     num = len(opacity)
-    room = room_for(num)
-    seen = _projected(camera, size, padded(mean, room), padded(factor, room), padded(opacity, room))
+    room = padded_size(num)
+    seen = _projected(camera, size, pad_rows(mean, room), pad_rows(factor, room), pad_rows(opacity, room))
     return tuple(np.asarray(leaf)[:num] for leaf in seen)
 
 

@@ -4,10 +4,10 @@ import dataclasses
 import math
 from typing import Any
 
-from foldgauss._runtime.checks import invalid, one_of, whole, within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
-from foldgauss.video.fitting.pruning.economy import Economy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +153,7 @@ class FitConfig:
             value = getattr(self, name)
             if value is None and name in ("num_gaussians", "max_gaussians", "steps"):
                 continue
-            if not whole(value, least):
+            if not is_integer(value, least):
                 raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
             object.__setattr__(self, name, int(value))  # NumPy's integers have no place in a checkpoint
         for name, most in {
@@ -180,14 +180,14 @@ class FitConfig:
             value = getattr(self, name)
             if value is None and name in ("minutes", "target_psnr", "max_size_mb"):
                 continue
-            if not within(value, bounds):
+            if not is_within(value, bounds):
                 raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
             object.__setattr__(self, name, float(value))
-        one_of("initialization", self.initialization, INITIALIZATIONS)
-        one_of("decayed", self.decayed, DECAYED)
-        one_of("on_divergence", self.on_divergence, ON_DIVERGENCE)
-        one_of("engine", self.engine, FIT_ENGINES)
-        one_of("compositing", self.compositing, COMPOSITINGS)
+        check_one_of("initialization", self.initialization, INITIALIZATIONS)
+        check_one_of("decayed", self.decayed, DECAYED)
+        check_one_of("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        check_one_of("engine", self.engine, FIT_ENGINES)
+        check_one_of("compositing", self.compositing, COMPOSITINGS)
         if self.quarter_fraction + self.half_fraction > 1:
             got = f"{self.quarter_fraction:g} and {self.half_fraction:g}"
             raise invalid("quarter_fraction, half_fraction", expected="at most 1 together", got=got)
@@ -227,7 +227,7 @@ class FitConfig:
 
         Raises ValueError for an unknown name or change. Example: `FitConfig.preset("paper", steps=3000)`.
         """
-        one_of("preset", name, tuple(PRESETS))
+        check_one_of("preset", name, tuple(PRESETS))
         unknown = changes.keys() - {field.name for field in dataclasses.fields(cls)}
         if unknown:
             raise invalid("changes", expected="fields of FitConfig", got=", ".join(sorted(unknown)))

@@ -5,7 +5,7 @@ import numpy as np
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig, most_gaussians
-from foldgauss.video.fitting.growth import Growth, Statistics, dim, grown
+from foldgauss.video.fitting.growth import GradientStatistics, Growth, dim, grown
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.kinds import kinds_of
 
@@ -51,4 +51,4 @@ def _replace(state: FitState, config: FitConfig, growth: Growth, size: tuple[int
     state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, config.degree)])
     state.young = np.concatenate([state.young[stay], np.zeros(len(born), bool)])
     state.colors, state.shapes = Codebook.of(None, 3), Codebook.of(None, 2)  # those born have their own
-    state.statistics = Statistics.zeros(len(state.rows))
+    state.statistics = GradientStatistics.zeros(len(state.rows))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.video.models.row_layout import columns
 
@@ -68,7 +68,7 @@ class Growth:
     def __post_init__(self) -> None:
         for name, least in {"from_step": 0, "until_step": 0, "every": 1, "big_from": 0, "reset_every": 1}.items():
             value = getattr(self, name)
-            if not whole(value, least):
+            if not is_integer(value, least):
                 raise invalid(f"growth.{name}", expected=f"a whole number >= {least}", got=repr(value))
             object.__setattr__(self, name, int(value))
         ranges = dict.fromkeys(
@@ -77,7 +77,7 @@ class Growth:
         ranges |= {"shrinking": "[1, inf)", "prune_opacity": "(0, 1)", "reset_opacity": "(0, 1)"}
         for name, bounds in ranges.items():
             value = getattr(self, name)
-            if not within(value, bounds):
+            if not is_within(value, bounds):
                 raise invalid(f"growth.{name}", expected=f"a number in {bounds}", got=repr(value))
             object.__setattr__(self, name, float(value))
         if self.reset_opacity < self.prune_opacity:
@@ -110,7 +110,7 @@ class Growth:
         return step < self.until_step and step % self.reset_every == 0
 
 
-class Statistics(NamedTuple):
+class GradientStatistics(NamedTuple):
     """Sums of the steps since the last births; (num,) each."""
 
     screen: np.ndarray  #: float32: of screen gradients
@@ -118,7 +118,7 @@ class Statistics(NamedTuple):
     seen: np.ndarray  #: int32: steps in which the Gaussian was seen
 
     @classmethod
-    def zeros(cls, num: int) -> "Statistics":
+    def zeros(cls, num: int) -> "GradientStatistics":
         return cls(np.zeros(num, np.float32), np.zeros(num, np.float32), np.zeros(num, np.int32))
 
     def add(self, views: Sequence[tuple[np.ndarray, np.ndarray]], by_time: np.ndarray) -> None:
@@ -137,7 +137,7 @@ class Statistics(NamedTuple):
 
 def grown(
     rows: np.ndarray,
-    statistics: Statistics,
+    statistics: GradientStatistics,
     growth: Growth,
     *,
     degree: int,
@@ -177,7 +177,7 @@ def dim(rows: np.ndarray, first: np.ndarray, second: np.ndarray, growth: Growth,
     second[:, place] = 0
 
 
-def _restless(statistics: Statistics, growth: Growth, room: int) -> np.ndarray:
+def _restless(statistics: GradientStatistics, growth: Growth, room: int) -> np.ndarray:
     """Indices, in order, of at most `room` Gaussians whose gradients reach a threshold."""
     steps = np.maximum(statistics.seen, 1).astype(np.float32)
     excess = np.maximum(

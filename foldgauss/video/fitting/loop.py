@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss._runtime.threads import check_process
 from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam
@@ -18,13 +18,23 @@ from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import UNIT_TIME, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.densify import grow
 from foldgauss.video.fitting.divergence import Guard
-from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.economy import MIN_PASSES_PER_ROUND
+from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.fitting.optical_flow import Motion
-from foldgauss.video.fitting.pruning.economy import LEAST_PASSES, frame_weights
+from foldgauss.video.fitting.pruning.description_length import frame_weights
 from foldgauss.video.fitting.pruning.pruner import Pruner
-from foldgauss.video.fitting.pyramid import Level, level_at, levels, shrunk, work_done
-from foldgauss.video.fitting.schedule import Rates, looked_at, steps_per_pass, views_of
+from foldgauss.video.fitting.schedule import (
+    Level,
+    Rates,
+    level_at,
+    levels,
+    looked_at,
+    shrunk,
+    steps_per_pass,
+    views_of,
+    work_done,
+)
 from foldgauss.video.fitting.state import (
     TIME_ADAM,
     FitState,
@@ -36,7 +46,8 @@ from foldgauss.video.fitting.state import (
     to_model,
 )
 from foldgauss.video.fitting.state import update_times as _update_times
-from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper, chosen_engine
+from foldgauss.video.fitting.steppers.engines import choose_engine
+from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import Conditioned, Shape, condition, pull_back, update_windows
@@ -130,7 +141,7 @@ def fit_steps(
         raise invalid(
             "interpolation_fraction", expected="0 for frames with alpha", got=config.interpolation_fraction, cure=cure
         )
-    engine = chosen_engine(frames, config, state)
+    engine = choose_engine(frames, config, state)
     _warm_up(frames, config, engine)
     flow = _Flow(frames, motion)
     state = _started(frames, config, None, flow) if state is None else state
@@ -223,7 +234,7 @@ class _StepPlanner:
         # The steps so far count as steps of the first level, which this many are still left of.
         left = (budget - state.seconds) / SLOWER + state.step * seconds[0]
         if self.taken:
-            left = left / GROWN - min(self.taken * seconds[-1], left * ROUND / (ROUND + LEAST_PASSES))
+            left = left / GROWN - min(self.taken * seconds[-1], left * ROUND / (ROUND + MIN_PASSES_PER_ROUND))
         planned = max(int(left / np.dot(self.shares, seconds)), state.step)
         return min(planned, self.config.steps or planned)
 
@@ -325,7 +336,7 @@ def _started(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, f
         frame_errors=np.zeros(num_frames, np.float32),
         time_logits=logits,
         time_moments=TIME_ADAM.init(jnp.asarray(logits)),
-        statistics=None if config.growth is None else Statistics.zeros(len(rows)),
+        statistics=None if config.growth is None else GradientStatistics.zeros(len(rows)),
         step=0,
         plan=0 if config.minutes is not None else planned_steps(config, num_frames),
         seconds=time.perf_counter() - begun,
@@ -342,9 +353,9 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
 
     Example: `for state, info in fit_steps(frames, config, start_from(model, config, 300, 0.7)): ...`
     """
-    if not whole(steps, 1):
+    if not is_integer(steps, 1):
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
-    if not within(progress, "[0, 1)"):
+    if not is_within(progress, "[0, 1)"):
         raise invalid("progress", expected="a number in [0, 1)", got=repr(progress))
     _check_config(model, config)
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
@@ -556,7 +567,7 @@ class _Stepper:
         """Loss of frame k, or of what lies `share` of the way to the next; gradients are added to `self.grad`, dL/dt is
         returned.
 
-        To `views`, where asked for, comes what `Statistics.add` wants.
+        To `views`, where asked for, comes what `GradientStatistics.add` wants.
         """
         if share is None:
             target = planar(shrunk(self.frames[k], shape.size), self.background)

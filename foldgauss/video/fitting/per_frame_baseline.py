@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import UInt8
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.config import FitConfig, LearningRates
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, without_end
@@ -95,7 +95,7 @@ def independent_frames(
     config = FitConfig() if config is None else config
     _check_config(config)
     num_frames, least = len(frames), FLOATS * len(frames)
-    if not whole(num_floats, least):
+    if not is_integer(num_floats, least):
         expected = f"a whole number >= {least:,}, one Gaussian in each frame"
         raise invalid("num_floats", expected=expected, got=repr(num_floats))
     each, more = divmod(int(num_floats) // FLOATS, num_frames)

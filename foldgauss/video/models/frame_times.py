@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss._runtime.threads import check_process
 from foldgauss.video.models.shots import is_cut
 
@@ -51,7 +51,7 @@ class FrameTimes(eqx.Module):
 
 def check_frame_before(k: object, num_frames: int) -> None:
     """Raise unless `k` is the number of a frame that another one follows."""
-    if not whole(k, 0) or k > num_frames - 2:
+    if not is_integer(k, 0) or k > num_frames - 2:
         raise invalid("k", expected=f"the number of a frame before the last of {num_frames}", got=short_repr(k))
 
 

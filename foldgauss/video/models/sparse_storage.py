@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt, UInt8
 
-from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.models.kinds import DEGREES, LASTS, SOLID, degrees_of, is_solid, lasts
 from foldgauss.video.models.splats import LASTING, OPAQUE, FoldedSplats
@@ -230,5 +230,5 @@ def _num_bytes(leaves: dict[str, np.ndarray]) -> int:
 
 
 def _check_count(name: str, value: object, least: int, most: int) -> None:
-    if not whole(value, least) or value > most:
+    if not is_integer(value, least) or value > most:
         raise invalid(name, expected=f"a whole number from {least} to {most:,}", got=short_repr(value))

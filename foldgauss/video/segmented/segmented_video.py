@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, short_repr, whole
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK
@@ -20,7 +20,7 @@ from foldgauss.video.models.video_model import VideoModel, check_time
 
 #: Models that are held ready at once; more only where more are seen: half way from the last frame of one fade to the
 #: first of the next, if these are neighbours.
-READY = 2
+MAX_PREPARED = 2
 #: Frames. A position so near to a frame is that frame: times k / (num_frames - 1) come back rounded.
 _CLOSE = 1e-6
 
@@ -47,7 +47,7 @@ class Segment:
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, first: int, model: VideoModel | EditedVideo) -> "Segment":
+    def from_model(cls, first: int, model: VideoModel | EditedVideo) -> "Segment":
         """A model in memory, whose first frame is the whole clip's `first`. Raises ValueError for another type."""
         if not isinstance(model, VideoModel | EditedVideo):
             cure = "End a chain of edits with .video()." if type(model).__name__ == "Edit" else ""
@@ -110,11 +110,11 @@ class SegmentedVideo:
     frame b. Before its first frame and after its last a model shows that frame. Where neighbours share nothing, they
     meet at a cut, and between the two frames the nearer one is shown.
 
-    Models are loaded when they are drawn, and at most `READY` of them are held ready.
+    Models are loaded when they are drawn, and at most `MAX_PREPARED` of them are held ready.
 
     **Units:** times are in [0, 1], frame k of the clip at k / (num_frames - 1), float64.
 
-    **Example:** `SegmentedVideo.of([(0, first), (95, second)]).render(0.5)`.
+    **Example:** `SegmentedVideo.from_models([(0, first), (95, second)]).render(0.5)`.
 
     **Raises:** ValueError for segments that leave a gap or are out of order, for one that reaches into the one after
     the next, and for those of another size, rate, compositing or `RenderOptions`.
@@ -130,9 +130,9 @@ class SegmentedVideo:
         self.compositing: str = lead.compositing
 
     @classmethod
-    def of(cls, parts: Sequence[tuple[int, VideoModel | EditedVideo]]) -> "SegmentedVideo":
+    def from_models(cls, parts: Sequence[tuple[int, VideoModel | EditedVideo]]) -> "SegmentedVideo":
         """Of models in memory, each with the number of its first frame in the whole clip."""
-        return cls([Segment.of(first, model) for first, model in parts])
+        return cls([Segment.from_model(first, model) for first, model in parts])
 
     def __repr__(self) -> str:
         return f"SegmentedVideo({len(self.segments)} segments, {self.num_frames} frames)"
@@ -177,9 +177,9 @@ class SegmentedVideo:
 
         return SegmentedVideo([changed(segment) for segment in self.segments])
 
-    def stage(self, size: tuple[int, int]) -> "SegmentedStage":
+    def stage(self, size: tuple[int, int]) -> "PreparedSegmentedVideo":
         """Made ready to be conditioned many times, for pictures of `size`."""
-        return SegmentedStage(self, size)
+        return PreparedSegmentedVideo(self, size)
 
     def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, front to back, in pixels of a picture of `size` (default: its own); NumPy leaves.
@@ -246,7 +246,7 @@ class SegmentedVideo:
         return min(max((position - first + 1) / (stop - first + 1), 0.0), 1.0)
 
 
-class SegmentedStage:
+class PreparedSegmentedVideo:
     """The splats of a video in segments by time, in pixels of a picture of `size`, see `PreparedModel`."""
 
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):
@@ -257,7 +257,7 @@ class SegmentedStage:
         """The splats of time t, of the segment that is seen most; NumPy leaves."""
         position = self._video.position(t)
         number, _ = max(self._video.weights(position), key=lambda pair: pair[1])
-        stage, time = self._at(number, position, READY)
+        stage, time = self._at(number, position, MAX_PREPARED)
         return stage.splats(time)
 
     def parts(self, t: float) -> list[tuple[float, Splats2D]]:
@@ -265,7 +265,7 @@ class SegmentedStage:
         position, parts = self._video.position(t), []
         weights = self._video.weights(position)
         for number, weight in weights:
-            stage, time = self._at(number, position, max(len(weights), READY))
+            stage, time = self._at(number, position, max(len(weights), MAX_PREPARED))
             parts += [(weight * own, splats) for own, splats in stage.parts(time)]
         return parts
 
@@ -290,9 +290,9 @@ def _check_segments(segments: tuple[Segment, ...]) -> None:
         raise invalid("segments", expected="at least one", got="none")
     for number, segment in enumerate(segments):
         if not isinstance(segment, Segment):
-            cure = "Of models: SegmentedVideo.of([(first, model), ...])."
+            cure = "Of models: SegmentedVideo.from_models([(first, model), ...])."
             raise invalid(f"segments[{number}]", expected="a Segment", got=short_repr(segment), cure=cure)
-        if not whole(segment.first, 0):
+        if not is_integer(segment.first, 0):
             expected = "the number of a frame of the whole clip"
             raise invalid(f"segments[{number}].first", expected=expected, got=short_repr(segment.first))
     if segments[0].first != 0:
@@ -341,15 +341,15 @@ def plan_segments(num_frames: int, cuts: Sequence[int], *, length: int, overlap:
     **Raises:** ValueError for no frames, a length below 2, cuts outside the clip, and an overlap that is not from 1 to
     half of the length.
     """
-    if not whole(num_frames, 1):
+    if not is_integer(num_frames, 1):
         raise invalid("num_frames", expected="a whole number >= 1", got=short_repr(num_frames))
-    if not whole(length, 2):
+    if not is_integer(length, 2):
         raise invalid("length", expected="a whole number of frames >= 2", got=short_repr(length))
-    if not (whole(overlap, 1) and 2 * overlap <= length):
+    if not (is_integer(overlap, 1) and 2 * overlap <= length):
         expected = f"a whole number of frames from 1 to {length // 2}, half of the length"
         raise invalid("overlap", expected=expected, got=short_repr(overlap))
     for cut in cuts:
-        if not (whole(cut, 1) and cut < num_frames):
+        if not (is_integer(cut, 1) and cut < num_frames):
             expected = f"frames from 1 to {num_frames - 1} that begin a shot"
             raise invalid("cuts", expected=expected, got=short_repr(cut), cure="Count from the clip's first frame.")
     num_frames, length, overlap = int(num_frames), int(length), int(overlap)

@@ -11,7 +11,7 @@ import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.video.models.video_model import VideoModel, check_model
 
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
@@ -111,7 +111,7 @@ def chosen_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] 
 
 def checked_share(name: str, value: object, bounds: str = "(0, 1]") -> float:
     """As float. Raises ValueError unless it is a number within the bounds."""
-    if not within(value, bounds):
+    if not is_within(value, bounds):
         raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
     return float(value)
 
@@ -136,7 +136,7 @@ def _checked_frames(model: VideoModel, frames: object) -> tuple[int, int]:
     pair = tuple(frames) if isinstance(frames, tuple | list | np.ndarray) else ()
     if len(pair) == 2:
         pair = tuple(end if given is None else given for given, end in zip(pair, (0, model.num_frames), strict=True))
-    if not (len(pair) == 2 and all(whole(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames):
+    if not (len(pair) == 2 and all(is_integer(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames):
         expected = f"(first, stop) with 0 <= first < stop <= {model.num_frames}"
         raise invalid(
             "frames",

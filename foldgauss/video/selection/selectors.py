@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
-from foldgauss._runtime.checks import invalid, whole
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model, check_time
 from foldgauss.video.selection.contributions import (
@@ -96,7 +96,7 @@ class Selection:
         return int(self.mask.sum())
 
     def __contains__(self, index: int) -> bool:
-        return whole(index, 0) and index < self.num_gaussians and bool(self.mask[index])
+        return is_integer(index, 0) and index < self.num_gaussians and bool(self.mask[index])
 
     def __or__(self, other: "Selection") -> "Selection":
         return Selection(self.mask | self._mask_of(other))

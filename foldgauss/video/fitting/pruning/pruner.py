@@ -9,11 +9,11 @@ from jaxtyping import Float, Float32
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video.fitting.codebook import Codebook, averaged, shared
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.initialize import START_OPACITY
 from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.pruning.births import among, newborns
-from foldgauss.video.fitting.pruning.economy import Cut, cut, frame_weights
+from foldgauss.video.fitting.pruning.description_length import Cut, allowed_error, count_births, cut, frame_weights
 from foldgauss.video.fitting.pruning.scores import PruningScores, measured
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr, planar
 from foldgauss.video.models.background import random_background
@@ -50,7 +50,7 @@ class Pruner:
         growing = state.step in steps[: len(steps) // 2]
         ledger, progress = self._ledger(state), state.step / state.plan
         psnr = self._psnr(state, ledger)
-        room, late = economy.room(ledger, psnr, progress), steps[max(len(steps) // 2, len(steps) - 1 - LATE)]
+        room, late = allowed_error(economy, ledger, psnr, progress), steps[max(len(steps) // 2, len(steps) - 1 - LATE)]
         made = self._cut(state, ledger, room, solid=state.step >= late)
         survived = state.young[made.stay].sum() / max(state.young.sum(), 1) if state.step > steps[0] else 1.0
         _keep(state, made, config.degree)
@@ -60,12 +60,12 @@ class Pruner:
         if growing:
             at_start = chosen_num_gaussians(config, *self._frames.shape[:3])
             most = min(most_gaussians(config, len(self._frames)), MOST_BORN * at_start)
-            num = min(economy.births(ledger, psnr, progress, len(state.rows), survived), most - len(state.rows))
+            num = min(count_births(economy, ledger, psnr, progress, len(state.rows), survived), most - len(state.rows))
         state.young = np.zeros(len(state.rows), bool)
         if num > 0:
             self._bear(state, ledger, num)
         if state.statistics is not None:
-            state.statistics = Statistics.zeros(len(state.rows))
+            state.statistics = GradientStatistics.zeros(len(state.rows))
         return True
 
     def trim(self, state: FitState) -> None:

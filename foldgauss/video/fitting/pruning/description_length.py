@@ -5,14 +5,13 @@ two-part code (Rissanen 1978): bits of the parameters, and of the residual given
 of one variance are n / 2 log2(squared error) and a constant.
 """
 
-import dataclasses
 import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from foldgauss._runtime.checks import invalid, whole, within
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.pruning.scores import ROUNDING, PruningScores
 from foldgauss.video.models.kinds import (
     LASTS,
@@ -28,8 +27,6 @@ from foldgauss.video.models.kinds import (
 from foldgauss.video.models.row_layout import columns, shift_path
 from foldgauss.video.models.splats import LASTING, OPAQUE
 
-#: A round costs as much as some two passes over the frames: there is one in so many passes of the plan at most.
-LEAST_PASSES = 5
 #: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
 #: lower; and so much higher, in dB, that the end is not missed by a hair.
 YET_TO_COME, SPARE = 0.8, 0.1
@@ -50,78 +47,31 @@ MOST_SOLID = 0.25
 _UNLIKE = 4.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Economy:
-    """Pruning by description length at `rounds` points of the plan, evenly from `first_fraction` to `last_fraction`.
+def count_births(
+    economy: Economy, ledger: PruningScores, psnr: float, progress: float, num: int, survived: float
+) -> int:
+    """How many Gaussians are born to `num`; `survived` is the fraction of the previous newborns that were not pruned.
 
-    * Without `psnr`: a Gaussian, a power of its path, a beginning and an end of its life, its opacity, a colour and a
-      shape of its own stay if they save more than `bits` for each of their numbers. (Compact files hold a number in
-      8 bits on the average.)
-      With `grows`, a `BIRTHS` share of Gaussians are born where the error is, as long as half of them stay.
-    * With `psnr`, dB: what is dropped is what costs the least, until the mean over all frames is that; where it seems
-      out of reach, Gaussians are born.
-
-    A round drops at most a share `most_dropped` of the Gaussians: then the others take over what is missed. Short plans
-    have fewer rounds.
-    Raises ValueError for numbers out of range.
+    `psnr` is the one reached now, in dB.
     """
+    if ledger.squared_error <= ROUNDING * ledger.num_samples:  # below the rounding to 8 bits
+        return 0
+    if economy.psnr is None:
+        return round(BIRTHS * num) if economy.grows and survived >= 0.5 else 0
+    missing = _round_target(economy, progress) - psnr
+    return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
 
-    psnr: float | None = None
-    bits: float = 8.0
-    rounds: int = 8
-    first_fraction: float = 0.15
-    last_fraction: float = 0.88
-    most_dropped: float = 0.3
-    grows: bool = True
 
-    def __post_init__(self) -> None:
-        bounds = {"bits": "(0, inf)", "first_fraction": "(0, 1)", "last_fraction": "(0, 1)", "most_dropped": "(0, 1]"}
-        if self.psnr is not None:
-            bounds["psnr"] = "(0, 100]"
-        for name, interval in bounds.items():
-            if not within(getattr(self, name), interval):
-                raise invalid(f"economy.{name}", expected=f"a number in {interval}", got=repr(getattr(self, name)))
-            object.__setattr__(self, name, float(getattr(self, name)))
-        if not whole(self.rounds, 1):
-            raise invalid("economy.rounds", expected="a whole number >= 1", got=repr(self.rounds))
-        object.__setattr__(self, "rounds", int(self.rounds))
-        if not isinstance(self.grows, bool):
-            raise invalid("economy.grows", expected="True or False", got=repr(self.grows))
-        if self.first_fraction > self.last_fraction:
-            got = f"{self.first_fraction:g} and {self.last_fraction:g}"
-            raise invalid("economy.first_fraction, last_fraction", expected="in this order", got=got)
+def allowed_error(economy: Economy, ledger: PruningScores, psnr: float, progress: float) -> float | None:
+    """The squared error that a round may add at the PSNR reached now, in dB; None where the price decides."""
+    if economy.psnr is None:
+        return None
+    return ledger.squared_error * (10 ** (min(psnr - _round_target(economy, progress), MOST_AT_ONCE) / 10) - 1)
 
-    def steps(self, plan: int, *, passes: float, coarse: float) -> Int[np.ndarray, "rounds"]:
-        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet.
 
-        The plan's steps are `passes` over the frames. Of a plan too short for all rounds some are left out.
-        """
-        first = max(self.first_fraction, min(coarse + 0.05, self.last_fraction))
-        num = max(min(self.rounds, int(passes / LEAST_PASSES)), 1)
-        shares = np.linspace(first, self.last_fraction, num) if num > 1 else np.array([self.last_fraction])
-        return np.clip(np.rint(shares * plan), 1, plan).astype(int)
-
-    def births(self, ledger: PruningScores, psnr: float, progress: float, num: int, survived: float) -> int:
-        """How many Gaussians are to be born to `num`; `survived`: the share still there of those born last.
-
-        `psnr`: what is reached now, dB.
-        """
-        if ledger.squared_error <= ROUNDING * ledger.num_samples:  # nothing to be seen
-            return 0
-        if self.psnr is None:
-            return round(BIRTHS * num) if self.grows and survived >= 0.5 else 0
-        missing = self._aim(progress) - psnr
-        return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
-
-    def room(self, ledger: PruningScores, psnr: float, progress: float) -> float | None:
-        """The squared error that a round may add at a PSNR of so many dB; None where the price decides."""
-        if self.psnr is None:
-            return None
-        return ledger.squared_error * (10 ** (min(psnr - self._aim(progress), MOST_AT_ONCE) / 10) - 1)
-
-    def _aim(self, progress: float) -> float:
-        """dB that a round aims at: the rest of the fit brings more."""
-        return self.psnr + SPARE - YET_TO_COME * (1 - progress)
+def _round_target(economy: Economy, progress: float) -> float:
+    """The PSNR in dB that a round aims at: the remaining steps improve it further."""
+    return economy.psnr + SPARE - YET_TO_COME * (1 - progress)
 
 
 def frame_weights(errors: Float32[np.ndarray, " num_frames"]) -> Float[np.ndarray, " num_frames"]:
