@@ -1,4 +1,11 @@
-"""How sure the learned frame times are: likelihood profiles, and what is drawn from them."""
+"""Posterior distribution of the learned frame times.
+
+`likelihood_profiles` renders the model at many times and gives the log-likelihood of each frame as a function of its
+time; `frame_time_posterior` samples the times from their posterior by emcee, beside the exact marginals
+(`exact_posterior`) and Laplace's approximation; `irregularities`, `summary` and `frame_table` report on it;
+`simulated_ranks` checks the calibration and `refit_frame_times` refits splats and times together. Sampling needs the
+extra `uncertainty`.
+"""
 
 from foldgauss.uncertainty.diagnostics.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
 from foldgauss.uncertainty.diagnostics.irregularities import (

@@ -154,8 +154,8 @@ def test_summary_says_what_is_not_known():
     posterior = posterior_about(times, std)
     text = summary(posterior, times)
     assert "Not identified: frame 5.**" in text
-    assert "Of 9 intervals none looks like" in text
-    assert "2 others were not judged" in text
+    assert "None of 9 intervals shows a duplicated or dropped frame" in text
+    assert "2 others were not assessed" in text
     assert "20" not in text.split("grey")[0].rsplit("residuals", 1)[1]
     unsure = dataclasses.replace(posterior, converged=False, message="Not converged after 9 steps.")
     assert summary(unsure).startswith("Not converged")

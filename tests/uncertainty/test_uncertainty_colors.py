@@ -56,9 +56,9 @@ def _by_hand(equations, k, t, prior_scale=PRIOR):
         if j != k:
             a = equations.weights(equations.times[j]).toarray()
             precision += a.T @ a / equations.variance[j]
-            rhs += a.T @ (frames[j] - a @ equations.colour) / equations.variance[j]
+            rhs += a.T @ (frames[j] - a @ equations.color) / equations.variance[j]
     covariance = np.linalg.inv(precision)
-    colour, a = equations.colour + covariance @ rhs, equations.weights(t).toarray()
+    colour, a = equations.color + covariance @ rhs, equations.weights(t).toarray()
     pixels = equations.variance[k] * np.eye(len(a)) + a @ covariance @ a.T
     expected = a @ colour
     return sum(scipy.stats.multivariate_normal(expected[:, c], pixels).logpdf(frames[k][:, c]) for c in range(3))
@@ -73,7 +73,7 @@ def test_exact_profile_is_the_gaussian_density_of_all_pixels(scene):
     curve = module._Dense(equations, FRAME)
     times = _times(equations, FRAME)
     for t in times:
-        curve.draw(t)
+        curve.evaluate(t)
     expected = np.array([_by_hand(equations, FRAME, t) for t in times])
     assert np.ptp(expected) > 0.5
     np.testing.assert_allclose(curve.profile()[1], expected - expected.max(), rtol=1e-6, atol=1e-6)
@@ -86,8 +86,8 @@ def test_estimated_profile_is_the_exact_one_given_all_probes(over):
     exact = module._Dense(equations, FRAME)
     estimated = module._Estimated(equations, FRAME, np.sqrt(num_pixels) * np.eye(num_pixels))
     for t in equations.times[FRAME] + np.linspace(-0.3, 0.3, 31):
-        exact.draw(t)
-        estimated.draw(t)
+        exact.evaluate(t)
+        estimated.evaluate(t)
     without = np.array([point.log_likelihood for point in estimated.points])
     expected, found = exact.values() - without, estimated.values() - without
     assert np.ptp(expected) > 0.5
@@ -142,7 +142,7 @@ def test_information_is_what_colours_leave_of_it(scene):
     equations = _equations(*scene)
     t, step = equations.times[FRAME], 1e-3
     at = equations.at(FRAME, t)
-    slope = ((equations.weights(t + step) - equations.weights(t - step)) / (2 * step)) @ equations.colour
+    slope = ((equations.weights(t + step) - equations.weights(t - step)) / (2 * step)) @ equations.color
     profiles = at.weights.T @ slope / at.variance
     held = (slope**2).sum() / at.variance
     free = held - (profiles * np.linalg.solve(at.dense(), profiles)).sum()
@@ -180,7 +180,7 @@ def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
     base_values[2] = -1.0  # an island
     times = np.linspace(0.45, 0.56, 9)
     values = -1500 * (times - 0.505) ** 2
-    nodes, joined = module._joined(times, values, base_nodes, base_values)
+    nodes, joined = module._join(times, values, base_nodes, base_values)
     assert (np.diff(nodes) > 0).all()
     assert (nodes[0], nodes[-1]) == (0, 1)
     np.testing.assert_array_equal(joined[np.isin(nodes, times)], values)
@@ -201,8 +201,8 @@ def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
         ({"prior_scale": float("nan")}, "prior_scale: expected a number > 0"),
         ({"most_dense": -1}, "most_dense: expected a whole number >= 0"),
         ({"probes": 0}, "probes: expected a whole number >= 1"),
-        ({"base": None}, "base: expected an Evidence"),
-        ({"video": np.zeros((4, *SIZE, 3), np.uint8)}, "base: expected evidence of 4 frames"),
+        ({"base": None}, "base: expected LikelihoodProfiles"),
+        ({"video": np.zeros((4, *SIZE, 3), np.uint8)}, "base: expected profiles of 4 frames"),
         ({"video": np.zeros((7, 5, 5, 3), np.uint8)}, "video: expected"),
     ],
 )

@@ -208,7 +208,7 @@ def test_narrow_profiles_out_of_order_have_no_times():
 
 def test_shares_are_checked():
     found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
-    with pytest.raises(ValueError, match="fraction"):
+    with pytest.raises(ValueError, match="probability"):
         found.quantile(1.5)
 
 

@@ -101,7 +101,7 @@ def test_logits_are_centred_and_give_the_times_back():
         ({"held": HELD[::-1].copy()}, "held"),
         ({"held": HELD + 0.1}, "held: expected times in .*1.1 of frame 6"),
         ({"held": HELD - 0.1}, "held"),
-        ({"held": np.where(HELD == 0.55, 0.9, HELD)}, "held: expected rising times.*frame 4 .*frame 5"),
+        ({"held": np.where(HELD == 0.55, 0.9, HELD)}, "held: expected increasing times.*frame 4 .*frame 5"),
         ({"held": np.where(HELD == 0.55, 0.7, HELD)}, "held"),
         ({"held": np.full(7, np.nan)}, "held"),
         ({"held": "x"}, "held"),
@@ -119,7 +119,7 @@ def test_shapes_and_order_are_checked():
         increments.times(np.zeros(4))
     with pytest.raises(ValueError, match="times"):
         increments.coordinates(np.zeros(4))
-    with pytest.raises(ValueError, match="rise"):
+    with pytest.raises(ValueError, match="increasing"):
         increments.coordinates(np.array([0, 0.5, 0.4, 0.6, 1.0]))
 
 
@@ -138,7 +138,7 @@ def test_increments_that_float64_has_lost_count_as_the_least(gap):
     assert np.isfinite(increments.logits(times)).all()
     for wrong in (-1e-18, -0.1, np.nan):
         times[1] = wrong
-        with pytest.raises(ValueError, match="times that rise"):
+        with pytest.raises(ValueError, match="increasing times"):
             increments.coordinates(times)
 
 

@@ -165,8 +165,8 @@ def test_profiles_refuse_what_is_none():
     t = np.linspace(0, 1, 5)
     for nodes, values, word in (
         ([t[:2]], [t[:2]], "three"),
-        ([t], [t[:4]], "rising"),
-        ([t[::-1]], [t], "rising"),
+        ([t], [t[:4]], "increasing"),
+        ([t[::-1]], [t], "increasing"),
         ([t], [np.where(t > 0.5, np.nan, t)], "finite"),
         ([t, t], [t], "as many"),
     ):

@@ -491,7 +491,7 @@ def test_progress_is_told():
     told = []
     settings = {"noise": white(), "steps": 20, "ensembles": 2}
     frame_time_posterior(model(), clip(uneven()), frames=[3], **settings, progress=lambda *each: told.append(each))
-    assert {what for what, _, _ in told} == {"pictures", "steps"}
+    assert {what for what, _, _ in told} == {"images", "steps"}
     assert all(0 < done <= total for _, done, total in told)
 
 

@@ -48,7 +48,7 @@ class ProfileCurves:
         for k, (times, height) in enumerate(zip(nodes, values, strict=True)):
             times, height = np.asarray(times, np.float64), np.asarray(height, np.float64)
             if times.shape != height.shape or times.ndim != 1 or not (np.diff(times) > 0).all():
-                raise invalid(f"nodes[{k}]", expected=f"{height.size} rising times", got=f"shape {times.shape}")
+                raise invalid(f"nodes[{k}]", expected=f"{height.size} increasing times", got=f"shape {times.shape}")
             if not np.isfinite(height).all():
                 raise invalid(f"values[{k}]", expected="finite log-likelihoods", got=height[~np.isfinite(height)][0])
             table[:, k, : count[k]] = times, height, np.gradient(height, times, edge_order=2)
@@ -97,12 +97,12 @@ class ProfileCurves:
 
 
 @inline
-def piece_of(value, rising, last):
-    """Index of the interval of increasing knots `rising` that contains a value; the first and last are unbounded."""
+def piece_of(value, knots, last):
+    """Index of the interval of increasing `knots` that contains a value; the first and last are unbounded."""
     low, high = 0, last
     while high - low > 1:
         middle = (low + high) // 2
-        if rising[middle] <= value:
+        if knots[middle] <= value:
             low = middle
         else:
             high = middle

@@ -66,7 +66,7 @@ class Residuals:
                 f"uint8 (frames, {model.size[0]}, {model.size[1]}, 3), as the model was fitted to, or 4 with alpha"
             )
             fits = frames.ndim == 4 and frames.shape[1:3] == model.size
-            cure = "Make it 8-bit colour." if fits else "Read it at that size."
+            cure = "Convert it to 8-bit color." if fits else "Read it at that size."
             raise invalid("video", expected=expected, got=f"{frames.dtype} {frames.shape}", cure=cure)
         if frames.shape[3] == 4:
             frames = np.stack([composited(frame, np.zeros(3, np.float32)) for frame in frames])

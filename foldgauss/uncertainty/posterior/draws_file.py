@@ -82,7 +82,7 @@ class DrawsFile:
             raise
 
     def raise_system_error(self, error: Exception) -> None:
-        """Raise an OSError with the error number, which HDF5 hides in a long text or a RuntimeError, if there is one."""
+        """Raise an OSError if the error has a system error number, also within the long text of an HDF5 error."""
         match = re.search(r"errno = (\d+)", str(error))
         number = int(match[1]) if match else getattr(error, "errno", None)
         if number is None:

@@ -41,7 +41,7 @@ from foldgauss.video.models.video_model import VideoModel
 
 #: Convergence: at least this many autocorrelation times kept, and split rank R-hat below this.
 TIMES_TAU, R_HAT = 50.0, 1.01
-#: Convergence: means of draws differ from the exact ones by at most APART standard deviations and ERRORS standard errors.
+#: Convergence: means differ from the exact ones by at most APART standard deviations plus ERRORS standard errors.
 APART, ERRORS = 0.1, 5.0
 #: Burn-in, in autocorrelation times.
 BURN_IN = 10.0
@@ -106,7 +106,7 @@ def frame_time_posterior(
     with lock_draws(settings.backend), _progress_function(progress) as show:
         if log_prob is None:
             if profiles is None:
-                profiles = likelihood_profiles(model, video, noise=noise, on_render=_labeled(show, "pictures"))
+                profiles = likelihood_profiles(model, video, noise=noise, on_render=_labeled(show, "images"))
             profiles = condition_on_level(level, model, video, profiles, frames, _labeled(show, "frames"))
             log_prob = frame_time_log_prob(model, frames=frames, concentration=concentration, profiles=profiles)
         return _Run(log_prob, settings).sample_until_converged(int(steps) // int(thin_by), show, profiles)
