@@ -15,8 +15,8 @@ from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import rendered_log_likelihood
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
+from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import evaluate
-from foldgauss.video.models.shots import is_cut
 from foldgauss.video.models.video_model import VideoModel
 
 #: An increment is compared with the median of those up to this many intervals before and after it.
@@ -86,7 +86,7 @@ def irregularities(
     """Intervals below `duplicate` or above `dropped` times the local median in at least `probability` of the draws.
 
     The local median is that of the `reach` intervals before and after within the shot, in the same draw, so a speed
-    that changes smoothly is regular. Cuts (`shots.is_cut`) are not reported and limit the neighborhood. Intervals
+    that changes smoothly is regular. Cuts (`frame_times.is_cut`) are not reported and limit the neighborhood. Intervals
     between two held frames and those of frames that are not identified (`FrameTimePosterior.identified`) are not
     assessed.
 
@@ -186,7 +186,7 @@ def _thin_draws(posterior: FrameTimePosterior) -> Float64[np.ndarray, "draws num
 
 
 def find_cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, " intervals"]:
-    """Intervals that are cuts, by the posterior means (`foldgauss.video.models.shots.is_cut`)."""
+    """Intervals that are cuts, by the posterior means (`foldgauss.video.models.frame_times.is_cut`)."""
     return np.asarray(is_cut(posterior.mean().astype(np.float32)))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import invalid, is_integer
-from foldgauss._runtime.file_lock import Held, alone
+from foldgauss._runtime.file_lock import LockHeld, hold_lock
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 #: Disk space that an HDF5 file needs beside its draws, since its last chunks are only partly used.
@@ -100,8 +100,8 @@ def lock_draws(backend: Path | None) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if backend is not None:
             try:
-                stack.enter_context(alone(_running_path(backend, ".lock")))
-            except Held as error:
+                stack.enter_context(hold_lock(_running_path(backend, ".lock")))
+            except LockHeld as error:
                 raise BlockingIOError(
                     f"backend: expected a file that no other run is writing, got {str(backend)!r}, which one is. "
                     "Wait for that one, or choose another file."

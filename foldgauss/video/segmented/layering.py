@@ -78,7 +78,7 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
 
     segments = []
     for number, segment in enumerate(lead.segments):
-        facts = {name: getattr(made(number), name) for name in ("num_gaussians", "degree", "num_floats")}
+        facts = {name: getattr(made(number), name) for name in ("num_gaussians", "degree", "num_parameters")}
         segments.append(dataclasses.replace(segment, **facts, load=functools.partial(made, number)))
     return SegmentedVideo(segments)
 
