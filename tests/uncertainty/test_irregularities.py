@@ -184,5 +184,5 @@ def test_evidence_tells_what_was_warned_of():
     noted = dataclasses.replace(posterior.profiles, notes=("It is late.",), level="colors")
     text = summary(dataclasses.replace(posterior, profiles=noted))
     assert "**Note:** It is late." in text
-    assert "their colours are integrated out" in text
+    assert "their colors are integrated out" in text
     assert len(repr(posterior)) < 200

@@ -170,7 +170,7 @@ def test_conjugate_gradients_solve_and_hold_still_at_zero():
 
 def test_equations_that_are_not_solved_are_told():
     rhs = np.ones((4, 1))
-    with pytest.raises(ValueError, match="prior_scale: expected colours solve_conjugate_gradient to 1e-05"):
+    with pytest.raises(ValueError, match="prior_scale: expected colors solved to 1e-05"):
         solve_conjugate_gradient(np.zeros_like, lambda r: r, rhs, np.zeros_like(rhs), 1e-5)
 
 

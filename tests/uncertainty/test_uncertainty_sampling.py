@@ -392,7 +392,7 @@ def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, profil
     both = [
         ({"model": None}, "model"),
         ({"model": "x"}, "model"),
-        ({"model": EditedVideo((Layer(model()),))}, "model.*EditedVideo.*Take the model"),
+        ({"model": EditedVideo((Layer(model()),))}, "model.*EditedVideo.*Give the model"),
         ({"video": frames[:2]}, "video: expected at least 3 frames"),
         ({"video": None}, "video"),
         ({"frames": [9]}, "frames"),

@@ -214,7 +214,7 @@ class _SimulatedResiduals:
     """Stands in for `Residuals`, with cached images and frames that are not rounded to 8 bits."""
 
     def __init__(self, cache: _RenderCache, frames: Float32[np.ndarray, "num_frames 3 height width"]):
-        self.frames, self.model, self._cache = frames, cache.residuals.model, cache
+        self.frames, self.model, self.render_at = frames, cache.residuals.model, cache
 
     def squared_errors(self, image: np.ndarray, which: Iterable[int]) -> np.ndarray:
         misses = (self.frames[np.asarray(which)] - image).reshape(len(which), -1)
