@@ -146,7 +146,7 @@ def test_without_colours_less_is_known(work, done, tmp_path, no_pictures):
     target = tmp_path / "results"
     assert run(*arguments(work, target, *SHORT, "--level", "colors")) == 0
     told = (target / "summary.md").read_text()
-    assert "their colours are integrated out" in told
+    assert "their colors are integrated out" in told
     assert "their colours" not in (done / "summary.md").read_text()
     wider = [float(one["exact_std"]) / float(other["exact_std"]) for one, other in zip(
         table_of(target)[5:9], table_of(done)[5:9], strict=True)]  # fmt: skip

@@ -401,7 +401,7 @@ def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, profil
         ({"noise": "loud"}, "noise"),
         ({"concentration": "a"}, "concentration"),
         ({"concentration": -1}, "concentration"),
-        ({"profiles": profiles}, "video: expected the 4 frames that were of `profiles`"),
+        ({"profiles": profiles}, "video: expected the 4 frames of `profiles`"),
         ({"profiles": profiles, "video": None, "noise": white()}, "noise"),
         ({"profiles": profiles, "video": None, "level": "colors"}, "video"),
     ]
