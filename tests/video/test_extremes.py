@@ -8,7 +8,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.io import load_video_model, save_compact, save_video_model
-from foldgauss.uncertainty import evidence
+from foldgauss.uncertainty import likelihood_profiles
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -200,7 +200,7 @@ def test_one_frame_in_a_compact_file(tmp_path, still, passes):
 def test_one_frame_tells_no_times(still):
     frames, model = still
     with pytest.raises(ValueError, match="at least 3 frames"):
-        evidence(model, frames)
+        likelihood_profiles(model, frames)
 
 
 # -------------------------------------------------------------------------------------------- alternating
