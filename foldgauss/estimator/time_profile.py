@@ -16,7 +16,7 @@ __all__ = ["Ascent", "Profile", "Space", "maximise"]
 _LOG_2PI = 1.8378770664093453
 _ARMIJO = 1e-4  # the usual sufficient share of the promised increase
 _SHORTEST = 2.0**-20  # below this share of a step the value no longer changes
-_LONGEST = 0.5  # a step moves time_loc by half a time_scale at most, or time_scale by exp(0.5)
+_MAX_STEP = 0.5  # a step moves time_loc by half a time_scale at most, or time_scale by exp(0.5)
 
 
 class Space(NamedTuple):
@@ -116,7 +116,7 @@ def maximise(profile: Profile, time_loc, time_scale, max_steps: int):
 def _step(state: Ascent, evaluate) -> Ascent:
     """One trial: accepted and learned from if the value rises enough, else a shorter share is left to try."""
     direction = jnp.matmul(state.inverse_hessian, state.gradient)
-    direction = direction * jnp.minimum(1, _LONGEST / jnp.abs(direction).max())
+    direction = direction * jnp.minimum(1, _MAX_STEP / jnp.abs(direction).max())
     move = state.share * direction
     value, gradient = evaluate(state.theta + move)
     rises = value >= state.value + _ARMIJO * (move * state.gradient).sum()
