@@ -21,7 +21,7 @@ from benchmarks.compress import kept
 from foldgauss.io import read_video, save_video_model
 from foldgauss.io.datasets import sample_clip
 from foldgauss.video import Economy, FitConfig, VideoModel, evaluate, fit
-from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
 SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (1, 3, 7, 0)
@@ -32,7 +32,7 @@ FIRST, RATIO = 12_000, 2**0.125
 def pruned(model: VideoModel, frames: np.ndarray, psnr: float) -> VideoModel:
     """Without as many of the Gaussians that add least as leave the mean PSNR at `psnr`."""
     lit, everywhere = Contributions(model), np.ones(model.size, np.float32)
-    order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
+    order = np.argsort(sum_contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     least, most = 0, model.num_gaussians - 1
     while most - least > max(model.num_gaussians // 200, 1):
         middle = (least + most) // 2

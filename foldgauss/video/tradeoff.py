@@ -23,10 +23,10 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 #: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
 #: with that many passes over the clip, at a loss of at most `MAX_LOSS_DB`.
 FLOAT32, FLOAT16 = "float32", "float16"
-PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, mended": 4})
+PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, finetuned": 4})
 MAX_LOSS_DB = 0.2
 #: What compressing takes, in steps of a fit per frame: about what was measured.
-_COMPRESSING = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, mended": 18.0}
+_COMPRESSING = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, finetuned": 18.0}
 #: Fewer steps show nothing of what a setting is worth.
 LEAST_STEPS = 200
 #: A point of the front is better than all cheaper ones by more than this, in dB: what is told of a PSNR.

@@ -26,7 +26,7 @@ from foldgauss.io.models.model_file import load_model
 from foldgauss.io.models.video_model import read_origin
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
-from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantize
+from foldgauss.video.compression.quantize import Rule, column_names, compute_columns, is_integral, quantize
 from foldgauss.video.editing.chain import edit
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
@@ -333,10 +333,10 @@ def _quantised() -> tuple:
         (tiny_model(16, 3, plain=False), (1, 1, 1)),
         (tiny_model(4, 0, frames=1), (1, 0, 1)),
     ):
-        described = describe(model)
-        names = column_names(model.degree, described.facts.shared)
-        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_whole(name)}
-        described = dataclasses.replace(described, facts=dataclasses.replace(described.facts, cells=cells))
+        described = compute_columns(model)
+        names = column_names(model.degree, described.info.shared)
+        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_integral(name)}
+        described = dataclasses.replace(described, info=dataclasses.replace(described.info, cells=cells))
         found.append(quantize(described, np.arange(model.num_gaussians, dtype=np.int32) % 4, rules))
     return tuple(found)
 

@@ -11,7 +11,7 @@ from scenes_of_motion import SIZE, cut, disc, noise, still
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
-from foldgauss.video.compression.finetune import refitted
+from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook, averaged, shared
 from foldgauss.video.fitting.growth import Growth
@@ -61,7 +61,7 @@ def weights(model) -> np.ndarray:
     lit = Contributions(model)
     out = np.zeros((model.num_frames, model.num_gaussians))
     for k in range(model.num_frames):
-        light = lit.frame(k)
+        light = lit.at_frame(k)
         out[k, light.alive] = light.total
     return out
 
@@ -487,7 +487,7 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
 
 def test_refitting_keeps_what_a_gaussian_is():
     frames, model, _, _ = fitted("line")
-    again = refitted(model, lambda k, _: _target(frames)(k), 2)
+    again = finetune_model(model, lambda k, _: _target(frames)(k), 2)
     np.testing.assert_array_equal(again.splats.static, model.splats.static)
     assert (again.splats.degrees <= model.splats.degrees).all()
     assert evaluate(again, frames).mean_psnr > 45

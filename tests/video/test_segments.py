@@ -314,7 +314,7 @@ def test_played_through_each_segment_is_loaded_once(way):
     assert loaded == []
     playback = VideoRenderer(clip)
     for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
-        assert len(playback._stage._ready) <= MAX_PREPARED
+        assert len(playback._prepared._ready) <= MAX_PREPARED
     assert loaded == [0, 1, 2, 3][::way]
     assert not alive()  # a stage needs no model
 

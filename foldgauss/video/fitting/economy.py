@@ -1,11 +1,13 @@
 """`Economy`: the settings of pruning, and the steps of a fit after which it prunes."""
 
 import dataclasses
+from dataclasses import field
 
 import numpy as np
 from jaxtyping import Int
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.settings import check_settings, setting
 
 #: A round of pruning costs as much as two passes over the frames: at most one in so many passes of the plan.
 MIN_PASSES_PER_ROUND = 5
@@ -27,27 +29,26 @@ class Economy:
     Raises ValueError for numbers out of range.
     """
 
-    psnr: float | None = None
-    bits: float = 8.0
-    rounds: int = 8
-    first_fraction: float = 0.15
-    last_fraction: float = 0.88
-    most_dropped: float = 0.3
-    grows: bool = True
+    psnr: float | None = field(
+        default=None,
+        metadata=setting(
+            "Fit the smallest model whose mean PSNR is this, in dB; takes longer",
+            bounds="(0, 100]",
+            option="--smallest-at-psnr",
+            group="model",
+        ),
+    )
+    bits: float = field(default=8.0, metadata=setting("Bits that a parameter must save", bounds="(0, inf)"))
+    rounds: int = field(default=8, metadata=setting("Rounds of pruning", least=1))
+    first_fraction: float = field(default=0.15, metadata=setting("First round, fraction of the plan", bounds="(0, 1)"))
+    last_fraction: float = field(default=0.88, metadata=setting("Last round, fraction of the plan", bounds="(0, 1)"))
+    most_dropped: float = field(
+        default=0.3, metadata=setting("Largest fraction of the Gaussians that a round prunes", bounds="(0, 1]")
+    )
+    grows: bool = field(default=True, metadata=setting("Gaussians are also born"))
 
     def __post_init__(self) -> None:
-        bounds = {"bits": "(0, inf)", "first_fraction": "(0, 1)", "last_fraction": "(0, 1)", "most_dropped": "(0, 1]"}
-        if self.psnr is not None:
-            bounds["psnr"] = "(0, 100]"
-        for name, interval in bounds.items():
-            if not is_within(getattr(self, name), interval):
-                raise invalid(f"economy.{name}", expected=f"a number in {interval}", got=repr(getattr(self, name)))
-            object.__setattr__(self, name, float(getattr(self, name)))
-        if not is_integer(self.rounds, 1):
-            raise invalid("economy.rounds", expected="a whole number >= 1", got=repr(self.rounds))
-        object.__setattr__(self, "rounds", int(self.rounds))
-        if not isinstance(self.grows, bool):
-            raise invalid("economy.grows", expected="True or False", got=repr(self.grows))
+        check_settings(self, "economy.")
         if self.first_fraction > self.last_fraction:
             got = f"{self.first_fraction:g} and {self.last_fraction:g}"
             raise invalid("economy.first_fraction, last_fraction", expected="in this order", got=got)
