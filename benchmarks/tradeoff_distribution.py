@@ -202,7 +202,7 @@ def main(arguments: list[str] | None = None) -> None:
     made.add_argument("--components", type=_common.whole, default=64, help="[64]")
     made.add_argument("--rounds", type=_common.whole, default=7, help="[7]")
     options = _common.parse(made, arguments)
-    facts, figures = _common.machine(), {}
+    facts, figures = _common.describe_machine(), {}
     quadrature(options.rounds, figures)
     precision(options.points, options.rounds, figures)
     e_step(options.points, options.components, options.rounds, figures)
