@@ -207,7 +207,9 @@ def main(arguments: list[str] | None = None) -> None:
             figures[name.rpartition(" ")[0]] = figures[name]
     if not options.skip_bending:
         figures |= _bends()
-    _common.finish(options.json, figures, _common.describe_machine(), points=options.points, components=options.components)
+    _common.finish(
+        options.json, figures, _common.describe_machine(), points=options.points, components=options.components
+    )
 
 
 if __name__ == "__main__":

@@ -95,7 +95,9 @@ def long(options) -> None:
     console.print(table)
     figures |= _long.progress(ran["fit"].lines)
     told = [{"at": at} | line for at, line in ran["fit"].lines]
-    _common.finish(options.json, figures, _common.describe_machine(), lines=told, size=options.size, frames=options.frames)
+    _common.finish(
+        options.json, figures, _common.describe_machine(), lines=told, size=options.size, frames=options.frames
+    )
 
 
 def soak(options) -> None:
