@@ -102,7 +102,7 @@ def test_gradients_that_run_away_leave_the_last_good_mixture():
     """Steps far too long: what is returned has a finite likelihood nevertheless."""
     x = _two_parabolas()
     for rate in (3.0, 30.0):
-        result = fit_gradient(_start(), x, steps=20, optimiser=optax.sgd(rate))
+        result = fit_gradient(_start(), x, steps=20, optimizer=optax.sgd(rate))
         assert np.isfinite(result.mixture.log_prob(x).mean())
         assert np.isfinite(result.mixture.components.time_scale).all()
 
