@@ -107,7 +107,7 @@ class Fit(eqx.Module):
 
     @property
     def degrees_of_freedom(self) -> Float[Array, ""]:
-        """Sum of weights less the coefficients per coordinate, `n - degree - 1`; errors are NaN unless it is positive."""
+        """Sum of weights less the coefficients per coordinate, `n - degree - 1`; errors need it positive."""
         return self.num_points - (self.degree + 1)
 
     @property
@@ -263,7 +263,7 @@ def _fit(plan: _Plan, weights: Float[Array, " n"], used: Int[Array, ""]) -> Fit:
     return jax.tree.map(lambda leaf: _nan_where(failed, leaf), result)
 
 
-def _prepared(x, weights, degree: int) -> _Data:
+def _prepare_data(x, weights, degree: int) -> _Data:
     missing = max(degree + 1 - x.shape[0], 0)  # a QR needs as many rows as columns; padding has no weight
     x, weights = jnp.pad(x, ((0, missing), (0, 0))), jnp.pad(weights, (0, missing))
     present = weights > 0

@@ -17,8 +17,8 @@ __all__ = ["MixtureChoice", "select_mixture"]
 
 
 class MixtureChoice(NamedTuple):
-    """The estimator with the smallest criterion, fitted to all points; the criterion, (components, degrees), inf where a
-    fit failed; and the values along these axes."""
+    """The estimator with the smallest criterion, fitted to all points; the criterion, (components, degrees), inf for a
+    failed fit; and the values along these axes."""
 
     estimator: FoldedGaussianMixture
     scores: Float[np.ndarray, "components degrees"]
