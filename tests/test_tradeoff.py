@@ -333,7 +333,7 @@ def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
 
 def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypatch):
     """`fit` finds it anew each time; so it is in each fit's seconds, though it was found once."""
-    found, given, steps, of = [], [], command.fit_steps, Motion.of
+    found, given, steps, of = [], [], command.fit_steps, Motion.from_frames
 
     def slow(frames):
         found.append(len(frames))
@@ -344,7 +344,7 @@ def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypat
         given.extend([known.get("motion")] if config.follow_motion else [])
         return steps(frames, config, **known)
 
-    monkeypatch.setattr(Motion, "of", slow)
+    monkeypatch.setattr(Motion, "from_frames", slow)
     monkeypatch.setattr(command, "fit_steps", watched)
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing", *QUICK) == 0
     assert found == [FRAMES]

@@ -14,7 +14,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.economy import Economy
-from foldgauss.video.fitting.schedule import levels
+from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.video_model import VideoModel
@@ -184,7 +184,8 @@ def _why_skipped(point: Point, base: FitConfig, num_frames: int, size: tuple[int
     if point.reuses_base:
         return ""
     fractions = {"quarter_fraction": base.quarter_fraction, "half_fraction": base.half_fraction}
-    same = dataclasses.replace(point.config, **fractions) == base and levels(point.config, size) == levels(base, size)
+    same = dataclasses.replace(point.config, **fractions) == base
+    same = same and plan_levels(point.config, size) == plan_levels(base, size)
     return f"it changes nothing at {size[0]}x{size[1]}" if same else ""
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from foldgauss.render import cpu
-from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import UNIT_TIME, LearningRates
+from foldgauss.video.fitting.state import FitState, update_rows
 from foldgauss.video.models.conditioning import apply_scale_cutoff, backpropagate, condition, update_windows
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.row_layout import columns, unpack
@@ -44,10 +44,9 @@ def finetune_model(
     rates, own = np.zeros(rows.shape[1], np.float32), LearningRates()
     for name, place in columns(model.degree).items():
         rates[place] = getattr(own, name) if free is None or name in free else 0.0
-    first, second, grad = np.zeros_like(rows), np.zeros_like(rows), np.zeros_like(rows)
-    kinds = find_kinds(rows, model.degree)  # absent parameters stay absent
-    codebook, colors = Codebook.of(shared, 3), columns(model.degree)["color_dc"]  # shared colours learn together
-    counts, times = np.zeros(len(rows), np.int32), np.asarray(model.frame_times.times())
+    kinds, codebook = find_kinds(rows, model.degree), Codebook.create(shared, 3)
+    state = FitState.create(rows, kinds, model.frame_times.logits, colors=codebook)
+    grad, times = np.zeros_like(rows), np.asarray(model.frame_times.times())
     steps = passes * model.num_frames
     for step in range(steps):
         if step % model.num_frames == 0:
@@ -63,8 +62,7 @@ def finetune_model(
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
         backpropagate(rows, done, cpu.backward(trace, by_image)[:4], spec, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
-        codebook.step(rows[:, colors], grad[:, colors], done.alive, rate * rates[colors])
-        sparse_adam(rows, grad, first, second, counts, done.alive, rates * rate, kinds=kinds, unit_time=UNIT_TIME)
+        update_rows(state, grad, done.alive, rates * rate, degree=model.degree, unit_time=UNIT_TIME)
         if free is None:
             update_windows(rows, done.alive, window)
             if model.scale_cutoff > 0:
