@@ -3,11 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.settings import check_settings, setting
 from foldgauss.render.camera import FIELD_OF_VIEW
 
 #: One unit of the published geometry in ours: there the image's half width is tan(FIELD_OF_VIEW / 2), here the longer
@@ -40,39 +42,37 @@ class Growth:
     published constants. Raises ValueError for values out of range.
     """
 
-    from_step: int = 500  #: 3DGS
-    until_step: int = 15_000  #: 3DGS
-    every: int = 100  #: 3DGS
-    screen_gradient: float = 2e-4  #: 3DGS
-    #: VeGaS; its value is not in the paper. That of the screen gradient is the plainest reading of "by either". Few
-    #: Gaussians then pass by time alone: the median time gradient is a quarter of the median screen gradient (Bunny,
-    #: 80x160).
-    time_gradient: float = 2e-4
-    clone_below: float = 0.01 * EXTENT  #: the larger standard deviation; 3DGS
-    shrinking: float = 1.6  #: halves of a split are smaller by this; 3DGS
-    prune_opacity: float = 0.01  #: VeGaS; 3DGS has 0.005
-    big_from: int = 3000  #: after this step the big are pruned, too: 3DGS
-    #: In pixels, 3 standard deviations at a Gaussian's own time, where it is largest: 3DGS.
-    prune_radius: float = 20.0
-    prune_scale: float = 0.1 * EXTENT  #: the larger standard deviation; 3DGS
-    reset_every: int = 3000  #: 3DGS
-    reset_opacity: float = 0.01  #: 3DGS
+    from_step: int = field(default=500, metadata=setting("First step of densification"))
+    until_step: int = field(default=15_000, metadata=setting("Last step of densification"))
+    every: int = field(default=100, metadata=setting("Steps between densifications", least=1))
+    screen_gradient: float = field(default=2e-4, metadata=setting("Screen gradient that densifies", bounds="(0, inf)"))
+    time_gradient: float = field(
+        default=2e-4,
+        metadata=setting(
+            "Time gradient that densifies",
+            "The paper does not give it; that of the screen gradient is the plainest reading of 'by either'. Few "
+            "Gaussians then pass by time alone: their median time gradient is a quarter of their screen gradient.",
+            bounds="(0, inf)",
+        ),
+    )
+    clone_below: float = field(
+        default=0.01 * EXTENT, metadata=setting("Larger standard deviation up to which to clone", bounds="(0, inf)")
+    )
+    shrinking: float = field(default=1.6, metadata=setting("Factor by which halves are smaller", bounds="[1, inf)"))
+    prune_opacity: float = field(default=0.01, metadata=setting("Least opacity; 3DGS has 0.005", bounds="(0, 1)"))
+    big_from: int = field(default=3000, metadata=setting("Step from which on big Gaussians are pruned"))
+    prune_radius: float = field(
+        default=20.0,
+        metadata=setting(
+            "Largest radius in pixels: 3 standard deviations at the Gaussian's own time", bounds="(0, inf)"
+        ),
+    )
+    prune_scale: float = field(default=0.1 * EXTENT, metadata=setting("Largest standard deviation", bounds="(0, inf)"))
+    reset_every: int = field(default=3000, metadata=setting("Steps between resets of opacity", least=1))
+    reset_opacity: float = field(default=0.01, metadata=setting("Opacity after a reset", bounds="(0, 1)"))
 
     def __post_init__(self) -> None:
-        for name, least in {"from_step": 0, "until_step": 0, "every": 1, "big_from": 0, "reset_every": 1}.items():
-            value = getattr(self, name)
-            if not is_integer(value, least):
-                raise invalid(f"growth.{name}", expected=f"a whole number >= {least}", got=repr(value))
-            object.__setattr__(self, name, int(value))
-        ranges = dict.fromkeys(
-            ("screen_gradient", "time_gradient", "clone_below", "prune_radius", "prune_scale"), "(0, inf)"
-        )
-        ranges |= {"shrinking": "[1, inf)", "prune_opacity": "(0, 1)", "reset_opacity": "(0, 1)"}
-        for name, bounds in ranges.items():
-            value = getattr(self, name)
-            if not is_within(value, bounds):
-                raise invalid(f"growth.{name}", expected=f"a number in {bounds}", got=repr(value))
-            object.__setattr__(self, name, float(value))
+        check_settings(self, "growth.")
         if self.reset_opacity < self.prune_opacity:
             raise invalid(
                 "growth.reset_opacity",
