@@ -19,8 +19,8 @@ from pathlib import Path
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scores
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig, independent_frames
 
 SIZES = {"bunny": (160, 320), "bikes": None, "carphone": None}

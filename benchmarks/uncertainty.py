@@ -28,9 +28,8 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import load_video_model
+from foldgauss.io import load_video_model, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
