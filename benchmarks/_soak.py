@@ -15,8 +15,8 @@ from foldgauss.io.datasets import bunny
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video import FitConfig, evaluate
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.loop import fit_steps, to_model
-from foldgauss.video.fitting.pruning.economy import Economy
 
 #: Frames and size of the clip, Gaussians and steps of each short fit.
 FRAMES, SIZE, GAUSSIANS, STEPS = (0, 16), (80, 160), 3000, 240

@@ -22,7 +22,7 @@ FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 13), (7, 9, 5), 18
 
 def video():
     """Of its first segment nothing is noted."""
-    parts = [Segment.of(first, soft_model(seed=k, num_frames=LENGTHS[k])) for k, first in enumerate(FIRSTS)]
+    parts = [Segment.from_model(first, soft_model(seed=k, num_frames=LENGTHS[k])) for k, first in enumerate(FIRSTS)]
     noted = [dataclasses.replace(part, metadata={"mean_psnr": 31.5, "seed": 3}) for part in parts[1:]]
     return SegmentedVideo([parts[0], *noted])
 
@@ -140,7 +140,7 @@ def test_figures(here, work, tmp_path, capsys):
 def test_the_middle_is_not_taken_at_a_cut(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     parts = [(0, soft_model(num_frames=5)), (5, soft_model(seed=1, num_frames=5))]
-    save_video_model("cut.safetensors", SegmentedVideo.of(parts))
+    save_video_model("cut.safetensors", SegmentedVideo.from_models(parts))
     assert run("figure", "interpolation", "cut.safetensors") == 0
     assert "from frame 3 to 4" in told(capsys)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from foldgauss._runtime.file_lock import Held, alone
+from foldgauss._runtime.file_lock import LockHeld, hold_lock
 from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, output_error
 
 STALE_AGE = 3600.0
@@ -27,8 +27,8 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     file = path.with_name(f".{_shorten(path.name)}.lock")
     with ExitStack() as stack:
         try:
-            stack.enter_context(alone(file))
-        except Held as error:
+            stack.enter_context(hold_lock(file))
+        except LockHeld as error:
             raise OutputError(
                 f"path: expected an output that no other process is writing, got {str(path)!r}, which another "
                 f"{what} is writing. Wait for it to end, or choose another name."

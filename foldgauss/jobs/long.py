@@ -143,7 +143,7 @@ def _video_of(sources: Sequence[tuple[int, str]]) -> SegmentedVideo:
     segments = []
     for first, file in sources:
         load = partial(load_video_model, file)
-        segments.append(dataclasses.replace(Segment.of(first, load()), load=load))
+        segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
     return SegmentedVideo(segments)
 
 

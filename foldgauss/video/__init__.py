@@ -7,10 +7,10 @@ from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.fitting.config import FitConfig, LearningRates
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.fitting.per_frame_baseline import IndependentFrames, independent_frames
-from foldgauss.video.fitting.pruning.economy import Economy
 from foldgauss.video.models.density import density_image
 from foldgauss.video.models.frame_times import (
     FrameTimes,

@@ -13,8 +13,8 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.pruning.economy import Economy
-from foldgauss.video.fitting.pyramid import levels
+from foldgauss.video.fitting.economy import Economy
+from foldgauss.video.fitting.schedule import levels
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.video_model import VideoModel

@@ -23,7 +23,7 @@ from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, 
 
 MODEL = soft_model()
 #: The same as a clip in segments, of one segment.
-IN_ONE = SegmentedVideo.of([(0, MODEL)])
+IN_ONE = SegmentedVideo.from_models([(0, MODEL)])
 BOX, FRAME = (12, 10, 32, 30), 3
 THERE = f"[selections.it]\nbox = {list(BOX)}\nframe = {FRAME}\n"
 
@@ -362,7 +362,7 @@ def test_mistakes_in_segments_are_told_as_in_a_model(text):
 
 
 def test_what_only_the_models_of_segments_tell_has_its_line():
-    long = SegmentedVideo.of([(0, soft_model(num_frames=7)), (4, soft_model(seed=1, num_frames=7))])
+    long = SegmentedVideo.from_models([(0, soft_model(num_frames=7)), (4, soft_model(seed=1, num_frames=7))])
     still = THERE + "[[edits]]\ndo = 'move'\noffset = [0.1, 0]\n[[edits]]\ndo = 'freeze'\nat = 2\n"
     told = error(still, long)
     assert told.startswith(

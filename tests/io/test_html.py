@@ -23,9 +23,9 @@ from foldgauss.io.page import player_page
 from foldgauss.io.page.player_page import bundle_script, quantize_finely
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, edit, fit, layers
-from foldgauss.video.compression.quantize import dequantise
+from foldgauss.video.compression.quantize import dequantize
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import time_logits
 
 #: What the brush is made of.
 MODULES = ("gaussians", "selection", "timeline")
@@ -155,7 +155,7 @@ def test_gaussians_beyond_proportion_get_even_steps():
     thin = np.array(model.splats.log_scale)
     thin[5] = -40.0, -45.0
     model = eqx.tree_at(lambda m: m.splats.log_scale, model, thin)
-    again = dequantise(quantize_finely(model))
+    again = dequantize(quantize_finely(model))
     np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=0.02)
 
 
@@ -278,7 +278,7 @@ MODELS = {
     "floor, no path": lambda fitted: soft_model(floor=0.1, degree=0, options=RenderOptions()),
     "degree 4, round": lambda fitted: soft_model(degree=4, options=RenderOptions(support_radius=1.5)),
     "scale cutoff": lambda fitted: _with(soft_model(options=RenderOptions()), scale_cutoff=0.03),
-    "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(time_logits(7, (3,)))),
+    "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(make_time_logits(7, (3,)))),
     "tall": lambda fitted: soft_model(size=(64, 36), options=RenderOptions()),
     "one frame": lambda fitted: soft_model(num_frames=1, options=RenderOptions()),
 }
@@ -538,8 +538,8 @@ def segmented(**how):
     parts = [soft_model(seed=k, num_frames=num, options=RenderOptions(), **how) for k, num in enumerate(LENGTHS)]
     logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5]).astype(np.float32)
     parts[1] = _with(parts[1], frame_times=FrameTimes(logits))  # of its own, learned times
-    parts[3] = _with(parts[3], frame_times=FrameTimes(time_logits(4, (2,))))  # a cut within it
-    return SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    parts[3] = _with(parts[3], frame_times=FrameTimes(make_time_logits(4, (2,))))  # a cut within it
+    return SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
 
 
 def test_a_page_of_segments_has_a_model_of_each(tmp_path):
@@ -561,7 +561,7 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
 
 
 def test_segments_that_no_page_holds_are_told(monkeypatch):
-    late = SegmentedVideo.of([(0, soft_model()), (5, _late(soft_model()))])
+    late = SegmentedVideo.from_models([(0, soft_model()), (5, _late(soft_model()))])
     with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model holds"):
         html_page(late)
     assert late._repr_html_() is None
@@ -602,7 +602,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
 
 def test_few_segments_are_held_whatever_the_length(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
-    video = SegmentedVideo.of(parts)
+    video = SegmentedVideo.from_models(parts)
     page, play = opened(video, **SMALL), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
     page.page.evaluate("foldgauss.player.segments.most = 0")

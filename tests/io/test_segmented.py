@@ -28,7 +28,7 @@ from foldgauss.io.models.model_file import read_header
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 from foldgauss.video.tradeoff import halved
 
 FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
@@ -38,9 +38,9 @@ def ragged(model):
     """With kinds, shared colours and shapes: stored in another form than it has in memory."""
     splats, lasting = model.splats, np.arange(NUM) % 2 == 0
     leaves = {name: np.array(getattr(splats, name)) for name in ("time_loc_logit", "log_time_scale", "coefficients")}
-    leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, LASTING
+    leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, STATIC_LOG_TIME_SCALE
     leaves["coefficients"][:, 1:] = 0
-    leaves["opacity_logit"] = np.where(lasting, OPAQUE, np.asarray(splats.opacity_logit))
+    leaves["opacity_logit"] = np.where(lasting, OPAQUE_LOGIT, np.asarray(splats.opacity_logit))
     leaves["color_dc"] = np.asarray(splats.color_dc)[np.arange(NUM) % 3]
     return dataclasses.replace(model, splats=dataclasses.replace(splats, **leaves))
 
@@ -80,7 +80,16 @@ def test_each_segment_is_the_model_of_its_file_to_the_bit(work):
     for (first, file), segment in zip(sources(work), video.segments, strict=True):
         own = load_video_model(file)
         same(own, segment.model)
-        for name in ("num_frames", "num_gaussians", "degree", "num_floats", "size", "fps", "options", "compositing"):
+        for name in (
+            "num_frames",
+            "num_gaussians",
+            "degree",
+            "num_parameters",
+            "size",
+            "fps",
+            "options",
+            "compositing",
+        ):
             assert getattr(segment, name) == getattr(own, name), name
         assert (segment.first, dict(segment.metadata)) == (first, {"mean_psnr": 30.0 + first, "seed": first})
     assert read_metadata(work / "long.safetensors") == {"clip": "long.mp4"}
@@ -89,7 +98,7 @@ def test_each_segment_is_the_model_of_its_file_to_the_bit(work):
 
 def test_what_is_played_is_what_was_in_memory(work):
     video, kept = load_video_model(work / "long.safetensors"), [load_video_model(file) for _, file in sources(work)]
-    expected = SegmentedVideo.of(list(zip(FIRSTS, kept, strict=True)))
+    expected = SegmentedVideo.from_models(list(zip(FIRSTS, kept, strict=True)))
     times = np.linspace(0, 1, 41)
     np.testing.assert_array_equal(list(video.frames(times)), list(expected.frames(times)))
 
@@ -109,7 +118,7 @@ def test_saved_again_it_has_the_same_bytes(work, tmp_path):
     join_segments(tmp_path / "joined.safetensors", sources(work), metadata={"clip": "long.mp4"})
     assert (tmp_path / "joined.safetensors").read_bytes() == long
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again.safetensors", "joined.safetensors"]
-    in_memory = SegmentedVideo.of(list(zip(FIRSTS, models(), strict=True)))
+    in_memory = SegmentedVideo.from_models(list(zip(FIRSTS, models(), strict=True)))
     save_video_model(tmp_path / "made.safetensors", in_memory)
     for one, other in zip(load_video_model(tmp_path / "made.safetensors").segments, video.segments, strict=True):
         same(one.model, other.model)
@@ -375,7 +384,7 @@ def test_cut_off_anywhere(work, tmp_path):
 
 def test_vegas_files_are_one_for_each_segment(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
-    video = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     export(video, "ply", tmp_path / "out")
     names = [f"segment-{number:03d}.ply" for number in range(3)]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
@@ -395,7 +404,7 @@ def test_vegas_files_are_one_for_each_segment(tmp_path):
 
 def test_frames_go_out_as_they_are_played(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
-    video = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     t = 15 / 17
     export(video, "obj", tmp_path / "mesh", times=[t])
     mesh = read_pseudomesh(tmp_path / "mesh")

@@ -18,7 +18,7 @@ from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.fitting import finished
-from foldgauss.video.fitting.pruning.economy import Economy
+from foldgauss.video.fitting.economy import Economy
 
 NUM_FRAMES = 10
 

@@ -15,9 +15,9 @@ from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, RenderOptions, cpu
 from foldgauss.video import Clock, EditedVideo, FrameTimes, SelectedGaussians, Selection, VideoModel, edit, layers
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import time_logits
 
 MODEL = soft_model()
 TIMES = np.asarray(MODEL.frame_times.times())
@@ -371,9 +371,9 @@ def test_the_own_centre_is_where_most_of_it_is():
     mean, opacity = np.float32([[0, 0], [1, 2]]), np.float32([0.3, 0.9])
     flat = SelectedGaussians(np.arange(2), mean, factor, opacity, ones)
     for gaussians in (flat, flat.in_space()):
-        np.testing.assert_allclose(gaussians.centre[:2], [0.6, 1.2], rtol=1e-6)
+        np.testing.assert_allclose(gaussians.center[:2], [0.6, 1.2], rtol=1e-6)
     unseen = dataclasses.replace(flat, opacity=0 * opacity)
-    np.testing.assert_allclose(unseen.centre, [0.5, 1.0])
+    np.testing.assert_allclose(unseen.center, [0.5, 1.0])
 
 
 def test_what_is_left_stays_where_it_was():
@@ -391,7 +391,7 @@ def test_what_is_left_stays_where_it_was():
 
 def own_centre(video):
     found = []
-    edit(video).select(OBJECT).apply(lambda g, t: found.append(g.centre) or g).video().at(0.31)
+    edit(video).select(OBJECT).apply(lambda g, t: found.append(g.center) or g).video().at(0.31)
     return found[0]
 
 
@@ -477,7 +477,7 @@ def test_clocks_follow_one_another():
 
 def test_shots():
     """Between two shots the nearer one's frame is seen, by an object's own clock, too; and no leaves say that."""
-    model = dataclasses.replace(MODEL, frame_times=FrameTimes(time_logits(8, [4])))
+    model = dataclasses.replace(MODEL, frame_times=FrameTimes(make_time_logits(8, [4])))
     times = np.asarray(model.frame_times.times())
     assert times[4] - times[3] > 0.5
     late = edit(model).select(OBJECT).retime(shift=0.02).video()

@@ -43,7 +43,7 @@ def test_it_is_asked_as_a_model_is():
     video = edit(MODEL).select(OBJECT).scale(1.5).video()
     assert (video.num_frames, video.size, video.fps) == (MODEL.num_frames, MODEL.size, MODEL.fps)
     assert (video.options, video.compositing, video.num_gaussians) == (MODEL.options, "over", NUM)
-    assert video.num_floats == MODEL.num_floats
+    assert video.num_parameters == MODEL.num_parameters
     image = video.render(0.31, background=(0.2, 0.4, 0.6))
     assert image.shape == (*SIZE, 3)
     played = VideoRenderer(video, background=(0.2, 0.4, 0.6)).frame(0.31)
@@ -274,8 +274,8 @@ def test_a_folded_model_stays_one_on_disk(tmp_path):
 @pytest.mark.parametrize(
     ("make", "got"),
     [
-        (lambda e: e.apply(lambda g, t: g), "overlays: .* got Function"),
-        (lambda e: e.apply_triangles(lambda v, t: v), "overlays: .* got FaceFunction"),
+        (lambda e: e.apply(lambda g, t: g), "overlays: .* got GaussianFunction"),
+        (lambda e: e.apply_triangles(lambda v, t: v), "overlays: .* got TriangleFunction"),
         (lambda e: e.seen_from(lambda t: Camera.front(ASPECT)), "camera: .* got a function"),
     ],
 )

@@ -7,15 +7,15 @@ from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FrameTimes, VideoModel, edit, layers
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import time_logits
-from foldgauss.video.segmented.flatten import flattened
+from foldgauss.video.segmented.flatten import flatten_video
 
 
 def test_layers_become_one_model_of_the_same_pictures():
     front = edit(soft_model(degree=1, options=RenderOptions())).select(OBJECT).move((0.2, 0.1)).video()
     video = layers(front, soft_model(seed=3, num_frames=9, options=RenderOptions()))
-    flat = flattened(video)
+    flat = flatten_video(video)
     assert isinstance(flat, VideoModel)
     assert (flat.num_gaussians, flat.degree, flat.num_frames) == (2 * NUM, 3, 9)
     for t in (0.0, 0.31, 1.0):
@@ -24,14 +24,14 @@ def test_layers_become_one_model_of_the_same_pictures():
 
 def test_plain_models_stay_as_they_are():
     model = soft_model()
-    assert flattened(model) is model
-    assert flattened(layers(model)) is model
+    assert flatten_video(model) is model
+    assert flatten_video(layers(model)) is model
 
 
 def _with_a_cut():
     model = soft_model()
     shared = (model.size, model.fps, model.options, model.compositing)
-    return VideoModel(model.splats, FrameTimes(time_logits(7, (3,))), *shared)
+    return VideoModel(model.splats, FrameTimes(make_time_logits(7, (3,))), *shared)
 
 
 @pytest.mark.parametrize(
@@ -47,10 +47,10 @@ def _with_a_cut():
 )
 def test_what_no_plain_model_holds_is_refused(video):
     with pytest.raises(ValueError, match=r"model: expected .*foldgauss render"):
-        flattened(video())
+        flatten_video(video())
 
 
 def test_a_cut_of_the_leading_layer_stays():
-    flat = flattened(layers(soft_model(), _with_a_cut()))
+    flat = flatten_video(layers(soft_model(), _with_a_cut()))
     assert len(jax.tree.leaves(flat.frame_times)) == 1
     assert flat.num_frames == 7

@@ -10,7 +10,7 @@ from clips import moving_blobs
 
 from foldgauss.video import FitConfig, fit_steps
 from foldgauss.video.fitting.config import chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, Growth, Statistics, dim, grown
+from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, GradientStatistics, Growth, dim, grown
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.models.row_layout import columns
 
@@ -31,7 +31,7 @@ def gaussians(num=5, scale=SMALL, opacity_logit=1.0):
 
 def statistics(num=5, screen=(), time=(), steps=4):
     """Means over `steps` steps: for the named Gaussians as given, 0 for others."""
-    sums = Statistics.zeros(num)
+    sums = GradientStatistics.zeros(num)
     for part, means in ((sums.screen, screen), (sums.time, time)):
         for index, mean in dict(means).items():
             part[index] = steps * mean
@@ -92,7 +92,7 @@ def test_halves_are_drawn_from_their_parent():
 
 
 def test_the_mean_is_over_the_steps_in_which_it_was_seen():
-    sums = Statistics.zeros(3)
+    sums = GradientStatistics.zeros(3)
     by_time = np.float32([-4e-4, 4e-4, 0])
     sums.add([(np.array([0]), np.float32([3e-4]))], by_time)
     sums.add([(np.array([0, 2]), np.float32([1e-4, 5e-4])), (np.array([2]), np.float32([7e-4]))], -by_time)

@@ -10,7 +10,7 @@ from clips import moving_blobs
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import Economy, FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting.loop import start, to_model
-from foldgauss.video.fitting.pyramid import level_at, levels, shrunk, work_done
+from foldgauss.video.fitting.schedule import level_at, levels, shrunk, work_done
 
 fit_module = sys.modules["foldgauss.video.fitting.loop"]
 HALF = FitConfig(num_gaussians=800, steps=60, quarter_fraction=0.0, half_fraction=0.5)
@@ -48,7 +48,7 @@ def test_a_pixel_is_the_mean_of_those_it_stands_for():
 @pytest.fixture
 def small(monkeypatch):
     """Levels for clips of a few dozen pixels; only the fit's own steps."""
-    monkeypatch.setattr("foldgauss.video.fitting.pyramid.LEAST_SIDE", 8)
+    monkeypatch.setattr("foldgauss.video.fitting.schedule.LEAST_SIDE", 8)
     monkeypatch.setattr(fit_module, "_warm_up", lambda *given: None)  # spies would see it
 
 

@@ -31,7 +31,7 @@ from foldgauss.video import (
     influence,
     layers,
 )
-from foldgauss.video.segmented.segmented_video import READY
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED
 
 #: Three segments of a dozen frames, three of which are shared with each neighbour.
 FIRSTS, LENGTH, NUM_FRAMES = (0, 9, 18), 12, 30
@@ -61,7 +61,7 @@ def span_of_scene(first, seed):
 def scene():
     """The long scene in three segments, labels of each."""
     models, labels = zip(*(span_of_scene(first, seed) for seed, first in enumerate(FIRSTS)), strict=True)
-    return SegmentedVideo.of(list(zip(FIRSTS, models, strict=True))), labels
+    return SegmentedVideo.from_models(list(zip(FIRSTS, models, strict=True))), labels
 
 
 @functools.cache
@@ -85,7 +85,7 @@ def soft_video(lengths=(7, 9, 6), overlap=3, evenly=False):
     firsts = np.cumsum([0, *(length - overlap for length in lengths[:-1])]).tolist()
     models = [soft_model(seed=k, num_frames=length) for k, length in enumerate(lengths)]
     models = models if evenly else [learned(model, k) for k, model in enumerate(models)]
-    return SegmentedVideo.of(list(zip(firsts, models, strict=True)))
+    return SegmentedVideo.from_models(list(zip(firsts, models, strict=True)))
 
 
 def drawn(video):
@@ -131,7 +131,7 @@ def test_one_segment_is_edited_as_the_model_to_the_bit(name):
     model = soft_model()
     box = {"box": (12, 10, 32, 30), "frame": 3}
     wanted = CHAINS[name](edit(model).select(**box)).video()
-    got = CHAINS[name](edit(SegmentedVideo.of([(0, model)])).select(**box)).video()
+    got = CHAINS[name](edit(SegmentedVideo.from_models([(0, model)])).select(**box)).video()
     assert isinstance(got, SegmentedVideo)
     made = got.segments[0].model
     leaves, described = jax.tree.flatten(made)
@@ -139,7 +139,7 @@ def test_one_segment_is_edited_as_the_model_to_the_bit(name):
     assert described == wanted_described
     for one, other in zip(leaves, wanted_leaves, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert (got.num_gaussians, got.num_floats) == (wanted.num_gaussians, wanted.num_floats)
+    assert (got.num_gaussians, got.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
     np.testing.assert_array_equal(drawn(got), drawn(wanted))
 
 
@@ -161,7 +161,7 @@ QUESTIONS = {
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_one_segment_answers_as_the_model(name):
     wanted = edit(soft_model()).select(**QUESTIONS[name]).selection
-    got = edit(SegmentedVideo.of([(0, soft_model())])).select(**QUESTIONS[name]).selection
+    got = edit(SegmentedVideo.from_models([(0, soft_model())])).select(**QUESTIONS[name]).selection
     assert 0 < len(wanted) < NUM
     assert got == SegmentedSelection((wanted,))
 
@@ -196,7 +196,9 @@ def test_a_click_is_carried():
     model, label = scene()[0].segments[2].model, scene()[1][2]
     rows, columns = np.nonzero(square(scene()[0], DISC, 28))
     place = (float(columns.mean()), float(rows.mean()))
-    alone = edit(SegmentedVideo.of([(0, model)])).select(click=place, frame=10, tolerance=25).selection.parts[0]
+    alone = (
+        edit(SegmentedVideo.from_models([(0, model)])).select(click=place, frame=10, tolerance=25).selection.parts[0]
+    )
     assert alone.mask[label == DISC].mean() > 0.8
     carried = edit(scene()[0]).select(click=place, frame=28, tolerance=25).selection
     assert carried.parts[2] == alone
@@ -235,7 +237,7 @@ def test_nothing_is_carried_over_a_cut_or_without_follow():
     assert len(still.parts[0])
     assert not len(still.parts[1]) + len(still.parts[2])
     models = [segment.model for segment in scene()[0].segments]
-    cut = SegmentedVideo.of([(0, models[0]), (12, models[1]), (21, models[2])])
+    cut = SegmentedVideo.from_models([(0, models[0]), (12, models[1]), (21, models[2])])
     found = edit(cut).select(**box).selection
     assert found.parts[0] == disc().parts[0]
     assert not len(found.parts[1]) + len(found.parts[2])
@@ -333,7 +335,7 @@ def test_copies_are_in_all_segments():
 
 
 def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, curve="linear"):
-    """How far along an edit over a span is at a frame position, by the words of `span_of`."""
+    """How far along an edit over a span is at a frame position, by the words of `make_span`."""
     if times is not None:
         begin, end = times[0] * last, times[1] * last
     else:
@@ -531,7 +533,7 @@ def test_edits_act_in_their_order_and_a_selection_goes_along():
         wanted = chain(edit(model), part).video()
         for one, other in zip(jax.tree.leaves(segment.model), jax.tree.leaves(wanted), strict=True):
             np.testing.assert_array_equal(one, other)
-        assert (segment.num_gaussians, segment.num_floats) == (wanted.num_gaussians, wanted.num_floats)
+        assert (segment.num_gaussians, segment.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
     copied = edit(video).select(parts).multiply([(0.2, 0)])
     assert len(copied.selection) == len(parts)
     assert len(copied.select_begun(parts).selection) == 2 * len(parts)
@@ -544,7 +546,7 @@ def test_edits_act_in_their_order_and_a_selection_goes_along():
 def test_layers_of_segments_are_edited():
     """Of each segment's layers one is selected; what is found in one layer is carried in that layer."""
     models = [layers(*(span_of_scene(first, 10 * k + n)[0] for n in range(2))) for k, first in enumerate((0, 9))]
-    video = SegmentedVideo.of([(0, models[0]), (9, models[1])])
+    video = SegmentedVideo.from_models([(0, models[0]), (9, models[1])])
     found = edit(video).select(box=disc_box(2), frame=2, layer=1).selection
     for part, model in zip(found.parts, models, strict=True):
         front = model.layers[0].num_gaussians
@@ -580,7 +582,7 @@ def test_models_are_loaded_one_after_another_and_let_go():
         return load
 
     spans = [(k * 2, soft_model(seed=k, num_frames=4)) for k in range(9)]
-    segments = [dataclasses.replace(Segment.of(first, model), load=loading(model)) for first, model in spans]
+    segments = [dataclasses.replace(Segment.from_model(first, model), load=loading(model)) for first, model in spans]
     video = SegmentedVideo(segments)
     chain = edit(video).select(color=(0.5, 0.5, 0.5), tolerance=40).move((0.1, 0), frames=(0, 19))
     list(chain.video().frames())
@@ -589,7 +591,7 @@ def test_models_are_loaded_one_after_another_and_let_go():
     assert len(edit(video).select(box=(0, 0, 64, 40), frame=0, follow=False, times=(0.0, 0.5)).selection) > 0
     assert len(edit(video).select(frames=(0, 2)).selection) > 0
     assert len(alive) == before + 3  # once for each question: those that cannot answer are not loaded
-    assert most <= 2 * READY + 1  # those that are drawn, and those before them
+    assert most <= 2 * MAX_PREPARED + 1  # those that are drawn, and those before them
 
 
 def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
@@ -618,7 +620,7 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
         (lambda e: e.select(box=(0, 0, 9, 9), frame=16), r"frame: expected a frame's number in \[0, 16\), got 16"),
         (lambda e: e.select(box=(0, 0, 9, 9), frames=(3, 17)), "frames: expected .first, stop. with .* <= 16"),
         (lambda e: e.select(box=(70, 0, 90, 9), frame=6), "box: expected pixels of a 40x64 frame"),
-        (lambda e: e.select(mask=np.zeros((40, 64), bool), frame=6), "mask: expected a mask with something in it"),
+        (lambda e: e.select(mask=np.zeros((40, 64), bool), frame=6), "mask: expected a mask that is not empty"),
         (lambda e: e.select(click=(3, 3)), "frame: expected the frame that was clicked in"),
         (lambda e: e.select(times=(0.5, 2)), "times: expected .start, stop."),
         (lambda e: e.select(frame=3, color=(2, 0, 0)), "color: expected red, green and blue"),

@@ -25,7 +25,7 @@ def learned(model, seed):
 def ground(seed=0, evenly=False):
     models = [soft_model(seed=seed + k, num_frames=length) for k, length in enumerate(LENGTHS)]
     models = models if evenly else [learned(model, seed + k) for k, model in enumerate(models)]
-    return SegmentedVideo.of(list(zip(FIRSTS, models, strict=True)))
+    return SegmentedVideo.from_models(list(zip(FIRSTS, models, strict=True)))
 
 
 def brighter(gaussians, t):
@@ -106,7 +106,7 @@ def test_each_frame_has_the_others_frame_over_it(kind, evenly):
 def test_one_segment_is_layered_as_the_model_to_the_bit():
     over, model = front("spans"), soft_model()
     wanted = layers(over, model)
-    made = layers(over, SegmentedVideo.of([(0, model)]))
+    made = layers(over, SegmentedVideo.from_models([(0, model)]))
     assert not any(layer.clocks for layer in made.segments[0].model.layers)
     np.testing.assert_array_equal(list(made.frames()), list(wanted.frames()))
 
@@ -157,7 +157,7 @@ def test_models_are_loaded_when_they_are_drawn():
     loads = []
 
     def segment(first, model):
-        one = Segment.of(first, model)
+        one = Segment.from_model(first, model)
         return dataclasses.replace(one, load=lambda: loads.append(first) or model)
 
     video = ground()
@@ -176,7 +176,7 @@ def test_models_are_loaded_when_they_are_drawn():
         ),
         (lambda: layers(soft_model(), ground(), timeline=2), "timeline: expected the number of one of 2 videos, got 2"),
         (
-            lambda: layers(SegmentedVideo.of([(0, soft_model(num_frames=16))]), ground()),
+            lambda: layers(SegmentedVideo.from_models([(0, soft_model(num_frames=16))]), ground()),
             "videos: expected the segments of video 1, 0:7, 4:13, 10:16, got 0:16 in video 0",
         ),
         (lambda: layers(3, ground()), "video: expected a VideoModel or an EditedVideo, got int"),

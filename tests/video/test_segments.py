@@ -33,10 +33,10 @@ from foldgauss.video import (
     psnr,
     times_at,
 )
+from foldgauss.video.models.frame_times import is_cut, make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import is_cut, time_logits
-from foldgauss.video.segmented.flatten import flattened
-from foldgauss.video.segmented.segmented_video import READY
+from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED
 from foldgauss.video.tradeoff import frames_per_second
 
 #: Spans 0:7, 4:13 (three frames shared), 13:18 (a cut), 17:23 (one shared).
@@ -55,7 +55,7 @@ def models():
 
 
 def video():
-    return SegmentedVideo.of(list(zip(FIRSTS, models(), strict=True)))
+    return SegmentedVideo.from_models(list(zip(FIRSTS, models(), strict=True)))
 
 
 def image(one, t):
@@ -74,14 +74,18 @@ def at(clip, position):
 def test_one_segment_is_the_model_to_the_bit(kind):
     model = learned(soft_model())
     if kind == "cut":
-        model = dataclasses.replace(model, frame_times=FrameTimes(time_logits(7, [3])))
+        model = dataclasses.replace(model, frame_times=FrameTimes(make_time_logits(7, [3])))
     elif kind == "edited":
         model = edit(model).select(np.arange(NUM) < 12).move((0.1, 0.0), times=(0.2, 0.7)).video()
     elif kind == "alone":
         model = soft_model(num_frames=1)
-    clip = SegmentedVideo.of([(0, model)])
+    clip = SegmentedVideo.from_models([(0, model)])
     assert (clip.size, clip.fps, clip.num_frames) == (model.size, model.fps, model.num_frames)
-    assert (clip.num_gaussians, clip.degree, clip.num_floats) == (model.num_gaussians, model.degree, model.num_floats)
+    assert (clip.num_gaussians, clip.degree, clip.num_parameters) == (
+        model.num_gaussians,
+        model.degree,
+        model.num_parameters,
+    )
     np.testing.assert_array_equal(list(clip.frames()), list(model.frames()))
     green = {"size": (30, 48), "background": (0.0, 0.5, 0.0)}
     np.testing.assert_array_equal(list(clip.frames(**green)), list(model.frames(**green)))
@@ -120,8 +124,8 @@ def test_between_frames_it_goes_by_the_segments_own_times():
 
 
 def test_a_cut_within_a_segment_is_kept():
-    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(time_logits(7, [3])))
-    clip = SegmentedVideo.of([(0, soft_model(num_frames=5)), (5, model)])
+    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(make_time_logits(7, [3])))
+    clip = SegmentedVideo.from_models([(0, soft_model(num_frames=5)), (5, model)])
     for position, frame in ((7.4, 2), (7.6, 3)):
         np.testing.assert_array_equal(at(clip, position), image(model, model.frame_times.times()[frame]))
     assert [clip.frame_times.cut_after(k) for k in range(11)] == [k in (4, 7) for k in range(11)]
@@ -180,7 +184,7 @@ def test_three_are_seen_where_one_fade_meets_the_next():
         loaded.append(number)
         return parts[number]
 
-    segments = SegmentedVideo.of(list(zip((0, 3, 5), parts, strict=True))).segments
+    segments = SegmentedVideo.from_models(list(zip((0, 3, 5), parts, strict=True))).segments
     clip = SegmentedVideo([dataclasses.replace(s, load=partial(load, n)) for n, s in enumerate(segments)])
     seen = clip.weights(4.5)
     assert [n for n, _ in seen] == [0, 1, 2]
@@ -199,7 +203,7 @@ def test_two_segments_of_one_clip_show_no_seam():
     spans = plan_segments(14, [], length=9, overlap=4)
     assert spans == [(0, 9), (5, 14)]
     config = FitConfig(num_gaussians=80, steps=150, seed=0)
-    clip = SegmentedVideo.of([(a, fit(frames[a:b], config).model) for a, b in spans])
+    clip = SegmentedVideo.from_models([(a, fit(frames[a:b], config).model) for a, b in spans])
     quality = np.array([psnr(*pair) for pair in zip(frames, clip.frames(), strict=True)])
     assert quality.min() > 22
     assert quality[5:9].mean() >= np.delete(quality, range(5, 9)).mean() - 0.2
@@ -214,8 +218,8 @@ def test_what_is_given_for_one_time():
     for position, number in ((4, 0), (6, 1), (20, 3)):
         t = position / 22
         own = parts[number]
-        expected = own.stage(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
-        for found in (clip.at(t), VideoRenderer(clip).splats(t), VideoRenderer(clip).shown(t)):
+        expected = own.prepare(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
+        for found in (clip.at(t), VideoRenderer(clip).splats(t), VideoRenderer(clip).dominant_splats(t)):
             np.testing.assert_array_equal(found.mean, expected.mean)
             np.testing.assert_array_equal(found.opacity, expected.opacity)
     np.testing.assert_array_equal(clip.render(0.3), np.moveaxis(image(clip, 0.3), 0, -1))
@@ -227,7 +231,7 @@ def test_what_is_given_for_one_time():
 def test_other_constants_go_to_all_segments():
     options = RenderOptions(alpha_cutoff=0.2, support_radius=1.0)
     clip, parts = video().with_options(options), [model.with_options(options) for model in models()]
-    expected = SegmentedVideo.of(list(zip(FIRSTS, parts, strict=True)))
+    expected = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     assert clip.options == options
     np.testing.assert_array_equal(list(clip.frames()), list(expected.frames()))
     assert np.abs(at(clip, 3) - at(video(), 3)).max() > 0.01
@@ -240,7 +244,7 @@ def test_other_constants_go_to_all_segments():
 
 def long_clip(num_frames=10**7, length=1000):
     """Of segments that are never loaded."""
-    lead = Segment.of(0, soft_model())
+    lead = Segment.from_model(0, soft_model())
     spans = plan_segments(num_frames, [], length=length, overlap=10)
     return SegmentedVideo(
         [dataclasses.replace(lead, first=a, num_frames=b - a, load=lambda: pytest.fail("loaded")) for a, b in spans]
@@ -310,7 +314,7 @@ def test_played_through_each_segment_is_loaded_once(way):
     assert loaded == []
     playback = VideoRenderer(clip)
     for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
-        assert len(playback._stage._ready) <= READY
+        assert len(playback._prepared._ready) <= MAX_PREPARED
     assert loaded == [0, 1, 2, 3][::way]
     assert not alive()  # a stage needs no model
 
@@ -364,7 +368,7 @@ def test_scores_of_lazy_frames_are_those_of_an_array():
 
 
 def spans(*pairs):
-    lead = Segment.of(0, soft_model())
+    lead = Segment.from_model(0, soft_model())
     return [dataclasses.replace(lead, first=a, num_frames=b - a) for a, b in pairs]
 
 
@@ -391,13 +395,13 @@ def test_segments_that_do_not_go_together_are_refused():
     for name, value in (("size", (40, 80)), ("fps", 24.0), ("compositing", "sum"), ("options", RenderOptions())):
         other = dataclasses.replace(lead, **{name: value})
         with pytest.raises(ValueError, match=rf"^segments\[1\]\.{name}: expected .*first segment.*fit them alike"):
-            SegmentedVideo.of([(0, lead), (5, other)])
+            SegmentedVideo.from_models([(0, lead), (5, other)])
     for wrong, message in (
         ([(0, "a")], "^model: expected a VideoModel or an EditedVideo, got str"),
         ([(0, edit(lead))], r"got Edit\. End a chain"),
     ):
         with pytest.raises(ValueError, match=message):
-            SegmentedVideo.of(wrong)
+            SegmentedVideo.from_models(wrong)
     with pytest.raises(ValueError, match=r"^segments\[0\]: expected a Segment"):
         SegmentedVideo([lead])
 
@@ -406,7 +410,7 @@ def test_segments_that_do_not_go_together_are_refused():
     "call",
     [
         compress,
-        flattened,
+        flatten_video,
         lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
         lambda clip: Selection.all(clip),
         lambda clip: Screen(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
@@ -420,7 +424,7 @@ def test_what_takes_one_model_says_how_to_get_one(call):
 
 
 def test_a_model_of_other_frames_is_refused_when_it_comes():
-    lead = Segment.of(0, soft_model())
+    lead = Segment.from_model(0, soft_model())
     for other in (soft_model(num_frames=8), soft_model(size=(20, 32))):
         clip = SegmentedVideo([dataclasses.replace(lead, load=lambda other=other: other)])
         with pytest.raises(ValueError, match=r"^segment\.load\(\): expected a model of 7 frames of 40x64"):

@@ -92,7 +92,7 @@ from foldgauss.jobs.long import kept_seconds
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, running_psnr, to_model
-from foldgauss.video.fitting.steppers.jax_stepper import chosen_engine, device_name
+from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
 
 DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
 DEMO_RECORD = "metrics.json"
@@ -248,7 +248,7 @@ def fit(
         raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
     try:
-        chosen_engine(clip.frames, config)
+        choose_engine(clip.frames, config)
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
     _say_clip(clip, config, manner)
@@ -447,8 +447,8 @@ def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
     if manner in ("json", "quiet"):
         return
     growing = "" if config.growth is None else " at the start"
-    engine = chosen_engine(clip.frames, config)
-    computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {device_name()}"
+    engine = choose_engine(clip.frames, config)
+    computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     number = "1 frame" if clip.num_frames == 1 else f"{clip.num_frames} frames"
     out.print(
         f"{clip.source}: {number} of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "

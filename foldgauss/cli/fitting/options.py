@@ -12,7 +12,7 @@ from foldgauss.cli.app.shared import with_constants
 from foldgauss.cli.fitting.progress import Manner
 from foldgauss.render import COMPOSITINGS
 from foldgauss.video.fitting.config import FIT_ENGINES, ON_DIVERGENCE, PRESETS, FitConfig
-from foldgauss.video.fitting.pruning.economy import Economy
+from foldgauss.video.fitting.economy import Economy
 
 #: Panels of `fit --help`.
 MODEL, BUDGET, COURSE = "What is fitted", "When it ends: the first of these", "How it is fitted"

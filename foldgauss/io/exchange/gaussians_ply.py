@@ -16,7 +16,7 @@ from foldgauss.io._atomic import atomic_folder, check_replaceable
 from foldgauss.io.exchange.ply_file import format_error, is_3dgs, is_vegas, read_ply, to_float32, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
-from foldgauss.video.models.renderer import Drawable, VideoRenderer
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.models.splats import SH_C0
 
 #: Depth between a Gaussian and the one behind it, in model units: some three steps of float32 at the distance of the
@@ -39,7 +39,7 @@ _LOGIT_MAX = 17.0
 _SMALLEST = 1e-20  # of a standard deviation, whose logarithm must be finite
 
 
-def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
+def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
     """The Gaussians that a model draws at time t, flat in space, front first, for programs that sort by depth.
 
     A `VideoRenderer` in place of the model saves the making of one for each of many times. Where segments of a video
@@ -77,7 +77,7 @@ def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: fl
 
 def _visible_splats(playback: VideoRenderer, t: float) -> tuple[np.ndarray, ...]:
     """(mean, factor, opacity, color) of what is drawn at time t (or near it, in a cut), in model space, float64."""
-    splats = playback.shown(t)
+    splats = playback.dominant_splats(t)
     seen = np.asarray(splats.opacity) > 0
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     mean, factor, opacity, color = (np.asarray(leaf, np.float64)[seen] for leaf in leaves)
@@ -126,7 +126,7 @@ def write_gaussians_ply(
 
 def write_3dgs_ply(
     path: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     t: float,
     *,
     depth_step: float = DEPTH_STEP,
@@ -149,7 +149,7 @@ def write_3dgs_ply(
 
 def write_3dgs_frames(
     folder: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
     depth_step: float = DEPTH_STEP,
@@ -180,13 +180,13 @@ def write_3dgs_frames(
     return folder
 
 
-def _check_compositing(model: Drawable) -> None:
+def _check_compositing(model: RenderableVideo) -> None:
     if model.compositing != "over":
         cure = "Fit it with --compositing over."
         raise invalid("model's compositing", expected="over, as viewers blend", got=model.compositing, cure=cure)
 
 
-def check_times(model: Drawable, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
+def check_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)

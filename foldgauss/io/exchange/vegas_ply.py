@@ -27,7 +27,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.splats import LASTING, FoldedSplats
+from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
@@ -155,8 +155,10 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
 def _convert_time_scale(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
-    """log sigma_t that gives an envelope of the `other` power the same values; what lasts is 1 with either."""
-    return np.where(log_time_scale == LASTING, log_time_scale, log_time_scale + 0.5 * np.log(other / power))
+    """log sigma_t that gives an envelope of power `other` the same values; static Gaussians have value 1 with either."""
+    return np.where(
+        log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
+    )
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:

@@ -12,7 +12,7 @@ from foldgauss.io.models.model_file import load_part, read_header, register_mode
 from foldgauss.io.models.video_model import read_header_of_kind
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import TIME_ADAM, FitState
 
 CHECKPOINT = "fit-checkpoint"
@@ -100,7 +100,7 @@ def _checkpoint_skeleton(header: dict) -> FitState:
         frame_errors=floats(intervals + 1),
         time_logits=floats(intervals),
         time_moments=jax.eval_shape(TIME_ADAM.init, floats(intervals)),
-        statistics=Statistics(floats(num), floats(num), counts) if header["growing"] else None,
+        statistics=GradientStatistics(floats(num), floats(num), counts) if header["growing"] else None,
         step=int(header["step"]),
         plan=int(header["plan"]),
         seconds=float(header["seconds"]),

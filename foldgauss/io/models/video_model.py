@@ -20,7 +20,7 @@ from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
-from foldgauss.video.editing.overlays import described, restored
+from foldgauss.video.editing.overlays import describe_overlay, restore_overlay
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.sparse_storage import from_stored, stored_counts, stored_skeleton, to_stored
@@ -204,8 +204,8 @@ def _describe_edited(video: EditedVideo) -> dict:
 def _describe_layer(layer: Layer) -> dict:
     return {
         "model": _describe_video(layer.model),
-        "overlays": list(map(described, layer.overlays)),
-        "clocks": list(map(described, layer.clocks)),
+        "overlays": list(map(describe_overlay, layer.overlays)),
+        "clocks": list(map(describe_overlay, layer.clocks)),
     }
 
 
@@ -227,7 +227,9 @@ def _edited_skeleton(header: dict) -> EditedVideo:
 def _layer_skeleton(header: dict) -> Layer:
     model = _video_skeleton(header["model"])
     mask = jax.ShapeDtypeStruct((model.splats.num_gaussians,), np.bool_)
-    return Layer(model, *(tuple(restored(edit, mask) for edit in header[name]) for name in ("overlays", "clocks")))
+    return Layer(
+        model, *(tuple(restore_overlay(edit, mask) for edit in header[name]) for name in ("overlays", "clocks"))
+    )
 
 
 def _camera_skeleton(header: dict | None) -> Camera | None:

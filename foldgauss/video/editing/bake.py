@@ -22,7 +22,7 @@ from foldgauss.video.models.splats import SH_C0, FoldedSplats
 Mask = Bool[np.ndarray, "num"]
 
 
-def gathered(splats: FoldedSplats, source: Int[np.ndarray, " num_new"]) -> FoldedSplats:
+def gather_splats(splats: FoldedSplats, source: Int[np.ndarray, " num_new"]) -> FoldedSplats:
     """The splats numbered `source`, in that order: some may be left out, some come twice."""
     num = splats.num_gaussians
 
@@ -34,28 +34,28 @@ def gathered(splats: FoldedSplats, source: Int[np.ndarray, " num_new"]) -> Folde
     return FoldedSplats(**leaves, envelope=envelope)
 
 
-def moved(splats: FoldedSplats, mask: Mask, map_: Affine) -> FoldedSplats | None:
+def apply_affine(splats: FoldedSplats, mask: Mask, map_: Affine) -> FoldedSplats | None:
     """Through an affine map; None where it has no fixed centre, and is more than a shift."""
-    loc, shift = _wide(splats.loc)[mask], np.array(map_.offset)
-    if map_.moves_only:
-        return _changed(splats, mask, loc=loc + shift)
+    loc, shift = _as_float64(splats.loc)[mask], np.array(map_.offset)
+    if map_.is_translation:
+        return _replace_rows(splats, mask, loc=loc + shift)
     if map_.about is None:
         return None
     matrix, centre = map_.matrix(), np.array(map_.about)
-    log_scale, angle = _mapped_axes(splats, mask, matrix)
-    return _changed(
+    log_scale, angle = _map_axes(splats, mask, matrix)
+    return _replace_rows(
         splats,
         mask,
         loc=(loc - centre) @ matrix.T + (centre + shift),
-        coefficients=_wide(splats.coefficients)[mask] @ matrix.T,
+        coefficients=_as_float64(splats.coefficients)[mask] @ matrix.T,
         log_scale=log_scale,
-        angle_logit=_logit_of(angle),
+        angle_logit=_angle_logit(angle),
     )
 
 
-def _mapped_axes(splats: FoldedSplats, mask: Mask, matrix: Float[np.ndarray, "2 2"]) -> tuple[np.ndarray, np.ndarray]:
+def _map_axes(splats: FoldedSplats, mask: Mask, matrix: Float[np.ndarray, "2 2"]) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of the standard deviations, and the angle, of A R S: by its singular values."""
-    log_scale, angle = _wide(splats.log_scale)[mask], 2 * np.pi * expit(_wide(splats.angle_logit)[mask])
+    log_scale, angle = _as_float64(splats.log_scale)[mask], 2 * np.pi * expit(_as_float64(splats.angle_logit)[mask])
     stretch = np.sqrt(abs(np.linalg.det(matrix)))
     conformal = np.abs(matrix @ matrix.T - stretch**2 * np.eye(2)).max() <= 1e-14 * stretch**2
     if conformal and np.linalg.det(matrix) > 0:
@@ -70,48 +70,54 @@ def _mapped_axes(splats: FoldedSplats, mask: Mask, matrix: Float[np.ndarray, "2 
     return np.stack([first, second], -1), np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
 
 
-def _logit_of(angle: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
+def _angle_logit(angle: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     """The angle counts modulo pi; in [pi/2, 3 pi/2) the sigmoid is best conditioned."""
     return logit(((angle - np.pi / 2) % np.pi + np.pi / 2) / (2 * np.pi))
 
 
-def faded(splats: FoldedSplats, mask: Mask, factor: float) -> FoldedSplats | None:
+def scale_opacity(splats: FoldedSplats, mask: Mask, factor: float) -> FoldedSplats | None:
     """Opacity times `factor`; None where it would be 0, or 1 and more."""
-    raw = _wide(splats.opacity_logit)[mask]
+    raw = _as_float64(splats.opacity_logit)[mask]
     opacity = factor * expit(raw)
     if not ((opacity > 0) & (opacity < 1)).all():
         return None
     # 1 / (f rho) - 1 = ((1 - f) + e^-raw) / f: near opacity 1 nothing is lost.
-    return _changed(splats, mask, opacity_logit=np.log(factor) - np.log((1 - factor) + np.exp(-raw)))
+    return _replace_rows(splats, mask, opacity_logit=np.log(factor) - np.log((1 - factor) + np.exp(-raw)))
 
 
-def recolored(splats: FoldedSplats, mask: Mask, recolor: Recolor) -> FoldedSplats | None:
+def apply_recolor(splats: FoldedSplats, mask: Mask, recolor: Recolor) -> FoldedSplats | None:
     """Other colours."""
-    color = recolor.recolored(looks(splats, mask)[1])
-    return _changed(splats, mask, color_dc=(color - 0.5) / SH_C0)
+    color = recolor.map_colors(opacities_and_colors(splats, mask)[1])
+    return _replace_rows(splats, mask, color_dc=(color - 0.5) / SH_C0)
 
 
-def looks(splats: FoldedSplats, mask: Mask) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, "num 3"]]:
+def opacities_and_colors(
+    splats: FoldedSplats, mask: Mask
+) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, "num 3"]]:
     """Opacities and colours."""
-    return expit(_wide(splats.opacity_logit)[mask]), np.maximum(0.5 + SH_C0 * _wide(splats.color_dc)[mask], 0.0)
-
-
-def retimed(splats: FoldedSplats, mask: Mask, *, shift: float, stretch: float, about: float) -> FoldedSplats | None:
-    """What was at time t comes at `about + shift + stretch (t - about)`; None where an own time leaves (0, 1)."""
-    time_loc = about + shift + stretch * (expit(_wide(splats.time_loc_logit)[mask]) - about)
-    if not ((time_loc > 0) & (time_loc < 1)).all():
-        return None
-    power = np.arange(1, splats.degree + 1)[:, None]
-    return _changed(
-        splats,
-        mask,
-        time_loc_logit=logit(time_loc),
-        log_time_scale=_wide(splats.log_time_scale)[mask] + np.log(abs(stretch)),
-        coefficients=_wide(splats.coefficients)[mask] / np.float64(stretch) ** power,
+    return expit(_as_float64(splats.opacity_logit)[mask]), np.maximum(
+        0.5 + SH_C0 * _as_float64(splats.color_dc)[mask], 0.0
     )
 
 
-def _changed(splats: FoldedSplats, mask: Mask, **leaves: np.ndarray) -> FoldedSplats | None:
+def apply_retiming(
+    splats: FoldedSplats, mask: Mask, *, shift: float, stretch: float, about: float
+) -> FoldedSplats | None:
+    """What was at time t comes at `about + shift + stretch (t - about)`; None where an own time leaves (0, 1)."""
+    time_loc = about + shift + stretch * (expit(_as_float64(splats.time_loc_logit)[mask]) - about)
+    if not ((time_loc > 0) & (time_loc < 1)).all():
+        return None
+    power = np.arange(1, splats.degree + 1)[:, None]
+    return _replace_rows(
+        splats,
+        mask,
+        time_loc_logit=logit(time_loc),
+        log_time_scale=_as_float64(splats.log_time_scale)[mask] + np.log(abs(stretch)),
+        coefficients=_as_float64(splats.coefficients)[mask] / np.float64(stretch) ** power,
+    )
+
+
+def _replace_rows(splats: FoldedSplats, mask: Mask, **leaves: np.ndarray) -> FoldedSplats | None:
     """New values for the masked; None if one is not finite in the leaves' dtype."""
     new = {}
     for name, values in leaves.items():
@@ -124,7 +130,7 @@ def _changed(splats: FoldedSplats, mask: Mask, **leaves: np.ndarray) -> FoldedSp
     return dataclasses.replace(splats, **new)
 
 
-def _wide(leaf) -> np.ndarray:
+def _as_float64(leaf) -> np.ndarray:
     return np.asarray(leaf, np.float64)
 
 

@@ -14,23 +14,30 @@ from jaxtyping import ArrayLike, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_within, short_repr, warn_if_degrees
 from foldgauss.render import Camera
-from foldgauss.video.editing import bake as baking
-from foldgauss.video.editing.clip_window import Part
-from foldgauss.video.editing.clock import NEVER, Clock, Span, checked_number, checked_numbers, span_of
+from foldgauss.video.editing.bake import (
+    apply_affine,
+    apply_recolor,
+    apply_retiming,
+    gather_splats,
+    opacities_and_colors,
+    scale_opacity,
+)
+from foldgauss.video.editing.clip_window import ClipWindow
+from foldgauss.video.editing.clock import NEVER, Clock, Span, check_number, check_numbers, make_span
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
 from foldgauss.video.editing.overlays import (
-    DARKEST,
     IDENTITY,
-    LIGHTNESS,
+    LUMINANCE_WEIGHTS,
+    MIN_LIGHTNESS,
     AbstractOverlay,
     Affine,
-    FaceFunction,
-    Function,
+    GaussianFunction,
     Opacity,
     Place,
     Recolor,
-    Retimed,
+    Retiming,
     SelectedGaussians,
+    TriangleFunction,
 )
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
@@ -44,7 +51,7 @@ FAR = 10.0
 
 
 class When(TypedDict, total=False):
-    """When an edit acts, as `span_of` takes it: over one frame, frames or times, eased in and out; else always."""
+    """When an edit acts, as `make_span` takes it: over one frame, frames or times, eased in and out; else always."""
 
     frame: int
     frames: tuple[int | None, int | None]
@@ -60,10 +67,10 @@ def edit(model: VideoModel | EditedVideo) -> "Edit":
     Example: `edit(model).select(ball).move((0.1, 0)).video()`; the methods are those of `Edit`. Of a `SegmentedVideo`
     it is a `SegmentedEdit`, which has the same.
     """
-    return begun(as_edited(model))
+    return start_chain(as_edited(model))
 
 
-def begun(video: EditedVideo, part: Part | None = None) -> "Edit":
+def start_chain(video: EditedVideo, part: ClipWindow | None = None) -> "Edit":
     """As `edit`; of a `part` of a longer clip, whose frames and times all edits are then given in."""
     counts = tuple(layer.num_gaussians for layer in video.layers)
     return Edit(video, Selection(np.ones(sum(counts), bool)), counts, tuple(map(np.arange, counts)), part)
@@ -80,7 +87,7 @@ class Edit:
     own centre, clocks, functions, depth. `video()` is a plain `VideoModel` where all could be baked. What an edit
     leaves alone keeps its bits, and an edit that changes nothing (a factor 1, an angle 0) is none.
 
-    Every edit takes `frame=`, `frames=` or `times=`, with `ease=` and `curve=`, see `span_of`: without, it acts always.
+    Every edit takes `frame=`, `frames=` or `times=`, `ease=` and `curve=`, as in `make_span`; without, it acts always.
     Frame numbers are those of `video().frame_times`. Spans are of the video's time, whatever clocks its objects have.
 
     **Units:** model space: the frame's centre is the origin, x right, y down, the frame's longer side 1; [0, 1] is the
@@ -98,7 +105,7 @@ class Edit:
     # By layer: how many Gaussians the chain was begun with, and which of those each one is now, or is a copy of.
     _begun_with: tuple[int, ...] = dataclasses.field(repr=False)
     _sources: tuple[Int[np.ndarray, " num"], ...] = dataclasses.field(repr=False)
-    _part: Part | None = dataclasses.field(default=None, repr=False)
+    _window: ClipWindow | None = dataclasses.field(default=None, repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
         """What has been made: a folded model if all edits could be baked, else an edited video."""
@@ -215,7 +222,7 @@ class Edit:
 
         `about`: the point (x, y) that stays; baked then, without a span. None: the selection's own centre at each time.
         """
-        angle = checked_number("angle", angle)
+        angle = check_number("angle", angle)
         warn_if_degrees("angle", angle)
         about = None if about is None else self._point("about", about)
         return self._map(angle, IDENTITY, (0.0, 0.0), about, when)
@@ -241,7 +248,7 @@ class Edit:
 
     def _point(self, parameter: str, value: ArrayLike, *, stacklevel: int = 3) -> tuple[float, ...]:
         """(x, y) in model space; what is far beyond the frame is warned of."""
-        point = checked_numbers(parameter, value, 2)
+        point = check_numbers(parameter, value, 2)
         if max(map(abs, point)) > FAR:
             side = max(self._video.size)
             text = f"{parameter}: expected units of the frame's longer side, got {value}, far beyond it."
@@ -250,8 +257,8 @@ class Edit:
 
     def _map(self, angle: float, stretch, offset: tuple, about: tuple | None, when: When) -> "Edit":
         make = partial(Affine, angle=angle, stretch=stretch, offset=offset, about=about)
-        identity = make(mask=np.zeros(0, bool), span=None).does_nothing
-        return self._apply(make, when, lambda splats, mask: baking.moved(splats, mask, make(mask, None)), skip=identity)
+        identity = make(mask=np.zeros(0, bool), span=None).is_identity
+        return self._apply(make, when, lambda splats, mask: apply_affine(splats, mask, make(mask, None)), skip=identity)
 
     # ------------------------------------------------------------------------------------------ how many, how seen
 
@@ -310,7 +317,7 @@ class Edit:
             counts = np.where(mask, num + 1, 1)
             source = np.repeat(np.arange(len(mask)), counts)
             copy = np.arange(len(source)) - np.repeat(np.cumsum(counts) - counts, counts)  # 0: the original
-            made.append(gathered(layer, source, mask, copy))
+            made.append(gather_layer(layer, source, mask, copy))
             chosen.append(mask[source])
             copies.append(copy)
             sources.append(source)
@@ -328,7 +335,7 @@ class Edit:
             delete = mask.any() and not mask.all() and _can_lose(layer, mask)
             source = np.flatnonzero(~mask) if delete else np.arange(len(mask))
             if delete:
-                layer = gathered(layer, source, mask, np.zeros(len(source), int))
+                layer = gather_layer(layer, source, mask, np.zeros(len(source), int))
             elif mask.any():
                 layer = _with_overlay(layer, Opacity(mask, None, 0.0))
             made.append(layer)
@@ -352,7 +359,7 @@ class Edit:
         parts = self._parts()
         sources = [np.argsort(~mask if front else mask, kind="stable") for mask in parts]
         made = [
-            gathered(layer, source, mask, np.zeros(len(source), int))
+            gather_layer(layer, source, mask, np.zeros(len(source), int))
             for layer, source, mask in zip(self._video.layers, sources, parts, strict=True)
         ]
         chosen = [mask[source] for mask, source in zip(parts, sources, strict=True)]
@@ -360,12 +367,12 @@ class Edit:
 
     def opacity(self, factor: float, **when: Unpack[When]) -> "Edit":
         """Opacity times `factor` >= 0, held at 1. Baked without a span, where it stays below 1; 0 is `vanish`."""
-        factor = checked_number("factor", factor)
+        factor = check_number("factor", factor)
         if factor == 0 and self._span(when) is None:
             return self.vanish()
         make = partial(Opacity, factor=factor)
         make(np.zeros(0, bool), None)  # the checks
-        return self._apply(make, when, lambda splats, mask: baking.faded(splats, mask, factor), skip=factor == 1)
+        return self._apply(make, when, lambda splats, mask: scale_opacity(splats, mask, factor), skip=factor == 1)
 
     def recolor(
         self,
@@ -392,20 +399,20 @@ class Edit:
         if hue is not None and not is_within(hue, "[0, 1]"):
             raise invalid("hue", expected="turns in [0, 1]", got=repr(hue), cure="Degrees over 360.")
         if color is not None:
-            target = checked_color(color)
+            target = check_color(color)
             self._check_selected()
-            matrix, gain = np.outer(target, LIGHTNESS), 1 / mean_lightness([self._light()])
-        make = _recolor(gain, offset, matrix, None if hue is None else checked_number("hue", hue))
+            matrix, gain = np.outer(target, LUMINANCE_WEIGHTS), 1 / mean_lightness([self._light()])
+        make = _recolor(gain, offset, matrix, None if hue is None else check_number("hue", hue))
         identity = make(np.zeros(0, bool), None) == _recolor(None, None, None, None)(np.zeros(0, bool), None)
-        bake = lambda splats, mask: baking.recolored(splats, mask, make(mask, None))  # noqa: E731
+        bake = lambda splats, mask: apply_recolor(splats, mask, make(mask, None))  # noqa: E731
         return self._apply(make, when, bake, skip=bool(identity))
 
     def _light(self) -> tuple[float, float]:
         """What the selection's Gaussians have of lightness, by their opacity, and their opacity, in all."""
         parts = zip(self._video.layers, self._parts(), strict=True)
-        looks = [baking.looks(layer.model.splats, mask) for layer, mask in parts]
+        looks = [opacities_and_colors(layer.model.splats, mask) for layer, mask in parts]
         opacity, color = (np.concatenate(leaves) for leaves in zip(*looks, strict=True))
-        return float(opacity @ (color @ LIGHTNESS)), float(opacity.sum())
+        return float(opacity @ (color @ LUMINANCE_WEIGHTS)), float(opacity.sum())
 
     # ------------------------------------------------------------------------------------------------------- when
 
@@ -445,31 +452,31 @@ class Edit:
 
     def _by_clock(self, clock: Clock, when: When, parameter: str) -> "Edit":
         """By another clock; always laid over."""
-        if self._part is not None:
-            self._part.check_own(clock, parameter, **when)
-            clock = self._part.clock(clock)
-        return self._apply(partial(Retimed, clock=clock), when)
+        if self._window is not None:
+            self._window.check_own(clock, parameter, **when)
+            clock = self._window.clock(clock)
+        return self._apply(partial(Retiming, clock=clock), when)
 
     def _by_line(self, shift: float, stretch: float, about: float, outside: str, when: When, parameter: str) -> "Edit":
         """What it does at t at about + shift + stretch (t - about): baked where it can be."""
         line = Clock.shifted(shift, stretch, about=about, outside=outside)
         identity = (shift, stretch) == (0, 1) and outside == "continue"
-        if self._part is not None and not identity:
-            own_line = self._part.line(shift, stretch, about)
+        if self._window is not None and not identity:
+            own_line = self._window.line(shift, stretch, about)
             if own_line is None:
                 return self._by_clock(line, when, parameter)
-            self._part.check_own(line, parameter, **when)
+            self._window.check_own(line, parameter, **when)
             shift, stretch, about = own_line
-            line = self._part.clock(line)
-        bake = partial(baking.retimed, shift=float(shift), stretch=float(stretch), about=float(about))
+            line = self._window.clock(line)
+        bake = partial(apply_retiming, shift=float(shift), stretch=float(stretch), about=float(about))
         # Between shots a clock shows the nearer one, of one frame alone that frame: no leaves say so.
         bakes = outside == "continue" and not any(layer.holds_frames for layer in self._video.layers)
-        return self._apply(partial(Retimed, clock=line), when, bake if bakes else None, skip=identity)
+        return self._apply(partial(Retiming, clock=line), when, bake if bakes else None, skip=identity)
 
     def freeze(self, at: float, **when: Unpack[When]) -> "Edit":
         """The selection stands still as it is at frame `at`, or a position between two."""
         times = self._frame_times()
-        position = checked_number("at", at)
+        position = check_number("at", at)
         if not 0 <= position <= len(times) - 1:
             raise invalid("at", expected=f"a frame in [0, {len(times) - 1}]", got=at)
         clock = Clock.frozen(float(np.interp(position, np.arange(len(times)), times)))
@@ -485,7 +492,7 @@ class Edit:
 
         **Example:** `edit(model).apply(lambda g, t: dataclasses.replace(g, mean=g.mean * (1 + t)))`
         """
-        return self._apply_function(Function, function, "gaussians", when)
+        return self._apply_function(GaussianFunction, function, "gaussians", when)
 
     def apply_triangles(
         self,
@@ -500,14 +507,14 @@ class Edit:
         **Source:** VeGaS eq:traingle_face, eq:gaussrecons1; GaMeS. **Raises:** ValueError, when drawn, for faces
         without area and numbers that are not finite.
         """
-        return self._apply_function(FaceFunction, function, "vertices", when)
+        return self._apply_function(TriangleFunction, function, "vertices", when)
 
     def _apply_function(self, kind: type[AbstractOverlay], function: object, of: str, when: When) -> "Edit":
         if not callable(function):
             raise invalid("function", expected="a function", got=type(function).__name__)
         check_signature("function", function, of, "t")
-        if self._part is not None:
-            function = self._part.by_clip_time(function)
+        if self._window is not None:
+            function = self._window.by_clip_time(function)
         return self._apply(partial(kind, function=function), when)
 
     # --------------------------------------------------------------------------------------------------- in space
@@ -528,8 +535,8 @@ class Edit:
         **Source:** MiraGe; VeGaS eq:mirage.
         """
         fields = {
-            "depth": checked_number("depth", depth),
-            "rotation": checked_numbers("rotate", rotate, 3),
+            "depth": check_number("depth", depth),
+            "rotation": check_numbers("rotate", rotate, 3),
             "about": None if about is None else self._point("about", about),
         }
         warn_if_degrees("rotate", *fields["rotation"])
@@ -546,15 +553,15 @@ class Edit:
             check_signature("camera", camera, "t")
         if isinstance(camera, Camera) and camera.position.ndim != 1:
             raise invalid("camera", expected="one camera", got=f"positions of shape {camera.position.shape}")
-        if self._part is not None and camera is not None and not isinstance(camera, Camera):
-            camera = self._part.by_clip_time(camera)
+        if self._window is not None and camera is not None and not isinstance(camera, Camera):
+            camera = self._window.by_clip_time(camera)
         return dataclasses.replace(self, _video=dataclasses.replace(self._video, camera=camera))
 
     # ---------------------------------------------------------------------------------------------------- the works
 
     def _apply(
         self,
-        make: Callable[..., AbstractOverlay | Retimed],
+        make: Callable[..., AbstractOverlay | Retiming],
         when: When,
         bake: Bake | None = None,
         *,
@@ -571,9 +578,9 @@ class Edit:
                 made.append(layer)
                 continue
             made_so = make(mask, span)
-            if isinstance(made_so, Retimed):
+            if isinstance(made_so, Retiming):
                 _check_apart(layer, mask)
-            before = layer.clocks if isinstance(made_so, Retimed) else layer.overlays
+            before = layer.clocks if isinstance(made_so, Retiming) else layer.overlays
             free = span is None and not any((np.asarray(other.mask) & mask).any() for other in before)
             if layer.model.scale_cutoff > 0 and isinstance(made_so, Affine) and made_so.stretch != IDENTITY:
                 free = False  # other sizes would be left out at other times
@@ -612,22 +619,22 @@ class Edit:
                 near = difflib.get_close_matches(name, When.__annotations__, 1)
                 expected, cure = "one of " + ", ".join(When.__annotations__), f"Did you mean {near[0]}?" if near else ""
                 raise invalid("when", expected=expected, got=name, cure=cure)
-        return span_of(self._frame_times(), **when) if self._part is None else self._part.span(**when)
+        return make_span(self._frame_times(), **when) if self._window is None else self._window.span(**when)
 
     @property
     def _num_frames(self) -> int:
-        return self._video.num_frames if self._part is None else self._part.num_frames
+        return self._video.num_frames if self._window is None else self._window.num_frames
 
     def _frame_times(self) -> Float[np.ndarray, " num_frames"]:
         """Of the clip."""
-        if self._part is not None:
-            return self._part.frame_times
+        if self._window is not None:
+            return self._window.frame_times
         return np.asarray(self._video.frame_times.times(), np.float64)
 
 
-def checked_color(color: ArrayLike) -> tuple[float, ...]:
+def check_color(color: ArrayLike) -> tuple[float, ...]:
     """Red, green and blue. Raises ValueError unless all are in [0, 1]."""
-    target = checked_numbers("color", color, 3)
+    target = check_numbers("color", color, 3)
     if min(target) < 0 or max(target) > 1:
         raise invalid("color", expected="red, green and blue in [0, 1]", got=target)
     return target
@@ -637,7 +644,7 @@ def mean_lightness(light: Sequence[tuple[float, float]]) -> float:
     """The mean of what `Edit` has of light, of one chain or several. Raises ValueError where it is dark."""
     of_light, opacity = (sum(parts) for parts in zip(*light, strict=True))
     mean = of_light / max(opacity, np.finfo(float).tiny)
-    if mean < DARKEST:
+    if mean < MIN_LIGHTNESS:
         cure = "It is black, without shading: use offset=."
         raise invalid("color", expected="an object with some light", got=f"lightness {mean:g}", cure=cure)
     return mean
@@ -647,7 +654,7 @@ def _split(mask: Mask, counts: Sequence[int]) -> list[Mask]:
     return np.split(mask, np.cumsum(counts)[:-1])
 
 
-def gathered(
+def gather_layer(
     layer: Layer, source: Int[np.ndarray, " num_new"], chosen: Mask, copy: Int[np.ndarray, " num_new"]
 ) -> Layer:
     """A layer of the Gaussians `source`, with all edits that they had; those of `copy` k are its k-th copies.
@@ -661,7 +668,7 @@ def gathered(
         masks = [mask[source] if k is None else mask[source] & (copy == k) for k in numbers]
         overlays += [dataclasses.replace(overlay, mask=one) for one in masks if one.any()]
     clocks = [dataclasses.replace(clock, mask=np.asarray(clock.mask)[source]) for clock in layer.clocks]
-    model = dataclasses.replace(layer.model, splats=baking.gathered(layer.model.splats, source))
+    model = dataclasses.replace(layer.model, splats=gather_splats(layer.model.splats, source))
     return Layer(model, tuple(overlays), tuple(clock for clock in clocks if clock.mask.any()))
 
 
@@ -669,8 +676,10 @@ def _check_apart(layer: Layer, mask: Mask) -> None:
     """Refuse another time for a part of what an edit takes as a whole: its rest would act otherwise."""
     for overlay in layer.overlays:
         own = np.asarray(overlay.mask)
-        whole_of_it = isinstance(overlay, Function | FaceFunction) or (
-            isinstance(overlay, Affine | Place) and overlay.about is None and not getattr(overlay, "moves_only", False)
+        whole_of_it = isinstance(overlay, GaussianFunction | TriangleFunction) or (
+            isinstance(overlay, Affine | Place)
+            and overlay.about is None
+            and not getattr(overlay, "is_translation", False)
         )
         if whole_of_it and (own & mask).any() and (own & ~mask).any():
             expected = "another time for all Gaussians of an edit about their centre, or for none of them"
@@ -683,8 +692,8 @@ def _can_lose(layer: Layer, mask: Mask) -> bool:
     return all(not (one & mask).any() or not (one & ~mask).any() for one in own)
 
 
-def _with_overlay(layer: Layer, edit: AbstractOverlay | Retimed) -> Layer:
-    name = "clocks" if isinstance(edit, Retimed) else "overlays"
+def _with_overlay(layer: Layer, edit: AbstractOverlay | Retiming) -> Layer:
+    name = "clocks" if isinstance(edit, Retiming) else "overlays"
     return dataclasses.replace(layer, **{name: (*getattr(layer, name), edit)})
 
 
@@ -734,12 +743,12 @@ def _warn_of_frames(parameter: str, shift: float, stretch: float, about: float, 
 def _listed(parameter: str, values: ArrayLike) -> tuple[float, ...]:
     """Numbers, or one number alone, as a tuple."""
     several = isinstance(values, (list, tuple)) or getattr(values, "ndim", 0) > 0
-    return checked_numbers(parameter, values) if several else (checked_number(parameter, values),)
+    return check_numbers(parameter, values) if several else (check_number(parameter, values),)
 
 
 def _square(parameter: str, values: ArrayLike, side: int) -> Float[np.ndarray, "side side"]:
     try:
-        return np.array([checked_numbers(parameter, row, side) for row in values]).reshape(side, side)
+        return np.array([check_numbers(parameter, row, side) for row in values]).reshape(side, side)
     except (TypeError, ValueError):
         expected = f"finite numbers of shape ({side}, {side})"
         raise invalid(parameter, expected=expected, got=short_repr(values)) from None

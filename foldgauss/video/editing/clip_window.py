@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.video.editing.clock import NEVER, Clock, Span, Stretch, span_in, stretch_of
+from foldgauss.video.editing.clock import NEVER, Clock, FrameSpan, Span, make_frame_span, restrict_span
 
 #: Frames. Learned times so near to even ones are even: a line through time stays a line.
 _EVEN = 1e-3
@@ -18,7 +18,7 @@ _CLOSE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Part:
+class ClipWindow:
     """Where a video stands in a clip of `num_frames` frames: `first` is the clip's number of its first frame.
 
     `times` are its own frame times. The clip's frame k is at k / (num_frames - 1), that of one frame alone at 0.
@@ -56,9 +56,9 @@ class Part:
         return max(self.num_frames - 1, 1)
 
     def span(self, **when: Any) -> Span | None:
-        """As `span_of` of the clip's frames and times, in own time; `NEVER` where it reaches none of its frames."""
-        stretch = stretch_of(self.frame_times, **when)
-        return None if stretch is None else span_in(stretch, self.times, self.first)
+        """As `make_span` of the clip's frames and times, in own time; `NEVER` where it reaches none of its frames."""
+        stretch = make_frame_span(self.frame_times, **when)
+        return None if stretch is None else restrict_span(stretch, self.times, self.first)
 
     def position(self, own_time: float) -> float:
         """The clip's frame position of an own time."""
@@ -83,7 +83,7 @@ class Part:
         """
         if self.span(**when) is NEVER:
             return
-        stretch = stretch_of(self.frame_times, **when) or Stretch(-np.inf, np.inf, 0.0, 0.0, "linear")
+        stretch = make_frame_span(self.frame_times, **when) or FrameSpan(-np.inf, np.inf, 0.0, 0.0, "linear")
         low, high = max(stretch.begin, self.first), min(stretch.end, self.last)
         knots = [position for position in (t * self._steps for t in clock.times) if low < position < high]
         for shown in (low, *knots, high):
@@ -147,7 +147,7 @@ class Part:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _ByClipTime:
     function: Callable[..., Any]
-    part: Part
+    part: ClipWindow
 
     def __call__(self, *arguments: Any) -> Any:
         *others, t = arguments

@@ -21,7 +21,7 @@ class Span:
     """A stretch of time in which an edit acts, and how far along it is there: `progress`, from 0 to 1.
 
     `start` <= t < `stop`, None for no end. Inside, progress is 1, or what lies between the knots `times` and `values`,
-    bent by `curve`: "linear", or "smooth", s^2 (3 - 2 s). Outside it is 0. Made from frame numbers by `span_of`.
+    bent by `curve`: "linear", or "smooth", s^2 (3 - 2 s). Outside it is 0. Made from frame numbers by `make_span`.
 
     **Units:** model time. **Example:** `Span(0.4, 0.6).progress(0.5)  # 1.0`
 
@@ -39,11 +39,11 @@ class Span:
         for name in ("start", "stop"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, checked_number(name, value))
+                object.__setattr__(self, name, check_number(name, value))
         if not self._first < self._last:
             raise invalid("start, stop", expected="a start before the stop", got=f"{self.start}, {self.stop}")
-        object.__setattr__(self, "times", checked_numbers("times", self.times))
-        object.__setattr__(self, "values", checked_numbers("values", self.values))
+        object.__setattr__(self, "times", check_numbers("times", self.times))
+        object.__setattr__(self, "values", check_numbers("values", self.values))
         if len(self.times) != len(self.values) or not all(is_within(value, "[0, 1]") for value in self.values):
             raise invalid("values", expected=f"{len(self.times)} numbers in [0, 1]", got=self.values)
         _check_rising(self.times)
@@ -66,7 +66,7 @@ class Span:
         return s if self.curve == "linear" else s * s * (3 - 2 * s)
 
 
-def span_of(
+def make_span(
     frame_times: Float[np.ndarray, " num_frames"],
     *,
     frame: int | None = None,
@@ -84,17 +84,17 @@ def span_of(
     `ease` is how many frames it takes to come in and to go out, from the ends of the span inwards, or two such numbers;
     at the ends of the clip there is nothing to come from, and the edit stands from the start, or stays.
 
-    **Example:** `span_of(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
+    **Example:** `make_span(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
 
     **Raises:** ValueError for more than one of the three, frames or times that the clip has not, and ease without a
     span, or longer than it.
     """
     knots = np.asarray(frame_times, np.float64)
-    stretch = stretch_of(knots, frame=frame, frames=frames, times=times, ease=ease, curve=curve)
-    return None if stretch is None else span_in(stretch, knots)
+    stretch = make_frame_span(knots, frame=frame, frames=frames, times=times, ease=ease, curve=curve)
+    return None if stretch is None else restrict_span(stretch, knots)
 
 
-class Stretch(NamedTuple):
+class FrameSpan(NamedTuple):
     """A span as positions among a clip's frames: from `begin` to `end`, infinite where it has no end.
 
     `rise` and `fall`: how many frames it takes to come in and to go out.
@@ -107,7 +107,7 @@ class Stretch(NamedTuple):
     curve: str
 
 
-def stretch_of(
+def make_frame_span(
     frame_times: Float[np.ndarray, " num_frames"],
     *,
     frame: int | None = None,
@@ -115,8 +115,8 @@ def stretch_of(
     times: tuple[float, float] | None = None,
     ease: float | tuple[float, float] = 0,
     curve: str = "linear",
-) -> Stretch | None:
-    """As `span_of`, among the frames."""
+) -> FrameSpan | None:
+    """As `make_span`, among the frames."""
     knots, one_of_them = np.asarray(frame_times, np.float64), [x for x in (frame, frames, times) if x is not None]
     check_one_of("curve", curve, CURVES)
     if len(one_of_them) > 1:
@@ -132,7 +132,7 @@ def stretch_of(
     if rise + fall > last - first:
         expected = f"no more than the span's {last - first:g} frames, in and out together"
         raise invalid("ease", expected=expected, got=f"{rise:g} and {fall:g}", cure="Make the span longer.")
-    return Stretch(begin, end, rise, fall, curve)
+    return FrameSpan(begin, end, rise, fall, curve)
 
 
 def _positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
@@ -157,7 +157,7 @@ def _positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
 
 
-def span_in(stretch: Stretch, frame_times: Float[np.ndarray, " num_frames"], first: int = 0) -> Span:
+def restrict_span(stretch: FrameSpan, frame_times: Float[np.ndarray, " num_frames"], first: int = 0) -> Span:
     """A clip's span in the own time of a part of it, whose frames, at `frame_times`, begin with the clip's `first`.
 
     At each frame and between progress is what it is in the clip; `NEVER` where it reaches no frame of the part.
@@ -205,8 +205,8 @@ class Clock:
     outside: str = "hold"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "times", checked_numbers("times", self.times))
-        object.__setattr__(self, "own_times", checked_numbers("own_times", self.own_times))
+        object.__setattr__(self, "times", check_numbers("times", self.times))
+        object.__setattr__(self, "own_times", check_numbers("own_times", self.own_times))
         check_one_of("outside", self.outside, OUTSIDE)
         least = 2 if self.outside == "continue" else 1
         if len(self.times) < least or len(self.times) != len(self.own_times):
@@ -228,7 +228,7 @@ class Clock:
         A negative stretch runs backwards. With `outside` "hold" the own time is kept within [0, 1].
         """
         shift, stretch, about = (
-            checked_number(name, x) for name, x in (("shift", shift), ("stretch", stretch), ("about", about))
+            check_number(name, x) for name, x in (("shift", shift), ("stretch", stretch), ("about", about))
         )
         if stretch == 0:
             raise invalid("stretch", expected="a number but 0", got=stretch, cure="To stand still use Clock.frozen.")
@@ -245,7 +245,7 @@ class Clock:
         return float(np.interp(t, self.times, self.own_times))
 
 
-def checked_number(parameter: str, value: object) -> float:
+def check_number(parameter: str, value: object) -> float:
     """`value` as a float. Raises ValueError unless it is one finite number, alone or as an array without axes."""
     value = value.item() if getattr(value, "ndim", None) == 0 else value
     if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
@@ -253,7 +253,7 @@ def checked_number(parameter: str, value: object) -> float:
     return float(value)
 
 
-def checked_numbers(parameter: str, values: object, length: int | None = None) -> tuple[float, ...]:
+def check_numbers(parameter: str, values: object, length: int | None = None) -> tuple[float, ...]:
     """`values` as a tuple of floats, `length` of them. Raises ValueError for anything else."""
     wanted = "finite numbers in a list" if length is None else f"{length} finite numbers"
     try:

@@ -14,12 +14,18 @@ from jaxtyping import Array, Bool, Float, UInt8
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
-from foldgauss.video.editing.overlays import AbstractOverlay, Retimed, SelectedGaussians, acts, padded, room_for
+from foldgauss.video.editing.overlays import (
+    AbstractOverlay,
+    Retiming,
+    SelectedGaussians,
+    is_active,
+    pad_rows,
+    padded_size,
+)
 from foldgauss.video.models.background import BLACK
-from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.frame_times import FrameTimes, is_cut, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import is_cut, out_of_cuts
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel, check_time
 
 
@@ -31,7 +37,7 @@ class Layer(eqx.Module):
 
     model: VideoModel
     overlays: tuple[AbstractOverlay, ...] = ()
-    clocks: tuple[Retimed, ...] = ()
+    clocks: tuple[Retiming, ...] = ()
 
     def __check_init__(self) -> None:
         num = getattr(self.model.splats.loc, "shape", (None,))[0]
@@ -117,22 +123,22 @@ class EditedVideo(eqx.Module):
         return max(layer.model.splats.degree for layer in self.layers)
 
     @property
-    def num_floats(self) -> int:
+    def num_parameters(self) -> int:
         """Numbers stored, masks not counted."""
-        return sum(layer.model.num_floats for layer in self.layers)
+        return sum(layer.model.num_parameters for layer in self.layers)
 
     def with_options(self, options: RenderOptions) -> "EditedVideo":
         """The same, drawn with other constants: those of all layers."""
         own = (dataclasses.replace(layer, model=layer.model.with_options(options)) for layer in self.layers)
         return dataclasses.replace(self, layers=tuple(own))
 
-    def stage(self, size: tuple[int, int]) -> "EditedStage":
+    def prepare(self, size: tuple[int, int]) -> "PreparedEditedVideo":
         """Made ready to be conditioned many times, for pictures of `size`."""
-        return EditedStage(self, size)
+        return PreparedEditedVideo(self, size)
 
     def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, front to back, in pixels of a picture of `size` (default: its own); NumPy leaves."""
-        return self.stage(self.size if size is None else size).splats(float(t))
+        return self.prepare(self.size if size is None else size).splats(float(t))
 
     def render(
         self,
@@ -160,7 +166,7 @@ class EditedVideo(eqx.Module):
         return notebook_hooks.show("video", self)
 
 
-def stacked(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
+def stack_layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
     """Videos of one piece each one over another: see `foldgauss.video.layers`."""
     parts = [as_edited(video) for video in videos]
     if not parts:
@@ -214,13 +220,13 @@ def _check_fitting(models: list[VideoModel]) -> None:
                 raise invalid("layers", expected=f"one {name} for all, {one!r}", got=repr(two), cure=cure)
 
 
-class EditedStage:
+class PreparedEditedVideo:
     """The splats of an edited video by time, in pixels of a picture of `size`, see `PreparedModel`."""
 
     def __init__(self, video: EditedVideo, size: tuple[int, int]):
         height, width = video.size
         self._size, self._camera = tuple(size), video.camera
-        self._layers = [_LayerStage(layer, self._size, height / width) for layer in video.layers]
+        self._layers = [_PreparedLayer(layer, self._size, height / width) for layer in video.layers]
         self._front = partial(Camera.front, height / width)
         self._times = np.asarray(video.frame_times.times())
 
@@ -240,9 +246,9 @@ class EditedStage:
         nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
         return jax.tree.map(lambda leaf: leaf[nearest_first], _together(moments))
 
-    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
-        """One picture, see `foldgauss.video.models.renderer.Staged`."""
-        return [(1.0, self.splats(out_of_cuts(t, self._times)))]
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
+        """One picture, see `foldgauss.video.models.renderer.PreparedVideo`."""
+        return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
     def _camera_at(self, t: float) -> Camera:
         camera = self._camera
@@ -254,12 +260,12 @@ class EditedStage:
         return seen
 
 
-def _together(moments: list["_Moment"]) -> Splats2D:
+def _together(moments: list["_ConditionedLayer"]) -> Splats2D:
     parts = [(moment.mean, moment.factor, moment.opacity, moment.color) for moment in moments]
     return Splats2D(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))))
 
 
-class _LayerStage:
+class _PreparedLayer:
     """A layer made ready: who goes by which clock is known."""
 
     def __init__(self, layer: Layer, size: tuple[int, int], aspect: float):
@@ -269,12 +275,12 @@ class _LayerStage:
         self._holds_frames = layer.holds_frames
         self._groups = _by_clocks(layer)
 
-    def at(self, t: float) -> "_Moment":
+    def at(self, t: float) -> "_ConditionedLayer":
         """The layer's Gaussians at the video's time t, edited."""
-        moment = _Moment(*self._conditioned(t), self._stage.shape.size, self._stage.shape.aspect)
+        moment = _ConditionedLayer(*self._conditioned(t), self._stage.spec.size, self._stage.spec.aspect)
         for overlay, mask in zip(self._layer.overlays, self._masks, strict=True):
             progress = overlay.progress(t)
-            if acts(overlay, progress):
+            if is_active(overlay, progress):
                 moment.edit(mask, partial(overlay, t=t, progress=progress))
         moment.drop_unseen()
         return moment
@@ -288,13 +294,13 @@ class _LayerStage:
         order = np.argsort(np.concatenate([part.alive for part in parts]), kind="stable")
         return tuple(np.take(np.concatenate(leaf), order, axis=0) for leaf in zip(*leaves, strict=True))
 
-    def _own_time(self, clocks: tuple[Retimed, ...], t: float) -> float:
+    def _own_time(self, clocks: tuple[Retiming, ...], t: float) -> float:
         for clock in reversed(clocks):  # the last edit is asked first: it retimes all that the others made
             t = clock.own_time(t)
-        return float(out_of_cuts(t, self._times)) if self._holds_frames else t
+        return float(snap_to_shots(t, self._times)) if self._holds_frames else t
 
 
-def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray, " num"] | None]]:
+def _by_clocks(layer: Layer) -> list[tuple[tuple[Retiming, ...], Bool[np.ndarray, " num"] | None]]:
     """Groups of Gaussians that go by the same clocks."""
     if not layer.clocks:
         return [((), None)]
@@ -305,7 +311,7 @@ def _by_clocks(layer: Layer) -> list[tuple[tuple[Retimed, ...], Bool[np.ndarray,
     return [(chain, group == k) for k, chain in enumerate(chains)]
 
 
-class _Moment:
+class _ConditionedLayer:
     """A layer's Gaussians at one time, in pixels, on the way through the edits; those in space also in model space."""
 
     def __init__(self, index, mean, factor, opacity, color, size: tuple[int, int], aspect: float):
@@ -392,8 +398,8 @@ class _Moment:
 def _project(camera: Camera, size: tuple[int, int], mean: np.ndarray, factor: np.ndarray, opacity: np.ndarray):
     """Mean, factor and opacity of what the camera sees, in pixels, in the order they come."""
     num = len(opacity)
-    room = room_for(num)
-    seen = _projected(camera, size, padded(mean, room), padded(factor, room), padded(opacity, room))
+    room = padded_size(num)
+    seen = _projected(camera, size, pad_rows(mean, room), pad_rows(factor, room), pad_rows(opacity, room))
     return tuple(np.asarray(leaf)[:num] for leaf in seen)
 
 

@@ -18,12 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.render import Gaussians3D, Triangles
-from foldgauss.video.editing.clock import Clock, Span, checked_number, checked_numbers
+from foldgauss.video.editing.clock import Clock, Span, check_number, check_numbers
 
 #: What each channel brings to lightness: Rec. 709.
-LIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
 #: Below this an object's lightness says nothing of its shading.
-DARKEST = 1e-4
+MIN_LIGHTNESS = 1e-4
 IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 
 
@@ -50,7 +50,7 @@ class SelectedGaussians:
         return len(self.opacity)
 
     @property
-    def centre(self) -> Float[np.ndarray, " dim"]:
+    def center(self) -> Float[np.ndarray, " dim"]:
         """Their own centre: the mean of the means, weighted by opacity times area.
 
         By area too, since Gaussians far from their own time are small and must not pull: the centre then moves evenly.
@@ -77,7 +77,7 @@ def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, " num"]:
     return np.abs(crosses[0]) if len(crosses) == 1 else np.linalg.norm(crosses, axis=0)
 
 
-def _mapped(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray, "num dim 2"]) -> np.ndarray:
+def _map_factors(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray, "num dim 2"]) -> np.ndarray:
     """A F for many F, as one product of matrices."""
     columns = np.swapaxes(factor, 1, 2)
     rows = columns.reshape(-1, len(matrix)) @ matrix.T.astype(np.float32)
@@ -123,26 +123,26 @@ class Affine(AbstractOverlay):
     about: tuple[float, float] | None = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        checked_number("angle", self.angle)
+        check_number("angle", self.angle)
         for row in self.stretch:
-            checked_numbers("stretch", row, 2)
-        checked_numbers("offset", self.offset, 2)
+            check_numbers("stretch", row, 2)
+        check_numbers("offset", self.offset, 2)
         if self.about is not None:
-            checked_numbers("about", self.about, 2)
+            check_numbers("about", self.about, 2)
         if len(self.stretch) != 2 or self.stretch[0][1] != self.stretch[1][0]:
             raise invalid("stretch", expected="a symmetric 2x2 matrix", got=self.stretch)
         if np.linalg.det(self.stretch) == 0:
             raise invalid("stretch", expected="a matrix that can be undone", got=self.stretch, cure="See vanish().")
 
     @property
-    def moves_only(self) -> bool:
+    def is_translation(self) -> bool:
         """Whether it shifts and does nothing else."""
         return self.angle == 0 and self.stretch == IDENTITY
 
     @property
-    def does_nothing(self) -> bool:
+    def is_identity(self) -> bool:
         """Whether it is the identity."""
-        return self.moves_only and self.offset == (0.0, 0.0)
+        return self.is_translation and self.offset == (0.0, 0.0)
 
     def matrix(self, progress: float = 1.0) -> Float[np.ndarray, "2 2"]:
         """A at that progress."""
@@ -152,15 +152,15 @@ class Affine(AbstractOverlay):
     def __call__(self, gaussians, t, progress):
         dim, shift = gaussians.mean.shape[1], progress * np.array(self.offset)
         move = np.zeros(dim)
-        if self.moves_only:
+        if self.is_translation:
             move[:2] = shift
             return dataclasses.replace(gaussians, mean=gaussians.mean + move.astype(np.float32))
         matrix = np.eye(dim)
         matrix[:2, :2] = self.matrix(progress)
-        centre = gaussians.centre[:2] if self.about is None else np.array(self.about)
+        centre = gaussians.center[:2] if self.about is None else np.array(self.about)
         move[:2] = centre - matrix[:2, :2] @ centre + shift
         mean = gaussians.mean @ matrix.T.astype(np.float32) + move.astype(np.float32)
-        return dataclasses.replace(gaussians, mean=mean, factor=_mapped(matrix, gaussians.factor))
+        return dataclasses.replace(gaussians, mean=mean, factor=_map_factors(matrix, gaussians.factor))
 
 
 class Opacity(AbstractOverlay):
@@ -173,7 +173,7 @@ class Opacity(AbstractOverlay):
 
     def __check_init__(self) -> None:
         for name in ("factor", "before"):
-            if checked_number(name, getattr(self, name)) < 0:
+            if check_number(name, getattr(self, name)) < 0:
                 raise invalid(name, expected="a number >= 0", got=getattr(self, name))
 
     def __call__(self, gaussians, t, progress):
@@ -181,7 +181,7 @@ class Opacity(AbstractOverlay):
         return dataclasses.replace(gaussians, opacity=np.minimum(gaussians.opacity * by, 1.0))
 
 
-def acts(overlay: AbstractOverlay, progress: float) -> bool:
+def is_active(overlay: AbstractOverlay, progress: float) -> bool:
     """Whether an overlay changes anything at that progress: at 0 only what is hidden outside its span does."""
     return progress > 0 or (isinstance(overlay, Opacity) and overlay.before != 1)
 
@@ -203,11 +203,11 @@ class Recolor(AbstractOverlay):
         if len(self.matrix) != 3:
             raise invalid("matrix", expected="a 3x3 matrix", got=self.matrix)
         for row in (*self.matrix, self.offset):
-            checked_numbers("matrix, offset", row, 3)
+            check_numbers("matrix, offset", row, 3)
         if self.hue is not None:
-            checked_number("hue", self.hue)
+            check_number("hue", self.hue)
 
-    def recolored(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
+    def map_colors(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
         """The colours when it has wholly acted, float64."""
         color = np.asarray(color, np.float64)
         if self.hue is not None:
@@ -216,13 +216,13 @@ class Recolor(AbstractOverlay):
 
     def __call__(self, gaussians, t, progress):
         color = gaussians.color
-        return dataclasses.replace(gaussians, color=color + progress * (self.recolored(color) - color))
+        return dataclasses.replace(gaussians, color=color + progress * (self.map_colors(color) - color))
 
 
 def _with_hue(color: Float[np.ndarray, "num 3"], hue: float) -> Float[np.ndarray, "num 3"]:
-    grey = (color @ LIGHTNESS)[:, None]
+    grey = (color @ LUMINANCE_WEIGHTS)[:, None]
     pure = np.clip(np.abs((hue + np.array([0, 2 / 3, 1 / 3])) % 1 * 6 - 3) - 1, 0, 1)
-    direction = pure - pure @ LIGHTNESS
+    direction = pure - pure @ LUMINANCE_WEIGHTS
     return grey + np.linalg.norm(color - grey, axis=1, keepdims=True) * direction / np.linalg.norm(direction)
 
 
@@ -245,22 +245,26 @@ class Place(AbstractOverlay):
     about: tuple[float, float] | None = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        checked_number("depth", self.depth)
-        checked_numbers("rotation", self.rotation, 3)
+        check_number("depth", self.depth)
+        check_numbers("rotation", self.rotation, 3)
         if self.about is not None:
-            checked_numbers("about", self.about, 2)
+            check_numbers("about", self.about, 2)
 
     def __call__(self, gaussians, t, progress):
         gaussians = gaussians.in_space()
         mean, factor, move = gaussians.mean, gaussians.factor, np.array([0, 0, progress * self.depth])
         if any(self.rotation):
-            centre = gaussians.centre if self.about is None else np.array([*self.about, 0.0])
+            centre = gaussians.center if self.about is None else np.array([*self.about, 0.0])
             turn = scipy.spatial.transform.Rotation.from_rotvec(progress * np.array(self.rotation)).as_matrix()
-            mean, factor, move = mean @ turn.T.astype(np.float32), _mapped(turn, factor), move + centre - turn @ centre
+            mean, factor, move = (
+                mean @ turn.T.astype(np.float32),
+                _map_factors(turn, factor),
+                move + centre - turn @ centre,
+            )
         return dataclasses.replace(gaussians, mean=mean + move.astype(np.float32), factor=factor)
 
 
-class Function(AbstractOverlay):
+class GaussianFunction(AbstractOverlay):
     """Any function of the conditioned Gaussians and the time. It cannot be saved."""
 
     mask: Bool[np.ndarray, " num_gaussians"]
@@ -272,7 +276,7 @@ class Function(AbstractOverlay):
         return after if progress == 1 else _between(gaussians, after, progress)
 
 
-class FaceFunction(AbstractOverlay):
+class TriangleFunction(AbstractOverlay):
     """Any function of the Gaussians' triangles: vertices (num, 3, 3) and the time to vertices. It cannot be saved.
 
     Source: GaMeS; VeGaS eq:traingle_face.
@@ -283,14 +287,14 @@ class FaceFunction(AbstractOverlay):
     function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
 
     def __call__(self, gaussians, t, progress):
-        solid, room = gaussians.in_space(), room_for(len(gaussians))
-        vertices = np.asarray(_to_faces(padded(solid.mean, room), padded(solid.factor, room)))[: len(solid)]
+        solid, room = gaussians.in_space(), padded_size(len(gaussians))
+        vertices = np.asarray(_to_faces(pad_rows(solid.mean, room), pad_rows(solid.factor, room)))[: len(solid)]
         given = vertices.copy()  # theirs to write to
         moved = _checked_vertices(self.function(given, t), vertices.shape)
         if np.array_equal(moved, vertices):
             return gaussians
         moved = vertices + progress * (moved - vertices)
-        mean, factor = (np.array(leaf)[: len(solid)] for leaf in _from_faces(padded(moved, room)))
+        mean, factor = (np.array(leaf)[: len(solid)] for leaf in _from_faces(pad_rows(moved, room)))
         _check_spanned(moved, factor)
         if gaussians.mean.shape[1] == 2 and not moved[..., 2].any():
             mean, factor = mean[:, :2], factor[:, :2]
@@ -300,12 +304,12 @@ class FaceFunction(AbstractOverlay):
 _SMALLEST_ROOM = 1024
 
 
-def room_for(num: int) -> int:
+def padded_size(num: int) -> int:
     """The size that code is compiled for where there are `num`: powers of two, so that few are."""
     return max(_SMALLEST_ROOM, 1 << (num - 1).bit_length())
 
 
-def padded(array: np.ndarray, room: int) -> Float[np.ndarray, "room ..."]:
+def pad_rows(array: np.ndarray, room: int) -> Float[np.ndarray, "room ..."]:
     """`array` with `room` rows, float32: those behind are 0, or unit matrices, which are sound factors and faces."""
     wide = np.empty((room, *array.shape[1:]), np.float32)
     wide[: len(array)] = array
@@ -377,7 +381,7 @@ def _between(before: SelectedGaussians, after: SelectedGaussians, progress: floa
     return dataclasses.replace(before, **mixed)
 
 
-class Retimed(eqx.Module):
+class Retiming(eqx.Module):
     """Gaussians with a clock of their own, over a span or always: where progress is s, t + s (clock(t) - t)."""
 
     mask: Bool[np.ndarray, " num_gaussians"]
@@ -398,11 +402,11 @@ KINDS: dict[str, type[eqx.Module]] = {
     "opacity": Opacity,
     "recolor": Recolor,
     "place": Place,
-    "retimed": Retimed,
+    "retimed": Retiming,
 }
 
 
-def described(overlay: eqx.Module) -> dict:
+def describe_overlay(overlay: eqx.Module) -> dict:
     """All of an overlay but its mask, in JSON's terms. Raises ValueError for functions, which cannot be written."""
     names = {kind: name for name, kind in KINDS.items()}
     if type(overlay) not in names:
@@ -413,8 +417,8 @@ def described(overlay: eqx.Module) -> dict:
     return {"kind": names[type(overlay)], **fields}
 
 
-def restored(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
-    """The inverse of `described`. Raises ValueError, KeyError or TypeError for what describes no overlay."""
+def restore_overlay(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
+    """The inverse of `describe_overlay`. Raises ValueError, KeyError or TypeError for what describes no overlay."""
     check_one_of("kind", description["kind"], tuple(KINDS))
     kind = KINDS[description["kind"]]
     fields = {name: _tuples(description[name]) for name in _plain_fields(kind)}

@@ -6,8 +6,8 @@ from typing import Any
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
-from foldgauss.video.fitting.pruning.economy import Economy
 
 
 @dataclasses.dataclass(frozen=True)

@@ -110,7 +110,7 @@ class Growth:
         return step < self.until_step and step % self.reset_every == 0
 
 
-class Statistics(NamedTuple):
+class GradientStatistics(NamedTuple):
     """Sums of the steps since the last births; (num,) each."""
 
     screen: np.ndarray  #: float32: of screen gradients
@@ -118,7 +118,7 @@ class Statistics(NamedTuple):
     seen: np.ndarray  #: int32: steps in which the Gaussian was seen
 
     @classmethod
-    def zeros(cls, num: int) -> "Statistics":
+    def zeros(cls, num: int) -> "GradientStatistics":
         return cls(np.zeros(num, np.float32), np.zeros(num, np.float32), np.zeros(num, np.int32))
 
     def add(self, views: Sequence[tuple[np.ndarray, np.ndarray]], by_time: np.ndarray) -> None:
@@ -137,7 +137,7 @@ class Statistics(NamedTuple):
 
 def grown(
     rows: np.ndarray,
-    statistics: Statistics,
+    statistics: GradientStatistics,
     growth: Growth,
     *,
     degree: int,
@@ -177,7 +177,7 @@ def dim(rows: np.ndarray, first: np.ndarray, second: np.ndarray, growth: Growth,
     second[:, place] = 0
 
 
-def _restless(statistics: Statistics, growth: Growth, room: int) -> np.ndarray:
+def _restless(statistics: GradientStatistics, growth: Growth, room: int) -> np.ndarray:
     """Indices, in order, of at most `room` Gaussians whose gradients reach a threshold."""
     steps = np.maximum(statistics.seen, 1).astype(np.float32)
     excess = np.maximum(

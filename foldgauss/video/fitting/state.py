@@ -13,7 +13,7 @@ import optax
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import Statistics
+from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.metrics import psnr
 from foldgauss.video.models.renderer import VideoRenderer
@@ -80,14 +80,14 @@ class FitState:
     first: np.ndarray  # Adam's moments, likewise
     second: np.ndarray
     counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
-    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `kinds.kinds_of`
+    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `sparse_storage.find_kinds`
     young: np.ndarray  # bool (num,): born the last time that stock was taken
     colors: Codebook  # which colours are one and the same
     shapes: Codebook  # likewise of the two standard deviations
     frame_errors: np.ndarray  # float32 (num_frames,): mean squared error when last seen, 0 before
     time_logits: np.ndarray  # float32 (num_frames - 1,)
     time_moments: optax.OptState
-    statistics: Statistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
+    statistics: GradientStatistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
     step: int
     plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
     seconds: float

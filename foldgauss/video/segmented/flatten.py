@@ -13,13 +13,13 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 _CURE = "Draw it as a video: foldgauss render, or write_video(path, video.frames(), video.fps)."
 
 
-def flattened(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoModel:
+def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoModel:
     """The plain model that draws the same pictures at all times: layers become one array, the front one first.
 
     Raises ValueError for what no folded model holds: edits of some times only, clocks, functions, a camera; and for
     layers of several envelopes or with cuts of their own, and for a video in segments.
 
-    Example: `flattened(layers(person, street))`.
+    Example: `flatten_video(layers(person, street))`.
     """
     if isinstance(video, VideoModel):
         return video

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from foldgauss._runtime.checks import invalid, is_integer
-from foldgauss.video.editing.chain import gathered
+from foldgauss.video.editing.chain import gather_layer
 from foldgauss.video.editing.clock import NEVER, Clock, Span
-from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, stacked
-from foldgauss.video.editing.overlays import AbstractOverlay, FaceFunction, Function, Opacity, Retimed
+from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, stack_layers
+from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Opacity, Retiming, TriangleFunction
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.segmented_video import READY, SegmentedVideo
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED, SegmentedVideo
 from foldgauss.video.selection.selectors import by_time
 
 Video = VideoModel | EditedVideo | SegmentedVideo
@@ -42,7 +42,7 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
     one with a camera: a camera sees all layers.
     """
     if not any(isinstance(video, SegmentedVideo) for video in videos):
-        return stacked(*videos, timeline=timeline)
+        return stack_layers(*videos, timeline=timeline)
     if not (is_integer(timeline, -len(videos)) and timeline < len(videos)):
         raise invalid("timeline", expected=f"the number of one of {len(videos)} videos", got=timeline)
     timeline %= len(videos)
@@ -58,7 +58,7 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
             expected = f"the segments of video {timeline}, {_told(lead)}"
             raise invalid("videos", expected=expected, got=f"{_told(video)} in video {number}")
 
-    @functools.lru_cache(maxsize=READY)
+    @functools.lru_cache(maxsize=MAX_PREPARED)
     def made(number: int) -> EditedVideo:
         segment = lead.segments[number]
         model = segment.model
@@ -74,11 +74,11 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
             else:
                 own = lead.frame_times.times()[segment.first : segment.stop]
                 parts.append(_Alongside(times, own).video(as_edited(video)))
-        return stacked(*parts, timeline=timeline)
+        return stack_layers(*parts, timeline=timeline)
 
     segments = []
     for number, segment in enumerate(lead.segments):
-        facts = {name: getattr(made(number), name) for name in ("num_gaussians", "degree", "num_floats")}
+        facts = {name: getattr(made(number), name) for name in ("num_gaussians", "degree", "num_parameters")}
         segments.append(dataclasses.replace(segment, **facts, load=functools.partial(made, number)))
     return SegmentedVideo(segments)
 
@@ -113,12 +113,12 @@ class _Alongside:
     def _layer(self, layer: Layer) -> Layer:
         layer = self._seen(layer)
         overlays = tuple(moved for moved in map(self._overlay, layer.overlays) if moved is not None)
-        clock = Retimed(np.ones(layer.num_gaussians, bool), None, self._clock())  # the last is asked first
+        clock = Retiming(np.ones(layer.num_gaussians, bool), None, self._clock())  # the last is asked first
         return Layer(layer.model, overlays, (*layer.clocks, clock))
 
     def _seen(self, layer: Layer) -> Layer:
         """Without those that are never there meanwhile, where no clock and no function could tell."""
-        functions = any(isinstance(overlay, Function | FaceFunction) for overlay in layer.overlays)
+        functions = any(isinstance(overlay, GaussianFunction | TriangleFunction) for overlay in layer.overlays)
         if layer.clocks or functions or layer.holds_frames:
             return layer
         first, last = np.clip([self.own[0] - _MARGIN, self.own[-1] + _MARGIN], 0.0, 1.0)
@@ -126,7 +126,7 @@ class _Alongside:
         if not len(there):
             there = np.arange(1)
         nobody = np.zeros(layer.num_gaussians, bool)
-        return gathered(layer, there, nobody, np.zeros(len(there), int)) if len(there) < len(nobody) else layer
+        return gather_layer(layer, there, nobody, np.zeros(len(there), int)) if len(there) < len(nobody) else layer
 
     def _clock(self) -> Clock:
         first, last = float(self.own[0]), float(self.own[-1])
@@ -138,7 +138,7 @@ class _Alongside:
         return Clock(tuple(self.times[apart].tolist()), tuple(self.own[apart].tolist()))
 
     def _overlay(self, overlay: AbstractOverlay) -> AbstractOverlay | None:
-        if isinstance(overlay, Function | FaceFunction):
+        if isinstance(overlay, GaussianFunction | TriangleFunction):
             overlay = dataclasses.replace(overlay, function=_InTime(overlay.function, self))
         if overlay.span is None:
             return overlay

@@ -15,16 +15,16 @@ from jaxtyping import ArrayLike, Bool, Float32
 
 from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.editing.chain import Edit, When, begun, checked_color, edit, mean_lightness
-from foldgauss.video.editing.clip_window import Part
+from foldgauss.video.editing.chain import Edit, When, check_color, edit, mean_lightness, start_chain
+from foldgauss.video.editing.clip_window import ClipWindow
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
-from foldgauss.video.editing.overlays import LIGHTNESS
+from foldgauss.video.editing.overlays import LUMINANCE_WEIGHTS
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.segmented_video import READY, Segment, SegmentedVideo
-from foldgauss.video.selection.contributions import Contributions, drawn_share
-from foldgauss.video.selection.regions import box_region, chosen_frames, mask_region, polygon_region
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
+from foldgauss.video.selection.contributions import Contributions, render_matte
+from foldgauss.video.selection.regions import region_from_box, region_from_mask, region_from_polygon, resolve_frames
 from foldgauss.video.selection.selectors import (
     THRESHOLD,
     Selection,
@@ -34,7 +34,7 @@ from foldgauss.video.selection.selectors import (
     by_mask,
     by_polygon,
     by_time,
-    questions,
+    list_criteria,
     select,
 )
 
@@ -104,7 +104,7 @@ class SegmentedSelection:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Step:
+class _Call:
     """A call of the chain: `act` takes a segment's `Edit` and the segment's number.
 
     Where nothing is selected it is left out, unless it is `for_all`. `place`: what its errors are told within.
@@ -115,7 +115,7 @@ class _Step:
     for_all: bool = False
 
 
-def _recorded(name: str) -> Callable[..., "SegmentedEdit"]:
+def _record_method(name: str) -> Callable[..., "SegmentedEdit"]:
     """A method of `Edit` as one of the chain for all segments."""
 
     @functools.wraps(getattr(Edit, name))
@@ -150,7 +150,7 @@ class SegmentedEdit:
 
     _video: SegmentedVideo
     _stand_in: Edit = dataclasses.field(repr=False)  # one Gaussian in a clip as long: what is given is checked on it
-    _steps: tuple[_Step, ...] = dataclasses.field(default=(), repr=False)
+    _steps: tuple[_Call, ...] = dataclasses.field(default=(), repr=False)
     _known: SegmentedSelection | None = dataclasses.field(default=None, repr=False)  # the selection, where it is known
     _gone: bool = dataclasses.field(default=False, repr=False)  # whether nothing can be selected
     _as_begun: bool = dataclasses.field(default=True, repr=False)  # whether all have the numbers that they began with
@@ -158,7 +158,7 @@ class SegmentedEdit:
 
     def video(self) -> SegmentedVideo:
         """What has been made: each segment is edited again when it is loaded, so none is held in memory."""
-        load = functools.lru_cache(maxsize=READY)(lambda number: self._replayed(number).video())
+        load = functools.lru_cache(maxsize=MAX_PREPARED)(lambda number: self._replayed(number).video())
         acted: set[int] = set()
         made = [
             self._segment(number, functools.partial(load, number), acted) for number in range(len(self._video.segments))
@@ -166,7 +166,7 @@ class SegmentedEdit:
         for number, step in enumerate(self._steps):
             if number not in acted:
                 with step.place:
-                    _nobody(self._stand_in)._check_selected()
+                    _deselect_all(self._stand_in)._check_selected()
         return SegmentedVideo(made)
 
     def _segment(self, number: int, load: Callable[[], VideoModel | EditedVideo], acted: set[int]) -> Segment:
@@ -176,7 +176,7 @@ class SegmentedEdit:
         if _same(edited._video, before._video):
             return segment
         made = edited.video()
-        facts = {name: getattr(made, name) for name in ("num_gaussians", "degree", "num_floats")}
+        facts = {name: getattr(made, name) for name in ("num_gaussians", "degree", "num_parameters")}
         return dataclasses.replace(segment, **facts, load=load)
 
     def __getattr__(self, name: str) -> object:
@@ -219,7 +219,7 @@ class SegmentedEdit:
             raise invalid("layer", expected="a whole number >= 0", got=layer)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
-            return self._chosen(self._answer(questions(**criteria), layer))
+            return self._chosen(self._answer(list_criteria(**criteria), layer))
         if selection is None:
             return self._selecting(lambda one, number: one.select(layer=layer), None)
         if callable(selection):
@@ -242,7 +242,7 @@ class SegmentedEdit:
         )
 
     def _selecting(self, act: Callable[[Edit, int], Edit], known: SegmentedSelection | None) -> "SegmentedEdit":
-        step = _Step(act, self._place, for_all=True)
+        step = _Call(act, self._place, for_all=True)
         return dataclasses.replace(self, _steps=(*self._steps, step), _known=known, _gone=False)
 
     def _checked(self, selection: object) -> SegmentedSelection:
@@ -260,11 +260,11 @@ class SegmentedEdit:
 
     # ------------------------------------------------------------------------------------------------ what
 
-    move, scale, rotate, transform = map(_recorded, ("move", "scale", "rotate", "transform"))
-    multiply, vanish, opacity = map(_recorded, ("multiply", "vanish", "opacity"))
-    to_front, to_back, place = map(_recorded, ("to_front", "to_back", "place"))
-    retime, freeze = map(_recorded, ("retime", "freeze"))
-    apply, apply_triangles, seen_from = map(_recorded, ("apply", "apply_triangles", "seen_from"))
+    move, scale, rotate, transform = map(_record_method, ("move", "scale", "rotate", "transform"))
+    multiply, vanish, opacity = map(_record_method, ("multiply", "vanish", "opacity"))
+    to_front, to_back, place = map(_record_method, ("to_front", "to_back", "place"))
+    retime, freeze = map(_record_method, ("retime", "freeze"))
+    apply, apply_triangles, seen_from = map(_record_method, ("apply", "apply_triangles", "seen_from"))
 
     @functools.wraps(Edit.recolor)
     def recolor(self, color: ArrayLike | None = None, **given: Any) -> "SegmentedEdit":
@@ -274,15 +274,15 @@ class SegmentedEdit:
         self._try("recolor", (color,), given)
         light = [one._light() for one in map(self._replayed, self._numbers) if len(one.selection)]
         if not light:
-            _nobody(self._stand_in)._check_selected()
+            _deselect_all(self._stand_in)._check_selected()
         when = {name: value for name, value in given.items() if name in When.__annotations__}
-        matrix = np.outer(checked_color(color), LIGHTNESS)
+        matrix = np.outer(check_color(color), LUMINANCE_WEIGHTS)
         return self._then("recolor", (), {"gain": 1 / mean_lightness(light), "matrix": matrix, **when})
 
     def _then(self, name: str, args: Sequence[Any], named: dict[str, Any]) -> "SegmentedEdit":
         """With one more call of a method of `Edit`."""
         after = self._try(name, args, named)
-        step = _Step(lambda one, number: getattr(one, name)(*args, **named), self._place, for_all=name == "seen_from")
+        step = _Call(lambda one, number: getattr(one, name)(*args, **named), self._place, for_all=name == "seen_from")
         keeps = name not in ("multiply", "vanish", "opacity", "to_front", "to_back")
         return dataclasses.replace(
             self,
@@ -295,7 +295,7 @@ class SegmentedEdit:
     def _try(self, name: str, args: Sequence[Any], named: dict[str, Any]) -> Edit:
         """What is given, checked; warnings are told as if of the caller's caller."""
         nobody = self._gone or (self._known is not None and not len(self._known))
-        trial = _nobody(self._stand_in) if nobody else self._stand_in
+        trial = _deselect_all(self._stand_in) if nobody else self._stand_in
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             after = getattr(trial, name)(*args, **named)
@@ -311,7 +311,7 @@ class SegmentedEdit:
         segment = self._video.segments[number]
         model = segment.model
         times = np.asarray(model.frame_times.times(), np.float64)
-        return begun(as_edited(model), Part(times, segment.first, self._video.num_frames))
+        return start_chain(as_edited(model), ClipWindow(times, segment.first, self._video.num_frames))
 
     def _through(self, one: Edit, number: int, acted: set[int]) -> Edit:
         """After all calls; the numbers of those that had something to act on go to `acted`."""
@@ -329,13 +329,13 @@ class SegmentedEdit:
     def _answer(
         self, asked: list[tuple[Callable[..., Selection], dict[str, Any]]], layer: int | None
     ) -> SegmentedSelection:
-        """The answers to all questions, intersected: those by place first, so that the others need ask fewer models."""
+        """The answers to all criteria, intersected: those by place first, so that the others need ask fewer models."""
         found: SegmentedSelection | None = None
         for function, named in sorted(asked, key=lambda question: question[0] in (by_color, by_time)):
             if function in (by_color, by_time):
                 answer = self._by_themselves(function, named, layer, found)
             else:
-                answer = _Carried(self, function, named, layer).selection()
+                answer = _RegionQuery(self, function, named, layer).selection()
             found = answer if found is None else found & answer
         return found
 
@@ -352,20 +352,20 @@ class SegmentedEdit:
                 parts.append(self._nothing(number))
             else:
                 one = self._replayed(number)
-                own = named if spans is None else _own_times(spans, segment, one._part, named)
-                parts.append(_ask(one, layer, lambda model, _, own=own: function(model, **own)))
+                own = named if spans is None else _own_times(spans, segment, one._window, named)
+                parts.append(_evaluate_by_layer(one, layer, lambda model, _, own=own: function(model, **own)))
         return SegmentedSelection(tuple(parts))
 
     def _nothing(self, number: int) -> Selection:
         """Of a segment; its model is loaded only where it must be to know how many Gaussians there are now."""
         if self._as_begun:
             return Selection(np.zeros(self._video.segments[number].num_gaussians, bool))
-        return _none(self._replayed(number))
+        return _empty_selection(self._replayed(number))
 
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
         """First and last frame position, of times, or the range of frames."""
         if times is None:
-            return chosen_frames(_model(self._stand_in), frame, frames)
+            return resolve_frames(_model(self._stand_in), frame, frames)
         pair = np.asarray(times)
         if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
             raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
@@ -378,7 +378,7 @@ def _reaches(spans: Any, segment: Segment) -> bool:
     return first <= segment.stop - 1 and segment.first <= last
 
 
-def _own_times(spans: Any, segment: Segment, part: Part, named: dict[str, Any]) -> dict[str, Any]:
+def _own_times(spans: Any, segment: Segment, part: ClipWindow, named: dict[str, Any]) -> dict[str, Any]:
     """What `by_time` is asked of a segment that is reached."""
     if isinstance(spans, range):
         first, stop = max(spans.start, segment.first), min(spans.stop, segment.stop)
@@ -390,7 +390,7 @@ def _own_times(spans: Any, segment: Segment, part: Part, named: dict[str, Any]) 
     return {"times": tuple(np.clip(times, 0.0, 1.0).tolist()), "alive": named["alive"]}
 
 
-class _Carried:
+class _RegionQuery:
     """The answer to a question that names frames: asked where these are, carried over shared frames elsewhere."""
 
     def __init__(
@@ -401,12 +401,12 @@ class _Carried:
         stand_in = _model(edits._stand_in)
         where = {"frame": named["frame"], "frames": named.get("frames")}
         if function is by_click:
-            self._frames = tuple(chosen_frames(stand_in, **where))
+            self._frames = tuple(resolve_frames(stand_in, **where))
         else:
             regions = {
-                by_mask: (mask_region, "mask"),
-                by_box: (box_region, "box"),
-                by_polygon: (polygon_region, "polygon"),
+                by_mask: (region_from_mask, "mask"),
+                by_box: (region_from_box, "box"),
+                by_polygon: (region_from_polygon, "polygon"),
             }
             make, name = regions[function]
             self._region = make(stand_in, named[name], **where)
@@ -450,10 +450,10 @@ class _Carried:
         elif self._function is by_mask:
             own["mask"] = {k - first: _share(self._region.at(k)) for k in held}
             if not any(mask.any() for mask in own["mask"].values()):
-                return _none(one)
+                return _empty_selection(one)
         else:
             own["frames"] = (held[0] - first, held[-1] + 1 - first)
-        return _ask(one, self._layer, lambda model, _: self._function(model, **own))
+        return _evaluate_by_layer(one, self._layer, lambda model, _: self._function(model, **own))
 
     def _show(self, one: Edit, found: Selection, number: int, other: int) -> None:
         """What is found in a segment, as masks of the frames that it shares with a neighbour."""
@@ -466,7 +466,7 @@ class _Carried:
                 if lit is None:
                     pictures[k] = np.zeros(layer.model.size, bool)
                 else:
-                    pictures[k] = drawn_share(lit, mask, float(one._part.times[k - here.first])) >= _SHOWN
+                    pictures[k] = render_matte(lit, mask, float(one._window.times[k - here.first])) >= _SHOWN
 
     def _from_neighbours(self, one: Edit, number: int) -> Selection:
         first, shown = self._segments[number].first, self._shown[number]
@@ -482,7 +482,7 @@ class _Carried:
                 return Selection.none(model)
             return by_mask(model, masks, threshold=threshold)
 
-        return _ask(one, self._layer, ask)
+        return _evaluate_by_layer(one, self._layer, ask)
 
 
 def _share(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
@@ -490,7 +490,7 @@ def _share(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "he
     return np.clip(mask, 0.0, 1.0)
 
 
-def _ask(one: Edit, layer: int | None, function: Callable[[VideoModel, int], Selection]) -> Selection:
+def _evaluate_by_layer(one: Edit, layer: int | None, function: Callable[[VideoModel, int], Selection]) -> Selection:
     """What each layer's model answers, or layer number `layer` alone."""
     numbers = one._layer_numbers(layer)
     masks = [
@@ -511,12 +511,12 @@ def _same(one: EditedVideo, other: EditedVideo) -> bool:
     return one.camera is other.camera and all(own is before for own, before in pairs)
 
 
-def _none(one: Edit) -> Selection:
+def _empty_selection(one: Edit) -> Selection:
     return one.selection - one.selection
 
 
-def _nobody(one: Edit) -> Edit:
-    return dataclasses.replace(one, selection=_none(one))
+def _deselect_all(one: Edit) -> Edit:
+    return dataclasses.replace(one, selection=_empty_selection(one))
 
 
 @edit.register
@@ -537,5 +537,5 @@ def _(video: SegmentedVideo) -> SegmentedEdit:
     )
     times = FrameTimes.uniform(video.num_frames)
     model = VideoModel(splats, times, video.size, video.fps, video.options, video.compositing)
-    part = Part(np.arange(video.num_frames) / max(video.num_frames - 1, 1), 0, video.num_frames)
-    return SegmentedEdit(video, begun(as_edited(model), part))
+    part = ClipWindow(np.arange(video.num_frames) / max(video.num_frames - 1, 1), 0, video.num_frames)
+    return SegmentedEdit(video, start_chain(as_edited(model), part))

@@ -15,12 +15,12 @@ from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.frame_times import check_frame_before, times_at
-from foldgauss.video.models.renderer import Staged, VideoRenderer
+from foldgauss.video.models.renderer import PreparedVideo, VideoRenderer
 from foldgauss.video.models.video_model import VideoModel, check_time
 
 #: Models that are held ready at once; more only where more are seen: half way from the last frame of one fade to the
 #: first of the next, if these are neighbours.
-READY = 2
+MAX_PREPARED = 2
 #: Frames. A position so near to a frame is that frame: times k / (num_frames - 1) come back rounded.
 _CLOSE = 1e-6
 
@@ -38,7 +38,7 @@ class Segment:
     num_frames: int
     num_gaussians: int
     degree: int
-    num_floats: int
+    num_parameters: int
     size: tuple[int, int]
     fps: float
     options: RenderOptions
@@ -47,7 +47,7 @@ class Segment:
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, first: int, model: VideoModel | EditedVideo) -> "Segment":
+    def from_model(cls, first: int, model: VideoModel | EditedVideo) -> "Segment":
         """A model in memory, whose first frame is the whole clip's `first`. Raises ValueError for another type."""
         if not isinstance(model, VideoModel | EditedVideo):
             cure = "End a chain of edits with .video()." if type(model).__name__ == "Edit" else ""
@@ -110,11 +110,11 @@ class SegmentedVideo:
     frame b. Before its first frame and after its last a model shows that frame. Where neighbours share nothing, they
     meet at a cut, and between the two frames the nearer one is shown.
 
-    Models are loaded when they are drawn, and at most `READY` of them are held ready.
+    Models are loaded when they are drawn, and at most `MAX_PREPARED` of them are held ready.
 
     **Units:** times are in [0, 1], frame k of the clip at k / (num_frames - 1), float64.
 
-    **Example:** `SegmentedVideo.of([(0, first), (95, second)]).render(0.5)`.
+    **Example:** `SegmentedVideo.from_models([(0, first), (95, second)]).render(0.5)`.
 
     **Raises:** ValueError for segments that leave a gap or are out of order, for one that reaches into the one after
     the next, and for those of another size, rate, compositing or `RenderOptions`.
@@ -130,9 +130,9 @@ class SegmentedVideo:
         self.compositing: str = lead.compositing
 
     @classmethod
-    def of(cls, parts: Sequence[tuple[int, VideoModel | EditedVideo]]) -> "SegmentedVideo":
+    def from_models(cls, parts: Sequence[tuple[int, VideoModel | EditedVideo]]) -> "SegmentedVideo":
         """Of models in memory, each with the number of its first frame in the whole clip."""
-        return cls([Segment.of(first, model) for first, model in parts])
+        return cls([Segment.from_model(first, model) for first, model in parts])
 
     def __repr__(self) -> str:
         return f"SegmentedVideo({len(self.segments)} segments, {self.num_frames} frames)"
@@ -153,9 +153,9 @@ class SegmentedVideo:
         return max(segment.degree for segment in self.segments)
 
     @property
-    def num_floats(self) -> int:
+    def num_parameters(self) -> int:
         """Numbers stored, of all segments."""
-        return sum(segment.num_floats for segment in self.segments)
+        return sum(segment.num_parameters for segment in self.segments)
 
     @property
     def frame_times(self) -> SegmentedTimes:
@@ -177,9 +177,9 @@ class SegmentedVideo:
 
         return SegmentedVideo([changed(segment) for segment in self.segments])
 
-    def stage(self, size: tuple[int, int]) -> "SegmentedStage":
+    def prepare(self, size: tuple[int, int]) -> "PreparedSegmentedVideo":
         """Made ready to be conditioned many times, for pictures of `size`."""
-        return SegmentedStage(self, size)
+        return PreparedSegmentedVideo(self, size)
 
     def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, front to back, in pixels of a picture of `size` (default: its own); NumPy leaves.
@@ -187,7 +187,7 @@ class SegmentedVideo:
         In a fade they are those of the model that is seen more of.
         """
         check_time(t)
-        return self.stage(self.size if size is None else size).splats(float(t))
+        return self.prepare(self.size if size is None else size).splats(float(t))
 
     def render(
         self,
@@ -246,40 +246,40 @@ class SegmentedVideo:
         return min(max((position - first + 1) / (stop - first + 1), 0.0), 1.0)
 
 
-class SegmentedStage:
+class PreparedSegmentedVideo:
     """The splats of a video in segments by time, in pixels of a picture of `size`, see `PreparedModel`."""
 
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):
         self._video, self._size = video, tuple(size)
-        self._ready: OrderedDict[int, tuple[Staged, np.ndarray]] = OrderedDict()
+        self._ready: OrderedDict[int, tuple[PreparedVideo, np.ndarray]] = OrderedDict()
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, of the segment that is seen most; NumPy leaves."""
         position = self._video.position(t)
         number, _ = max(self._video.weights(position), key=lambda pair: pair[1])
-        stage, time = self._at(number, position, READY)
+        stage, time = self._at(number, position, MAX_PREPARED)
         return stage.splats(time)
 
-    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
-        """The pictures of the segments that are seen at time t, see `foldgauss.video.models.renderer.Staged`."""
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
+        """The pictures of the segments that are seen at time t, see `foldgauss.video.models.renderer.PreparedVideo`."""
         position, parts = self._video.position(t), []
         weights = self._video.weights(position)
         for number, weight in weights:
-            stage, time = self._at(number, position, max(len(weights), READY))
-            parts += [(weight * own, splats) for own, splats in stage.parts(time)]
+            stage, time = self._at(number, position, max(len(weights), MAX_PREPARED))
+            parts += [(weight * own, splats) for own, splats in stage.weighted_splats(time)]
         return parts
 
-    def _at(self, number: int, position: float, most: int) -> tuple[Staged, np.ndarray]:
+    def _at(self, number: int, position: float, most: int) -> tuple[PreparedVideo, np.ndarray]:
         """A segment made ready, one of at `most` so many, and its own time at a position in the whole clip."""
         stage, times = self._prepared(number, most)
         return stage, times_at(times, position - self._video.segments[number].first)
 
-    def _prepared(self, number: int, most: int) -> tuple[Staged, np.ndarray]:
+    def _prepared(self, number: int, most: int) -> tuple[PreparedVideo, np.ndarray]:
         if number not in self._ready:
             while len(self._ready) >= most:
                 self._ready.popitem(last=False)  # before the next is loaded, so that there is room for it
             model = self._video.segments[number].model
-            self._ready[number] = model.stage(self._size), np.asarray(model.frame_times.times())
+            self._ready[number] = model.prepare(self._size), np.asarray(model.frame_times.times())
         self._ready.move_to_end(number)
         return self._ready[number]
 
@@ -290,7 +290,7 @@ def _check_segments(segments: tuple[Segment, ...]) -> None:
         raise invalid("segments", expected="at least one", got="none")
     for number, segment in enumerate(segments):
         if not isinstance(segment, Segment):
-            cure = "Of models: SegmentedVideo.of([(first, model), ...])."
+            cure = "Of models: SegmentedVideo.from_models([(first, model), ...])."
             raise invalid(f"segments[{number}]", expected="a Segment", got=short_repr(segment), cure=cure)
         if not is_integer(segment.first, 0):
             expected = "the number of a frame of the whole clip"

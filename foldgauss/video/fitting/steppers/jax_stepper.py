@@ -9,57 +9,17 @@ import time
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
-from foldgauss.render import pallas
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.densify import changes_at, grow
-from foldgauss.video.fitting.growth import Statistics
-from foldgauss.video.fitting.pyramid import levels, shrunk
-from foldgauss.video.fitting.schedule import Rates, looked_at, steps_per_pass, views_of
+from foldgauss.video.fitting.growth import GradientStatistics
+from foldgauss.video.fitting.schedule import Rates, levels, looked_at, shrunk, steps_per_pass, views_of
 from foldgauss.video.fitting.state import FitState, frame_times
 from foldgauss.video.fitting.steppers.jax_step import Arrays, Control, Figures, Plan, everywhere, look, program
 
 #: Of a fit that grows without a bound that it could reach: room for so many times the Gaussians of its start, and
 #: twice as much whenever that is not enough, for which steps are compiled anew.
 ROOM = 4
-
-
-def chosen_engine(frames: np.ndarray, config: FitConfig, state: FitState | None = None) -> str:
-    """ "cpu", "xla" or "pallas": what computes a fit to `frames`, on from `state`.
-
-    Raises ValueError where an engine is asked for that does not know a setting.
-    """
-    if config.engine == "cpu" or (config.engine == "auto" and jax.default_backend() == "cpu"):
-        return "cpu"
-    unknown = _unknown(frames, config, state)
-    if config.engine == "auto":
-        return "cpu" if unknown else "xla"
-    if unknown:
-        cure = "Give engine='cpu', which knows all settings."
-        raise invalid("engine", expected=f"'cpu' with {unknown}", got=repr(config.engine), cure=cure)
-    if config.engine == "pallas":
-        pallas.check_options(config.options)
-    return config.engine
-
-
-def device_name() -> str:
-    """The device that steps are computed on where they are not on the CPU's kernels, as "NVIDIA H200"."""
-    first, *others = jax.local_devices()
-    return f"{len(others) + 1} times {first.device_kind}" if others else first.device_kind
-
-
-def _unknown(frames: np.ndarray, config: FitConfig, state: FitState | None) -> str:
-    """What steps on a device do not know, in words; empty where there is nothing."""
-    if config.economy is not None:
-        return "an economy"
-    if config.interpolation_fraction > 0:
-        return f"interpolation_fraction {config.interpolation_fraction:g}"
-    if frames.shape[3] == 4:
-        return "frames that have alpha"
-    if state is not None and (len(state.colors.index) or len(state.shapes.index)):
-        return "a state whose Gaussians share numbers"
-    return ""
 
 
 def _seen_at(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -133,7 +93,7 @@ class DeviceStepper:
 
         statistics = None
         if self.config.growth is not None:  # also after the last births: else steps were to be compiled anew
-            statistics = state.statistics if growing else Statistics.zeros(num)
+            statistics = state.statistics if growing else GradientStatistics.zeros(num)
         arrays = Arrays(
             *(padded(getattr(state, name)) for name in ("rows", "first", "second", "counts", "kinds")),
             np.array(state.frame_errors),

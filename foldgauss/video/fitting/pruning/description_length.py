@@ -5,31 +5,28 @@ two-part code (Rissanen 1978): bits of the parameters, and of the residual given
 of one variance are n / 2 log2(squared error) and a constant.
 """
 
-import dataclasses
 import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.pruning.scores import ROUNDING, PruningScores
-from foldgauss.video.models.kinds import (
-    LASTS,
-    NUMBERS,
-    OF_OPACITY,
-    OF_POWER,
-    OF_TIME,
-    SOLID,
-    degrees_of,
-    is_solid,
-    lasts,
-)
 from foldgauss.video.models.row_layout import columns, shift_path
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.sparse_storage import (
+    BASE_PARAMETERS,
+    OPACITY_PARAMETERS,
+    OPAQUE_BIT,
+    POWER_PARAMETERS,
+    STATIC_BIT,
+    TIME_PARAMETERS,
+    get_degrees,
+    is_opaque,
+    is_static,
+)
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 
-#: A round costs as much as some two passes over the frames: there is one in so many passes of the plan at most.
-LEAST_PASSES = 5
 #: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
 #: lower; and so much higher, in dB, that the end is not missed by a hair.
 YET_TO_COME, SPARE = 0.8, 0.1
@@ -50,78 +47,31 @@ MOST_SOLID = 0.25
 _UNLIKE = 4.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Economy:
-    """Pruning by description length at `rounds` points of the plan, evenly from `first_fraction` to `last_fraction`.
+def count_births(
+    economy: Economy, ledger: PruningScores, psnr: float, progress: float, num: int, survived: float
+) -> int:
+    """How many Gaussians are born to `num`; `survived` is the fraction of the previous newborns that were not pruned.
 
-    * Without `psnr`: a Gaussian, a power of its path, a beginning and an end of its life, its opacity, a colour and a
-      shape of its own stay if they save more than `bits` for each of their numbers. (Compact files hold a number in
-      8 bits on the average.)
-      With `grows`, a `BIRTHS` share of Gaussians are born where the error is, as long as half of them stay.
-    * With `psnr`, dB: what is dropped is what costs the least, until the mean over all frames is that; where it seems
-      out of reach, Gaussians are born.
-
-    A round drops at most a share `most_dropped` of the Gaussians: then the others take over what is missed. Short plans
-    have fewer rounds.
-    Raises ValueError for numbers out of range.
+    `psnr` is the one reached now, in dB.
     """
+    if ledger.squared_error <= ROUNDING * ledger.num_samples:  # below the rounding to 8 bits
+        return 0
+    if economy.psnr is None:
+        return round(BIRTHS * num) if economy.grows and survived >= 0.5 else 0
+    missing = _round_target(economy, progress) - psnr
+    return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
 
-    psnr: float | None = None
-    bits: float = 8.0
-    rounds: int = 8
-    first_fraction: float = 0.15
-    last_fraction: float = 0.88
-    most_dropped: float = 0.3
-    grows: bool = True
 
-    def __post_init__(self) -> None:
-        bounds = {"bits": "(0, inf)", "first_fraction": "(0, 1)", "last_fraction": "(0, 1)", "most_dropped": "(0, 1]"}
-        if self.psnr is not None:
-            bounds["psnr"] = "(0, 100]"
-        for name, interval in bounds.items():
-            if not is_within(getattr(self, name), interval):
-                raise invalid(f"economy.{name}", expected=f"a number in {interval}", got=repr(getattr(self, name)))
-            object.__setattr__(self, name, float(getattr(self, name)))
-        if not is_integer(self.rounds, 1):
-            raise invalid("economy.rounds", expected="a whole number >= 1", got=repr(self.rounds))
-        object.__setattr__(self, "rounds", int(self.rounds))
-        if not isinstance(self.grows, bool):
-            raise invalid("economy.grows", expected="True or False", got=repr(self.grows))
-        if self.first_fraction > self.last_fraction:
-            got = f"{self.first_fraction:g} and {self.last_fraction:g}"
-            raise invalid("economy.first_fraction, last_fraction", expected="in this order", got=got)
+def allowed_error(economy: Economy, ledger: PruningScores, psnr: float, progress: float) -> float | None:
+    """The squared error that a round may add at the PSNR reached now, in dB; None where the price decides."""
+    if economy.psnr is None:
+        return None
+    return ledger.squared_error * (10 ** (min(psnr - _round_target(economy, progress), MOST_AT_ONCE) / 10) - 1)
 
-    def steps(self, plan: int, *, passes: float, coarse: float) -> Int[np.ndarray, "rounds"]:
-        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet.
 
-        The plan's steps are `passes` over the frames. Of a plan too short for all rounds some are left out.
-        """
-        first = max(self.first_fraction, min(coarse + 0.05, self.last_fraction))
-        num = max(min(self.rounds, int(passes / LEAST_PASSES)), 1)
-        shares = np.linspace(first, self.last_fraction, num) if num > 1 else np.array([self.last_fraction])
-        return np.clip(np.rint(shares * plan), 1, plan).astype(int)
-
-    def births(self, ledger: PruningScores, psnr: float, progress: float, num: int, survived: float) -> int:
-        """How many Gaussians are to be born to `num`; `survived`: the share still there of those born last.
-
-        `psnr`: what is reached now, dB.
-        """
-        if ledger.squared_error <= ROUNDING * ledger.num_samples:  # nothing to be seen
-            return 0
-        if self.psnr is None:
-            return round(BIRTHS * num) if self.grows and survived >= 0.5 else 0
-        missing = self._aim(progress) - psnr
-        return round(num * (2 ** min(missing / DOUBLING, 1.0) - 1)) if missing > 0 else 0
-
-    def room(self, ledger: PruningScores, psnr: float, progress: float) -> float | None:
-        """The squared error that a round may add at a PSNR of so many dB; None where the price decides."""
-        if self.psnr is None:
-            return None
-        return ledger.squared_error * (10 ** (min(psnr - self._aim(progress), MOST_AT_ONCE) / 10) - 1)
-
-    def _aim(self, progress: float) -> float:
-        """dB that a round aims at: the rest of the fit brings more."""
-        return self.psnr + SPARE - YET_TO_COME * (1 - progress)
+def _round_target(economy: Economy, progress: float) -> float:
+    """The PSNR in dB that a round aims at: the remaining steps improve it further."""
+    return economy.psnr + SPARE - YET_TO_COME * (1 - progress)
 
 
 def frame_weights(errors: Float32[np.ndarray, " num_frames"]) -> Float[np.ndarray, " num_frames"]:
@@ -211,10 +161,10 @@ class _Book:
         self._rows, self._kinds, self._ledger, self._degree, self._pixels = rows, kinds, ledger, degree, pixels
         self._grown = np.zeros(len(rows)) if sized else ledger.mean_log_envelope
         self._at, num = columns(degree), len(rows)
-        own, lasting = degrees_of(kinds), lasts(kinds)
+        own, lasting = get_degrees(kinds), is_static(kinds)
         place = np.concatenate([rows[:, self._at["loc"]], rows[:, self._at["coefficients"]]], 1)
         self._place = place.reshape(num, degree + 1, 2).astype(float) * pixels
-        added = np.full((num, degree + 1, 2, 2), np.inf)  # by degree, whether it lasts, whether it is solid
+        added = np.full((num, degree + 1, 2, 2), np.inf)  # by degree, whether it is static, whether it is opaque
         for lower in range(degree + 1):
             which = np.flatnonzero(own > lower)
             if len(which):
@@ -224,10 +174,15 @@ class _Book:
         added[lasting, :, 1], added[lasting, :, 0] = added[lasting, :, 0], np.inf
         opacity = 1 / (1 + np.exp(-rows[:, self._at["opacity_logit"].start].astype(float)))
         added[:, :, :, 1] = added[:, :, :, 0] + (ledger.solid(opacity)[:, None, None] if solid else np.inf)
-        self._solid = is_solid(kinds)
+        self._solid = is_opaque(kinds)
         added[self._solid, :, :, 1], added[self._solid, :, :, 0] = added[self._solid, :, :, 0], np.inf
-        powers = OF_POWER * np.arange(degree + 1)[:, None, None]
-        numbers = NUMBERS + powers - OF_TIME * np.array([0, 1])[:, None] - OF_OPACITY * np.array([0, 1])
+        powers = POWER_PARAMETERS * np.arange(degree + 1)[:, None, None]
+        numbers = (
+            BASE_PARAMETERS
+            + powers
+            - TIME_PARAMETERS * np.array([0, 1])[:, None]
+            - OPACITY_PARAMETERS * np.array([0, 1])
+        )
         self._added, self._numbers = added.reshape(num, -1), numbers.ravel()
 
     def _chosen(self, price: float, most_dropped: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -262,12 +217,12 @@ class _Book:
         stays, best, added = self._chosen(price, most_dropped)
         stay = np.flatnonzero(stays)
         lower, lasting, solid = np.unravel_index(best[stay], (self._degree + 1, 2, 2))
-        kinds = (lower + LASTS * lasting + SOLID * solid).astype(np.uint8)
+        kinds = (lower + STATIC_BIT * lasting + OPAQUE_BIT * solid).astype(np.uint8)
         return Cut(stay, self._changed(stay, lower, lasting == 1, solid == 1), kinds, added, price)
 
     def _changed(self, stay: np.ndarray, lower: np.ndarray, lasting: np.ndarray, solid: np.ndarray) -> np.ndarray:
-        rows, own, at = self._rows[stay].copy(), degrees_of(self._kinds[stay]), self._at
-        place, now = self._place[stay], lasting & ~lasts(self._kinds[stay])
+        rows, own, at = self._rows[stay].copy(), get_degrees(self._kinds[stay]), self._at
+        place, now = self._place[stay], lasting & ~is_static(self._kinds[stay])
         for degree in range(self._degree):
             here = np.flatnonzero((lower == degree) & (own > degree))
             if len(here):
@@ -275,8 +230,8 @@ class _Book:
         logit = rows[now, at["time_loc_logit"].start].astype(float)
         place[now] = shift_path(place[now], 0.5 - 1 / (1 + np.exp(-logit)))
         rows[now, at["log_scale"]] += self._grown[stay[now], None].astype(np.float32)
-        rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, LASTING
-        rows[solid, at["opacity_logit"].start] = OPAQUE
+        rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, STATIC_LOG_TIME_SCALE
+        rows[solid, at["opacity_logit"].start] = OPAQUE_LOGIT
         moved = now | (lower < own)
         anew = (place[moved] / self._pixels).astype(np.float32)
         rows[moved, at["loc"]] = anew[:, 0]
