@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from soft_models import SIZE, soft_model
 
+import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
 from foldgauss.io.models.compact import MAGIC, VERSION, pack_compact
@@ -339,7 +340,7 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     if how == "crowd of kinds":
         model = of_kinds(model)
     path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantized)
-    decoder = Path(player_page.__file__).with_name("compact.js")
+    decoder = Path(foldgauss.io.page.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
         """

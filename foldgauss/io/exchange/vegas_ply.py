@@ -155,7 +155,7 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
 def _convert_time_scale(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
-    """log sigma_t that gives an envelope of power `other` the same values; static Gaussians have value 1 with either."""
+    """log sigma_t that gives an envelope of power `other` the same values; static Gaussians keep the value 1."""
     return np.where(
         log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
     )
