@@ -36,7 +36,7 @@ from foldgauss.video.fitting.loop import FitConfig, FitState, fit_steps
 from foldgauss.video.models.row_layout import unpack
 
 #: The module, which the function `fit` of the package hides.
-fit_module = importlib.import_module("foldgauss.video.fitting.loop")
+stepper_module = importlib.import_module("foldgauss.video.fitting.steppers.cpu_stepper")
 WARMUP = 5  # steps: the first compiles, and the optimiser's pages are touched for the first time
 #: What is timed, in the order of a step.
 PARTS = {
@@ -82,18 +82,18 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
     )
     parts = {
         "frame_times": "frame times",
-        "_update_times": "frame times",
+        "update_frame_times": "frame times",
         "condition": "condition",
         "image_loss": "loss",
         "backpropagate": "backpropagate",
-        "sparse_adam": "adam",
+        "update_rows": "adam",
         "update_windows": "adam",
     }
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.object(fit_module, "cpu", kernels))
+        stack.enter_context(mock.patch.object(stepper_module, "cpu", kernels))
         for name, part in parts.items():
-            timed = clock.timed(part, getattr(fit_module, name))
-            stack.enter_context(mock.patch.object(fit_module, name, timed))
+            timed = clock.timed(part, getattr(stepper_module, name))
+            stack.enter_context(mock.patch.object(stepper_module, name, timed))
         yield
 
 

@@ -491,15 +491,15 @@ def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
 def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsys):
     pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
-    from foldgauss.uncertainty.posterior import sampling as posterior
+    from foldgauss.uncertainty.posterior import draws_file
 
-    keep = posterior._Kept.keep
+    keep = draws_file.DrawsFile.save
 
     def kept(self):
         keep(self)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(posterior._Kept, "keep", kept)
+    monkeypatch.setattr(draws_file.DrawsFile, "save", kept)
     words = ["uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", tmp_path, "--steps", "600"]
     assert run(*words) == 143
     assert "goes on when called again" in " ".join(capsys.readouterr().err.split())

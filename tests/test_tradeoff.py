@@ -141,7 +141,7 @@ def test_each_turn_changes_one_thing_and_has_a_command():
         assert "my clip.mp4" in shlex.split(line)
     assert made[0].config == BASE
     shown = dict(zip((point.name for point in made), lines, strict=True))
-    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-share 0.0")
+    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-fraction 0.0")
     assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
     assert shown["economy on"].endswith("--steps 1000 --economy")  # a flag
     assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
@@ -333,7 +333,7 @@ def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
 
 def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypatch):
     """`fit` finds it anew each time; so it is in each fit's seconds, though it was found once."""
-    found, given, steps, of = [], [], command.fit_steps, Motion.of
+    found, given, steps, of = [], [], command.fit_steps, Motion.from_frames
 
     def slow(frames):
         found.append(len(frames))
@@ -344,7 +344,7 @@ def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypat
         given.extend([known.get("motion")] if config.follow_motion else [])
         return steps(frames, config, **known)
 
-    monkeypatch.setattr(Motion, "of", slow)
+    monkeypatch.setattr(Motion, "from_frames", slow)
     monkeypatch.setattr(command, "fit_steps", watched)
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing", *QUICK) == 0
     assert found == [FRAMES]
@@ -384,7 +384,7 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
     assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
     record = record_of(tmp_path / "r")
     assert [name_of(row) for row in record["points"]] == ["base", "precision float16"]
-    assert set(record["left_out"]) == {"precision compact", "precision compact, mended"}
+    assert set(record["left_out"]) == {"precision compact", "precision compact, finetuned"}
     quick = command.compress
     monkeypatch.setattr(command, "compress", lambda *given, **more: quick(*given, **more | {"passes": 0}))
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
@@ -525,7 +525,7 @@ def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(
         fitting, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config)
     )
-    options = ["--ssim-share", 0.3, "--quarter-share", 0.1, "--half-share", 0.2]
+    options = ["--ssim-fraction", 0.3, "--quarter-fraction", 0.1, "--half-fraction", 0.2]
     options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
     target = tmp_path / "m.safetensors"
     assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0

@@ -216,7 +216,7 @@ class _Run:
         """The clip's, found once; what that took is kept with the plan: `fit` spends it anew on every model."""
         if self._motion is None:
             begun = _Spent.now()
-            self._motion = Motion.of(np.ascontiguousarray(self.clip.frames[..., :3]))
+            self._motion = Motion.from_frames(np.ascontiguousarray(self.clip.frames[..., :3]))
             self.record.plan.setdefault("motion", _Spent.since(begun)._asdict())
         return self._motion
 

@@ -14,7 +14,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.economy import Economy
-from foldgauss.video.fitting.schedule import levels
+from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.video_model import VideoModel
@@ -23,10 +23,10 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 #: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
 #: with that many passes over the clip, at a loss of at most `MAX_LOSS_DB`.
 FLOAT32, FLOAT16 = "float32", "float16"
-PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, mended": 4})
+PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, finetuned": 4})
 MAX_LOSS_DB = 0.2
 #: What compressing takes, in steps of a fit per frame: about what was measured.
-_COMPRESSING = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, mended": 18.0}
+_COMPRESSING = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, finetuned": 18.0}
 #: Fewer steps show nothing of what a setting is worth.
 LEAST_STEPS = 200
 #: A point of the front is better than all cheaper ones by more than this, in dB: what is told of a PSNR.
@@ -183,7 +183,8 @@ def _why_not(point: Point, base: FitConfig, num_frames: int, size: tuple[int, in
     if point.of_base:
         return ""
     shares = {"quarter_fraction": base.quarter_fraction, "half_fraction": base.half_fraction}
-    same = dataclasses.replace(point.config, **shares) == base and levels(point.config, size) == levels(base, size)
+    same = dataclasses.replace(point.config, **shares) == base
+    same = same and plan_levels(point.config, size) == plan_levels(base, size)
     return f"it changes nothing at {size[0]}x{size[1]}" if same else ""
 
 

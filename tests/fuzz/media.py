@@ -19,8 +19,9 @@ from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.media import format_detection
 from foldgauss.io.media.format_detection import _ASF_AUDIO, _CLUSTER, _MATROSKA_AUDIO
 from foldgauss.io.media.masks import MAX_PIXELS, MAX_PIXELS_PER_BYTE
-from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, Profiles
-from foldgauss.uncertainty.posterior import sampling as posterior
+from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, ProfileCurves
+from foldgauss.uncertainty.posterior import draws_file
+from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 from .branches import ONLY
 from .models import written
@@ -29,7 +30,7 @@ from .target import CONSTANT, Target, chance
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    posterior.needed("arviz")
+    import_optional("arviz")
 
 _NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
 
@@ -323,7 +324,7 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
 
     def write(path: Path) -> None:
         rng = np.random.default_rng(0)
-        with h5py.File(path, "w", libver=version, userblock_size=posterior._BLOCK) as file:
+        with h5py.File(path, "w", libver=version, userblock_size=draws_file._BLOCK) as file:
             file.attrs["fingerprint"] = _FINGERPRINT
             for n in range(_SHAPE[0]):
                 group = file.create_group(f"ensemble_{n}")
@@ -342,20 +343,20 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
                 group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
                 for k, value in enumerate(np.random.RandomState(0).get_state()):
                     group.attrs[f"random_state_{k}"] = value
-        posterior._seal(path)
+        draws_file._seal(path)
 
     return written(write, ".h5")
 
 
 def _read_chains(path: Path) -> None:
     there = path.exists()
-    kept = posterior._Kept(path, _FINGERPRINT, _SHAPE)
+    kept = draws_file.DrawsFile(path, _FINGERPRINT, _SHAPE)
     if not there:  # a run begins there
         kept.live.unlink()
         raise FileNotFoundError
     try:
         for n in range(_SHAPE[0]):
-            backend = kept.of(n)
+            backend = kept.backend(n)
             assert backend.initialized
             assert backend.shape == _SHAPE[1:]
             if backend.iteration:
@@ -405,12 +406,12 @@ def h5_changed(data: bytes, random: Random) -> bytes:
                     if int(np.prod(shape)) > 10**6:
                         options = {"chunks": (1, *shape[1:])}
                     group.create_dataset(name, shape, kind, **options)
-        posterior._seal(path)
+        draws_file._seal(path)
 
     try:
         return written(write, ".h5")
     except (OSError, KeyError, ValueError, TypeError, IndexError):
-        return by_chance(data, random, posterior._BLOCK)
+        return by_chance(data, random, draws_file._BLOCK)
 
 
 CHAINS = Target(
@@ -420,12 +421,12 @@ CHAINS = Target(
     _read_chains,
     (ValueError,),
     {
-        "foldgauss.uncertainty.posterior.sampling": (
-            ONLY, "_Kept", "-check_space", "-check_room", "-written",
-            "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "is_sealed",
+        "foldgauss.uncertainty.posterior.draws_file": (
+            ONLY, "DrawsFile", "-check_space", "-raise_system_error", "-convert_errors",
+            "read_fingerprint", "_damaged", "_is_valid", "_is_random_state", "is_sealed",
         )
     },
-    lambda data: posterior._BLOCK,
+    lambda data: draws_file._BLOCK,
     lambda size: 4 * CONSTANT + 64 * size,
     (h5_changed,),
     past_header=1,
@@ -436,18 +437,18 @@ CHAINS = Target(
 @functools.cache
 def _evidence() -> bytes:
     times, heights = np.linspace(0, 1, 4), np.array([0.0, -1.0, -0.5, -2.0])
-    profiles = Profiles.of([times, times[:3], times], [heights, heights[:3], heights])
-    seen = LikelihoodProfiles(
-        profiles, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
+    curves = ProfileCurves.from_nodes([times, times[:3], times], [heights, heights[:3], heights])
+    profiles = LikelihoodProfiles(
+        curves, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
     )
-    return written(lambda path: keep_evidence(path, "key", seen), ".npz")
+    return written(lambda path: keep_evidence(path, "key", profiles), ".npz")
 
 
 def _read_evidence(path: Path) -> None:
-    seen = kept_evidence(path, "key", 3)
-    if seen is None:
+    profiles = kept_evidence(path, "key", 3)
+    if profiles is None:
         raise ValueError("expected evidence, got none")  # what the command does then: it draws the pictures
-    assert seen.profiles(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
+    assert profiles.curves(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
 
 
 EVIDENCE = Target(

@@ -15,7 +15,7 @@ from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.io import save_selection
 from foldgauss.render import RenderOptions
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -413,7 +413,7 @@ def test_segments_that_do_not_go_together_are_refused():
         flatten_video,
         lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
         lambda clip: Selection.all(clip),
-        lambda clip: Screen(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
+        lambda clip: Residuals(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
         lambda clip: save_selection("never", Selection(np.ones(NUM, bool)), clip),
     ],
 )

@@ -13,14 +13,11 @@ import typer
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.shared import (
-    AlphaCutoff,
     Frames,
     NewClip,
     Overwrite,
     Size,
     Stopped,
-    SupportRadius,
-    TransmittanceStop,
     WrongUse,
     app,
     as_option,
@@ -45,35 +42,15 @@ from foldgauss.cli.app.signals import noted_signals
 from foldgauss.cli.fitting.jobs_view import WorkerOptions
 from foldgauss.cli.fitting.long import fit_in_segments
 from foldgauss.cli.fitting.options import (
-    WATCHED,
-    BatchSize,
-    BetweenShare,
+    PROGRESS,
     CheckpointSeconds,
-    Compositing,
-    Degree,
-    Engine,
-    Gaussians,
-    HalfShare,
     LogJson,
-    MaxGaussians,
-    MaxSizeMb,
-    Minutes,
-    OnDivergence,
-    Power,
-    Preset,
-    QuarterShare,
     Quiet,
     Scheduler,
-    Seed,
     SegmentSeconds,
-    SmallestAtPsnr,
-    SsimShare,
-    Steps,
-    TargetPsnr,
     Threads,
-    UseEconomy,
     Workers,
-    config_of,
+    fit_options,
     manner_of,
 )
 from foldgauss.cli.fitting.progress import Manner, Observer, previewing, print_json, watching
@@ -151,49 +128,28 @@ def _is_demos(path: Path) -> bool:
 
 
 @app.command()
+@fit_options
 def fit(
     context: typer.Context,
     video: NewClip,
+    config: FitConfig,
     out_path: Annotated[
         Path | None,
         typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name, in this folder]."),
     ] = None,
-    preset: Preset = "standard",
     size: Size = None,
     frames: Frames = None,
     overwrite: Overwrite = False,
-    gaussians: Gaussians = None,
-    max_gaussians: MaxGaussians = None,
-    economy: UseEconomy = False,
-    smallest_at_psnr: SmallestAtPsnr = None,
-    max_size_mb: MaxSizeMb = None,
-    degree: Degree = None,
-    steps: Steps = None,
-    minutes: Minutes = None,
-    target_psnr: TargetPsnr = None,
-    batch_size: BatchSize = None,
-    power: Power = None,
-    compositing: Compositing = None,
-    interpolation_fraction: BetweenShare = None,
-    ssim_fraction: SsimShare = None,
-    quarter_fraction: QuarterShare = None,
-    half_fraction: HalfShare = None,
-    engine: Engine = "auto",
-    seed: Seed = 0,
-    alpha_cutoff: AlphaCutoff = None,
-    support_radius: SupportRadius = None,
-    transmittance_stop: TransmittanceStop = None,
-    on_divergence: OnDivergence = "back-off",
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=WATCHED),
+        typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=PROGRESS),
     ] = False,
     history: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE.jsonl",
             help="Write every step's figures here as it is done; FILE.png: the curves.",
-            rich_help_panel=WATCHED,
+            rich_help_panel=PROGRESS,
         ),
     ] = None,
     preview: Annotated[
@@ -201,7 +157,7 @@ def fit(
         typer.Option(
             metavar="FILE.png",
             help="Keep a picture of the running fit here, new every 10 s.",
-            rich_help_panel=WATCHED,
+            rich_help_panel=PROGRESS,
         ),
     ] = None,
     checkpoint_seconds: CheckpointSeconds = None,
@@ -222,7 +178,6 @@ def fit(
         check_model_name(target, "out")
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
-    config = config_of(context.params)
     kept = target.with_name(f"{target.name}.checkpoint")
     manner = manner_of(quiet, log_json)
     hands = WorkerOptions(workers, scheduler, threads)
@@ -269,7 +224,7 @@ def fit(
     with watching(manner, err, history=recorded, preview=previews) as observe:
         state, info = _run_fit(clip.frames, config, observe, state, keep, begin, seconds=checkpoint_seconds)
     model = to_model(state, config, clip.size, clip.fps)
-    about = noted(clip, seed, frames)
+    about = noted(clip, config.seed, frames)
     try:
         save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
     except OSError as error:
@@ -289,6 +244,7 @@ def fit(
     except OSError as error:  # of the second write; the model is there
         err.print(f"warning: {target} is written, but its scores could not be noted in it: {error}", soft_wrap=True)
     kept.unlink(missing_ok=True)
+    smallest_at_psnr = None if config.economy is None else config.economy.psnr
     if smallest_at_psnr is not None and info.stopped_by != "smallest_at_psnr":
         got = f"{scores.mean_psnr:.2f} dB after {info.step:,} steps"
         err.print(

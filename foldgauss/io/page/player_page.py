@@ -23,7 +23,14 @@ from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.video.compression.quantize import Quantized, Rule, column_names, describe, is_whole, quantize
+from foldgauss.video.compression.quantize import (
+    Quantized,
+    Rule,
+    column_names,
+    compute_columns,
+    is_integral,
+    quantize,
+)
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.video_model import VideoModel
@@ -163,12 +170,12 @@ def _up_to(blocks: Iterable[str], most: float) -> Iterator[str]:
 
 def quantize_finely(model: VideoModel) -> Quantized:
     """All its Gaussians in their own order, by steps so fine that the picture stays."""
-    described = describe(model)
+    described = compute_columns(model)
     classes = np.zeros(model.num_gaussians, np.int32)
     try:
         return quantize(described, classes, _rules(model.degree))
     except ValueError:  # Gaussians so thin that steps in proportion would be beyond the format
-        names = [name for name in column_names(model.degree) if not is_whole(name)]
+        names = [name for name in column_names(model.degree) if not is_integral(name)]
         return quantize(described, classes, {name: Rule(0.0, _EVEN) for name in names})
 
 
@@ -206,7 +213,7 @@ def _pictures(original: Frames, model: Loaded, quality: int) -> list[bytes]:
 
 def _size_and_number(model: Loaded) -> tuple[tuple[int, int], int]:
     if isinstance(model, Quantized):
-        return tuple(model.facts.size), len(model.intervals) + 1
+        return tuple(model.info.size), len(model.intervals) + 1
     return tuple(model.size), model.num_frames
 
 
