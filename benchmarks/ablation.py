@@ -220,7 +220,9 @@ def main(arguments: list[str] | None = None) -> None:
     show_starts(made, clip.size, steps)
     words = trend(made)
     console.print("What the paper finds:", *words, sep="\n- ", soft_wrap=True)
-    console.print("machine: " + ", ".join(f"{name} {value}" for name, value in _common.machine().items()), style="dim")
+    console.print(
+        "machine: " + ", ".join(f"{name} {value}" for name, value in _common.describe_machine().items()), style="dim"
+    )
     figures = {f"psnr, {cell.name}": run["psnr"] for cell, run in made.items()}
     runs.write(figures=figures, trend=words)
 

@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(parser, arguments)
     if options.model is not None and options.clip is None:
         parser.error("--model needs --clip")
-    facts, figures = _common.machine(), {}
+    facts, figures = _common.describe_machine(), {}
     for name in CLIPS if options.clip is None else (options.clip,):
         clip = read_video(sample_clip(name), size=options.size)
         if options.model is not None:

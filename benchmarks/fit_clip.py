@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     figures, setting, course = measure(options)
     if options.plot is not None:
         plot({str(options.clip): course}, options.plot)
-    _common.finish(options.json, figures, _common.machine(), setting=setting, course=course)
+    _common.finish(options.json, figures, _common.describe_machine(), setting=setting, course=course)
 
 
 def measure(options: argparse.Namespace) -> tuple[dict, dict, list[dict]]:

@@ -82,7 +82,7 @@ def main(arguments: list[str] | None = None) -> None:
         for title, run in list(made.items())[1:]:
             end = "" if title == ALONE else f"_over_{options.longer:g}_times_as_long"
             figures[f"gain_{Path(name).stem}{end}"] = made[FOLDED]["psnr"] - run["psnr"]
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
 
 

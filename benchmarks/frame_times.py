@@ -141,7 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
         plot(options.plot, times, shown)
     gain = made[LEARNED]["psnr"] - made[FIXED]["psnr"]
     figures = {"psnr_fixed": made[FIXED]["psnr"], "psnr_learned": made[LEARNED]["psnr"], "gain": gain, **found}
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures, shown=shown.tolist())
 
 

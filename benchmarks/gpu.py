@@ -207,7 +207,11 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
 
 def facts() -> dict[str, object]:
     devices = jax.local_devices()
-    return _common.machine() | {"device": devices[0].device_kind, "devices": len(devices), "jax": jax.__version__}
+    return _common.describe_machine() | {
+        "device": devices[0].device_kind,
+        "devices": len(devices),
+        "jax": jax.__version__,
+    }
 
 
 if __name__ == "__main__":

@@ -118,7 +118,9 @@ def main(arguments: list[str] | None = None) -> None:
         clip = read_video(path, frames=options.frames, size=options.size)
         figures |= measure(clip, config, Path(name).stem, options.sheet)
     setting = {"size": options.size, "gaussians": options.gaussians, "seed": options.seed} | budget
-    _common.finish(options.json, figures, _common.machine(), setting=setting | {"set": dict(options.set or ())})
+    _common.finish(
+        options.json, figures, _common.describe_machine(), setting=setting | {"set": dict(options.set or ())}
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

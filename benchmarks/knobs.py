@@ -59,7 +59,7 @@ def settings(fitted: RenderOptions) -> dict[tuple[str, str], RenderOptions]:
 
 def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(_parser(), arguments)
-    facts, clip = _common.machine(), read_video(sample_clip("bunny"), size=options.size)
+    facts, clip = _common.describe_machine(), read_video(sample_clip("bunny"), size=options.size)
     if options.model is not None:
         model = load_video_model(options.model)
     else:

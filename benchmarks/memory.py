@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
         slope, base = np.polyfit(list(peaks), list(peaks.values()), 1)
         figures |= {"bytes_per_frame_over_its_own": slope / each, "base_mib": base / 2**20}
     figures["within_2_gib"] = float(max(peaks.values()) <= LIMIT)
-    _common.finish(options.json, figures, _common.machine(), gaussians=options.gaussians, size=options.size)
+    _common.finish(options.json, figures, _common.describe_machine(), gaussians=options.gaussians, size=options.size)
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def stages(playback: VideoRenderer, times: np.ndarray) -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(_parser(), arguments)
-    facts, model = _common.machine(), fitted(options)
+    facts, model = _common.describe_machine(), fitted(options)
     playback, times = VideoRenderer(model, options.size), np.asarray(model.frame_times.times())
     list(playback.frames(times[:3]))  # compiled
     rates, slowest = [], 0.0

@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> None:
         made = measure(clip, runs, options.minutes, options.seed)
         show(f"{setting['clip']}, {clip.num_frames} frames of {size[0]}x{size[1]}, seed {options.seed}", made)
         figures |= {f"{name}_{size[0]}x{size[1]}": gain for name, gain in gains(made).items()}
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
 
 

@@ -299,7 +299,7 @@ def main(arguments: list[str] | None = None) -> None:
         calibration(options.replicates, options.seed, options.plot, figures)
     if "retimed" in options.parts:
         retimed(options.seed, figures)
-    _common.finish(options.json, figures, _common.machine(), parts=options.parts)
+    _common.finish(options.json, figures, _common.describe_machine(), parts=options.parts)
 
 
 def clip_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
