@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--degrees", default=",".join(map(str, DEGREES)), help="[1,3,7,0]")
     parser.add_argument("--model", type=Path, help="write the economical model here")
     options = _common.parse(parser, arguments)
-    facts, figures, rows = _common.machine(), {}, []
+    facts, figures, rows = _common.describe_machine(), {}, []
     clip = read_video(sample_clip(options.clip), size=options.size)
     begun = time.perf_counter()
     result = fit(clip.frames, FitConfig(steps=options.steps, economy=Economy(psnr=options.psnr)), fps=clip.fps)

@@ -28,9 +28,8 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import load_video_model
+from foldgauss.io import load_video_model, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
@@ -300,7 +299,7 @@ def main(arguments: list[str] | None = None) -> None:
         calibration(options.replicates, options.seed, options.plot, figures)
     if "retimed" in options.parts:
         retimed(options.seed, figures)
-    _common.finish(options.json, figures, _common.machine(), parts=options.parts)
+    _common.finish(options.json, figures, _common.describe_machine(), parts=options.parts)
 
 
 def clip_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
