@@ -23,8 +23,8 @@ from pathlib import Path
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, kept_setting, scaled, seconds_per_step
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig
 
 SIZE, MINUTES = (160, 320), 60.0

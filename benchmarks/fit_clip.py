@@ -24,8 +24,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video.fitting.config import PRESETS, FitConfig
 from foldgauss.video.fitting.loop import FitInfo, fit
 from foldgauss.video.models.metrics import Evaluation, evaluate

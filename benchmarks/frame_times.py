@@ -28,9 +28,9 @@ import numpy as np
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.figures import write_figure
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig, LearningRates
 
 MINUTES, SHARE = 2.0, 0.15

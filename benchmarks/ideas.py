@@ -15,8 +15,8 @@ import statistics
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, evaluate, fit
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 
 FRAMES, SIZE, LIMIT = (125, 250, 500, 1000, 2000), (320, 640), 2 * 1024**3
 

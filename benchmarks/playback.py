@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.render import cpu
 from foldgauss.video.fitting.loop import FitConfig, fit

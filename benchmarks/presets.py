@@ -23,8 +23,8 @@ from pathlib import Path
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scaled, seconds_per_step, told
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.config import PRESETS
 

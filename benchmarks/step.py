@@ -29,8 +29,8 @@ import optax
 from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import cpu
 from foldgauss.video.fitting.loop import FitConfig, FitState, fit_steps
 from foldgauss.video.models.row_layout import unpack
