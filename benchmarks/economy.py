@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
         "fit",
         "degree",
         "Gaussians",
-        "numbers stored",
+        "parameters stored",
         "PSNR",
         "seconds",
     )
