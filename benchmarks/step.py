@@ -29,8 +29,8 @@ import optax
 from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import cpu
 from foldgauss.video.fitting.loop import FitConfig, FitState, fit_steps
 from foldgauss.video.models.row_layout import unpack
@@ -182,7 +182,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=_common.size, default=(160, 320), metavar="HxW", help="frames [160x320]")
     parser.add_argument("--steps", type=_common.whole, default=24, help="steps that are timed [24]")
     options = _common.parse(parser, arguments)
-    facts = _common.machine()
+    facts = _common.describe_machine()
     frames = read_video(sample_clip("bunny"), size=options.size).frames
     config = FitConfig(num_gaussians=options.gaussians, degree=3, steps=3000, quarter_fraction=0.0, half_fraction=0.0)
     records, state, num_alive = measure(frames, config, options.steps)

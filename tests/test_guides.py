@@ -89,7 +89,7 @@ def _distribution(names, folder):
 
 def _economy(names, folder):
     assert names["degrees"][1] == names["degrees"][1:].max()
-    assert names["static"] > 0
+    assert names["throughout"] > 0
 
 
 def _editing(names, folder):

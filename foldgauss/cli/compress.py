@@ -26,7 +26,7 @@ from foldgauss.cli.app.shared import (
     scores_of,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_file import Clip
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,

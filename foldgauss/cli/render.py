@@ -44,7 +44,8 @@ from foldgauss.cli.app.shared import (
     write_json,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
+from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.video_model import load_video_model, read_metadata, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited

@@ -41,8 +41,9 @@ from foldgauss.cli.app.shared import (
 from foldgauss.cli.compress import save_compressed, save_halved
 from foldgauss.cli.fitting.fit import make_folder, noted
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io._lock import only_writer
-from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
@@ -129,7 +130,7 @@ def tradeoff_command(
     tell_of(clip)
     make_folder(out_dir)
     own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))
-    context.with_resource(only_writer(out_dir / RECORD, own=own, what="tradeoff"))
+    context.with_resource(lock_output(out_dir / RECORD, own=own, what="tradeoff"))
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
     run = _Run(clip, record, Commands(video, size, frames, out_dir), noted(clip, seed, frames))
     base = run.planned(wanted, chosen, minutes, steps)

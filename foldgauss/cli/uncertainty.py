@@ -32,9 +32,9 @@ from foldgauss.cli.app.shared import (
     out,
     refuse_segments,
 )
-from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
-from foldgauss.io._lock import only_writer
-from foldgauss.io.media.video_file import Clip
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.uncertainty import LikelihoodProfiles, frame_time_log_prob, frame_time_posterior, likelihood_profiles
 from foldgauss.uncertainty.diagnostics import plots
@@ -134,7 +134,7 @@ def uncertainty_command(
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
     context.with_resource(_made_folder(out_dir))
     own = tuple(out_dir / name for name in (*FILES, EVIDENCE))
-    context.with_resource(only_writer(out_dir / CHAINS, own=own, what="run of uncertainty"))
+    context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
     with _no_other_run(), lock_draws(out_dir / CHAINS):
         pass  # known now, not when pictures are drawn
     profiles = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
@@ -311,7 +311,7 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
         if error.filename is None or Path(error.filename) != path:
             raise
         again = f" What {path} holds goes on when called again." if path.exists() else ""
-        raise OutputError(f"{not_writable(path, error)}{again}") from error
+        raise OutputError(f"{output_error(path, error)}{again}") from error
     if existed:
         text = "had finished: nothing was drawn anew" if not course else "went on from where it was stopped"
         out.print(f"{path}: {text}", soft_wrap=True)

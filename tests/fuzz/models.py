@@ -386,7 +386,7 @@ def numbers_changed(data: bytes, random: Random) -> bytes:
     changed = dataclasses.replace(quantized, columns=columns, rules=rules, intervals=intervals)
     try:
         with np.errstate(all="ignore"):
-            return compact.packed(changed, {"clip": "a"})
+            return compact.pack_compact(changed, {"clip": "a"})
     except (ValueError, IndexError, KeyError, OverflowError):
         return stream_changed(data, random)
 
@@ -418,8 +418,8 @@ COMPACT = Target(
     _read_compact,
     (ModelFileError,),
     {
-        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
-        "foldgauss.io.models.columns": (),
+        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact", "_steps"),
+        "foldgauss.io.models.column_contexts": (),
         "foldgauss.io.models.video_model": (
             ONLY,
             "load_video_model",

@@ -21,7 +21,7 @@ import foldgauss
 from foldgauss.cli._profiles_file import kept_evidence
 from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
-from foldgauss.io.media.containers import shown_seconds
+from foldgauss.io.media.format_detection import read_shown_seconds
 from foldgauss.uncertainty.posterior import draws_file
 
 from . import media, models, scenes, texts
@@ -505,7 +505,7 @@ def test_scripts_set_text_and_never_markup():
 def test_a_box_of_any_64_bits_is_passed_by():
     """Python's files cannot seek that far."""
     box = b"\0\0\0\x10ftypisom\0\0\0\0" + b"\0\0\0\1free" + b"\xff" * 8
-    assert shown_seconds(io.BytesIO(box)) is None
+    assert read_shown_seconds(io.BytesIO(box)) is None
 
 
 def test_a_gif_whose_frame_grows_is_damaged_there(tmp_path):

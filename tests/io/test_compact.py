@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from soft_models import SIZE, soft_model
 
+import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
-from foldgauss.io.models.compact import MAGIC, VERSION, packed
+from foldgauss.io.models.compact import MAGIC, VERSION, pack_compact
 from foldgauss.io.models.video_model import read_metadata
-from foldgauss.io.page import html
 from foldgauss.render import RenderOptions
 from foldgauss.video import compress, layers
 from foldgauss.video.compression.quantize import (
@@ -201,7 +201,7 @@ def test_power_that_saves_little_is_dropped():
 def test_kinds_save_bytes():
     plain = crowd(soft_model(degree=3))
     model = of_kinds(plain)
-    assert len(packed(fine(model))) < 0.8 * len(packed(fine(plain)))
+    assert len(pack_compact(fine(model))) < 0.8 * len(pack_compact(fine(plain)))
 
 
 # ------------------------------------------------------------------------------------ stated loss
@@ -244,7 +244,7 @@ def test_fine_tuning_makes_smaller_files(how):
         alpha = 255 - (over_white - pictures(best)).mean(-1, keepdims=True)
         clip = np.concatenate([np.minimum(clip, alpha), alpha], -1).round().astype(np.uint8)
     plain, mended = (compress(model, clip, max_loss_db=0.2, passes=passes) for passes in (0, 30))
-    assert len(packed(mended.quantized)) < 0.95 * len(packed(plain.quantized))
+    assert len(pack_compact(mended.quantized)) < 0.95 * len(pack_compact(plain.quantized))
     lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
     assert lost == pytest.approx(mended.loss_db, abs=1e-9)
     assert lost <= 0.2
@@ -252,7 +252,7 @@ def test_fine_tuning_makes_smaller_files(how):
 
 def test_a_greater_loss_makes_a_smaller_file():
     model = soft_model(options=RenderOptions())
-    sizes = [len(packed(compress(model, max_loss_db=loss).quantized)) for loss in (0.02, 0.2, 2.0)]
+    sizes = [len(pack_compact(compress(model, max_loss_db=loss).quantized)) for loss in (0.02, 0.2, 2.0)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.85 * sizes[0]
 
@@ -282,7 +282,7 @@ def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
     quantized = compress(soft_model(options=RenderOptions())).quantized
     path = save_compact(tmp_path / "m.fgz", quantized, metadata={"clip": "x", "bad": float("nan")})
     again = load_compact(path)
-    assert packed(again, read_metadata(path)) == path.read_bytes()
+    assert pack_compact(again, read_metadata(path)) == path.read_bytes()
     same(dequantize(again), dequantize(quantized))
     same(load_video_model(path), dequantize(quantized))
     assert read_metadata(path) == {"clip": "x", "bad": None}
@@ -293,7 +293,7 @@ def test_a_decoded_model_by_the_same_rules_is_the_same_file():
     quantized = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantized
     columns = quantized.columns
     again = quantize(compute_columns(dequantize(quantized)), columns["class"], quantized.rules, columns["cell"])
-    assert packed(again) == packed(quantized)
+    assert pack_compact(again) == pack_compact(quantized)
 
 
 def test_logarithm_matches_numpy():
@@ -340,7 +340,7 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     if how == "crowd of kinds":
         model = of_kinds(model)
     path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantized)
-    decoder = Path(html.__file__).with_name("compact.js")
+    decoder = Path(foldgauss.io.page.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
         """
@@ -437,7 +437,7 @@ def test_models_that_the_format_cannot_hold_are_rejected():
 
 @pytest.fixture(scope="module")
 def good():
-    return packed(fine(soft_model(), -12.0), {"clip": "x"})
+    return pack_compact(fine(soft_model(), -12.0), {"clip": "x"})
 
 
 def resealed(data, change=lambda header: None, cut=None):
@@ -583,7 +583,7 @@ def test_forged_kinds_are_rejected(tmp_path, name, number):
     quantized = fine(of_kinds(soft_model(degree=3)), -12.0)
     columns = quantized.columns | {name: quantized.columns[name].copy()}
     columns[name][7] = number
-    data = packed(dataclasses.replace(quantized, columns=columns))
+    data = pack_compact(dataclasses.replace(quantized, columns=columns))
     refused(tmp_path, data, "compact model")
 
 

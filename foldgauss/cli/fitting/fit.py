@@ -21,6 +21,7 @@ from foldgauss.cli.app.shared import (
     WrongUse,
     app,
     as_option,
+    describe_source,
     err,
     evaluate_with_progress,
     figures_of,
@@ -30,7 +31,6 @@ from foldgauss.cli.app.shared import (
     parse_frames,
     parse_size,
     print_figures,
-    provenance,
     refuse_existing,
     refuse_foreign,
     refuse_input,
@@ -55,11 +55,13 @@ from foldgauss.cli.fitting.options import (
 )
 from foldgauss.cli.fitting.progress import Manner, Observer, previewing, print_json, watching
 from foldgauss.io._atomic import OutputError, check_writable
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.io.media.pictures import comparison
-from foldgauss.io.media.video_file import Clip, read_video, write_image, write_video
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.contact_sheet import make_comparison_sheet
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.video_writing import write_image, write_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name, save_video_model
 from foldgauss.jobs.fitting import CHECKPOINT_SECONDS
@@ -97,13 +99,13 @@ def demo(
     frames = {"psnr": scores.psnr, "ssim": scores.ssim}
     write_json(out_dir / DEMO_RECORD, figures | frames)  # first: whatever stops this demo, the next may replace it
     path = save_video_model(
-        out_dir / "model.safetensors", model, metadata=provenance(clip, DEMO_CONFIG.seed) | scores_of(scores)
+        out_dir / "model.safetensors", model, metadata=describe_source(clip, DEMO_CONFIG.seed) | scores_of(scores)
     )
     figures["file_bytes"] = path.stat().st_size
     write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
-    picture = comparison([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
+    picture = make_comparison_sheet([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
     write_image(out_dir / "comparison.png", picture)
     write_json(out_dir / DEMO_RECORD, figures | frames)
     print_figures("Demo", figures)
@@ -179,7 +181,7 @@ def fit(
     kept = target.with_name(f"{target.name}.checkpoint")
     manner = manner_of(quiet, log_json)
     hands = WorkerOptions(workers, scheduler, threads)
-    context.with_resource(only_writer(target, own=(kept,)))
+    context.with_resource(lock_output(target, own=(kept,)))
     refuse_existing(target, overwrite)
     begun = kept_seconds(target) is not None and not kept.exists() and (resume or not overwrite)
     if begun or not (segment_seconds is None and workers is None and scheduler is None):
@@ -261,7 +263,7 @@ def fit(
 
 def noted(clip: Clip, seed: int, frames: str | None) -> dict[str, Any]:
     """What `fit` notes in a model's file, but for its scores."""
-    return provenance(clip, seed) | {"frames": parse_frames(frames)}
+    return describe_source(clip, seed) | {"frames": parse_frames(frames)}
 
 
 def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:

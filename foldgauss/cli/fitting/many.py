@@ -31,7 +31,7 @@ from foldgauss.cli.fitting.options import (
     fit_options,
     manner_of,
 )
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Outcome, find_clips, jobs_of
 from foldgauss.jobs.fitting import begin, begun, finished
 from foldgauss.jobs.many import RECORDS
@@ -82,7 +82,7 @@ def fit_many(
         raise WrongUse(f"--out: expected another folder than the clips', got {out_dir}.")
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)
-    context.with_resource(only_writer(out_dir / SUMMARY, what="fit-many"))
+    context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))
     try:
         how = {"size": parse_size(size), "frames": parse_frames(frames), "checkpoint_seconds": checkpoint_seconds}
         jobs = jobs_of(found.clips, out_dir, config, **how)

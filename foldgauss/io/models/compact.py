@@ -15,9 +15,9 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import atomic_path, checked_path
+from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.models import range_coder
-from foldgauss.io.models.columns import Walk
+from foldgauss.io.models.column_contexts import Walk
 from foldgauss.io.models.model_file import ModelFileError, plain, to_json
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression.quantize import (
@@ -50,9 +50,9 @@ def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dic
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
     """
-    path = checked_path(path, "path, quantized")
+    path = check_path(path, "path, quantized")
     check_compact_name(path)
-    data = packed(quantized, metadata)
+    data = pack_compact(quantized, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -64,7 +64,7 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
         raise invalid(parameter, expected=f"a name ending in {COMPACT_SUFFIX}", got=repr(str(path)))
 
 
-def packed(quantized: Quantized, metadata: dict | None = None) -> bytes:
+def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
     info, walk = quantized.info, Walk(quantized.rules, quantized.info)
     streams, described = [], []
@@ -118,13 +118,13 @@ def load_compact(path: str | os.PathLike) -> Quantized:
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
-    path = checked_path(path)
+    path = check_path(path)
     return _unpacked(path, path.read_bytes())[0]
 
 
 def load_compact_model(path: str | os.PathLike) -> VideoModel:
     """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
-    path = checked_path(path)
+    path = check_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
@@ -134,7 +134,7 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
 
 def compact_metadata(path: str | os.PathLike) -> dict:
     """What `save_compact` was given as `metadata`. Raises as `load_compact`."""
-    path = checked_path(path)
+    path = check_path(path)
     return _header(path, path.read_bytes())[0]["metadata"]
 
 
