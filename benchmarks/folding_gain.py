@@ -1,4 +1,4 @@
-"""What folds bring: a folded video against every frame its own Gaussians (eq:miragevideo), at equal numbers stored.
+"""What folds bring: a folded video against every frame its own Gaussians (eq:miragevideo), at equal parameters stored.
 
     python -m benchmarks.folding_gain [--json FILE] [--clip bunny|bikes|carphone|PATH ...] [--size HxW] [--frames A:B]
                                       [--minutes M | --steps N] [--longer F] [--gaussians N] [--seed S]
@@ -51,7 +51,7 @@ def measure(name: str, clip: Clip, config: FitConfig, runs: Runs, longer: float 
 
 
 def show(title: str, made: dict[str, Run]) -> None:
-    columns = "PSNR, dB", "worst", "SSIM", "Gaussians", "numbers stored", "frames seen", "minutes"
+    columns = "PSNR, dB", "worst", "SSIM", "Gaussians", "parameters stored", "frames seen", "minutes"
     table = _common.table(title, "fit", *columns)
     for name, run in made.items():
         quality = f"{run['psnr']:.2f}", f"{run['worst_psnr']:.2f}", f"{run['ssim']:.4f}"

@@ -10,7 +10,7 @@
   is each frame found where the whole clip has it? Its pictures and its splats are the same, so this tells only that
   frames are found wherever they are.
 - unseen: every second frame of the clip is fitted, and the frames between are looked for: are they half way between
-  the times of their neighbours, as far as a clip's pace is even?
+  the times of their neighbours, if the clip's playback speed is regular?
 - calibration: ranks of true times in simulated videos of a small synthetic scene, with right noise, noise assumed 1.5
   times too great and too small, and smoothed noise; coverage of 50% and 90% intervals; `--plot` draws the ranks.
 - retimed: that scene drawn at a smooth warp of times, with noise: are the warp's times in the intervals, given the
@@ -86,7 +86,7 @@ def drawn(model: VideoModel, times: np.ndarray, scale: float, rng: np.random.Gen
 
 
 def warp(u: np.ndarray) -> np.ndarray:
-    """From [0, 1] to [0, 1], rising, at paces from 0.5 to 1.5."""
+    """An increasing map of [0, 1] onto itself, at speeds from 0.5 to 1.5."""
     return u + 0.5 * np.sin(2 * np.pi * u) / (2 * np.pi)
 
 
@@ -214,7 +214,7 @@ def draw(found: dict[str, SimulatedRanks], path: Path) -> None:
             known = label if k == len(ranks.names) - 1 else ("times of frames" if k == 0 else None)
             axis.step(uniform, shares - uniform, where="post", label=known, **style)
         axis.set(title=f"{name} ({ranks.inside(0.99).sum()} of {len(ranks.names)} inside)", xlabel="rank / ranks")
-    axes[0].set_ylabel("share of ranks below, less uniform")
+    axes[0].set_ylabel("fraction of ranks below, less uniform")
     axes[0].legend(fontsize=8, loc="lower right")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
