@@ -15,7 +15,7 @@ import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, write_both
 
-from foldgauss.cli import view as viewing
+from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import edit
 

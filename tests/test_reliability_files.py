@@ -19,12 +19,14 @@ from commands import run
 from benchmarks import _kills, _long, _outputs, _soak
 from benchmarks.memory import write_clip
 from foldgauss._runtime import kernels as _kernels
-from foldgauss.cli import uncertainty
-from foldgauss.cli.app import shared as _shared
+from foldgauss.cli.app.application import WrongUse
 from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.measuring import uncertainty
+from foldgauss.cli.shared import rendering as _shared
 from foldgauss.io import load_video_model, save_video_model, write_video
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.io.models.model_file import load_model, read_header
+from foldgauss.jobs import runner
 
 resource = pytest.importorskip("resource", reason="limits to the size of files are POSIX's; CI runs it on Linux")
 
@@ -162,7 +164,7 @@ def test_a_full_disk_costs_no_older_output_and_leaves_nothing(work, disk, capsys
 
 def filling(monkeypatch, disk, full_at, empty_at=None):
     """Fill the disk before step `full_at` is told, and empty it before `empty_at` is."""
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def stepping(*arguments):
         for state, info in steps(*arguments):
@@ -172,38 +174,38 @@ def filling(monkeypatch, disk, full_at, empty_at=None):
                 disk.empty()
             yield state, info
 
-    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    monkeypatch.setattr(runner, "fit_steps", stepping)
 
 
 def test_a_checkpoint_without_room_is_told_and_the_fit_goes_on(work, disk, monkeypatch, capsys):
     target, kept = disk.folder / "m.safetensors", disk.folder / "m.safetensors.checkpoint"
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 0.0)
     filling(monkeypatch, disk, 6, 9)
-    seen, keep = [], fitting._keep_if_possible
+    seen, keep = [], runner.Checkpoint.try_save
 
     def keeping(*arguments):
         keep(*arguments)
         load_model(kept)
         seen.append(read_header(kept)["header"]["step"])
 
-    monkeypatch.setattr(fitting, "_keep_if_possible", keeping)
+    monkeypatch.setattr(runner.Checkpoint, "try_save", keeping)
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
     assert seen == [1, 2, 3, 4, 5, 5, 5, 5, *range(9, 31)]  # whole at any time
     told = capsys.readouterr().err
-    assert told.count("warning: the fit could not be kept at step ") == 3
-    assert f"expected room for {str(kept)!r}" in told
+    assert told.count("warning: no checkpoint at step ") == 3
+    assert f"expected free space for {str(kept)!r}" in told
     assert load_model(target).num_frames == 6
     assert set(os.listdir(disk.folder)) <= {"m.safetensors", "ballast"}
 
 
 def test_a_model_without_room_is_written_by_resuming_to_the_bit(work, disk, monkeypatch, capsys):
     target, kept = disk.folder / "m.safetensors", disk.folder / "m.safetensors.checkpoint"
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 0.0)
     filling(monkeypatch, disk, 27)
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told.startswith(f"error: path: expected room for {str(target)!r}")
-    assert f"The fit is kept in {kept}: --resume goes on" in told
+    assert told.startswith(f"error: path: expected free space for {str(target)!r}")
+    assert f"The fit is kept in {kept}: --resume continues" in told
     assert read_header(kept)["header"]["step"] == 26
     assert set(os.listdir(disk.folder)) <= {kept.name, "ballast"}
     monkeypatch.undo()
@@ -219,7 +221,7 @@ def test_scores_without_room_are_told_and_the_model_is_there(work, disk, monkeyp
         _shared, "evaluate", lambda *arguments, **options: disk.fill() or evaluate(*arguments, **options)
     )
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
-    assert f"warning: {target} is written, but its scores could not be noted" in capsys.readouterr().err
+    assert f"warning: {target} is written, but its scores could not be added" in capsys.readouterr().err
     found, whole = load_video_model(target), load_video_model(work / "model.safetensors")
     assert np.array_equal(found.render(0.3), whole.render(0.3))
     assert set(os.listdir(disk.folder)) <= {target.name, "ballast"}
@@ -258,7 +260,7 @@ def test_draws_without_room(size, what, work, small_disk, capsys):
     out = folder / "draws"
     assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told.startswith(f"error: path: expected room for {str(out / what)!r}, got none")
+    assert told.startswith(f"error: path: expected free space for {str(out / what)!r}, got none")
     there = sorted(path.name for path in folder.rglob("*"))
     assert there == ([] if what == "evidence.npz" else ["draws", "evidence.npz"])
 
@@ -270,7 +272,7 @@ def test_draws_without_room(size, what, work, small_disk, capsys):
 def before_any_work(monkeypatch):
     """A fit that comes as far as reading its clip fails the test."""
     for name in ("read_video", "fit_steps"):
-        monkeypatch.setattr(fitting, name, lambda *a, name=name, **k: pytest.fail(f"{name} was called"))
+        monkeypatch.setattr(runner, name, lambda *a, name=name, **k: pytest.fail(f"{name} was called"))
 
 
 @pytest.fixture
@@ -300,10 +302,10 @@ def test_places_that_cannot_be_written_are_found_before_the_fit(work, tmp_path, 
     told = {
         tmp_path / "none" / "m.safetensors": "expected an existing folder",
         tmp_path / "file" / "m.safetensors": "expected a folder, got the file",
-        tmp_path / "folder.safetensors": "not a plain file",
+        tmp_path / "folder.safetensors": "not a regular file",
         tmp_path / f"{'m' * 250}.safetensors": "File name too long",
         tmp_path / f"{'m' * 240}.safetensors": ".checkpoint' (File name too long)",
-        tmp_path / "m.safetensors": "m.safetensors.checkpoint', which is not a plain file",
+        tmp_path / "m.safetensors": "m.safetensors.checkpoint', which is not a regular file",
     }
     for target, what in told.items():
         before = sorted(os.listdir(tmp_path))
@@ -317,13 +319,13 @@ def test_places_that_cannot_be_written_are_found_before_the_fit(work, tmp_path, 
 
 def test_a_read_only_folder_is_found_before_the_fit(work, read_only, capsys, before_any_work):
     found = refused(work, read_only / "m.safetensors", capsys)
-    assert f"expected a writable place, got {str(read_only / 'm.safetensors')!r}" in found
+    assert f"expected a writable path, got {str(read_only / 'm.safetensors')!r}" in found
     assert "Choose another output path" in found
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the folder of processes is Linux's")
 def test_a_folder_of_the_system_is_found_before_the_fit(work, capsys, before_any_work):
-    assert "expected a writable place" in refused(work, "/proc/self/m.safetensors", capsys)
+    assert "expected a writable path" in refused(work, "/proc/self/m.safetensors", capsys)
 
 
 def test_read_only_for_every_command(work, read_only, capsys):
@@ -338,7 +340,7 @@ def test_read_only_for_every_command(work, read_only, capsys):
 def test_the_clip_may_vanish_while_it_is_fitted(work, tmp_path, monkeypatch, capsys):
     clip, target = tmp_path / "clip.mp4", tmp_path / "m.safetensors"
     shutil.copy(work / "clip.mp4", clip)
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def stepping(*arguments):
         for state, info in steps(*arguments):
@@ -346,7 +348,7 @@ def test_the_clip_may_vanish_while_it_is_fitted(work, tmp_path, monkeypatch, cap
                 clip.unlink()
             yield state, info
 
-    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    monkeypatch.setattr(runner, "fit_steps", stepping)
     assert run("fit", clip, "--out", target, *SMALL) == 0
     assert target.read_bytes() == (work / "model.safetensors").read_bytes()
     monkeypatch.undo()
@@ -366,7 +368,7 @@ def test_one_output_by_any_name_has_one_fit(work, tmp_path, monkeypatch, capsys,
     monkeypatch.chdir(folder)
     names = [folder / "m.safetensors", "m.safetensors", "../models/m.safetensors", tmp_path / "link" / "m.safetensors"]
     for held in names:
-        with only_writer(fitting.Path(held)):
+        with lock_output(fitting.Path(held)):
             for other in names:
                 assert "which another fit is" in refused(work, other, capsys)
     assert os.listdir(folder) == []
@@ -377,9 +379,9 @@ def test_a_folder_of_results_has_one_run(work, tmp_path, capsys, command, name):
     if command == "uncertainty":
         pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
     words = [work / "model.safetensors"] if command == "uncertainty" else []
-    with only_writer(tmp_path / name):
+    with lock_output(tmp_path / name):
         assert run(command, *words, work / "clip.mp4", "--out", tmp_path) == 1
-        assert f"{command} is. Wait for that one" in capsys.readouterr().err
+        assert f"{command} is writing. Wait for it" in capsys.readouterr().err
     assert os.listdir(tmp_path) == []
 
 
@@ -389,7 +391,7 @@ def test_a_link_is_an_output_of_its_own(work, tmp_path):
     real, link = tmp_path / "other" / "m.safetensors", tmp_path / "m.safetensors"
     real.write_bytes(OLDER)
     link.symlink_to(real)
-    with only_writer(real):
+    with lock_output(real):
         assert run("fit", work / "clip.mp4", "--out", link, *SMALL, "--overwrite") == 0
     assert real.read_bytes() == OLDER
     assert not link.is_symlink()
@@ -491,15 +493,15 @@ def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
 def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsys):
     pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
-    from foldgauss.uncertainty.posterior import sampling as posterior
+    from foldgauss.uncertainty.posterior import draws_file
 
-    keep = posterior._Kept.keep
+    keep = draws_file.DrawsFile.save
 
     def kept(self):
         keep(self)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(posterior._Kept, "keep", kept)
+    monkeypatch.setattr(draws_file.DrawsFile, "save", kept)
     words = ["uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", tmp_path, "--steps", "600"]
     assert run(*words) == 143
     assert "goes on when called again" in " ".join(capsys.readouterr().err.split())
@@ -510,7 +512,7 @@ def test_draws_go_on_where_a_kill_left_a_picture(work, tmp_path):
     (tmp_path / ".times.tmp-01ab23cd.png").write_bytes(OLDER)
     uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
     (tmp_path / "frame.png").write_bytes(OLDER)
-    with pytest.raises(_shared.WrongUse, match="without other images"):
+    with pytest.raises(WrongUse, match="without other images"):
         uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
 
 

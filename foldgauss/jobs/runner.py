@@ -17,17 +17,20 @@ from typing import Any, Literal, NamedTuple
 import jax
 
 from foldgauss.io._atomic import OutputError, atomic_path
-from foldgauss.io._lock import only_writer
-from foldgauss.io.media.frame_index import FrameIndex, read_indexed
-from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import FrameIndex
+from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import save_video_model
-from foldgauss.io.provenance import fingerprint, provenance
+from foldgauss.io.provenance import describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
 from foldgauss.jobs.warning_capture import WarningCapture
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
-from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, to_model
+from foldgauss.video.fitting.loop import FitInfo, fit_steps
+from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
 
@@ -176,7 +179,7 @@ def read_clip(job: FitJob) -> Clip:
 
 def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
     """Metadata of a fitted model: its clip, the range of frames, and the seed."""
-    return provenance(clip, seed) | {"frames": frames}
+    return describe_source(clip, seed) | {"frames": frames}
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:
@@ -260,7 +263,7 @@ def _lock_target(job: FitJob) -> Iterator[None]:
     """Hold the lock of the target, for which a job waits a while."""
     until = time.monotonic() + WAIT_SECONDS
     while True:
-        holder = only_writer(Path(job.target), own=(job.checkpoint, job.record))
+        holder = lock_output(Path(job.target), own=(job.checkpoint, job.record))
         try:
             holder.__enter__()
             break

@@ -16,13 +16,15 @@ from foldgauss.cli.shared.outputs import make_folder, refuse_foreign
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.pictures import comparison
-from foldgauss.io.media.video_file import read_video, write_image, write_video
+from foldgauss.io.media.contact_sheet import make_comparison_sheet
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.video_writing import write_image, write_video
 from foldgauss.io.models.video_model import save_video_model
-from foldgauss.io.provenance import provenance
+from foldgauss.io.provenance import describe_source
 from foldgauss.jobs.runner import mean_scores, run_steps
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.loop import fit_steps, to_model
+from foldgauss.video.fitting.loop import fit_steps
+from foldgauss.video.fitting.state import to_model
 
 SIZE, FRAMES = (160, 320), (0, 24)
 RECORD = "metrics.json"
@@ -50,12 +52,12 @@ def demo(
     figures = summarize_scores(model, scores) | summarize_fit(info)
     frames = {"psnr": scores.psnr, "ssim": scores.ssim}
     write_json(out_dir / RECORD, figures | frames)  # first: the next demo may then replace this one, however it ends
-    metadata = provenance(clip, CONFIG.seed) | mean_scores(scores)
+    metadata = describe_source(clip, CONFIG.seed) | mean_scores(scores)
     figures["file_bytes"] = save_video_model(out_dir / "model.safetensors", model, metadata=metadata).stat().st_size
     write_video(out_dir / "reconstruction.mp4", images, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
-    sheet = comparison([clip.frames[k] for k in shown], [images[k] for k in shown], captions)
+    sheet = make_comparison_sheet([clip.frames[k] for k in shown], [images[k] for k in shown], captions)
     write_image(out_dir / "comparison.png", sheet)
     write_json(out_dir / RECORD, figures | frames)
     print_figures("Demo", figures)

@@ -30,9 +30,9 @@ from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_inp
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
 from foldgauss.io._atomic import OutputError, check_writable
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.io.media.video_file import Clip
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import FitRun, clip_warnings, missed_psnr, run_fit
@@ -40,8 +40,9 @@ from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
-from foldgauss.video.fitting.loop import FitInfo, FitState, running_psnr
-from foldgauss.video.fitting.steppers.engines import choose_engine, device_name
+from foldgauss.video.fitting.loop import FitInfo
+from foldgauss.video.fitting.state import FitState, running_psnr
+from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
 
 
 @app.command()
@@ -105,7 +106,7 @@ def fit(
     )
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
-    context.with_resource(only_writer(target, own=(job.checkpoint,)))
+    context.with_resource(lock_output(target, own=(job.checkpoint,)))
     refuse_existing(target, overwrite)
     begun = read_segment_seconds(target) is not None and not job.checkpoint.exists() and (resume or not overwrite)
     if begun or not (segment_seconds is None and workers is None and scheduler is None):
@@ -243,8 +244,8 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.batch_size < clip.num_frames:
         warn(
-            f"--steps: {steps:,} steps use {steps * config.batch_size:,} of {clip.num_frames:,} frames; the others keep "
-            "their initial Gaussians, which look faint."
+            f"--steps: {steps:,} steps use {steps * config.batch_size:,} of {clip.num_frames:,} frames; the others "
+            "keep their initial Gaussians, which look faint."
         )
     if display == "json":
         about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
@@ -256,7 +257,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         psnr = config.economy.psnr
         plan += ", pruned by description length" if psnr is None else f", the smallest at {psnr:g} dB"
     growing = "" if config.growth is None else " at the start"
-    computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {device_name()}"
+    computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
         f"{' with alpha' if clip.has_alpha else ''}, {num:,} Gaussians of degree {config.degree}{growing}, "

@@ -26,7 +26,7 @@ from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.arguments import Frames, Overwrite, Size, parse_frames, parse_size
 from foldgauss.cli.shared.outputs import make_folder
 from foldgauss.cli.shared.tables import format_count, write_json
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
 from foldgauss.jobs.clips import RECORDS
 from foldgauss.jobs.job import read_record, read_request, write_request
@@ -89,7 +89,7 @@ def fit_many(
         raise WrongUse(f"--out: expected another folder than the clips', got {out_dir}.")
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)
-    context.with_resource(only_writer(out_dir / SUMMARY, what="fit-many"))
+    context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))
     try:
         jobs = make_jobs(
             found.clips,

@@ -156,10 +156,10 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     at_cuts = sum(before[1] == after[0] for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     where = f" ({at_cuts} end at cuts)" if at_cuts else ""
+    plan = describe_budgets(config, planned_steps(config, max(lengths)))
     out.print(
         f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
-        f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with {num:,} "
-        f"Gaussians of degree {config.degree} and {describe_budgets(config, planned_steps(config, max(lengths)))}, "
-        f"by {workers}",
+        f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
+        f"{num:,} Gaussians of degree {config.degree} and {plan}, by {workers}",
         soft_wrap=True,
     )

@@ -70,9 +70,7 @@ Original = Annotated[
         autocompletion=complete_clips,
     ),
 ]
-OriginalQuality = Annotated[
-    int, typer.Option(help="WebP quality of the clip's frames in the page.", min=1, max=100)
-]
+OriginalQuality = Annotated[int, typer.Option(help="WebP quality of the clip's frames in the page.", min=1, max=100)]
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

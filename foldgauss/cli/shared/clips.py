@@ -6,11 +6,13 @@ from typing import Any
 
 from foldgauss.cli.app.application import WrongUse, err, warn, wrong_use
 from foldgauss.cli.shared.arguments import parse_frames
-from foldgauss.io.media.frame_index import LazyFrames, index_video
-from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import index_video
+from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.segmented import is_segmented
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.io.provenance import are_others
+from foldgauss.io.provenance import has_other_frames
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -55,7 +57,7 @@ def read_fitted_clip(
             f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
             f"Give those that it was fitted to, as 0:{model.num_frames}."
         )
-    if are_others(about, clip):
+    if has_other_frames(about, clip):
         warn(
             f"the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
             "another clip or range, or another version of OpenCV decoded them."
@@ -78,7 +80,7 @@ def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float
     """
     about = read_origin(model_path)
     fitted = about.get("mean_psnr")
-    return fitted is not None and are_others(about, clip) and measure_psnr() < fitted - OTHER_CLIP_DB
+    return fitted is not None and has_other_frames(about, clip) and measure_psnr() < fitted - OTHER_CLIP_DB
 
 
 def keep_origin(about: dict[str, Any], *names: str) -> dict[str, Any]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from foldgauss.cli.app.application import WrongUse, wrong_use
 from foldgauss.io._atomic import OutputError, check_writable
-from foldgauss.io.media.video_file import ANIMATION_SUFFIXES, VIDEO_SUFFIXES, memory_limit
+from foldgauss.io.media.resizing import memory_limit
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, VIDEO_SUFFIXES
 
 IMAGE_SUFFIX = ".png"
 

@@ -12,8 +12,9 @@ from foldgauss.cli.app.application import err, out, wrong_use
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
 from foldgauss.cli.shared.tables import format_count
-from foldgauss.io.media.frame_index import LazyFrames
-from foldgauss.io.media.video_file import MAX_FPS, MAX_GIF_FPS, write_image, write_video
+from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.video_writing import MAX_GIF_FPS, write_image, write_video
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.metrics import Evaluation, evaluate
 

@@ -15,18 +15,16 @@ MIN_PASSES_PER_ROUND = 5
 
 @dataclasses.dataclass(frozen=True)
 class Economy:
-    """Pruning by description length at `rounds` points of the plan, evenly from `first_fraction` to `last_fraction`.
+    """Pruning by description length in `rounds` over the plan, evenly from `first_fraction` to `last_fraction`.
 
-    * Without `psnr`: a Gaussian, a power of its path, a beginning and an end of its life, its opacity, a colour and a
-      shape of its own stay if they save more than `bits` for each of their numbers. (Compact files hold a number in
-      8 bits on the average.)
-      With `grows`, a `BIRTHS` share of Gaussians are born where the error is, as long as half of them stay.
-    * With `psnr`, dB: what is dropped is what costs the least, until the mean over all frames is that; where it seems
-      out of reach, Gaussians are born.
+    * Without `psnr`: a Gaussian, a power of its fold, its m_t and sigma_t, its opacity, a color and a shape of its own
+      are kept if they save more than `bits` for each of their parameters. (Compact files take 8 bits for a parameter on
+      average.) With `grows`, Gaussians are born where errors are large, as long as half of them survive.
+    * With `psnr`, dB: the Gaussians and parameters of least cost are dropped until the mean over all frames is that;
+      where it seems out of reach, Gaussians are born.
 
-    A round drops at most a share `most_dropped` of the Gaussians: then the others take over what is missed. Short plans
-    have fewer rounds.
-    Raises ValueError for numbers out of range.
+    A round drops at most a fraction `most_dropped` of the Gaussians, so that the others can compensate. Short plans
+    have fewer rounds. Raises ValueError for values out of range.
     """
 
     psnr: float | None = field(
@@ -54,11 +52,11 @@ class Economy:
             raise invalid("economy.first_fraction, last_fraction", expected="in this order", got=got)
 
     def steps(self, plan: int, *, passes: float, coarse: float) -> Int[np.ndarray, "rounds"]:
-        """After which of `plan` steps stock is taken; a share `coarse` at the beginning says nothing yet.
+        """The steps of a plan after which there is a round; a fraction `coarse` at its beginning is too early.
 
-        The plan's steps are `passes` over the frames. Of a plan too short for all rounds some are left out.
+        The `plan` steps are `passes` over the frames. A plan too short for all rounds has fewer.
         """
         first = max(self.first_fraction, min(coarse + 0.05, self.last_fraction))
         num = max(min(self.rounds, int(passes / MIN_PASSES_PER_ROUND)), 1)
-        shares = np.linspace(first, self.last_fraction, num) if num > 1 else np.array([self.last_fraction])
-        return np.clip(np.rint(shares * plan), 1, plan).astype(int)
+        fractions = np.linspace(first, self.last_fraction, num) if num > 1 else np.array([self.last_fraction])
+        return np.clip(np.rint(fractions * plan), 1, plan).astype(int)

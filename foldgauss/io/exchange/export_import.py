@@ -1,0 +1,133 @@
+"""Export and import of models, with the format chosen by name."""
+
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_replaceable, check_writable
+from foldgauss.io.exchange.gaussians_ply import AXES, DEPTH_STEP, write_3dgs_frames, write_3dgs_ply
+from foldgauss.io.exchange.ply_file import format_error
+from foldgauss.io.exchange.pseudomesh import write_pseudomesh
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
+from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, Frames, write_html
+from foldgauss.video.editing.chain import Edit
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+#: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame;
+#: an HTML page with a player.
+FORMATS = ("ply", "ply3dgs", "obj", "html")
+
+
+def export(
+    model: VideoModel | EditedVideo | SegmentedVideo,
+    format: str,
+    out: str | os.PathLike,
+    *,
+    times: Sequence[float] | None = None,
+    depth_step: float | None = None,
+    axes: str | None = None,
+    sh_degree: int | None = None,
+    original: Frames | None = None,
+    quality: int | None = None,
+    title: str | None = None,
+    overwrite: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
+) -> Path:
+    """Write a model for other programs; returns the path of the file or the folder.
+
+    - `ply`: one file, the published VeGaS video (`write_vegas_ply`); of a video in segments a folder with one of each,
+      segment-000.ply and so on
+    - `ply3dgs`: a folder with a 3DGS scene of each frame (`write_3dgs_frames`); or one file, where `out` ends in .ply
+      and `times` is one (`write_3dgs_ply`)
+    - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
+    - `html`: one page for browsers, which renders the Gaussians at any time (`write_html`)
+
+    `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
+    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality` and `title` for `html`. An existing output
+    is refused unless `overwrite`. `on_frame` is called after each frame of a folder.
+
+    **Raises:** ValueError for an unknown format, an option of another format, and as the function;
+    `OutputError` where the output cannot be written or exists.
+
+    **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
+    """
+    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
+        cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
+        raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
+    check_one_of("format", format, FORMATS)
+    out = check_path(out, "model, format, out")
+    of_scenes = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
+    of_pages = {"original": original, "quality": quality, "title": title}
+    given = {name: value for name, value in of_scenes.items() if value is not None}
+    unknown = list(given) if format != "ply3dgs" else []
+    unknown += [name for name, value in of_pages.items() if format != "html" and value is not None]
+    unknown += ["times"] if format in ("ply", "html") and times is not None else []
+    if unknown:
+        got = f"it for {format!r}"
+        raise invalid(unknown[0], expected="an option of this format", got=got, cure="Leave it out.")
+    if format == "ply" and isinstance(model, SegmentedVideo):
+        return _write_vegas_segments(out, model, overwrite)
+    if format == "ply":
+        _check_new(out, overwrite)
+        return write_vegas_ply(out, model)
+    if format == "html":
+        if out.suffix.lower() == HTML_SUFFIX:
+            _check_new(out, overwrite)
+        return write_html(out, model, **of_pages | {"quality": QUALITY if quality is None else quality})
+    if format == "obj":
+        if out.suffix.lower() == ".obj" and not out.is_dir():
+            cure = "Each frame becomes a file in it: leave the extension out."
+            raise invalid("out", expected="a folder", got=repr(str(out)), cure=cure)
+        return write_pseudomesh(out, model, times, overwrite=overwrite, on_frame=on_frame)
+    given = {"depth_step": DEPTH_STEP, "axes": AXES[0], "sh_degree": 3} | given
+    if out.suffix.lower() != ".ply" or out.is_dir():
+        return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **given)
+    if times is None or np.size(times) != 1:
+        got = "all frames" if times is None else str(np.size(times))
+        cure = "Give one time, or a folder (a name without .ply)."
+        raise invalid("times", expected="one for a single file", got=got, cure=cure)
+    _check_new(out, overwrite)
+    return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **given)
+
+
+def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
+    if folder.suffix.lower() == ".ply" and not folder.is_dir():
+        cure = "Each segment becomes a file in it: leave the extension out."
+        raise invalid("out", expected="a folder", got=repr(str(folder)), cure=cure)
+    check = partial(check_replaceable, folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments")
+    check()
+    with atomic_folder(folder, check=check) as temporary:
+        for number, segment in enumerate(video.segments):
+            write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)
+    return folder
+
+
+def _check_new(path: Path, overwrite: bool) -> None:
+    check_writable(path)
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"path: expected a new file, got {str(path)!r}, which exists. Choose another path, or allow overwriting."
+        )
+
+
+def import_model(
+    path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
+) -> VideoModel:
+    """The model in a file of another program: a published VeGaS video. See `read_vegas_ply` for `size` and `fps`.
+
+    **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Static 3DGS
+    scenes and pseudomeshes are not videos: use `read_3dgs_ply` and `read_pseudomesh`.
+
+    **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
+    """
+    path = check_path(path)
+    if path.is_dir() or path.suffix.lower() == ".obj":
+        cure = "Render frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
+        raise format_error(path, expected="a .ply file with a video", got="a folder or a mesh", cure=cure)
+    return read_vegas_ply(path, size=size, fps=fps)

@@ -1,0 +1,352 @@
+"""PLY files as tables of numbers: the container format, independent of the meaning of its columns.
+
+Files are not trusted: every count is checked against the size of the file before anything is allocated, and invalid
+content raises only `FormatError`.
+
+Source of the layout: G. Turk, "The PLY Polygon File Format" (1994).
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.io._atomic import atomic_path
+
+_SIZES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+#: Bytes; a header names each frame of a VeGaS video in about 30, so this allows some 100,000 frames.
+MAX_HEADER = 4 << 20
+#: Characters of the longest accepted number.
+LONGEST_WORD = 64
+
+
+class FormatError(ValueError):
+    """A file of another program's format cannot be read or written; the message is one line."""
+
+
+def format_error(path: object, *, expected: str, got: str, cure: str = "") -> FormatError:
+    """The error for a file; `path` is its name, optionally with the position in it."""
+    return FormatError(str(invalid(str(path), expected=expected, got=got, cure=cure)))
+
+
+def facts_error(path: object, error: Exception) -> FormatError:
+    """The error for invalid metadata, with the text of `error` where it is one of our messages."""
+    text = " ".join(str(error).split())[:300]
+    if ": expected " in text:
+        return FormatError(f"{path}: {text}")
+    got = f"others ({type(error).__name__}: {text})"
+    return format_error(path, expected="facts as foldgauss notes them", got=got, cure="Remove them.")
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...]  # (name, type code); of a list "count type, item type"
+
+    @property
+    def has_lists(self) -> bool:
+        return any("," in code for _, code in self.properties)
+
+    def dtype(self, order: str) -> np.dtype:
+        return np.dtype([(name, order + code) for name, code in self.properties])
+
+
+@dataclass(frozen=True)
+class Ply:
+    """What a PLY file holds: structured arrays by element, the comments of its header, and where it came from."""
+
+    path: Path
+    elements: Mapping[str, np.ndarray]
+    comments: tuple[str, ...]
+
+    def names(self, element: str) -> tuple[str, ...]:
+        """The properties of an element in their order; none where it is missing."""
+        return self.elements[element].dtype.names if element in self.elements else ()
+
+    def columns(self, element: str, names: Sequence[str]) -> Float[np.ndarray, "rows names"]:
+        """The named properties side by side, float64. Raises `FormatError` for one that is missing or not finite."""
+        found = self.names(element)
+        missing = [name for name in names if name not in found]
+        if missing:
+            has = "the properties " + ", ".join(found[:40]) if found else "no such element"
+            expected = f"properties {', '.join(missing)} of element {element!r}"
+            raise format_error(self.path, expected=expected, got=has, cure="It holds another kind of data.")
+        rows = self.elements[element]
+        columns = np.empty((len(rows), len(names)), np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for place, name in enumerate(names):
+                columns[:, place] = rows[name]
+            wrong = np.argwhere(~np.isfinite(columns.astype(np.float32)))
+        if len(wrong):
+            row, place = wrong[0]
+            got = f"{columns[row, place]} in {names[place]} of {element} {row}"
+            raise format_error(self.path, expected="numbers that float32 holds", got=got, cure="Drop that row.")
+        return columns
+
+
+# ---------------------------------------------------------------------------------------------- reading
+
+
+def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
+    """Read the `wanted` elements of a PLY file, those of them that it has: text or binary, of either byte order.
+
+    Other elements, lists among them, are skipped. Raises `FileNotFoundError` for a missing path and `FormatError` for
+    a file that is not PLY, breaks off, declares more rows than it holds, or has lists in a wanted element.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    header, start = _split_header(path, data)
+    order, elements, comments = _parse_header(path, header)
+    wanted = set(wanted)
+    body = _TextBody(path, data[start:]) if order == "" else _BinaryBody(path, data, start, order)
+    found = {}
+    for element in elements:
+        if wanted <= found.keys():
+            break
+        if element.name not in wanted:
+            body.skip(element)
+            continue
+        if element.has_lists:
+            lists = [name for name, code in element.properties if "," in code]
+            got = f"the list {lists[0]!r}"
+            expected = f"plain numbers only in element {element.name!r}"
+            raise format_error(path, expected=expected, got=got, cure="It is a mesh, or made by another program.")
+        found[element.name] = body.read(element)
+    return Ply(path, found, comments)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"path: expected a file, got {str(path)!r}, which is missing. Check the spelling and the current folder."
+        ) from None
+    except OSError as error:
+        expected, got = "a file that can be read", error.strerror or str(error)
+        raise format_error(path, expected=expected, got=got, cure="Give the path of a file.") from error
+
+
+def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
+    """The lines between "ply" and "end_header", and where the rows start."""
+    if data[:4] not in (b"ply\n", b"ply\r"):
+        got = "an empty file" if not data else f"one that starts with {data[:8]!r}"
+        raise format_error(path, expected="a PLY file, which starts with 'ply'", got=got, cure="Check the path.")
+    head = data[:MAX_HEADER]
+    lines, start = [], 0
+    while True:
+        end = head.find(b"\n", start)
+        if end < 0:
+            got = f"none in {len(head)} bytes"
+            raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
+        line = head[start:end].rstrip(b"\r").decode("ascii", errors="replace")
+        start = end + 1
+        if line.strip() == "end_header":
+            return lines[1:], start
+        lines.append(line)
+
+
+def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
+    """(byte order, elements, comments); see `_ORDERS`."""
+    order, comments = None, []
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for number, line in enumerate(lines, start=2):
+        word, *rest = line.split() or [""]
+        where = f"{path}, line {number}"
+        if word == "comment":
+            comments.append(line.strip()[len("comment ") :])
+        elif word in ("obj_info", ""):
+            continue
+        elif word == "format" and order is None and len(rest) == 2 and rest[0] in _ORDERS and rest[1] == "1.0":
+            order = _ORDERS[rest[0]]
+        elif word == "element" and len(rest) == 2 and _is_count(rest[1]):
+            if any(rest[0] == name for name, _, _ in elements):
+                raise format_error(where, expected="elements of different names", got=f"{rest[0]!r} twice")
+            elements.append((rest[0], int(rest[1]), []))
+        elif word == "property" and elements:
+            elements[-1][2].append(_parse_property(where, rest))
+        else:
+            expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
+            raise format_error(where, expected=expected, got=repr(line[:80]), cure="The header is damaged.")
+    if order is None:
+        raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
+    for name, _, properties in elements:
+        names = [own for own, _ in properties]
+        if len(set(names)) < len(names) or not names:
+            got = "none" if not names else f"{max(names, key=names.count)!r} twice"
+            raise format_error(path, expected=f"different properties of element {name!r}", got=got)
+    return order, [_Element(name, count, tuple(properties)) for name, count, properties in elements], tuple(comments)
+
+
+def _parse_property(where: str, words: list[str]) -> tuple[str, str]:
+    """(name, type code) of what follows "property"."""
+    if len(words) == 2 and words[0] in _SIZES:
+        return words[1], _SIZES[words[0]]
+    if len(words) == 4 and words[0] == "list" and words[2] in _SIZES and _SIZES.get(words[1], "f")[0] in "iu":
+        return words[3], f"{_SIZES[words[1]]},{_SIZES[words[2]]}"
+    expected = "property TYPE NAME or property list COUNT_TYPE TYPE NAME, of known types"
+    raise format_error(where, expected=expected, got=repr(" ".join(["property", *words])[:80]))
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= 15
+
+
+class _BinaryBody:
+    """Rows as bytes, element after element."""
+
+    def __init__(self, path: Path, data: bytes, start: int, order: str):
+        self.path, self.data, self.at, self.order = path, data, start, order
+
+    def read(self, element: _Element) -> np.ndarray:
+        dtype = element.dtype(self.order)
+        self._need(element, element.count * dtype.itemsize)
+        rows = np.frombuffer(self.data, dtype, element.count, self.at)
+        self.at += rows.nbytes
+        return rows
+
+    def skip(self, element: _Element) -> None:
+        if not element.has_lists:
+            num_bytes = element.count * element.dtype(self.order).itemsize
+            self._need(element, num_bytes)
+            self.at += num_bytes
+            return
+        codes = [[np.dtype(self.order + part) for part in code.split(",")] for _, code in element.properties]
+        self._need(element, element.count * sum(code[0].itemsize for code in codes))
+        for _ in range(element.count):
+            for code in codes:
+                self._skip_one(element, code)
+
+    def _skip_one(self, element: _Element, code: list[np.dtype]) -> None:
+        self._need(element, code[0].itemsize)
+        if len(code) == 2:
+            num = int(np.frombuffer(self.data, code[0], 1, self.at)[0])
+            if num < 0:
+                raise format_error(self.path, expected=f"lengths of lists in {element.name!r}", got=str(num))
+            self._need(element, code[0].itemsize + num * code[1].itemsize)
+            self.at += num * code[1].itemsize
+        self.at += code[0].itemsize
+
+    def _need(self, element: _Element, num_bytes: int) -> None:
+        left = len(self.data) - self.at
+        if num_bytes > left:
+            expected = f"{element.count} rows of element {element.name!r}, {num_bytes} bytes or more"
+            raise format_error(self.path, expected=expected, got=f"{left} bytes", cure="The file breaks off.")
+
+
+class _TextBody:
+    """Rows as words, element after element."""
+
+    def __init__(self, path: Path, data: bytes):
+        self.path, self.words, self.at = path, data.split(), 0
+
+    def read(self, element: _Element) -> np.ndarray:
+        width = len(element.properties)
+        words = self._take(element, element.count * width)
+        long = next((word for word in words if len(word) > LONGEST_WORD), None)
+        if long is not None:  # an array of words gives each the room of the longest
+            raise format_error(self.path, expected="numbers", got=f"a word of {len(long)} characters")
+        try:
+            values = np.array(words, dtype=np.bytes_).astype(np.float64).reshape(element.count, width)
+        except ValueError:
+            place = next(place for place, word in enumerate(words) if not _is_number(word))
+            name, where = element.properties[place % width][0], f"{element.name} {place // width}"
+            got = f"{words[place][:40]!r} in {name} of {where}"
+            raise format_error(self.path, expected="numbers", got=got, cure="The file is damaged.") from None
+        rows = np.empty(element.count, [(name, "f8") for name, _ in element.properties])
+        for column, (name, _) in enumerate(element.properties):
+            rows[name] = values[:, column]
+        return rows
+
+    def skip(self, element: _Element) -> None:
+        if not element.has_lists:
+            self._take(element, element.count * len(element.properties))
+            return
+        self._need(element, element.count * len(element.properties))
+        for _ in range(element.count):
+            for _, code in element.properties:
+                word = self._take(element, 1)[0]
+                if "," not in code:
+                    continue
+                if not _is_count(word.decode("ascii", errors="replace")):
+                    raise format_error(self.path, expected=f"lengths of lists in {element.name!r}", got=repr(word[:40]))
+                self._take(element, int(word))
+
+    def _take(self, element: _Element, num: int) -> list[bytes]:
+        self._need(element, num)
+        words = self.words[self.at : self.at + num]
+        self.at += num
+        return words
+
+    def _need(self, element: _Element, num: int) -> None:
+        left = len(self.words) - self.at
+        if num > left:
+            expected = f"{element.count} rows of element {element.name!r}, {num} numbers or more"
+            raise format_error(self.path, expected=expected, got=str(left), cure="The file breaks off.")
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        np.array([word]).astype(np.float64)
+    except ValueError:
+        return False
+    return True
+
+
+# ---------------------------------------------------------------------------------------------- writing
+
+
+def write_ply(
+    path: str | os.PathLike, elements: Mapping[str, Mapping[str, np.ndarray]], *, comments: Sequence[str] = ()
+) -> Path:
+    """Write columns of numbers, float32, binary and little-endian as viewers expect; whole or not at all.
+
+    `elements` by name, each with its columns by name, in the order given. Raises `OutputError` where the path cannot
+    be written.
+    """
+    path = Path(path)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(_encode(elements, comments))
+    return path
+
+
+def _encode(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence[str]) -> Iterator[bytes]:
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    for name, columns in elements.items():
+        lines.append(f"element {name} {len(next(iter(columns.values())))}")
+        lines.extend(f"property float {column}" for column in columns)
+    yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
+    for columns in elements.values():
+        yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()
+
+
+# ---------------------------------------------------------------------------------------------- layouts
+
+
+def is_vegas(ply: Ply) -> bool:
+    """Whether a PLY file is a published VeGaS video, by the columns that only those have."""
+    return {"m_0", "sigma_0", "rot_0"} <= set(ply.names("vertex"))
+
+
+def is_3dgs(ply: Ply) -> bool:
+    """Whether a PLY file is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
+    return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(ply.names("vertex"))
+
+
+def to_float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:
+    """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
+    with np.errstate(over="ignore"):
+        leaf = np.ascontiguousarray(leaf, np.float32)
+    if not np.isfinite(leaf).all():
+        raise format_error(ply.path, expected=f"a {name} that float32 holds in model space", got="a larger one")
+    return leaf

@@ -1,0 +1,380 @@
+"""GaMeS pseudomeshes: frames as triangles for mesh tools, in one `.obj` and one `.ply` file per frame.
+
+The `.obj` contains the shape, one triangle per Gaussian; the `.ply`, an ordinary 3DGS file, opacity and color.
+"""
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss.io._atomic import atomic_folder, check_replaceable
+from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
+from foldgauss.io.exchange.ply_file import facts_error, format_error
+from foldgauss.io.media.frame_rate import DEFAULT_FPS
+from foldgauss.io.media.image_files import natural_sort_key
+from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
+from foldgauss.render.splats import check_size, pixels_per_unit
+from foldgauss.render.triangle import COLLINEAR
+from foldgauss.video.models.background import BLACK, check_background
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer, to_bytes
+
+#: Frame times, size and rate of the video, and render options, which an `.obj` cannot hold.
+NOTES = "pseudomesh.json"
+_FILES = r"frame_[0-9]{4,}\.(obj|ply)|pseudomesh\.json"
+#: Model space (x right, y down, z away) to the axes of mesh tools (x right, y up, z towards the viewer), and back.
+_AXES_TURN = np.array([1.0, -1.0, -1.0])
+#: No sine of the angle between two edges is smaller than that in a face that float32 tells from a line.
+_COLLINEAR = COLLINEAR * float(np.finfo(np.float32).eps)
+_LARGEST = 1e38  # of a coordinate: float32 holds the difference of two such
+_AXES_SLANT = 1e-6  # cosine up to which two columns of a factor are its axes: rounding of float32
+
+
+@dataclass(frozen=True, eq=False)
+class Pseudomesh:
+    """Frames as triangles with opacity and colour: what a folder of `.obj` and `.ply` files holds.
+
+    **Shapes:** `triangles` one `Triangles` (NumPy leaves, front first) for each frame, of its own number of faces;
+    `times` (num_frames,), those of the frames in [0, 1]. **Units:** model space.
+
+    `size` is (height, width), `fps` the rate; `options` and `compositing` are the render options.
+    """
+
+    triangles: tuple[Triangles, ...]
+    times: Float[np.ndarray, "num_frames"]
+    size: tuple[int, int]
+    fps: float
+    options: RenderOptions
+    compositing: str = "over"
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.triangles)
+
+    def vertices(self, number: int) -> Float[np.ndarray, "num 3 3"]:
+        """The vertices m, v1 and v2 of each face of a frame, in model space."""
+        faces = self.triangles[number]
+        return np.concatenate([faces.origin[:, None], faces.origin[:, None] + faces.edges], axis=1)
+
+    def splats(self, number: int, size: tuple[int, int] | None = None) -> Splats2D:
+        """The conditioned Gaussians of a frame, in pixels of an image of `size` (default: the video's own).
+
+        Frames whose vertices lie in the plane are rendered directly, others through the front camera, in array order.
+        Source: VeGaS eq:gaussrecons1, eq:gaussrecons2.
+        """
+        size = self.size if size is None else size
+        check_size(size)
+        faces, aspect = self.triangles[number], self.size[0] / self.size[1]
+        if faces.origin[:, 2].any() or faces.edges[..., 2].any():
+            return jax.tree.map(np.asarray, project(faces.to_gaussians(), Camera.front(aspect), size, order="array"))
+        unit = pixels_per_unit(size, aspect=aspect)
+        centre = np.array([size[1] / 2, size[0] / 2], np.float32)
+        mean, factor = faces.origin[:, :2] * np.float32(unit) + centre, _flat_factor(faces.edges) * np.float32(unit)
+        return Splats2D(mean, factor, faces.opacity, faces.color)
+
+    def frame(
+        self,
+        number: int,
+        size: tuple[int, int] | None = None,
+        *,
+        background: tuple[float, float, float] = BLACK,
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """The image of a frame over `background`. Raises ValueError for an invalid size or background."""
+        size = self.size if size is None else tuple(size)
+        splats, behind = self.splats(number, size), check_background(background, self.compositing)
+        leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
+        drawn = {"compositing": self.compositing, "options": self.options}
+        return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
+
+    def frames(
+        self, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
+    ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        """The images of all frames one by one."""
+        for number in range(self.num_frames):
+            yield self.frame(number, size, background=background)
+
+
+def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 2 2"]:
+    """F = [s1 r1, s2 r2] of faces in the plane: the second edge less its part along the first (eq:gaussrecons1)."""
+    first, second = edges[:, 0, :2], edges[:, 1, :2]
+    along = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    second = second - along * np.sum(along * second, axis=-1, keepdims=True)
+    return np.stack([first, second], axis=-1)
+
+
+# ---------------------------------------------------------------------------------------------- writing
+
+
+def write_pseudomesh(
+    folder: str | os.PathLike,
+    model: RenderableVideo,
+    times: Sequence[float] | None = None,
+    *,
+    overwrite: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
+) -> Path:
+    """Write frames as triangles: frame_0000.obj, frame_0000.ply and so on, and pseudomesh.json; returns the folder.
+
+    Face k of an `.obj` is Gaussian k of the frame, front first, with three vertices of its own: m, m + s1 r1 and
+    m + s2 r2, the covariance's axes to one standard deviation. Mesh tools show it upright (x right, y up, z towards the
+    viewer; the frame's centre is the origin, its longer side 1) in the colours of the vertices. The `.ply` beside it is
+    the frame as an ordinary 3DGS file, y down. Edit the vertices, keep their order and number, and `read_pseudomesh`
+    takes the shape from the `.obj`, opacity and colour from the `.ply`.
+
+    `times` (default: the model's frame times), in [0, 1]. The folder appears whole or not at all; one that holds files
+    is refused unless `overwrite`, and even then if it holds anything else. `on_frame` is called after each frame.
+
+    **Raises:** ValueError for times outside [0, 1]; `OutputError` where the folder is refused.
+
+    **Example:** `write_pseudomesh("mesh", model, times=[0.5])`
+
+    **Source:** VeGaS eq:traingle_face; Waczyńska et al. 2024, GaMeS (pseudomesh).
+    """
+    folder, times = Path(folder), check_times(model, times)
+    check = partial(check_replaceable, folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
+    check()
+    with atomic_folder(folder, check=check) as temporary:
+        renderer = VideoRenderer(model)
+        for number, t in enumerate(times):
+            gaussians = frame_gaussians(renderer, t, depth_step=0.0)
+            write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, sh_degree=0)
+            (temporary / f"frame_{number:04d}.obj").write_text(_obj_text(gaussians, t), encoding="ascii")
+            on_frame()
+        notes = {
+            "times": [float(t) for t in times],
+            "size": list(model.size),
+            "fps": model.fps,
+            "options": dataclasses.asdict(model.options),
+            "compositing": model.compositing,
+        }
+        (temporary / NOTES).write_text(json.dumps(notes, indent=1) + "\n", encoding="ascii")
+    return folder
+
+
+def _obj_text(gaussians: Gaussians3D, t: float) -> str:
+    mean = gaussians.mean.astype(np.float64)
+    edges = np.pad(_axes(gaussians.factor[:, :2, :2].astype(np.float64)), [(0, 0), (0, 0), (0, 1)])
+    vertices = np.concatenate([mean[:, None], mean[:, None] + edges], axis=1) * _AXES_TURN
+    colors = np.repeat(np.clip(gaussians.color, 0, 1), 3, axis=0)
+    rows = np.concatenate([vertices.reshape(-1, 3), colors], axis=1) + 0.0  # no -0
+    lines = ["# foldgauss pseudomesh: a face for each Gaussian, front first; keep the order of vertices and faces"]
+    lines.append(f"# time {t:.9g}")
+    lines.extend("v {:.10g} {:.10g} {:.10g} {:.4g} {:.4g} {:.4g}".format(*row) for row in rows.tolist())
+    lines.extend(f"f {k + 1} {k + 2} {k + 3}" for k in range(0, len(rows), 3))
+    return "\n".join(lines) + "\n"
+
+
+def _axes(factor: Float[np.ndarray, "num 2 2"]) -> Float[np.ndarray, "num 2 2"]:
+    """s1 r1 and s2 r2 as rows: the factor's own columns where they are at right angles, else its principal axes."""
+    first, second = factor[..., 0], factor[..., 1]
+    lengths = np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
+    slanted = np.abs(np.sum(first * second, axis=-1)) > _AXES_SLANT * lengths
+    rows = np.stack([first, second], axis=-2)
+    axes, scale, _ = np.linalg.svd(factor[slanted])
+    rows[slanted] = (axes * scale[:, None]).mT
+    return rows
+
+
+# ---------------------------------------------------------------------------------------------- reading
+
+
+def read_pseudomesh(
+    folder: str | os.PathLike,
+    *,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    axes: str = "y-up",
+) -> Pseudomesh:
+    """Read frames as triangles, after editing in a mesh tool or straight from `write_pseudomesh`.
+
+    Every `NAME.obj` of the folder, in natural order, with `NAME.ply` beside it: shape from the one, opacity and colour
+    from the other, face k being Gaussian k. `size` = (height, width), `fps` and the times come from pseudomesh.json;
+    without that file `size` must be given, the rate is 25 and the frames are evenly spaced. `axes` are those of the
+    `.obj`: "y-up" as written, or "y-down" for a tool that turned it.
+
+    **Raises:** `FileNotFoundError`; `FormatError`, with the file and where it can the line, for a file that is damaged
+    or incomplete, faces that are no triangles or have no area, and vertices that a tool merged, split or reordered.
+
+    **Example:** `write_video("edited.mp4", read_pseudomesh("mesh").frames(), fps=25)`
+
+    **Source:** VeGaS eq:gaussrecons1, eq:gaussrecons2; GaMeS.
+    """
+    check_one_of("axes", axes, ("y-up", "y-down"))
+    folder = Path(folder)
+    if not os.path.exists(folder):
+        raise FileNotFoundError(
+            f"path: expected a folder, got {str(folder)!r}, which is missing. Check the current folder."
+        )
+    paths = sorted(folder.glob("*.obj"), key=lambda path: natural_sort_key(path.name)) if folder.is_dir() else []
+    if not paths:
+        cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
+        raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)
+    notes = _read_notes(folder, len(paths))
+    given = {"size": size, "fps": fps}
+    notes |= {name: value for name, value in given.items() if value is not None}
+    facts = _check_notes(folder, notes, len(paths))
+    return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
+
+
+def _read_notes(folder: Path, num_frames: int) -> dict:
+    """The content of pseudomesh.json, with defaults for folders of other programs."""
+    evenly = np.linspace(0, 1, num_frames).tolist()
+    defaults = {"times": evenly, "size": None, "fps": DEFAULT_FPS, "options": {}, "compositing": "over"}
+    path = folder / NOTES
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return defaults
+    except (ValueError, RecursionError, OSError) as error:
+        raise format_error(path, expected="JSON", got="text that is none", cure="Remove it, and give size.") from error
+    if not isinstance(found, dict):
+        raise format_error(path, expected="an object", got=type(found).__name__, cure="Remove it, and give size.")
+    return defaults | {name: value for name, value in found.items() if name in defaults}
+
+
+def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
+    if notes["size"] is None:
+        cure = "Give the size of the video, such as size=(480, 854)."
+        raise format_error(folder, expected=f"a size in {NOTES}", got="none", cure=cure)
+    try:
+        times, size, fps = np.asarray(notes["times"], np.float64), tuple(notes["size"]), float(notes["fps"])
+        options = RenderOptions(**notes["options"])
+        check_one_of("compositing", notes["compositing"], COMPOSITINGS)
+        check_size(size)
+        if not 0 < fps < math.inf:
+            raise invalid("fps", expected="a positive rate", got=fps)
+        if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
+            expected = f"{num_frames} numbers in [0, 1], one for each .obj"
+            cure = "A frame was added or removed: mend the list too, or remove the file and give size."
+            raise invalid("times", expected=expected, got=f"shape {times.shape}", cure=cure)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise facts_error(folder / NOTES, error) from error
+    facts = {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
+    return facts | {"compositing": notes["compositing"]}
+
+
+def _read_frame(path: Path, axes: str) -> Triangles:
+    beside = path.with_suffix(".ply")
+    if not beside.exists():
+        got = f"{path.name!r} without {beside.name!r}"
+        raise format_error(path.parent, expected="a .ply with opacity and colour beside every .obj", got=got)
+    look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where no Gaussian was visible
+    if len(vertices) != len(look.opacity):
+        cure = "Faces were added or removed: keep them all, and hide Gaussians by opacity instead."
+        expected = f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}"
+        raise format_error(path, expected=expected, got=str(len(vertices)), cure=cure)
+    if axes == "y-up":
+        vertices = vertices * _AXES_TURN
+    edges = vertices[:, 1:] - vertices[:, :1]
+    _check_area(path, edges)
+    origin = vertices[:, 0].astype(np.float32) + np.float32(0)  # no -0
+    return Triangles(origin, edges.astype(np.float32), look.opacity, look.color)
+
+
+def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
+    first, second = edges[:, 0], edges[:, 1]
+    with np.errstate(over="ignore", invalid="ignore"):
+        area = np.linalg.norm(np.cross(first, second), axis=-1)
+        valid = area > _COLLINEAR * np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
+    if not valid.all():
+        cure = "Move a vertex off the line through the other two."
+        raise format_error(path, expected="faces of some area", got=f"none in face {np.argmin(valid) + 1}", cure=cure)
+
+
+def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
+    """The vertices of a triangle soup in an `.obj` file, (x, y, z) as they stand there, float64.
+
+    Face k must have vertices 3k + 1, 3k + 2, 3k + 3 of the file, in this order: its first vertex is the Gaussian's
+    centre, and a tool that merges or reorders vertices destroys that. Everything but `v` and `f` lines is skipped, and
+    so is what follows x, y and z in a `v` line (a colour) or the vertex in an `f` line (`1/2/3`). Indices may be
+    negative.
+
+    **Raises:** `FileNotFoundError`; `FormatError` with the line.
+
+    **Example:** `read_obj("mesh/frame_0000.obj").shape`
+
+    **Source:** Wavefront, "Object Files (.obj)", appendix B1 of the Advanced Visualizer manual.
+    """
+    path = Path(path)
+    vertices: list[tuple[float, ...]] = []
+    faces: list[tuple[int, list[int]]] = []
+    for number, words in _obj_lines(path):
+        if words[0] == "v":
+            vertices.append(_parse_vertex(path, number, words[1:]))
+        elif words[0] == "f":
+            faces.append((number, _parse_face(path, number, words[1:], len(vertices))))
+    if not faces and vertices:
+        raise format_error(path, expected="faces", got=f"none, and {len(vertices)} vertices", cure="Export them too.")
+    _check_soup(path, faces, len(vertices))
+    return np.array(vertices).reshape(-1, 3, 3)
+
+
+def _obj_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Numbered lines of words, those that a backslash continues as one, without comments and blank ones."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"path: expected a file, got {str(path)!r}, which is missing.") from None
+    except OSError as error:
+        raise format_error(path, expected="a file that can be read", got=error.strerror or str(error)) from error
+    parts: list[str] = []  # of a line that goes on; joined once, as there may be a million
+    for number, line in enumerate(text.split("\n"), start=1):
+        line = line.rstrip("\r")
+        if line.endswith("\\"):
+            parts.append(line[:-1])
+            continue
+        words = " ".join([*parts, line]).split("#", 1)[0].split()
+        parts = []
+        if words:
+            yield number, words
+
+
+def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...]:
+    try:
+        place = tuple(float(word) for word in words[:3])
+    except ValueError:
+        place = ()
+    if len(place) < 3 or not all(abs(x) <= _LARGEST for x in place):
+        got, cure = repr(" ".join(words)[:60]), "The file is damaged, or the tool wrote NaN."
+        raise format_error(f"{path}, line {number}", expected="a vertex x y z", got=got, cure=cure)
+    return place
+
+
+def _parse_face(path: Path, number: int, words: list[str], num_vertices: int) -> list[int]:
+    """Numbers of the vertices from 0 on; a negative index counts back from the last vertex so far."""
+    where = f"{path}, line {number}"
+    try:
+        indices = [int(word.split("/", 1)[0]) for word in words]
+    except ValueError:
+        indices = []
+    if len(indices) != 3 or 0 in indices:
+        cure = "Triangles alone stand for Gaussians: turn off what makes polygons."
+        raise format_error(where, expected="a face of 3 vertices", got=repr(" ".join(words)[:60]), cure=cure)
+    return [index - 1 if index > 0 else num_vertices + index for index in indices]
+
+
+def _check_soup(path: Path, faces: list[tuple[int, list[int]]], num_vertices: int) -> None:
+    """Every face has three vertices of its own, in the order in which they were written."""
+    for line, indices in faces:
+        if not all(0 <= index < num_vertices for index in indices):
+            outside = next(index for index in indices if not 0 <= index < num_vertices)
+            expected, got = f"vertices from 1 to {num_vertices}", str(outside + 1)
+            raise format_error(f"{path}, line {line}", expected=expected, got=got, cure="The file is damaged.")
+    cure = "Export with the vertices' order kept, and merge none by distance."
+    if num_vertices != 3 * len(faces):
+        got = f"{num_vertices} vertices for {len(faces)} faces: a tool merged, split or dropped some"
+        raise format_error(path, expected="3 vertices of its own for each face", got=got, cure=cure)
+    for place, (line, indices) in enumerate(faces):
+        if indices != [3 * place, 3 * place + 1, 3 * place + 2]:
+            expected = f"face {place + 1} of vertices {3 * place + 1}, {3 * place + 2}, {3 * place + 3}"
+            got = ", ".join(str(index + 1) for index in indices) + ": a tool reordered them"
+            raise format_error(f"{path}, line {line}", expected=expected, got=got, cure=cure)

@@ -1,0 +1,150 @@
+"""The contexts in which the columns of a compact file are entropy-coded.
+
+Encoder and decoder derive them, column by column, from the columns before.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int, Int32, UInt8
+
+from foldgauss._runtime.kernels import exact_kernel
+from foldgauss.io.models.range_coder import Column
+from foldgauss.video.compression.quantize import (
+    COLORS,
+    ColumnDecoder,
+    CompactInfo,
+    Rule,
+    clamp_unit,
+    compute_steps,
+    path_power,
+    path_span,
+)
+
+#: Gaussians nearby that say what to expect; candidates for them in each square of a grid; what time counts as length.
+NEIGHBOURS, CANDIDATES, TIME = 4, 16, 0.3
+_LEVELS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
+
+
+class Walk:
+    """The columns of a file, one after another: ask for `column`, then `add` its numbers."""
+
+    def __init__(self, rules: dict[str, Rule], info: CompactInfo):
+        self._info, self._decoder = info, ColumnDecoder(rules, info)
+        self._numbers: dict[str, np.ndarray] = {}
+        self._in_cell = self._nearest = np.zeros((info.num_gaussians, 0), np.int32)
+        self._half = np.ones(info.num_gaussians)
+
+    def column(self, name: str) -> Column:
+        """The one that comes next."""
+        decoder = self._decoder
+        rows = decoder.rows(name)
+        if name == "cell":
+            return Column.plain(rows)
+        halves = decoder.half_exponents(name)
+        known = {"origin": decoder.origin(name), "step": compute_steps(halves, name)}
+        if name in COLORS and self._info.shared:
+            return dataclasses.replace(Column.plain(rows), near=np.arange(-1, rows - 1)[:, None], **known)
+        power = path_power(name)
+        near = self._nearest if power or name in ("angle", "shade", *COLORS) else self._in_cell
+        scale = np.ones(rows)
+        for _ in range(power):  # not a power, whose last bit libraries do not agree on
+            scale = scale * self._half
+        contexts = self._contexts(name, power, halves)
+        return Column(present=decoder.has(name), contexts=contexts, scale=scale, near=near, **known)
+
+    def add(self, name: str, numbers: Int32[np.ndarray, " rows"]) -> None:
+        """Its numbers."""
+        decoder, info = self._decoder, self._info
+        self._numbers[name] = numbers
+        decoder.add(name, numbers, decoder.half_exponents(name))
+        if name == "cell":
+            self._in_cell = latest_in(numbers, 1 << sum(info.cells))
+        if name == "y0":
+            v = decoder.values
+            middle, self._half = path_span(clamp_unit(v["time"]), v["duration"], info.reach)
+            bits = max(info.cells[:2]) + 1
+            self._nearest = nearest_of(v["x0"], v["y0"], TIME * middle, bits)
+
+    def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
+        """The first and the second context of each number."""
+        q, first = self._numbers, (halves >> 1) & 31
+        if name == "class":
+            second = 0
+        elif name == "without":
+            second = q["class"] & 31
+        elif power:
+            first = first + 32 * (q["degree"] == power)
+            # The other axis's number that comes before, and this one's of the power before.
+            other = f"x{power}" if name[0] == "y" else f"y{power - 1}"
+            high = q["degree"] if name == "x1" else level(q[other])
+            low = q["degree"] if power == 1 else level(q[f"{name[0]}{power - 1}"])
+            second = 16 * high + low
+        elif name == "blue":
+            second = 16 * level(q["luma"])
+        elif name == "green":
+            second = 16 * level(q["luma"]) + level(q["blue"])
+        else:
+            second = (q["class"] & 31) + 32 * (q["without"] & 1)
+        return np.stack(np.broadcast_arrays(first, second), 1).astype(np.uint8)
+
+
+def level(numbers: Int32[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
+    """The size of numbers: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most."""
+    return np.searchsorted(_LEVELS, np.abs(numbers), side="right")
+
+
+def latest_in(cell: Int32[np.ndarray, " num"], num_cells: int) -> Int32[np.ndarray, "num 4"]:
+    """The last Gaussians before each that are in its cell; where there are none, the one before it. -1: no more."""
+    out = np.full((len(cell), NEIGHBOURS), -1, np.int32)
+    _latest(cell, np.full(num_cells, -1, np.int32), np.full(len(cell), -1, np.int32), out)
+    return out
+
+
+@exact_kernel
+def _latest(cell, last, before, out):
+    for i in range(len(cell)):
+        j, count = last[cell[i]], 0
+        before[i] = j
+        while j >= 0 and count < out.shape[1]:
+            out[i, count] = j
+            j = before[j]
+            count += 1
+        if count == 0:
+            out[i, 0] = i - 1
+        last[cell[i]] = i
+
+
+def nearest_of(
+    x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], bits: int
+) -> Int32[np.ndarray, "num 4"]:
+    """The nearest Gaussians before each, among the last ones of its square of a grid and of those around. -1: none."""
+    side = 1 << bits
+    at = [np.minimum(np.maximum(np.floor((one + 0.5) * side), 0), side - 1).astype(np.int64) for one in (x, y)]
+    out = np.full((len(x), NEIGHBOURS), -1, np.int32)
+    _nearest(x, y, time, *at, np.full((side, side), -1, np.int32), np.full(len(x), -1, np.int32), CANDIDATES, out)
+    return out
+
+
+@exact_kernel
+def _nearest(x, y, time, column, row, last, before, most, out):
+    best = np.empty(out.shape[1])
+    for i in range(len(x)):
+        best[:] = np.inf
+        for c in range(max(column[i] - 1, 0), min(column[i] + 2, last.shape[0])):
+            for r in range(max(row[i] - 1, 0), min(row[i] + 2, last.shape[1])):
+                j, count = last[c, r], 0
+                while j >= 0 and count < most:
+                    dx, dy, dt = x[i] - x[j], y[i] - y[j], time[i] - time[j]
+                    far = dx * dx + dy * dy + dt * dt
+                    place = len(best)
+                    while place > 0 and far < best[place - 1]:
+                        place -= 1
+                    if place < len(best):
+                        for k in range(len(best) - 1, place, -1):
+                            best[k], out[i, k] = best[k - 1], out[i, k - 1]
+                        best[place], out[i, place] = far, j
+                    j = before[j]
+                    count += 1
+        before[i] = last[column[i], row[i]]
+        last[column[i], row[i]] = i

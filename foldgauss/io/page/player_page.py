@@ -1,0 +1,293 @@
+"""A model as one HTML page with a player that renders the folded Gaussians at any time in a browser.
+
+The page is self-contained: it holds the model as a compact file (one per segment) and makes no network requests.
+Its sources are the files in `player/`; `compact.js` decodes the models there. See docs/player.md.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import os
+import re
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.models.compact import is_compact, pack_compact
+from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.video.compression.quantize import (
+    Quantized,
+    Rule,
+    column_names,
+    compute_columns,
+    is_integral,
+    quantize,
+)
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.background import BLACK, composite
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+HTML_SUFFIX = ".html"
+#: WebP quality of the original's frames.
+QUALITY = 80
+#: Bytes above which browsers open a page slowly, and above which notebooks do not show it automatically.
+LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
+_SOURCES = Path(__file__).parent / "player"
+_DECODER = Path(__file__).parent / "compact.js"
+_IMPORT = re.compile(r'^import (?:\{[^}]*\}|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
+#: Binary logarithms of the steps, for pages that quantize a model: to a hundredth of what each number is measured by.
+_EVEN = -18.0
+_PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
+
+Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantized
+Model = Loaded | str | os.PathLike
+Frames = Clip | UInt8[np.ndarray, "num_frames height width channels"]
+
+
+def write_html(
+    path: str | os.PathLike,
+    model: Model,
+    *,
+    original: Frames | None = None,
+    quality: int = QUALITY,
+    title: str | None = None,
+) -> Path:
+    """Write the page of `html_page` to a file that ends in .html; what exists is replaced. Warns of one beyond 50 MB.
+
+    Raises as `html_page`, ValueError for another name, `OutputError` where it cannot be written.
+
+    Example: `write_html("clip.html", model, original=clip.frames)`.
+    """
+    path = check_path(path, "path, model")
+    if path.suffix.lower() != HTML_SUFFIX:
+        raise invalid("path", expected=f"a name ending in {HTML_SUFFIX}", got=repr(str(path)))
+    page = html_page(model, original=original, quality=quality, title=path.stem if title is None else title)
+    warn_of_size(page, original is not None)
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return path
+
+
+def warn_of_size(page: str, has_original: bool) -> None:
+    """Warn of a page that browsers open slowly."""
+    if len(page) > LARGE:
+        cure = (
+            "Leave the original out, or lower its quality." if has_original else "Compress the model, or show a part."
+        )
+        warnings.warn(f"page: {len(page) / 1e6:.0f} MB, which browsers are slow to open. {cure}", stacklevel=3)
+
+
+def html_page(model: Model, *, original: Frames | None = None, quality: int = QUALITY, title: str | None = None) -> str:
+    """The page as text.
+
+    `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantized
+    finely, and so is each segment of a video in segments: see docs/player.md for the accuracy.
+    `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
+
+    Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
+    and for frames that do not fit; errors of reading as `load_video_model`.
+
+    Example: `html_page(model, title="holiday")`.
+    """
+    if not (is_integer(quality, 1) and quality <= 100):
+        raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
+    plain, name = _load(model)
+    pictures = [] if original is None else _encode_original(original, plain, quality)
+    return _assemble(_encode_model(model, plain), pictures, name if title is None else title)
+
+
+def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
+    """The page as an iframe for notebooks; None where it is too large or the model cannot be shown."""
+    try:
+        page = _assemble(_limit_size(_encode_model(model, model), LARGEST_IN_NOTEBOOK), [], "foldgauss")
+    except (ValueError, OSError):  # the file of a video in segments may be gone
+        return None
+    if len(page) > LARGEST_IN_NOTEBOOK:
+        return None
+    height, width = model.size
+    tall = min(max(round(720 * height / width), 240), 560) + 150
+    shown = f'srcdoc="{html.escape(page)}" sandbox="allow-scripts allow-downloads" loading="lazy"'
+    return f'<iframe {shown} width="100%" height="{tall}" frameborder="0" title="foldgauss player"></iframe>'
+
+
+# ----------------------------------------------------------------------------------------------- the model
+
+
+def _load(model: Model) -> tuple[Loaded, str]:
+    """The model, and a name for it."""
+    if isinstance(model, str | os.PathLike):
+        path = check_path(model, "model")
+        name = read_origin(path).get("clip", path.stem)
+        return load_video_model(path), name
+    if not isinstance(model, Loaded):
+        cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
+        raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)
+    return model, "foldgauss"
+
+
+def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
+    """The page's data blocks of the model, one by one; a compact file is embedded unchanged."""
+    if isinstance(loaded, SegmentedVideo):
+        names = ("first", "num_frames", "num_gaussians")
+        spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
+        yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
+        for number, segment in enumerate(loaded.segments):
+            yield _block(f"model-{number}", pack_compact(quantize_finely(_flatten_segment(number, segment.model))))
+    elif isinstance(model, Quantized):
+        yield _block("model", pack_compact(model))
+    elif loaded is not model and is_compact(model):
+        yield _block("model", Path(model).read_bytes())
+    else:
+        yield _block("model", pack_compact(quantize_finely(flatten_video(loaded))))
+
+
+def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel:
+    try:
+        return flatten_video(model)
+    except ValueError as error:
+        raise ValueError(f"segment {number}: {error}") from error
+
+
+def _limit_size(blocks: Iterable[str], most: float) -> Iterator[str]:
+    """The blocks; raises ValueError once their total size exceeds `most`."""
+    total = 0
+    for block in blocks:
+        total += len(block)
+        if total > most:
+            raise invalid("model", expected=f"a page of at most {most / 1e6:g} MB", got="a larger one")
+        yield block
+
+
+def quantize_finely(model: VideoModel) -> Quantized:
+    """The model quantized in steps too fine to change the image, with its Gaussians in their order."""
+    described = compute_columns(model)
+    classes = np.zeros(model.num_gaussians, np.int32)
+    try:
+        return quantize(described, classes, _fine_rules(model.degree))
+    except ValueError:  # Gaussians so thin that steps in proportion would be beyond the format
+        names = [name for name in column_names(model.degree) if not is_integral(name)]
+        return quantize(described, classes, {name: Rule(0.0, _EVEN) for name in names})
+
+
+def _fine_rules(degree: int) -> dict[str, Rule]:
+    """Steps in proportion to what a number is measured by: paths by the shorter deviation, times by the longer ones.
+
+    Features are class, size, stretch, duration, opacity, in this order.
+    """
+    rules = {name: Rule(0.0, exponent) for name, exponent in _STEPS.items()}
+    rules["duration"] = Rule(0.0, -8.5)
+    rules["opacity"] = Rule(0.0, -7.5)
+    rules["time"] = Rule(0.5, -9.0, (0.0, 0.0, 0.0, _PER_E))
+    rules["angle"] = Rule(0.5, -10.5, (0.0, 0.0, -2 * _PER_E))
+    by_width = (0.0, _PER_E, -_PER_E)
+    return rules | {f"{axis}{k}": Rule(0.0, -7.5, by_width) for k in range(degree + 1) for axis in "xy"}
+
+
+_STEPS = {"size": -8.5, "stretch": -8.5, "luma": -8.5, "blue": -8.5, "green": -8.5}
+
+
+# -------------------------------------------------------------------------------------------- the original
+
+
+def _encode_original(original: Frames, model: Loaded, quality: int) -> list[bytes]:
+    """The original's frames as WebP."""
+    frames = original.frames if isinstance(original, Clip) else original
+    size, num = _frame_size_and_count(model)
+    shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
+    if len(shape) != 4 or shape[:3] != (num, *size) or shape[3] not in (3, 4) or dtype != np.uint8:
+        expected = f"frames uint8 ({num}, {size[0]}, {size[1]}, 3), those of the model"
+        cure = "Read them with read_video(path, size=model.size)."
+        raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
+    return [_encode_webp(frame, quality) for frame in frames]
+
+
+def _frame_size_and_count(model: Loaded) -> tuple[tuple[int, int], int]:
+    if isinstance(model, Quantized):
+        return tuple(model.info.size), len(model.intervals) + 1
+    return tuple(model.size), model.num_frames
+
+
+def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
+    opaque = frame if frame.shape[-1] == 3 else composite(frame, np.float32(BLACK))
+    done, data = cv2.imencode(".webp", opaque[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
+    return data.tobytes()
+
+
+# ------------------------------------------------------------------------------------------------ the page
+
+
+def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
+    script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
+    blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
+    parts = {
+        "policy": _policy(script, style),
+        "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8
+        "style": style,
+        "data": "\n".join(blocks),
+        "script": script,
+    }
+    page = (_SOURCES / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+
+
+def _block(name: str, data: bytes) -> str:
+    """Bytes as a script element of a type that browsers do not execute."""
+    return f'<script type="application/octet-stream" id="{name}">{base64.b64encode(data).decode()}</script>'
+
+
+def _policy(script: str, style: str) -> str:
+    """The content security policy: the page's own script, style, images and worker, and nothing else."""
+    allowed = {
+        "default-src": "'none'",
+        "script-src": _digest(script),
+        "style-src": _digest(style),
+        "img-src": "blob: data:",
+        "worker-src": "blob:",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+    return "; ".join(f"{name} {value}" for name, value in allowed.items())
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def bundle_script(entry: str) -> str:
+    """A module and all that it imports, each once, as one script without imports; texts become strings."""
+    done: dict[str, str] = {}
+
+    def add(name: str) -> None:
+        if name in done:
+            return
+        done[name] = ""  # so that a circle ends
+        source = (_DECODER if name == _DECODER.name else _SOURCES / name).read_text(encoding="utf-8")
+        for found in _IMPORT.finditer(source):
+            if not found["text"]:
+                add(found["name"])
+        source = _IMPORT.sub(_as_constant, source)
+        del done[name]
+        done[name] = re.sub(r"^export ", "", source, flags=re.MULTILINE)
+
+    add(entry)
+    return '"use strict";\n' + "\n".join(done.values())
+
+
+def _as_constant(found: re.Match) -> str:
+    """An import of a text, as of a shader, as a constant; others are in the bundle and go."""
+    if not found["text"]:
+        return ""
+    text = json.dumps((_SOURCES / found["name"]).read_text(encoding="utf-8")).replace("</", "<\\/")
+    return f"const {found['text']} = {text};\n"

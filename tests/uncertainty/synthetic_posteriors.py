@@ -1,0 +1,37 @@
+"""Posteriors of frame times made by hand: independent draws, no pictures and no sampler."""
+
+import numpy as np
+
+from foldgauss.uncertainty import (
+    FrameNoise,
+    FrameTimeLogProb,
+    FrameTimePosterior,
+    Increments,
+    LikelihoodProfiles,
+    ProfileCurves,
+    exact_posterior,
+    laplace_approximation,
+)
+
+
+def posterior_about(
+    times, std=0.02, *, frames=None, concentration=1.0, shape=(4, 25, 10), seed=0
+) -> FrameTimePosterior:
+    """Likelihoods of frames are Gaussians about `times`, of standard deviation `std` frames (a number, or one each)."""
+    num = len(times)
+    std = np.broadcast_to(np.asarray(std, float), num) / (num - 1)
+    nodes = [np.unique(np.clip(np.concatenate([np.linspace(0, 1, 60), t + s * np.linspace(-7, 7, 57)]), 0, 1))
+             for t, s in zip(times, std, strict=True)]  # fmt: skip
+    values = [-0.5 * ((at - t) / s) ** 2 for at, t, s in zip(nodes, times, std, strict=True)]
+    increments = Increments.with_free(np.asarray(times, float), frames, concentration)
+    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes(nodes, values), increments)
+    exact = exact_posterior(log_prob.curves, increments)
+    laplace = laplace_approximation(log_prob.curves, increments, exact.quantile(0.5))
+    draws = exact.sample(int(np.prod(shape)), seed).reshape(*shape, num)
+    told = np.ones(increments.num_free)
+    noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
+    profiles = LikelihoodProfiles(log_prob.curves, noise, 0.7 ** np.arange(12.0), 100)
+    return FrameTimePosterior(
+        log_prob, draws, np.full(shape[0], 0.3), 40 * told, 1.001 * told, 1000 * told, True, "Converged.",
+        laplace, exact, profiles,
+    )  # fmt: skip

@@ -1,0 +1,159 @@
+"""Divergence: detected, named and undone; and no alarm in fits that converge."""
+
+import dataclasses
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video.fitting.divergence import MAX_BACKOFFS, Guard
+from foldgauss.video.fitting.state import running_psnr, to_model
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
+from foldgauss.video.models.row_layout import columns
+
+CLIP = moving_blobs()
+CONFIG = FitConfig(num_gaussians=200, steps=240)
+RATES = LearningRates()
+
+
+@pytest.fixture(scope="module")
+def usual() -> float:
+    """dB of the fit that nothing happens to."""
+    return evaluate(fit(CLIP, CONFIG).model, CLIP).mean_psnr
+
+
+def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
+    """dB of a fit whose state is changed after a step."""
+    for state, info in fit_steps(CLIP, config):
+        if info.step == at:
+            change(state)
+    assert np.isfinite(state.rows).all()
+    assert info.step == config.steps
+    return evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("leaf", ["loc", "opacity_logit", "coefficients", "log_time_scale"])
+def test_nonfinite_parameter_is_named_and_repaired(usual, leaf, value):
+    def spoil(state):
+        state.rows[17, columns(CONFIG.degree)[leaf]] = value
+
+    with pytest.warns(DivergenceWarning, match=rf"step 101: .*no finite {leaf} in 1 Gaussians, the first of them 17"):
+        got = _fit_with(spoil)
+    assert got > usual - 3  # 240 steps, half of them at a quarter of the rates
+
+
+def test_nonfinite_frame_times_are_named():
+    def spoil(state):
+        state.time_logits = state.time_logits + np.float32(np.nan)
+
+    with pytest.warns(DivergenceWarning, match="no finite frame times"):
+        _fit_with(spoil)
+
+
+def test_stop_raises_with_the_last_finite_state():
+    config = dataclasses.replace(CONFIG, on_divergence="stop")
+
+    def spoil(state):
+        state.rows[:, columns(CONFIG.degree)["log_scale"]] = np.nan
+
+    with pytest.raises(FitDiverged, match=r"no finite log_scale in 200 Gaussians.*of step 100") as error:
+        _fit_with(spoil, config, at=120)
+    state = error.value.state
+    assert state.step == 120  # as was told last: what watched goes on from there
+    assert running_psnr(state) > 20
+    assert np.isfinite(state.rows).all()
+    assert evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr > 20
+
+
+# Of the others a thousand times as much is borne: they come to an end of what they can do.
+@pytest.mark.parametrize("leaf", ["loc", "color_dc", "log_scale", "log_time_scale"])
+def test_too_high_rates_are_lowered_until_the_fit_converges(leaf):
+    rates = dataclasses.replace(RATES, **{leaf: 1000 * getattr(RATES, leaf)})
+    with pytest.warns(DivergenceWarning, match=r"worse than they were|worse than at the start|no finite"):
+        model = fit(CLIP, dataclasses.replace(CONFIG, rates=rates)).model
+    start = evaluate(fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model, CLIP).mean_psnr
+    assert evaluate(model, CLIP).mean_psnr > start
+
+
+def test_exploding_folds_are_named(usual):
+    def explode(state):
+        state.rows[:, columns(CONFIG.degree)["coefficients"]] *= 1e6
+
+    with pytest.warns(DivergenceWarning, match="dB worse than they were; coefficients moved most"):
+        got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_fraction=0, half_fraction=0))
+    assert got > usual - 3
+
+
+def test_exhausted_backoffs_raise():
+    def spoiled():
+        for state, _ in fit_steps(CLIP, CONFIG):
+            state.rows[:] = np.nan
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", DivergenceWarning)
+        with pytest.raises(FitDiverged, match="lower these"):
+            spoiled()
+    assert sum(issubclass(one.category, DivergenceWarning) for one in told) == MAX_BACKOFFS
+
+
+def test_nonfinite_state_is_refused():
+    for state, info in fit_steps(CLIP, CONFIG):
+        if info.step == 5:
+            break
+    state.rows[3] = np.nan
+    with pytest.raises(FitDiverged, match="state: expected finite parameters"):
+        next(fit_steps(CLIP, CONFIG, state))
+
+
+def _clips():
+    rng = np.random.default_rng(0)
+    flash = CLIP.copy()
+    flash[3] = 255
+    half_black = np.concatenate([np.zeros_like(CLIP), CLIP])
+    hard = np.repeat(CLIP[:1], 8, axis=0)
+    hard[5] = rng.integers(0, 256, CLIP.shape[1:], np.uint8)
+    two = np.stack([np.zeros_like(CLIP[0]), hard[5]])
+    text = np.zeros((3, 48, 64, 4), np.uint8)
+    text[:, 20:28, 10:50, 3] = 255  # black, over what is random
+    return {
+        "black": np.zeros_like(CLIP),
+        "white": np.full_like(CLIP, 255),
+        "noise": rng.integers(0, 256, CLIP.shape, np.uint8),
+        "flash": flash,
+        "half black": half_black,
+        "cut": np.concatenate([CLIP, 255 - CLIP]),
+        "one frame": CLIP[:1],
+        "one frame of noise": hard,
+        "one of two of noise": two,
+        "alpha": text,
+        "alpha, one frame": text[:1],
+    }
+
+
+@pytest.mark.parametrize("name", list(_clips()))
+@pytest.mark.parametrize("num", [3, 200])
+def test_good_fits_raise_no_warning(name, num):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DivergenceWarning)
+        fit(_clips()[name], FitConfig(num_gaussians=num, steps=150))
+
+
+def test_guard_changes_no_bit(monkeypatch):
+    watched = fit(CLIP, CONFIG).model
+    monkeypatch.setattr(Guard, "find_fault", lambda self, state, loss: "")
+    monkeypatch.setattr(Guard, "keep_good", lambda self, state: None)
+    monkeypatch.setattr(CpuStepper, "measure_start", lambda self, state: {})
+    alone = fit(CLIP, CONFIG).model
+    for one, other in zip(jax.tree.leaves(watched), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_opacity_resets_raise_no_warning():
+    config = FitConfig.preset("paper", initialization="clip", num_gaussians=200, max_gaussians=400, steps=300, degree=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DivergenceWarning)
+        fit(CLIP, config)
