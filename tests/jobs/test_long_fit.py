@@ -152,7 +152,7 @@ def test_another_clip_in_its_place_is_refused_and_the_same_one_is_not(tmp_path):
     os.utime(clip, (1, 1))
     plan_long_fit(clip, target, CONFIG, **ASKED)
     write_drifting(clip, 20, phase=1.0)
-    with pytest.raises(ValueError, match="clip: expected the clip that was begun with"):
+    with pytest.raises(ValueError, match="clip: expected the clip that the fit was started with"):
         plan_long_fit(clip, target, CONFIG, **ASKED)
 
 
@@ -246,7 +246,7 @@ def test_anew_gives_up_what_is_kept_once_the_clip_can_be_read(clip, tmp_path):
     with pytest.raises(FileNotFoundError):
         plan_long_fit(tmp_path / "none.mp4", target, CONFIG, **ASKED, restart=True)
     (fit.folder / "mine.txt").write_text("")
-    with pytest.raises(ValueError, match=r"target: expected parts of a fit alone in .*'mine.txt' in it"):
+    with pytest.raises(ValueError, match=r"target: expected only files of a fit in .*'mine.txt' in it"):
         plan_long_fit(clip, target, CONFIG, **ASKED, restart=True)
     (fit.folder / "mine.txt").unlink()
     assert kept.exists()

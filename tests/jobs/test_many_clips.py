@@ -70,7 +70,7 @@ def test_a_clip_in_the_place_of_another_is_another(tmp_path):
     before = make_jobs(find_clips(tmp_path).clips, tmp_path)[0]
     (tmp_path / "one.mp4").write_bytes(b"other")
     after = make_jobs(find_clips(tmp_path).clips, tmp_path)[0]
-    assert before.asked != after.asked
+    assert before.request != after.request
 
 
 def test_settings_reach_each_job(tmp_path):

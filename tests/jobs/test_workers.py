@@ -18,10 +18,12 @@ from foldgauss.jobs import (
     find_clips,
     local_workers,
     make_jobs,
-    pool,
     run_here,
     run_on,
     running_cluster,
+)
+from foldgauss.jobs import (
+    workers as pool,
 )
 
 #: A fit that lasts, since a kill is to come in its midst.
@@ -88,7 +90,7 @@ def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, sa
     crew = NoCrew()
     crew.is_remote = is_remote
     with pytest.raises(SchedulerLost, match=says):
-        pool._Run(crew, [], ignored, lambda: False)._fill()
+        pool._PoolRun(crew, [], ignored, lambda: False)._fill()
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):

@@ -107,7 +107,7 @@ def segment_command(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Take one segment out of a model in segments, as a model of its own.
+    """Extract one segment of a model in segments as a model of its own.
 
     It is compressed, edited, viewed as any other; its frames are those of its span, told by foldgauss info.
     """

@@ -64,7 +64,7 @@ def export_command(
     original_quality: OriginalQuality = QUALITY,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model for other programs, or a page.
+    """Write a model for other programs, or as a web page.
 
     See docs/formats.md; of the page, which plays the model, docs/player.md.
     """
@@ -139,7 +139,7 @@ def import_command(
     fps: Annotated[float | None, typer.Option(help="Frames a second [default: as noted in the file, or 25].")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Read what another program made: see docs/formats.md.
+    """Read a model of another program: see docs/formats.md.
 
     Frames edited as triangles have no fold any more: they become pictures.
     """

@@ -97,7 +97,7 @@ def uncertainty_command(
     seed: Annotated[int, typer.Option(help="Seed of all draws.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Say how sure the frame times are, given the splats.
+    """Estimate the uncertainty of the frame times, given the splats.
 
     Tells error bars of every frame, duplicated and dropped frames, and whether sampling has converged. A run that was
     stopped goes on when called again with the same arguments; more --steps go on from fewer.

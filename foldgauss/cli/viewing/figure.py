@@ -25,7 +25,7 @@ PARTS, MAX_PARTS = 4, 32
 SHOWN, MAX_ROWS, LEAST_WIDTH = 3, 32, 16
 
 figure = App(no_args_is_help=True)
-app.add_typer(figure, name="figure", help="Make a labelled picture of pictures from a model: PNG.")
+app.add_typer(figure, name="figure", help="Make a labeled figure of images from a model: PNG.")
 
 Out = Annotated[
     Path | None,

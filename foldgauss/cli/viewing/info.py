@@ -23,7 +23,7 @@ MOST_SEGMENTS = 100
 
 @app.command()
 def info(model_path: ModelFile) -> None:
-    """Say what a model file holds."""
+    """Show what a model file contains."""
     model = load_video_model(model_path)
     about = read_metadata(model_path)
     if isinstance(model, SegmentedVideo):

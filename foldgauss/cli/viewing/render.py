@@ -83,7 +83,7 @@ def render(
     transmittance_stop: TransmittanceStop = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw a model as a video, in between its frames too."""
+    """Render a model as a video, also between its frames."""
     course = _Course(upsample, fps, speed, _parse_remap(remap), parse_times(times))
     picture_size, behind = parse_size(size), parse_color(background)
     if out_path is None:
