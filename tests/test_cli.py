@@ -491,7 +491,7 @@ def test_killed_at_any_moment_and_resumed(work, tmp_path):
 
 
 def _step_of(checkpoint):
-    return read_header(checkpoint)["header"]["step"]
+    return read_header(checkpoint)["header"]["counters"]["step"]
 
 
 def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypatch, capsys):

@@ -186,7 +186,7 @@ def test_a_checkpoint_without_room_is_told_and_the_fit_goes_on(work, disk, monke
     def keeping(*arguments):
         keep(*arguments)
         load_model(kept)
-        seen.append(read_header(kept)["header"]["step"])
+        seen.append(read_header(kept)["header"]["counters"]["step"])
 
     monkeypatch.setattr(runner.Checkpoint, "try_save", keeping)
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
@@ -206,7 +206,7 @@ def test_a_model_without_room_is_written_by_resuming_to_the_bit(work, disk, monk
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith(f"error: path: expected free space for {str(target)!r}")
     assert f"The fit is kept in {kept}: --resume continues" in told
-    assert read_header(kept)["header"]["step"] == 26
+    assert read_header(kept)["header"]["counters"]["step"] == 26
     assert set(os.listdir(disk.folder)) <= {kept.name, "ballast"}
     monkeypatch.undo()
     disk.empty()
