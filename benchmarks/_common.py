@@ -11,7 +11,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from foldgauss._runtime.machine import machine as machine
 from foldgauss.io._atomic import atomic_path, check_writable
 
 console = Console(width=140)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._common import Scene
-from foldgauss._numerics.simd import choose, every, exp2, lanes, load, store
+from foldgauss._numerics.simd import broadcast, exp2, lane_indices, load, select, store
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, _cpu_kernels, cpu
@@ -21,7 +21,7 @@ from foldgauss.render._cpu_kernels import _f, _i, _u
 
 SOURCE = Path(__file__).with_name("rasterizer_kernel.cpp")
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-mprefer-vector-width=512", "-std=c++17", "-shared", "-fPIC")
-_TILE, _PIXELS, _aligned = _cpu_kernels.TILE, _cpu_kernels.PIXELS, _cpu_kernels._aligned
+_TILE, _PIXELS, _aligned = _cpu_kernels.TILE, _cpu_kernels.PIXELS, _cpu_kernels._aligned_empty
 
 
 class Lists(NamedTuple):
@@ -68,7 +68,7 @@ def _plain(start, listed, geometry, color, background, ceiling, finished, image,
     width = light.shape[1]
     across = (width + _TILE - 1) // _TILE
     scratch = _aligned(4 * _PIXELS)
-    highest, stop, none, columns = every(ceiling), every(finished), every(_f(0.0)), lanes()
+    highest, stop, none, columns = broadcast(ceiling), broadcast(finished), broadcast(_f(0.0)), lane_indices()
     for tile in range(len(start) - 1):
         left, top = tile % across * _TILE, tile // across * _TILE
         scratch[:_PIXELS] = 1.0
@@ -77,18 +77,18 @@ def _plain(start, listed, geometry, color, background, ceiling, finished, image,
             i = listed[k]
             x, y = geometry[i, 0] - _f(left) - _f(0.5), geometry[i, 1] - _f(top) - _f(0.5)
             p, q, r = geometry[i, 2], geometry[i, 3], geometry[i, 4]
-            log, least = geometry[i, 5], every(geometry[i, 6])
+            log, least = geometry[i, 5], broadcast(geometry[i, 6])
             for row in range(_u(_TILE)):
                 base, dy = row * _u(_TILE), _f(_i(row)) - y
-                along = every(p) * columns + every(q * dy - p * x)
-                power = every(log - r * dy * r * dy) - along * along
+                along = broadcast(p) * columns + broadcast(q * dy - p * x)
+                power = broadcast(log - r * dy * r * dy) - along * along
                 alpha, here = exp2(power), load(scratch, base)
-                alpha = choose(power >= least, choose(alpha < highest, alpha, highest), none)
-                weight = alpha * choose(here > stop, here, none)
+                alpha = select(power >= least, select(alpha < highest, alpha, highest), none)
+                weight = alpha * select(here > stop, here, none)
                 store(scratch, base, here - weight)
                 for c in range(_u(3)):
                     plane = base + (c + _u(1)) * _u(_PIXELS)
-                    store(scratch, plane, load(scratch, plane) + weight * every(color[i, c]))
+                    store(scratch, plane, load(scratch, plane) + weight * broadcast(color[i, c]))
         _write_rows(scratch, background, image, light, top, left)
 
 
@@ -141,7 +141,7 @@ def _boxes(geometry, span, across, first, last):
             first[i], last[i] = 0, 0
             continue
         own = geometry[i]
-        radius = _cpu_kernels._edge(own[2], own[3], own[4], _cpu_kernels._level(own[5], own[6]), own[7])
+        radius = _cpu_kernels._right_edge(own[2], own[3], own[4], _cpu_kernels._level(own[5], own[6]), own[7])
         left, right = own[0] - radius, own[0] + radius
         first[i, 0] = min(max(left, _f(0.0)) / _f(_TILE), _f(across))
         last[i, 0] = min(max(right, _f(0.0)) / _f(_TILE) + _f(1.0), _f(across))
@@ -150,7 +150,7 @@ def _boxes(geometry, span, across, first, last):
 
 def plain_image(scene: Scene, trace: cpu.Trace) -> Planes:
     """A whole image the textbook way: projection, lists by bounding box, every pixel of every listed pair."""
-    draft = cpu._Draft(scene.leaves, scene.size, "over", RenderOptions(), False)
+    draft = cpu._ForwardPass(scene.leaves, scene.size, "over", RenderOptions(), False)
     run_tasks(draft.project, draft.chunks)
     across, down = -(-scene.size[1] // _TILE), -(-scene.size[0] // _TILE)
     first, last = np.empty((len(draft.span), 2), np.int32), np.empty((len(draft.span), 2), np.int32)

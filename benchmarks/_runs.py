@@ -92,7 +92,7 @@ def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True) -> tuple[Vi
     result = fit(clip.frames, config, fps=clip.fps)
     seconds, steps = result.history[-1].seconds, result.history[-1].step
     run = scores(result.model, clip.frames, with_ssim=with_ssim)
-    run |= {"gaussians": result.model.num_gaussians, "floats": result.model.num_floats, "steps": steps}
+    run |= {"gaussians": result.model.num_gaussians, "floats": result.model.num_parameters, "steps": steps}
     return result.model, run | {"frames_seen": steps * config.batch_size, "seconds": seconds}
 
 

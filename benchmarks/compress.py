@@ -26,7 +26,7 @@ from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.video_file import Clip
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit, psnr
-from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
 SIZE, CLIPS, PRUNED_DB = (160, 320), ("bunny", "bikes"), 0.01
@@ -41,7 +41,7 @@ def pruned(model: VideoModel, clip: Clip) -> VideoModel:
     """Without as many of the Gaussians that add least as `PRUNED_DB` allows."""
     lit = Contributions(model)
     everywhere = np.ones(model.size, np.float32)
-    order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
+    order = np.argsort(sum_contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     before, least, most = evaluate(model, clip.frames).mean_psnr, 0, model.num_gaussians - 1
     while most - least > model.num_gaussians // 200:
         middle = (least + most) // 2
@@ -98,7 +98,7 @@ def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespac
             begun = time.perf_counter()
             made = compress(model, clip.frames, max_loss_db=options.loss, passes=passes)
             seconds = time.perf_counter() - begun
-            path = save_compact(folder / f"{what}.fgz", made.quantised)
+            path = save_compact(folder / f"{what}.fgz", made.quantized)
             lost = before - evaluate(load_video_model(path), clip.frames).mean_psnr
             row(what, path, lost, made.model.num_gaussians, seconds)
         if shutil.which("ffmpeg") is None:

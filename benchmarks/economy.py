@@ -21,7 +21,7 @@ from benchmarks.compress import kept
 from foldgauss.io import read_video, save_video_model
 from foldgauss.io.datasets import sample_clip
 from foldgauss.video import Economy, FitConfig, VideoModel, evaluate, fit
-from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
 SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (1, 3, 7, 0)
@@ -32,7 +32,7 @@ FIRST, RATIO = 12_000, 2**0.125
 def pruned(model: VideoModel, frames: np.ndarray, psnr: float) -> VideoModel:
     """Without as many of the Gaussians that add least as leave the mean PSNR at `psnr`."""
     lit, everywhere = Contributions(model), np.ones(model.size, np.float32)
-    order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
+    order = np.argsort(sum_contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     least, most = 0, model.num_gaussians - 1
     while most - least > max(model.num_gaussians // 200, 1):
         middle = (least + most) // 2
@@ -59,7 +59,7 @@ class Sweep:
         return reached >= self.psnr
 
     def _note(self, what: str, model: VideoModel, reached: float, seconds: float) -> None:
-        self.rows.append((what, self.degree, model.num_gaussians, model.num_floats, reached, seconds))
+        self.rows.append((what, self.degree, model.num_gaussians, model.num_parameters, reached, seconds))
         console.print(*self.rows[-1])
 
     def search(self, first: int) -> int:
@@ -92,7 +92,9 @@ def main(arguments: list[str] | None = None) -> None:
     reached, steps = evaluate(model, clip.frames).mean_psnr, result.history[-1].step
     if options.model is not None:
         save_video_model(options.model, model)
-    rows.append((f"economy, {steps:,} steps", model.degree, model.num_gaussians, model.num_floats, reached, seconds))
+    rows.append(
+        (f"economy, {steps:,} steps", model.degree, model.num_gaussians, model.num_parameters, reached, seconds)
+    )
     console.print(*rows[0])
     first = options.first
     for degree in map(int, options.degrees.split(",")):

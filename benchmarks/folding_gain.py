@@ -28,10 +28,10 @@ MINUTES = 3.0
 FOLDED, ALONE = "folded", "independent frames"
 
 
-def of_frames(clip: Clip, num_floats: int, config: FitConfig) -> Run:
+def of_frames(clip: Clip, num_parameters: int, config: FitConfig) -> Run:
     """The control's quality and what it took."""
-    made = independent_frames(clip.frames, num_floats, config, fps=clip.fps)
-    run = scores(made, clip.frames) | {"gaussians": made.num_gaussians, "floats": made.num_floats}
+    made = independent_frames(clip.frames, num_parameters, config, fps=clip.fps)
+    run = scores(made, clip.frames) | {"gaussians": made.num_gaussians, "floats": made.num_parameters}
     return run | {"steps": made.steps, "frames_seen": made.steps * config.batch_size, "seconds": made.seconds}
 
 

@@ -77,7 +77,7 @@ def engine_tasks(scene: Scene) -> dict[str, Task]:
     tasks = {}
     for engine, tile in ENGINES.items():
         num_tiles = -(-scene.size[0] // tile) * -(-scene.size[1] // tile)
-        capacity = max(min(num_boxes(scene, tile), tiles.MOST_SLOTS), num_tiles)
+        capacity = max(min(num_boxes(scene, tile), tiles.MAX_SLOTS), num_tiles)
         how = {"engine": engine, "options": RenderOptions(list_capacity=capacity)}
 
         def drawn(leaves, how=how):

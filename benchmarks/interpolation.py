@@ -29,8 +29,8 @@ from foldgauss.io.media.video_file import Clip, read_video, write_image
 from foldgauss.video import interpolated_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit
+from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import psnr
-from foldgauss.video.models.shots import is_cut
 
 CLIPS, SIZE, GAUSSIANS, MINUTES = ("bunny", "bikes"), (160, 320), 40_000, 2.0
 SHOWN = 4

@@ -85,7 +85,7 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
         "_update_times": "frame times",
         "condition": "condition",
         "image_loss": "loss",
-        "pull_back": "pull back",
+        "backpropagate": "backpropagate",
         "sparse_adam": "adam",
         "update_windows": "adam",
     }

@@ -12,27 +12,27 @@ from jaxtyping import Array, ArrayLike, Float, Key
 from foldgauss._numerics.batch import (
     align,
     as_value,
-    batch_of,
+    batch_shape_of,
     broadcast,
+    broadcast_leaves,
     cast,
+    check_batch,
     check_event,
     check_positive,
-    checked_batch,
     common_dtype,
-    expand,
-    fill,
-    parts_of,
+    expand_leaves,
+    ranked_leaves,
 )
-from foldgauss._numerics.factor import check_loc, checked_indices, given_factor, restricted_tril
-from foldgauss._numerics.safe_grad import far_reaching
-from foldgauss._numerics.triangular import columns_of, lower_times, solve_lower, stacked
+from foldgauss._numerics.factor import check_loc, marginal_tril, normalize_indices, resolve_scale_tril
+from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
+from foldgauss._numerics.triangular import join_columns, multiply_lower, solve_lower, split_columns
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis import interop, moments
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
-from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, restricted_fold, shift_at
+from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
 from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
@@ -100,7 +100,7 @@ class FoldedGaussian(eqx.Module):
         dtype = common_dtype(loc, *(x for x in given.values() if x is not None), time_loc, time_scale)
         loc, time_loc, time_scale = (jnp.asarray(x, dtype) for x in (loc, time_loc, time_scale))
         check_loc(loc)
-        tril = given_factor(given, dim=loc.shape[-1], dtype=dtype, validate=validate_args)
+        tril = resolve_scale_tril(given, dim=loc.shape[-1], dtype=dtype, validate=validate_args)
         if validate_args:
             check_positive("time_scale", time_scale)
         fold = ZeroFold(loc.shape[-1]) if fold is None else as_fold(fold)
@@ -110,11 +110,11 @@ class FoldedGaussian(eqx.Module):
         # Every leaf is given the whole batch, so that slices, `vmap` over the distribution, and an axis that
         # `vmap` over this constructor puts in front, are all well defined.
         parts = [(loc, 1), (tril, 2), (time_loc, 0), (time_scale, 0)]
-        batch = checked_batch([*parts, *parts_of(fold), *parts_of(envelope)])
+        batch = check_batch([*parts, *ranked_leaves(fold), *ranked_leaves(envelope)])
         self.loc, self.scale_tril, self.time_loc, self.time_scale = broadcast(parts, batch)
-        self.envelope = fill(envelope, batch)
+        self.envelope = broadcast_leaves(envelope, batch)
         # But a network's parameters are not copied per component: they keep axes of size 1.
-        self.fold = expand(fold, len(batch)) if isinstance(fold, CallableFold) else fill(fold, batch)
+        self.fold = expand_leaves(fold, len(batch)) if isinstance(fold, CallableFold) else broadcast_leaves(fold, batch)
 
     @property
     def event_shape(self) -> tuple[int, ...]:
@@ -127,7 +127,7 @@ class FoldedGaussian(eqx.Module):
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """Broadcast leading dimensions of all leaves, the fold's and the envelope's included."""
-        return batch_of(parts_of(self))
+        return batch_shape_of(ranked_leaves(self))
 
     @property
     def time_marginal(self) -> Normal:
@@ -150,9 +150,9 @@ class FoldedGaussian(eqx.Module):
         `scale_tril`.
         """
         t = as_value(t, self.loc.dtype)
-        dist = expand(self, t.ndim)
+        dist = expand_leaves(self, t.ndim)
         (t,) = align([(t, 0)], dist.time_loc.ndim)
-        shift = shift_at(dist.fold, dist.time_loc - t)
+        shift = evaluate_shift(dist.fold, dist.time_loc - t)
         log_a = dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
         largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would make inf - inf of the density
         log_a = jnp.clip(log_a, -largest, largest)
@@ -175,7 +175,7 @@ class FoldedGaussian(eqx.Module):
         def scaled_log_prob(root, s, t, *leaves):
             return jax.tree.unflatten(structure, leaves)._scaled_log_prob(root, s, t)
 
-        return far_reaching(
+        return evaluate_with_safe_grad(
             scaled_log_prob, x[..., :-1], x[..., -1], *leaves, closed=self.fold.is_closed and self.envelope.is_closed
         )
 
@@ -206,7 +206,7 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:foldgauss, read as a recipe. **Raises:** nothing.
         """
-        check_process()
+        check_not_forked()
         time_key, space_key = jax.random.split(key)
         # Every batch element draws its own t, also where only loc or the fold carries the batch.
         shape = (*sample_shape, *self.batch_shape)
@@ -352,8 +352,8 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:integral_proof. **Raises:** ValueError on indices that are none.
         """
-        check_process()
-        indices = checked_indices(indices, self.event_shape[0])
+        check_not_forked()
+        indices = normalize_indices(indices, self.event_shape[0])
         space = tuple(i for i in indices if i != self._time_index)
         if len(space) == len(indices):
             return time_mixture(self, space, (), jnp.zeros((0,), self.loc.dtype), keeps_time=False)
@@ -363,10 +363,10 @@ class FoldedGaussian(eqx.Module):
             return Gaussian(self.time_loc[..., None], self.time_scale[..., None, None], validate_args=False)
         return FoldedGaussian(
             self.loc[..., np.array(space)],
-            restricted_tril(self.scale_tril, space),
+            marginal_tril(self.scale_tril, space),
             time_loc=self.time_loc,
             time_scale=self.time_scale,
-            fold=restricted_fold(self.fold, space),
+            fold=restrict_fold(self.fold, space),
             envelope=self.envelope,
             validate_args=False,
         )
@@ -384,7 +384,7 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:cond_dens. **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
         """
-        indices = checked_indices(indices, self.event_shape[0])
+        indices = normalize_indices(indices, self.event_shape[0])
         values = as_value(values, self.loc.dtype)
         check_event("values", values, (len(indices),))
         rest = tuple(i for i in range(self._time_index) if i not in indices)
@@ -432,7 +432,7 @@ class FoldedGaussian(eqx.Module):
 
 def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:
     """Standard normal coordinates of s, and log |dz/ds|."""
-    y = stacked(solve_lower(at.base_tril, columns_of(s - at.loc)))
+    y = join_columns(solve_lower(at.base_tril, split_columns(s - at.loc)))
     half = jnp.exp(-0.5 * at.log_scale)[..., None]  # twice: the product may fit where exp(-log_scale) does not
     return y * half * half, -_log_det(at)
 
@@ -440,7 +440,7 @@ def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:
 def _coloured(at: Gaussian, z: Array) -> tuple[Array, Array]:
     """The inverse: s, and log |ds/dz|."""
     half = jnp.exp(0.5 * at.log_scale)[..., None]
-    return at.loc + stacked(lower_times(at.base_tril, columns_of(z))) * half * half, _log_det(at)
+    return at.loc + join_columns(multiply_lower(at.base_tril, split_columns(z))) * half * half, _log_det(at)
 
 
 def _log_det(at: Gaussian) -> Array:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._numerics.pointwise import call_each, split
+from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._runtime.checks import invalid
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
@@ -134,7 +134,7 @@ class CallableEnvelope(AbstractEnvelope):
     def __init__(self, log_a: Callable[[Array, Array, Array], Array]):
         if not callable(log_a):
             raise invalid("log_a", expected="a callable (t, time_loc, time_scale) -> log a", got=repr(log_a))
-        self.parameters, self.static, self.parameter_ranks = split(log_a)
+        self.parameters, self.static, self.parameter_ranks = split_parameters(log_a)
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
@@ -143,7 +143,7 @@ class CallableEnvelope(AbstractEnvelope):
     def log_a(self, t, *, time_loc, time_scale):
         dtype = jnp.result_type(t, time_loc, time_scale)
         scalars = (jnp.asarray(x, dtype) for x in (t, time_loc, time_scale))
-        return call_each(self.parameters, self.static, self.parameter_ranks, *scalars)
+        return call_elementwise(self.parameters, self.static, self.parameter_ranks, *scalars)
 
 
 def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelope:

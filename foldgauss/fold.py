@@ -16,10 +16,10 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._numerics.pointwise import call_each, split
-from foldgauss._numerics.triangular import columns_of, stacked
+from foldgauss._numerics.pointwise import call_elementwise, split_parameters
+from foldgauss._numerics.triangular import join_columns, split_columns
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 
 __all__ = [
     "AbstractFold",
@@ -82,7 +82,7 @@ class ZeroFold(AbstractFold):
         return True
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
-        check_process()
+        check_not_forked()
         return jnp.zeros((*jnp.shape(u), self.dim), jnp.result_type(u))
 
 
@@ -121,7 +121,7 @@ class PolynomialFold(AbstractFold):
         return self.coefficients.shape[-2]
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        check_process()
+        check_not_forked()
         u = jnp.asarray(u)
         u, coefficients = _aligned(u, self.coefficients)
         batch = jnp.broadcast_shapes(u.shape[:-1], coefficients.shape[:-2])
@@ -138,7 +138,7 @@ class SplineFold(AbstractFold):
 
     Outside its domain the fold is held at the end value (a polynomial continued out there would overflow where the
     time likelihood is still alive). **f(0) is not forced to 0:** the B_i sum to 1, so a shift of all c_i is a shift
-    of `loc`, and when both are fitted only their sum is determined. `centred()` takes the constant out, and leaves
+    of `loc`, and when both are fitted only their sum is determined. `centered()` takes the constant out, and leaves
     `loc` the centre at `time_loc`, as with the other folds.
 
     **Shapes:** `knots` (n + degree + 1,), fixed, not trained; `coefficients` (*batch, n, d-1); u (*batch,) ->
@@ -172,14 +172,14 @@ class SplineFold(AbstractFold):
         return True
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        check_process()
+        check_not_forked()
         u, coefficients = _aligned(jnp.asarray(u), self.coefficients)
         n, k = coefficients.shape[-2], self.degree
         v = jnp.clip(u, self.knots[k], self.knots[n])
         terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
         return sum(terms, 0 * v)  # and a NaN propagates through degree 0 too
 
-    def centred(self) -> "SplineFold":
+    def centered(self) -> "SplineFold":
         """The same fold less its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution."""
         here = self(jnp.zeros((), self.coefficients.dtype))
         return eqx.tree_at(lambda fold: fold.coefficients, self, self.coefficients - here[..., None, :])
@@ -231,7 +231,7 @@ class FourierFold(AbstractFold):
         return self.sine.shape[-2]
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        check_process()
+        check_not_forked()
         u = jnp.asarray(u)
         rank = max(u.ndim, self.period.ndim, self.sine.ndim - 2)
         sine, cosine = (_with_rank(x, rank + 2) for x in (self.sine, self.cosine))
@@ -268,14 +268,14 @@ class CallableFold(AbstractFold):
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
-        self.parameters, self.static, self.parameter_ranks = split(function)
+        self.parameters, self.static, self.parameter_ranks = split_parameters(function)
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return self.parameter_ranks
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        return call_each(self.parameters, self.static, self.parameter_ranks, u)
+        return call_elementwise(self.parameters, self.static, self.parameter_ranks, u)
 
 
 def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
@@ -288,7 +288,7 @@ def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
     return fold if isinstance(fold, AbstractFold) else CallableFold(fold)
 
 
-def shift_at(fold: AbstractFold, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+def evaluate_shift(fold: AbstractFold, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
     """`fold(u)`, with a derivative by u that is made for large batches.
 
     A fold is pointwise in u, so that its slope is one forward derivative. Backwards, autodiff would sum over the d-1
@@ -318,8 +318,8 @@ def _shift_jvp(structure, primals, tangents):
     if isinstance(tangents[0], SymbolicZero):
         return shift, moved
     slope = jax.jvp(lambda u: jax.tree.unflatten(structure, leaves)(u), (u,), (jnp.ones_like(u),))[1]
-    by_u = [column * tangents[0][..., None] for column in columns_of(slope)]
-    return shift, moved + stacked(by_u)
+    by_u = [column * tangents[0][..., None] for column in split_columns(slope)]
+    return shift, moved + join_columns(by_u)
 
 
 def _with_rank(x: Array, rank: int) -> Array:
@@ -329,7 +329,7 @@ def _with_rank(x: Array, rank: int) -> Array:
 
 def _aligned(u: Array, rows: Array) -> tuple[Array, Array]:
     """u (*batch, 1) and rows (*batch, n, d-1), of equal batch rank."""
-    check_process()
+    check_not_forked()
     rank = max(u.ndim, rows.ndim - 2)
     return _with_rank(u, rank)[..., None], _with_rank(rows, rank + 2)
 
@@ -388,7 +388,7 @@ class RestrictedFold(AbstractFold):
         return self.fold(u)[..., np.array(self.indices)]
 
 
-def restricted_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:
+def restrict_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:
     if isinstance(fold, ZeroFold):
         return ZeroFold(len(indices))
     if isinstance(fold, PolynomialFold):

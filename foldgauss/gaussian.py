@@ -17,26 +17,26 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key
 from foldgauss._numerics.batch import (
     align,
     as_value,
-    batch_of,
+    batch_shape_of,
+    check_batch,
     check_event,
     check_positive,
-    checked_batch,
     common_dtype,
-    parts_of,
+    ranked_leaves,
 )
-from foldgauss._numerics.factor import check_space, check_tril, checked_indices, restricted_tril
-from foldgauss._numerics.safe_grad import far_reaching
+from foldgauss._numerics.factor import check_space, check_tril, marginal_tril, normalize_indices
+from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
 from foldgauss._numerics.triangular import (
     UNROLLED_SIZE,
     Columns,
-    columns_of,
-    lower_times,
+    join_columns,
+    multiply_lower,
     solve_lower,
     solve_upper,
-    stacked,
+    split_columns,
 )
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 
 __all__ = ["Gaussian", "Normal"]
 
@@ -75,7 +75,7 @@ class Normal(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return batch_of(parts_of(self))
+        return batch_shape_of(ranked_leaves(self))
 
     def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log N(loc, scale^2)(value)."""
@@ -128,7 +128,7 @@ class Gaussian(eqx.Module):
         if validate_args:
             check_tril(tril)
         parts = [(loc, 1), (tril, 2), (log_scale, 0)]
-        checked_batch(parts)
+        check_batch(parts)
         # Ones in front instead of copies: one factor may serve a million times.
         self.loc, self.base_tril, self.log_scale = align(parts)
 
@@ -142,7 +142,7 @@ class Gaussian(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return batch_of(parts_of(self))
+        return batch_shape_of(ranked_leaves(self))
 
     @property
     def scale_tril(self) -> Float[Array, "*#batch dim dim"]:
@@ -172,7 +172,7 @@ class Gaussian(eqx.Module):
         value = as_value(value, self.loc.dtype)
         check_event("value", value, self.event_shape)
         parts = [(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
-        return far_reaching(_scaled_log_prob, *align(parts))
+        return evaluate_with_safe_grad(_scaled_log_prob, *align(parts))
 
     def scaled_log_prob(self, root: Array | None, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
         """root^2 log N(loc, Sigma)(value), the factor put in where it keeps derivatives in range (see `_far`)."""
@@ -188,15 +188,15 @@ class Gaussian(eqx.Module):
         noise = jax.random.normal(key, shape, self.loc.dtype)
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         scale = jnp.exp(log_scale)[..., None]
-        return loc + stacked([scale * y for y in lower_times(tril, columns_of(noise))])
+        return loc + join_columns([scale * y for y in multiply_lower(tril, split_columns(noise))])
 
     def marginal(self, indices) -> "Gaussian":
         """The distribution of some coordinates, in the order wanted; the indices are kept.
 
         **Raises:** ValueError on indices that are none.
         """
-        indices = checked_indices(indices, self.event_shape[0])
-        tril = restricted_tril(self.base_tril, indices)
+        indices = normalize_indices(indices, self.event_shape[0])
+        tril = marginal_tril(self.base_tril, indices)
         return Gaussian(self.loc[..., np.array(indices)], tril, log_scale=self.log_scale, validate_args=False)
 
     def condition(self, indices, values: Float[Array, "*#batch n"]) -> "Gaussian":
@@ -206,20 +206,20 @@ class Gaussian(eqx.Module):
 
         **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
         """
-        indices = checked_indices(indices, self.event_shape[0])
+        indices = normalize_indices(indices, self.event_shape[0])
         rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
         if not rest:
             raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
         values = as_value(values, self.loc.dtype)
         check_event("values", values, (len(indices),))
-        return given_first(self.marginal((*indices, *rest)), values)
+        return condition_on_first(self.marginal((*indices, *rest)), values)
 
 
-def given_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussian:
+def condition_on_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussian:
     """The later coordinates given the first ones: `loc_k + L_kg L_gg^-1 (values - loc_g)`, and the factor L_kk."""
     given = values.shape[-1]
     values, loc, tril, log_scale = align([(values, 1), (dist.loc, 1), (dist.base_tril, 2), (dist.log_scale, 0)])
-    z = stacked(solve_lower(tril[..., :given, :given], columns_of(values - loc[..., :given])))
+    z = join_columns(solve_lower(tril[..., :given, :given], split_columns(values - loc[..., :given])))
     # One sum per coordinate, not a product of matrices: there are many, and they are small.
     mean = loc[..., given:] + (tril[..., given:, :given] * z[..., None, :]).sum(-1)
     return Gaussian(mean, tril[..., given:, given:], log_scale=log_scale, validate_args=False)
@@ -229,7 +229,7 @@ def given_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussi
 
 
 def _as_gaussian(normal: Normal) -> Gaussian:
-    check_process()
+    check_not_forked()
     return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
 
 
@@ -247,7 +247,7 @@ def _scaled_log_prob(root: Array | None, value: Array, loc: Array, tril: Array, 
 @jax.custom_jvp
 def _half_mahalanobis(value, loc, tril, log_scale, root):
     """root^2 |L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; it is inf where it would be for root = 1."""
-    residual = columns_of(value - loc)
+    residual = split_columns(value - loc)
     z = [_times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
     # A residual that is infinite in one coordinate meets zeros of L as 0 * inf; it is simply far away.
     beyond = _any([jnp.isinf(r) for r in residual])
@@ -265,16 +265,16 @@ def _half_mahalanobis_jvp(primals, tangents):
     value_dot, loc_dot, tril_dot, log_scale_dot, _ = tangents
     half = _half_mahalanobis(value, loc, tril, log_scale, root)
     unreachable, c = jnp.isposinf(half)[..., None], -log_scale[..., None]
-    residual = [jnp.where(unreachable, 0, r) for r in columns_of(value - loc)]
+    residual = [jnp.where(unreachable, 0, r) for r in split_columns(value - loc)]
     z = [_times_exp(jnp.where(unreachable, 0, y), c, root) for y in solve_lower(tril, residual)]
     w = solve_upper(tril, z)
     by_residual = [_times_exp(y, c, root) for y in w]
     # The barrier: gradients are made one coordinate at a time, before they are put side by side. XLA on the CPU would
     # fuse the two, and then ask for every number of every coordinate which of them it is: many times slower.
-    residual_dot = lax.optimization_barrier(columns_of(value_dot - loc_dot))
+    residual_dot = lax.optimization_barrier(split_columns(value_dot - loc_dot))
     return half, (
         _sum([g * dr for g, dr in zip(by_residual, residual_dot, strict=True)])
-        - _sum([g * dx for g, dx in zip(w, lower_times(tril_dot, z), strict=True)])
+        - _sum([g * dx for g, dx in zip(w, multiply_lower(tril_dot, z), strict=True)])
         - _sum([y * y for y in z]) * log_scale_dot
     )
 

@@ -21,14 +21,23 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from foldgauss._numerics.batch import align, as_value, broadcast, check_event, checked_batch, fill, known, parts_of
-from foldgauss._numerics.factor import checked_indices
+from foldgauss._numerics.batch import (
+    align,
+    as_value,
+    broadcast,
+    broadcast_leaves,
+    check_batch,
+    check_event,
+    concrete_value,
+    ranked_leaves,
+)
+from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture
 from foldgauss.analysis.interop import to_numpyro, to_scipy
-from foldgauss.analysis.pair_densities import chunked, components_first, pair_log_prob
+from foldgauss.analysis.pair_densities import map_in_chunks, move_components_first, pair_log_prob
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import CallableFold
 from foldgauss.gaussian import Gaussian
@@ -67,7 +76,7 @@ class AbstractMixture(eqx.Module):
     @property
     def log_weights(self) -> Float[Array, "*batch k"]:
         """Normalised log w_k; -inf where a component has no weight."""
-        check_process()
+        check_not_forked()
         return jax.nn.log_softmax(self.logits, axis=-1)
 
     @property
@@ -429,15 +438,15 @@ def _weighted(components, logits, weights, validate: bool):
         raise invalid(name, expected=expected, got=f"shape {given.shape}", cure="One number for each component.")
     if validate:
         _check_weights(name, given)
-    batch = checked_batch([*parts_of(components), (given, 0)])
+    batch = check_batch([*ranked_leaves(components), (given, 0)])
     if batch != components.batch_shape:
-        components = fill(components, batch)
+        components = broadcast_leaves(components, batch)
     (given,) = broadcast([(given, 0)], batch)
     return components, given if name == "logits" else _log(given)
 
 
 def _check_weights(name: str, given: Array) -> None:
-    given = known(given)
+    given = concrete_value(given)
     if given is None:
         return
     least = 0 if name == "weights" else -np.inf
@@ -480,13 +489,13 @@ def _of_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
     rank, components = len(mixture.batch_shape), mixture.components
     rows, shape = _as_rows(mixture, x)
     if isinstance(components, FoldedGaussian | Gaussian):
-        components = components_first(components, rank)
+        components = move_components_first(components, rank)
         pairs = lambda rows: pair_log_prob(components, rows)  # noqa: E731
     else:
         pairs = lambda rows: jnp.moveaxis(components.log_prob(_beside_components(mixture, rows)), -1, 0)  # noqa: E731
     log_weights = jnp.expand_dims(jnp.moveaxis(mixture.log_weights, rank, 0), 1)
     size = max(1, _CHUNK // (math.prod(mixture.batch_shape) * mixture.num_components))
-    result = chunked(pairs, lambda log_p: function(log_weights, log_p), rows, size)
+    result = map_in_chunks(pairs, lambda log_p: function(log_weights, log_p), rows, size)
     return result.reshape(*shape, *result.shape[1 + rank :])
 
 
@@ -540,7 +549,7 @@ def _at_time(mixture: FoldedMixture, t: Array) -> GaussianMixture:
 
 
 def _conditioned(mixture: AbstractMixture, indices, values: ArrayLike):
-    indices = checked_indices(indices, mixture.event_shape[0])
+    indices = normalize_indices(indices, mixture.event_shape[0])
     values = as_value(values, mixture.logits.dtype)
     check_event("values", values, (len(indices),))
     values = values[..., None, :]
@@ -615,7 +624,7 @@ def _drawn(mixture: AbstractMixture, key, sample_shape, component: Array) -> Arr
     """A draw from the component of each number."""
     components, batch = mixture.components, mixture.batch_shape
     if isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
-        return _picked(fill(components, (*batch, mixture.num_components)), component, batch).sample(key)
+        return _picked(broadcast_leaves(components, (*batch, mixture.num_components)), component, batch).sample(key)
     every = components.sample(key, sample_shape)
     event = every.ndim - component.ndim - 1
     index = jnp.expand_dims(component, range(component.ndim, every.ndim))

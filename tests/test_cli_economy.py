@@ -28,7 +28,7 @@ def test_what_pays_and_what_it_tells(clip, tmp_path, capsys):
     assert "degrees" in told
     assert "throughout the clip" in told
     model = load_video_model(out)
-    assert model.num_floats < 17 * model.num_gaussians
+    assert model.num_parameters < 17 * model.num_gaussians
 
 
 def test_the_smallest_at_a_psnr(clip, tmp_path, capsys):

@@ -10,7 +10,7 @@ from tiny_clips import NUM_FRAMES, clip_of, model_of_12, write_both
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.media.pictures import ERROR_GAIN
 from foldgauss.video import FrameTimes, VideoModel, layers
-from foldgauss.video.models.shots import time_logits
+from foldgauss.video.models.frame_times import make_time_logits
 
 #: Of a montage: what is left of each picture, what is above it, and what follows the last.
 MARGIN, BAND = 8, 26
@@ -82,7 +82,7 @@ def test_width_and_overwrite(work, tmp_path, capsys):
 
 def test_a_cut_is_not_chosen_and_warned_of(tmp_path, capsys):
     model = model_of_12()
-    cut = FrameTimes(time_logits(NUM_FRAMES, [6]))
+    cut = FrameTimes(make_time_logits(NUM_FRAMES, [6]))
     model = VideoModel(model.splats, cut, model.size, model.fps, model.options)
     save_video_model(tmp_path / "m.safetensors", model)
     assert run("figure", "interpolation", tmp_path / "m.safetensors", "--out", tmp_path / "a.png") == 0

@@ -10,7 +10,7 @@ import pytest
 from scipy import integrate, stats
 
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture
-from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, gauss_hermite, normal_rule, peaks
+from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_rule
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
@@ -62,7 +62,7 @@ def test_adaptive_panels_see_narrow_peaks_and_count_them_in_logarithms():
     def total(width, place, height):
         bump = lambda x: height - 0.5 * ((x - place) / width) ** 2 - jnp.log(width)  # noqa: E731
         log_f = lambda x: jnp.logaddexp(bump(x), height - 0.5 * x**2)  # noqa: E731
-        guides = peaks(lambda x: -jnp.abs(x - place), jnp.asarray(SEARCH_GRID), 4)
+        guides = find_peaks(lambda x: -jnp.abs(x - place), jnp.asarray(SEARCH_GRID), 4)
         panels = adaptive_panels(log_f, guides)
         return panels.log_total - height, panels.error_estimate
 

@@ -95,8 +95,8 @@ def test_spline_equals_scipy_and_is_held_outside(knots, degree):
 def test_centred_spline_differs_by_a_constant():
     fold = FOLDS["spline"]()
     u = jnp.linspace(-1.5, 1.5, 9)
-    np.testing.assert_allclose(fold.centred()(u), fold(u) - fold(0.0)[None], atol=1e-4)
-    np.testing.assert_allclose(fold.centred()(0.0), jnp.zeros(2), atol=1e-5)
+    np.testing.assert_allclose(fold.centered()(u), fold(u) - fold(0.0)[None], atol=1e-4)
+    np.testing.assert_allclose(fold.centered()(0.0), jnp.zeros(2), atol=1e-5)
     assert jnp.abs(fold(0.0)).max() > 1
 
 

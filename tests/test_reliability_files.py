@@ -472,9 +472,9 @@ def test_sigterm_from_outside_twice(work, tmp_path):
 def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
     script = (
         "import signal\n"
-        "from foldgauss import _interrupts\n"
+        "from foldgauss._runtime import interrupts as _interrupts\n"
         f"_interrupts.SAME = {-1.0 if late else 1e9}\n"
-        "with _interrupts.ending_well():\n"
+        "with _interrupts.raise_on_sigterm():\n"
         "    try:\n"
         "        signal.raise_signal(signal.SIGTERM)\n"
         "    except KeyboardInterrupt:\n"

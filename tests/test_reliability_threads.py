@@ -22,7 +22,7 @@ from soft_models import soft_model
 
 from foldgauss import FoldedMixture
 from foldgauss._runtime import threads as _threads
-from foldgauss._runtime.interrupts import leaving_at_once
+from foldgauss._runtime.interrupts import use_default_signals
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.render import ENGINES, render
 from foldgauss.render.pallas import HIGHEST_CEILING
@@ -548,12 +548,12 @@ def test_whoever_answers_interrupts_still_does():
     before = signal.getsignal(signal.SIGINT)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        with leaving_at_once():
+        with use_default_signals():
             assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         for other in (signal.SIG_IGN, lambda number, frame: None):
             signal.signal(signal.SIGINT, other)
-            with leaving_at_once():
+            with use_default_signals():
                 assert signal.getsignal(signal.SIGINT) is other
             assert signal.getsignal(signal.SIGINT) is other
     finally:
@@ -609,7 +609,7 @@ MADE = """
         for engine in ("cpu", "xla", "reference"):
             say(engine, np.asarray(shown.render(0.4, (200, 300), engine=engine)).tobytes())
         made = compress(shown, frames, max_loss_db=0.5, passes=1)
-        say("fgz", save_compact(folder / "model.fgz", made.quantised).read_bytes())
+        say("fgz", save_compact(folder / "model.fgz", made.quantized).read_bytes())
         rng = np.random.default_rng(0)
         points = rng.uniform(0, 1, (6000, 3)).astype(np.float32)
         with warnings.catch_warnings():

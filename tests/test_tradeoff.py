@@ -26,7 +26,7 @@ from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig, evaluate, tradeoff
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.optical_flow import Motion
-from foldgauss.video.models.splats import LASTING
+from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
 from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,
@@ -206,13 +206,13 @@ def test_half_precision_is_kept_and_widened(tmp_path):
         name: np.array(getattr(model.splats, name)) for name in ("coefficients", "log_time_scale", "time_loc_logit")
     }
     leaves["coefficients"][:, 1:] = 0
-    leaves["log_time_scale"][:5], leaves["time_loc_logit"][:5] = LASTING, 0
+    leaves["log_time_scale"][:5], leaves["time_loc_logit"][:5] = STATIC_LOG_TIME_SCALE, 0
     lean = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
     save_video_model(tmp_path / "lean.safetensors", halved(lean))
     again = load_video_model(tmp_path / "lean.safetensors")
     assert (again.splats.degrees == 1).all()
-    np.testing.assert_array_equal(again.splats.lasting, lean.splats.lasting)
-    assert again.splats.lasting.sum() == 5
+    np.testing.assert_array_equal(again.splats.static, lean.splats.static)
+    assert again.splats.static.sum() == 5
     # A leaf with a number beyond 16 bits keeps its 32.
     leaves["coefficients"][3, 0, 0] = 1e5
     steep = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
@@ -268,7 +268,7 @@ def test_everything_is_there(done, clip):
     assert rows["base"]["psnr"] == pytest.approx(scores.mean_psnr, abs=1e-4)
     assert rows["base"]["bytes"] == (done / "base.safetensors").stat().st_size
     assert rows["time 3 steps"]["psnr"] < rows["base"]["psnr"] < rows["time 24 steps"]["psnr"]
-    assert rows["degree 0"]["floats"] == base.num_floats - 6 * base.num_gaussians
+    assert rows["degree 0"]["floats"] == base.num_parameters - 6 * base.num_gaussians
     assert rows["cutoff radius 2, played"]["psnr"] != rows["base"]["psnr"]
     assert rows["cutoff radius 2, played"]["seconds"] == rows["base"]["seconds"]
     assert rows["precision float16"]["bytes"] < 0.52 * rows["base"]["bytes"]

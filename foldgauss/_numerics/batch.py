@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
 
@@ -30,27 +30,27 @@ def broadcast(parts: list[tuple[Array, int]], batch: tuple[int, ...]) -> list[Ar
     return [jnp.broadcast_to(x, batch + x.shape[x.ndim - event :]) for x, event in parts]
 
 
-def parts_of(module: eqx.Module) -> list[tuple[Array, int]]:
+def ranked_leaves(module: eqx.Module) -> list[tuple[Array, int]]:
     """(leaf, event rank) of every leaf."""
-    check_process()
+    check_not_forked()
     return list(zip(jax.tree.leaves(module), module.leaf_ranks, strict=True))
 
 
 def _map_parts(function: Callable[[tuple[Array, int]], Array], module: _ModuleT) -> _ModuleT:
-    return jax.tree.unflatten(jax.tree.structure(module), [function(part) for part in parts_of(module)])
+    return jax.tree.unflatten(jax.tree.structure(module), [function(part) for part in ranked_leaves(module)])
 
 
-def expand(module: _ModuleT, rank: int) -> _ModuleT:
+def expand_leaves(module: _ModuleT, rank: int) -> _ModuleT:
     """`module` with at least `rank` batch dimensions on each leaf, by ones in front."""
     return _map_parts(lambda part: align([part], max(rank, _batch_rank([part])))[0], module)
 
 
-def fill(module: _ModuleT, batch: tuple[int, ...]) -> _ModuleT:
+def broadcast_leaves(module: _ModuleT, batch: tuple[int, ...]) -> _ModuleT:
     """`module` with every leaf broadcast to the whole batch."""
     return _map_parts(lambda part: broadcast([part], batch)[0], module)
 
 
-def batch_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
+def batch_shape_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
     return jnp.broadcast_shapes(*(x.shape[: x.ndim - event] for x, event in parts))
 
 
@@ -59,7 +59,7 @@ def batch_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
 
 def common_dtype(*inputs: ArrayLike):
     """The float type of the arrays among the inputs; Python numbers and lists follow, they do not lead."""
-    check_process()
+    check_not_forked()
     dtypes = [x.dtype for x in inputs if hasattr(x, "dtype") and not isinstance(x, float)]
     floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
     if not floats:
@@ -69,7 +69,7 @@ def common_dtype(*inputs: ArrayLike):
 
 def as_value(x: ArrayLike, dtype) -> Array:
     """A value as an array: float arrays keep their type, all else takes that of the distribution."""
-    check_process()
+    check_not_forked()
     own = getattr(x, "dtype", None)
     keeps = own is not None and jnp.issubdtype(own, jnp.floating) and not isinstance(x, float)
     return jnp.asarray(x) if keeps else jnp.asarray(x, dtype)
@@ -82,14 +82,14 @@ def cast(module: _ModuleT, dtype) -> _ModuleT:
 # --- checks: shapes always, values only where there are values ----------------------------------------------
 
 
-def known(x: Array) -> np.ndarray | None:
+def concrete_value(x: Array) -> np.ndarray | None:
     """The numbers, in NumPy (nothing to compile); None under tracing, where there are none to look at."""
     return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
 
 
-def checked_batch(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
+def check_batch(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
     try:
-        return batch_of(parts)
+        return batch_shape_of(parts)
     except ValueError:
         shapes = ", ".join(str(x.shape[: x.ndim - event]) for x, event in parts)
         cure = "Batch dimensions come first in every parameter."
@@ -103,7 +103,7 @@ def check_event(name: str, value: Array, event_shape: tuple[int, ...]) -> None:
 
 
 def check_positive(name: str, scale: Array) -> None:
-    scale = known(scale)
+    scale = concrete_value(scale)
     if scale is not None and (scale <= 0).any():  # a NaN passes, and propagates
         got, cure = f"a least of {np.nanmin(scale)}", "It is a standard deviation."
         raise invalid(name, expected="positive numbers", got=got, cure=cure)
@@ -116,16 +116,16 @@ _CHUNK = 64
 
 
 @eqx.filter_jit
-def over_batch(function: Callable, *items):
+def map_over_batch(function: Callable, *items):
     """`function` of unbatched things, over all their batch dimensions together; compiled.
 
     `function` is one of a module's own: a new closure each time would be compiled each time. Each item is a module
     with `leaf_ranks`, or a pair (array, event rank).
     """
-    arrays = [parts_of(x) if isinstance(x, eqx.Module) else [x] for x in items]
-    batch = checked_batch([part for parts in arrays for part in parts])
+    arrays = [ranked_leaves(x) if isinstance(x, eqx.Module) else [x] for x in items]
+    batch = check_batch([part for parts in arrays for part in parts])
     size = int(np.prod(batch))
-    flat = [fill(x, batch) if isinstance(x, eqx.Module) else broadcast([x], batch)[0] for x in items]
+    flat = [broadcast_leaves(x, batch) if isinstance(x, eqx.Module) else broadcast([x], batch)[0] for x in items]
     flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[len(batch) :]), flat)
     if size <= _CHUNK:
         result = jax.vmap(function)(*flat)

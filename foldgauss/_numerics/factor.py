@@ -5,11 +5,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import check_positive, known
+from foldgauss._numerics.batch import check_positive, concrete_value
 from foldgauss._runtime.checks import invalid
 
 
-def given_factor(given: dict[str, ArrayLike | None], *, dim: int, dtype, validate: bool) -> Array:
+def resolve_scale_tril(given: dict[str, ArrayLike | None], *, dim: int, dtype, validate: bool) -> Array:
     """The lower-triangular factor L of Sigma = L L^T, from the one matrix (or scales) that is given."""
     name, matrix = _the_one_given(given)
     matrix = jnp.asarray(matrix, dtype)
@@ -21,9 +21,9 @@ def given_factor(given: dict[str, ArrayLike | None], *, dim: int, dtype, validat
             check_tril(matrix)
         return matrix
     if name == "covariance_matrix":
-        return checked_cholesky(name, matrix, validate)
+        return check_and_factorize(name, matrix, validate)
     # P = U^T U with U lower is a Cholesky factorisation from the last coordinate on; then L = U^-1.
-    upper = checked_cholesky(name, matrix[..., ::-1, ::-1], validate)[..., ::-1, ::-1]
+    upper = check_and_factorize(name, matrix[..., ::-1, ::-1], validate)[..., ::-1, ::-1]
     identity = jnp.broadcast_to(jnp.eye(dim, dtype=dtype), matrix.shape)
     return jnp.tril(lax.linalg.triangular_solve(jnp.swapaxes(upper, -1, -2), identity, left_side=True, lower=True))
 
@@ -65,7 +65,7 @@ def _diagonal(scale: Array, dim: int, validate: bool) -> Array:
 
 
 def check_tril(tril: Array) -> None:
-    tril = known(tril)
+    tril = concrete_value(tril)
     if tril is None:
         return
     if (np.triu(tril, 1) != 0).any():
@@ -81,8 +81,8 @@ def check_tril(tril: Array) -> None:
         raise invalid("scale_tril", expected="a positive diagonal", got=got, cure=cure)
 
 
-def checked_cholesky(name: str, covariance: Array, validate: bool) -> Array:
-    tril, value = jnp.linalg.cholesky(covariance), known(covariance)
+def check_and_factorize(name: str, covariance: Array, validate: bool) -> Array:
+    tril, value = jnp.linalg.cholesky(covariance), concrete_value(covariance)
     if not validate or value is None:
         return tril
     # Rounding of the user's own arithmetic is no asymmetry.
@@ -97,7 +97,7 @@ def checked_cholesky(name: str, covariance: Array, validate: bool) -> Array:
     return tril
 
 
-def restricted_tril(tril: Float[Array, "*batch dim dim"], indices: tuple[int, ...]) -> Float[Array, "*batch kept kept"]:
+def marginal_tril(tril: Float[Array, "*batch dim dim"], indices: tuple[int, ...]) -> Float[Array, "*batch kept kept"]:
     """Factor of the covariance of some coordinates, in any order, by QR: the covariance is never formed."""
     if indices == tuple(range(len(indices))):
         return tril[..., : len(indices), : len(indices)]
@@ -107,7 +107,7 @@ def restricted_tril(tril: Float[Array, "*batch dim dim"], indices: tuple[int, ..
     return jnp.tril(jnp.swapaxes(upper * sign[..., :, None], -1, -2))
 
 
-def checked_indices(indices, dim: int) -> tuple[int, ...]:
+def normalize_indices(indices, dim: int) -> tuple[int, ...]:
     """Coordinates counted from 0, each once, from any integers (negative ones count from the end)."""
     cure = f"The coordinates are 0 to {dim - 1}, time is {dim - 1} (or -1)."
     try:

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 
-def split(function: Callable) -> tuple[PyTree, PyTree, tuple[int, ...]]:
+def split_parameters(function: Callable) -> tuple[PyTree, PyTree, tuple[int, ...]]:
     """The arrays of a callable pytree, the rest of it, and the rank of each array for one function."""
     parameters, static = eqx.partition(function, eqx.is_array)
     return parameters, static, tuple(x.ndim for x in jax.tree.leaves(parameters))
 
 
-def call_each(parameters: PyTree, static: PyTree, ranks: tuple[int, ...], *scalars: Array) -> Array:
+def call_elementwise(parameters: PyTree, static: PyTree, ranks: tuple[int, ...], *scalars: Array) -> Array:
     """`function(*scalars)` elementwise; dimensions of the parameters in front of their ranks are batch."""
     leaves, treedef = jax.tree.flatten(parameters)
     events = [x.shape[x.ndim - r :] for x, r in zip(leaves, ranks, strict=True)]

@@ -30,7 +30,7 @@ try:
 except ImportError:  # of older JAX
     from jax.core import unmapped_aval
 
-__all__ = ["far_reaching"]
+__all__ = ["evaluate_with_safe_grad"]
 
 #: `function(root, *arrays)` is root^2 times a list of arrays; root None is 1.
 _Scaled = Callable[..., list[Array]]
@@ -40,7 +40,7 @@ _Scaled = Callable[..., list[Array]]
 _LADDER = -0.0945 * np.arange(1, 11)
 
 
-def far_reaching(function: Callable[..., Array], *arrays: Array, closed: bool = True) -> Array:
+def evaluate_with_safe_grad(function: Callable[..., Array], *arrays: Array, closed: bool = True) -> Array:
     """`function(None, *arrays)`, whose derivatives by `arrays` are true where they fit and saturate where not.
 
     `function(root, *arrays)` is root^2 times the same, and its derivatives overflow no sooner than root^2 times the

@@ -58,7 +58,7 @@ def _broadcast(builder, scalar, vector=_FLOATS):
 
 
 @intrinsic
-def every(typing_context, scalar):
+def broadcast(typing_context, scalar):
     """A vector of one float32, 16 times."""
     return VECTOR(types.float32), lambda context, builder, signature, args: _broadcast(builder, args[0])
 
@@ -71,19 +71,19 @@ def _constant(numbers):
 
 
 @intrinsic
-def lanes(typing_context):
+def lane_indices(typing_context):
     """The vector (0, 1, ..., 15)."""
     return _constant([float(k) for k in range(LANES)])
 
 
 @intrinsic
-def columns_of_cell(typing_context):
+def cell_columns(typing_context):
     """The vector (0, 1, 2, 3, 0, 1, ...): the pixels' columns in a cell of 4 x 4, row by row."""
     return _constant([float(k % 4) for k in range(LANES)])
 
 
 @intrinsic
-def rows_of_cell(typing_context):
+def cell_rows(typing_context):
     """The vector (0, 0, 0, 0, 1, 1, ...): likewise their rows."""
     return _constant([float(k // 4) for k in range(LANES)])
 
@@ -152,13 +152,13 @@ _on_operator(operator.and_, _Mask, _both)
 
 
 @intrinsic
-def choose(typing_context, mask, a, b):
+def select(typing_context, mask, a, b):
     """`a` where the mask is set, else `b`."""
     return VECTOR(MASK, VECTOR, VECTOR), lambda context, builder, signature, args: builder.select(*args)
 
 
 @intrinsic
-def any_of(typing_context, mask):
+def any_set(typing_context, mask):
     """Whether any bit is set."""
 
     def generate(context, builder, signature, args):
@@ -169,7 +169,7 @@ def any_of(typing_context, mask):
 
 
 @intrinsic
-def between(typing_context, first, last, index, number):
+def range_mask(typing_context, first, last, index, number):
     """The 16 lowest bits: in which of the 16 places from `index` on first <= number < last; int32 arrays and number."""
 
     def generate(context, builder, signature, args):
@@ -193,7 +193,7 @@ def lowest_bit(typing_context, bits):
 
 
 @intrinsic
-def split(typing_context, x):
+def split_exponent(typing_context, x):
     """(whole, part): x rounded to whole, moved to the place of a float's exponent, and what is left, in [-0.5, 0.5]."""
 
     def generate(context, builder, signature, args):
@@ -207,8 +207,8 @@ def split(typing_context, x):
 
 
 @intrinsic
-def scale(typing_context, value, whole):
-    """`value` times 2 to the power of the `whole` that `split` gave; no meaning beyond float32's normal range."""
+def scale_by_power(typing_context, value, whole):
+    """`value` times 2 to the power `whole` from `split_exponent`, within float32's normal range."""
 
     def generate(context, builder, signature, args):
         total = builder.add(*(builder.bitcast(arg, _INTS) for arg in args))
@@ -218,7 +218,7 @@ def scale(typing_context, value, whole):
 
 
 @intrinsic
-def root(typing_context, x):
+def sqrt(typing_context, x):
     """The square root."""
 
     def generate(context, builder, signature, args):
@@ -237,52 +237,52 @@ def exp2(x):
 
     For x in [-126, 127]; anything else gives numbers without meaning, for the caller to drop.
     """
-    whole, part = split(x)
-    y = every(_f(1.3264727e-3))
-    y = y * part + every(_f(9.671513e-3))
-    y = y * part + every(_f(5.5507336e-2))
-    y = y * part + every(_f(0.24022242))
-    y = y * part + every(_f(0.693147))
-    y = y * part + every(_f(1.0))
-    return scale(y, whole)
+    whole, part = split_exponent(x)
+    y = broadcast(_f(1.3264727e-3))
+    y = y * part + broadcast(_f(9.671513e-3))
+    y = y * part + broadcast(_f(5.5507336e-2))
+    y = y * part + broadcast(_f(0.24022242))
+    y = y * part + broadcast(_f(0.693147))
+    y = y * part + broadcast(_f(1.0))
+    return scale_by_power(y, whole)
 
 
 @inline
 def exp(x):
     """e^x: within 4e-7 for |x| < 5, 1e-5 for |x| < 87.3; beyond it stays at the ends of these."""
-    y, most = x * every(_f(math.log2(math.e))), every(_f(126.0))
-    y = choose(y < most, y, most)
-    y = choose(y > every(_f(-126.0)), y, every(_f(-126.0)))
-    return choose(x >= x, exp2(y), x)  # NaN stays what it is
+    y, most = x * broadcast(_f(math.log2(math.e))), broadcast(_f(126.0))
+    y = select(y < most, y, most)
+    y = select(y > broadcast(_f(-126.0)), y, broadcast(_f(-126.0)))
+    return select(x >= x, exp2(y), x)  # NaN stays what it is
 
 
 @inline
 def sigmoid(x):
     """1 / (1 + e^-x)."""
-    one = every(_f(1.0))
-    return one / (one + exp(every(_f(0.0)) - x))
+    one = broadcast(_f(1.0))
+    return one / (one + exp(broadcast(_f(0.0)) - x))
 
 
 @inline
 def cos_and_sin(turns):
     """Cosine and sine of 2 pi x within 5e-7: the series of pi x, to its 12th power, then the angle doubled."""
-    _, part = split(turns)
+    _, part = split_exponent(turns)
     square = part * part
-    y = every(_f(-0.00737043094571435))
-    y = y * square + every(_f(0.08214588661112823))
-    y = y * square + every(_f(-0.5992645293207921))
-    y = y * square + every(_f(2.550164039877345))
-    y = y * square + every(_f(-5.16771278004997))
-    y = y * square + every(_f(3.141592653589793))
+    y = broadcast(_f(-0.00737043094571435))
+    y = y * square + broadcast(_f(0.08214588661112823))
+    y = y * square + broadcast(_f(-0.5992645293207921))
+    y = y * square + broadcast(_f(2.550164039877345))
+    y = y * square + broadcast(_f(-5.16771278004997))
+    y = y * square + broadcast(_f(3.141592653589793))
     sine = y * part
-    y = every(_f(0.0019295743094039))
-    y = y * square + every(_f(-0.02580689139001406))
-    y = y * square + every(_f(0.2353306303588935))
-    y = y * square + every(_f(-1.3352627688545893))
-    y = y * square + every(_f(4.058712126416768))
-    y = y * square + every(_f(-4.934802200544679))
-    y = y * square + every(_f(1.0))
-    return (y - sine) * (y + sine), every(_f(2.0)) * sine * y
+    y = broadcast(_f(0.0019295743094039))
+    y = y * square + broadcast(_f(-0.02580689139001406))
+    y = y * square + broadcast(_f(0.2353306303588935))
+    y = y * square + broadcast(_f(-1.3352627688545893))
+    y = y * square + broadcast(_f(4.058712126416768))
+    y = y * square + broadcast(_f(-4.934802200544679))
+    y = y * square + broadcast(_f(1.0))
+    return (y - sine) * (y + sine), broadcast(_f(2.0)) * sine * y
 
 
 def _shuffled(builder, a, b, picks):
@@ -290,7 +290,7 @@ def _shuffled(builder, a, b, picks):
 
 
 @intrinsic
-def columns_of_rows(typing_context, array, indices, start):
+def gather_columns(typing_context, array, indices, start):
     """The 8 columns of 16 rows of a contiguous float32 array (num, 8): of rows indices[start : start + 16], int32."""
 
     def generate(context, builder, signature, args):
@@ -315,7 +315,7 @@ def columns_of_rows(typing_context, array, indices, start):
 
 
 @intrinsic
-def turned(typing_context, a, b, c, d):
+def transpose_cells(typing_context, a, b, c, d):
     """Four vectors as a 4 x 4 matrix of groups of 4 lanes, transposed: four cells of pixels become four rows of 16."""
 
     def generate(context, builder, signature, args):
@@ -330,7 +330,7 @@ def turned(typing_context, a, b, c, d):
 
 
 @intrinsic(prefer_literal=True)
-def folded(typing_context, a, b, width):
+def add_lanes(typing_context, a, b, width):
     """Halfway to the sums of many vectors at once: neighbouring groups of `width` lanes (1, 2, 4, 8) added.
 
     Of each pair of groups, the sum for `a` takes the first one's place, that for `b` the second one's. After widths

@@ -15,12 +15,12 @@ Columns = list[Array]
 UNROLLED_SIZE = 8
 
 
-def columns_of(x: Vector) -> Columns:
+def split_columns(x: Vector) -> Columns:
     dim = x.shape[-1]
     return [x] if dim > UNROLLED_SIZE else [x[..., i : i + 1] for i in range(dim)]
 
 
-def stacked(columns: Columns) -> Vector:
+def join_columns(columns: Columns) -> Vector:
     return columns[0] if len(columns) == 1 else jnp.concatenate(jnp.broadcast_arrays(*columns), axis=-1)
 
 
@@ -61,7 +61,7 @@ def solve_upper_matrix(upper: Float[Array, "dim dim"], b: Float[Array, "dim colu
     return jnp.concatenate([row.T for row in rows])
 
 
-def lower_times(tril: Matrix, x: Columns) -> Columns:
+def multiply_lower(tril: Matrix, x: Columns) -> Columns:
     """L x, reading the lower triangle only."""
     if tril.shape[-1] > UNROLLED_SIZE:
         return [jnp.matmul(jnp.tril(tril), x[0][..., None])[..., 0]]

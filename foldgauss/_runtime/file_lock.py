@@ -7,21 +7,21 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 
-class Held(BlockingIOError):
+class LockHeld(BlockingIOError):
     """Another holds the lock."""
 
 
 @contextmanager
-def alone(file: Path) -> Iterator[None]:
+def hold_lock(file: Path) -> Iterator[None]:
     """Hold the lock `file`, made here and removed afterwards, until the block or the process ends, however it does.
 
-    Raises `Held` at once where another holds it, of this process too, and OSError where it cannot be made.
+    Raises `LockHeld` at once where another holds it, of this process too, and OSError where it cannot be made.
     """
     lock = FileLock(file, timeout=0)
     try:
         lock.acquire()
     except Timeout as error:
-        raise Held(f"{file} is held by another") from error
+        raise LockHeld(f"{file} is held by another") from error
     try:
         yield
     finally:

@@ -13,12 +13,12 @@ SAME = 5.0
 TERMINATED = 128 + signal.SIGTERM
 
 
-class Terminated(KeyboardInterrupt):
+class SigtermReceived(KeyboardInterrupt):
     """SIGTERM, which is to leave no more behind than Ctrl-C does."""
 
 
 class _Answer:
-    """The first SIGTERM raises `Terminated`; a later one ends the process at once, whatever it is at."""
+    """The first SIGTERM raises `SigtermReceived`; a later one ends the process at once, whatever it is at."""
 
     def __init__(self) -> None:
         self.first: float | None = None
@@ -27,15 +27,15 @@ class _Answer:
         now = time.monotonic()
         if self.first is None:
             self.first = now
-            raise Terminated("ended by SIGTERM")
+            raise SigtermReceived("ended by SIGTERM")
         if now - self.first > SAME:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
 
 
 @contextmanager
-def ending_well() -> Iterator[None]:
-    """Within, SIGTERM raises `Terminated`, unless somebody else answers it; the process then exits with 143.
+def raise_on_sigterm() -> Iterator[None]:
+    """Within, SIGTERM raises `SigtermReceived`, unless somebody else answers it; the process then exits with 143.
 
     As the system ends it, what is unfinished would lie about for good.
     """
@@ -54,7 +54,7 @@ def ending_well() -> Iterator[None]:
 
 
 @contextmanager
-def leaving_at_once() -> Iterator[None]:
+def use_default_signals() -> Iterator[None]:
     """Within, Ctrl-C and SIGTERM end the process as the system does, unless somebody else answers them.
 
     Nothing is open yet that would be lost; and of a KeyboardInterrupt in their midst the native libraries that are

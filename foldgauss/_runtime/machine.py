@@ -7,10 +7,10 @@ from pathlib import Path
 
 from foldgauss._runtime.threads import available_cores, num_threads
 
-PACKAGES = ("jax", "jaxlib", "numba", "numpy", "optax")
+_PACKAGES = ("jax", "jaxlib", "numba", "numpy", "optax")
 
 
-def machine() -> dict[str, object]:
+def describe_machine() -> dict[str, object]:
     """Facts a timing depends on; no names of hosts or users. `load_average`: processes that ran in the last minute."""
     return {
         "cpu": cpu_model(),
@@ -19,7 +19,7 @@ def machine() -> dict[str, object]:
         "load_average": load_average(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in PACKAGES},
+        **{name: importlib.metadata.version(name) for name in _PACKAGES},
     }
 
 

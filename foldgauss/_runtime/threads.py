@@ -49,7 +49,7 @@ def set_num_threads(count: int | None) -> None:
         _num_threads, _pool = count, None
 
 
-def check_process() -> None:
+def check_not_forked() -> None:
     """Raise RuntimeError in a process that was forked from one in which JAX had started.
 
     JAX's threads do not exist there, and what waits for them waits for ever. Our own kernels alone do work.

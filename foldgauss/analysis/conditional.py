@@ -12,13 +12,21 @@ from jax import lax
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float, Key
 
-from foldgauss._numerics.batch import as_value, batch_of, check_event, over_batch, parts_of
-from foldgauss._numerics.factor import checked_indices
+from foldgauss._numerics.batch import as_value, batch_shape_of, check_event, map_over_batch, ranked_leaves
+from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.narrow_crossings import ROUNDING, centre_at, modes_of, spikes_of
-from foldgauss.analysis.quadrature import REACH, SEARCH_GRID, Panels, adaptive_panels, diverges, peaks, within_any
+from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
+from foldgauss.analysis.quadrature import (
+    REACH,
+    SEARCH_GRID,
+    Panels,
+    adaptive_panels,
+    diverges,
+    find_peaks,
+    is_within_any,
+)
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.gaussian import Gaussian, given_first
+from foldgauss.gaussian import Gaussian, condition_on_first
 
 __all__ = ["TimeDensity", "TimeMixture", "conditional_gaussian", "time_density", "time_mixture"]
 
@@ -101,10 +109,10 @@ class TimeDensity(eqx.Module):
     def modes(self) -> Float[Array, "*batch modes"]:
         """The local maxima of p(t | s), highest first, at most 8; NaN where there are fewer."""
 
-        return over_batch(_modes, self.parent, (self.values, 1), self.panels)
+        return map_over_batch(_modes, self.parent, (self.values, 1), self.panels)
 
     def _moments(self):
-        return over_batch(_tau_moments, self.panels)
+        return map_over_batch(_tau_moments, self.panels)
 
     def _elementwise(self, function, x):
         """function(panels, x) for x of shape (*sample, *batch), without a copy of the panels for each sample."""
@@ -149,7 +157,7 @@ class TimeMixture(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return batch_of([*parts_of(self.parent), (self.values, 1)])
+        return batch_shape_of([*ranked_leaves(self.parent), (self.values, 1)])
 
     def log_prob(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """log p(x | given)."""
@@ -186,7 +194,7 @@ class TimeMixture(eqx.Module):
         if self.keeps_time:
             return self.time.cdf(x[..., 0])
         infinite = jnp.isinf(x)
-        log_mass = over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, x)), 1))
+        log_mass = map_over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, x)), 1))
         mass = jnp.clip(jnp.exp(log_mass - jnp.broadcast_to(self._log_normalizer, log_mass.shape)), 0, 1)
         infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, x))
         return jnp.where(infinite, (last > 0).astype(mass.dtype), mass)
@@ -224,14 +232,14 @@ class TimeMixture(eqx.Module):
 
     def marginal(self, indices) -> "TimeMixture":
         """Some of the coordinates; the indices are kept."""
-        space, keeps_time = self._split(checked_indices(indices, self.event_shape[0]))
+        space, keeps_time = self._split(normalize_indices(indices, self.event_shape[0]))
         keep = (*range(self._num_given), *(self._num_given + i for i in space))
         parent = self.parent.marginal((*keep, self.parent.event_shape[0] - 1))
         return TimeMixture(parent, self.values, self.time, keeps_time)
 
     def condition(self, indices, values) -> "TimeMixture | Gaussian":
         """The other coordinates, given these: exact, a Gaussian, if time is among the given."""
-        indices = checked_indices(indices, self.event_shape[0])
+        indices = normalize_indices(indices, self.event_shape[0])
         offset = self._num_given
         values = as_value(values, self.values.dtype)
         check_event("values", values, (len(indices),))
@@ -267,7 +275,7 @@ class TimeMixture(eqx.Module):
         return jnp.concatenate([_over(self.values, shape), _over(x, shape)], axis=-1)
 
     def _space_integral(self, x):
-        return over_batch(_log_space_density, self.parent, (self._with_values(x), 1))
+        return map_over_batch(_log_space_density, self.parent, (self._with_values(x), 1))
 
     def _split(self, indices):
         keeps_time = self.keeps_time and self._space_dim in indices
@@ -279,14 +287,14 @@ class TimeMixture(eqx.Module):
         if self.time is None:
             mean, covariance = self.parent.moments()
             return mean[..., :-1], covariance[..., :-1, :-1]
-        mean, covariance = over_batch(_mixture_moments, self.parent, (self.values, 1), self.time.panels)
+        mean, covariance = map_over_batch(_mixture_moments, self.parent, (self.values, 1), self.time.panels)
         end = self.event_shape[0]
         return mean[..., :end], covariance[..., :end, :end]
 
 
 def time_density(parent, values: Float[Array, "*#batch d-1"]) -> TimeDensity:
     """p(t | s = values) of a Folded-Gaussian."""
-    panels, log_normalizer, error = over_batch(_space_panels, parent, (values, 1))
+    panels, log_normalizer, error = map_over_batch(_space_panels, parent, (values, 1))
     values = _over(values, log_normalizer.shape)
     return TimeDensity(parent, values, panels, log_normalizer, error)
 
@@ -302,7 +310,7 @@ def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixtur
 def conditional_gaussian(parent, values: Float[Array, "*#batch given"], t: Float[Array, "*#batch"]) -> Gaussian:
     """The later space coordinates given t and the first ones: exact, all of it is Gaussian given t."""
     at = parent.condition_time(t)
-    return given_first(at, values) if values.shape[-1] else at
+    return condition_on_first(at, values) if values.shape[-1] else at
 
 
 @eqx.filter_jit
@@ -340,7 +348,7 @@ def _log_joint(parent, s):
 def _log_joint_frozen(parent, s):
     """The same without derivatives, and less to compile."""
     parent, s = lax.stop_gradient((parent, s))
-    return lambda tau: centre_at(parent, tau).log_prob(_over(s, tau.shape)) - 0.5 * tau**2 - _HALF_LOG_2PI
+    return lambda tau: gaussian_at(parent, tau).log_prob(_over(s, tau.shape)) - 0.5 * tau**2 - _HALF_LOG_2PI
 
 
 def _guides(parent, s, log_f):
@@ -351,21 +359,21 @@ def _guides(parent, s, log_f):
     grid = jnp.asarray(SEARCH_GRID, s.dtype)
 
     def nearness(tau):
-        here = centre_at(parent, tau)
+        here = gaussian_at(parent, tau)
         return Gaussian(here.loc, here.base_tril, validate_args=False).log_prob(_over(s, tau.shape))
 
-    near = peaks(nearness, grid, _CROSSINGS, score=lambda tau: -(tau**2))
+    near = find_peaks(nearness, grid, _CROSSINGS, score=lambda tau: -(tau**2))
     # A square tells its minimum to half the digits; the residual itself, which is linear there, to all of them.
     near = lax.fori_loop(0, 3, lambda _, tau: _nearer(parent, s, tau), near)
     there = jnp.where(jnp.isnan(near), 0, near)
     # A ridge far out is high because it is narrow: its mass goes without the factor a^(-(d-1)/2).
-    mass = jnp.where(jnp.isnan(near), -jnp.inf, log_f(there) + s.size * centre_at(parent, there).log_scale)
-    return jnp.concatenate([near[lax.top_k(mass, _BEST)[1]], peaks(log_f, grid, _MAXIMA)]), near
+    mass = jnp.where(jnp.isnan(near), -jnp.inf, log_f(there) + s.size * gaussian_at(parent, there).log_scale)
+    return jnp.concatenate([near[lax.top_k(mass, _BEST)[1]], find_peaks(log_f, grid, _MAXIMA)]), near
 
 
 def _nearer(parent, s, tau):
     """A Gauss-Newton step from tau to where the ridge is nearest to s; no step that would be a long one."""
-    place, speed = jax.jvp(lambda tau: centre_at(parent, tau).loc[..., : s.size], (tau,), (jnp.ones_like(tau),))
+    place, speed = jax.jvp(lambda tau: gaussian_at(parent, tau).loc[..., : s.size], (tau,), (jnp.ones_like(tau),))
     tril = parent.scale_tril[: s.size, : s.size]
     solve = lambda rows: lax.linalg.triangular_solve(tril, rows.T, left_side=True, lower=True)  # noqa: E731
     residual, rate = solve(_over(s, tau.shape) - place), solve(speed)
@@ -378,7 +386,7 @@ def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
     parent, s = _centred(parent, s)
     frozen, log_f = lax.stop_gradient((parent, s)), _log_joint_frozen(parent, s)
     guides, near = _guides(*frozen, log_f)
-    spikes, log_unseen = spikes_of(parent, s) if s.size == 1 else (None, jnp.asarray(-jnp.inf, s.dtype))
+    spikes, log_unseen = crossing_panels(parent, s) if s.size == 1 else (None, jnp.asarray(-jnp.inf, s.dtype))
     panels = adaptive_panels(_log_joint(parent, s), guides, search=log_f, spikes=spikes)
     log_total = panels.log_total
     log_error = jnp.logaddexp(log_unseen, _log_rounding(*frozen, near, spikes))
@@ -398,7 +406,7 @@ def _log_rounding(parent, s, near, spikes: Panels | None):
     eps, tril = jnp.finfo(s.dtype).eps, parent.scale_tril[: s.size, : s.size]
 
     def curve(tau):
-        at = centre_at(parent, tau)
+        at = gaussian_at(parent, tau)
         return at.loc[..., : s.size], at.log_scale
 
     (place, log_scale), (speed, _) = jax.jvp(curve, (tau,), (jnp.ones_like(tau),))
@@ -415,7 +423,7 @@ def _log_rounding(parent, s, near, spikes: Panels | None):
     log_error = log_best + jnp.log(q * (z + q))
     counts = ~jnp.isnan(near) & jnp.isfinite(place).all(-1)
     if spikes is not None:
-        counts = counts & ~within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)
+        counts = counts & ~is_within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)
     return logsumexp(jnp.where(counts, log_error, -jnp.inf))
 
 
@@ -423,13 +431,13 @@ def _modes(parent, values, panels: Panels):
     own, s = _centred(parent, values)
     log_f = _log_joint_frozen(own, s)
     grid = jnp.unique(panels.nodes.ravel(), size=panels.nodes.size, fill_value=REACH)
-    found = peaks(log_f, grid, 2 * _MODES)
+    found = find_peaks(log_f, grid, 2 * _MODES)
     height = jnp.where(jnp.isnan(found), -jnp.inf, log_f(jnp.where(jnp.isnan(found), 0, found)))
     if s.size == 1:
-        spikes, _ = spikes_of(own, s)
+        spikes, _ = crossing_panels(own, s)
         holes = spikes.left[:, 0], spikes.right[:, -1]
-        peak, peak_height = modes_of(own, s, spikes)
-        height = jnp.concatenate([jnp.where(within_any(holes, found), -jnp.inf, height), peak_height])
+        peak, peak_height = crossing_modes(own, s, spikes)
+        height = jnp.concatenate([jnp.where(is_within_any(holes, found), -jnp.inf, height), peak_height])
         found = jnp.concatenate([found, peak])
     height, order = lax.top_k(height, height.size)
     found = jnp.where(jnp.isneginf(height), jnp.nan, found[order])
@@ -479,7 +487,7 @@ def _log_space_cdf(parent, s):
     log_f, search = make(_log_joint, parent, s), make(_log_joint_frozen, *frozen)
     spikes = None
     if given == 1:
-        spikes, _ = spikes_of(parent.marginal(keep), s[:-1])
+        spikes, _ = crossing_panels(parent.marginal(keep), s[:-1])
         shares = log_share(parent, s, spikes.nodes)
         spikes = eqx.tree_at(lambda panels: panels.log_values, spikes, spikes.log_values + shares)
     guides, _ = _guides(*frozen, _log_joint_frozen(*frozen))

@@ -6,10 +6,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import expand, fill, known, over_batch
+from foldgauss._numerics.batch import broadcast_leaves, concrete_value, expand_leaves, map_over_batch
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.moments import mean_log_envelope
-from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, diverges, gauss_hermite, normal_rule, peaks
+from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, diverges, find_peaks, gauss_hermite, normal_rule
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.gaussian import Gaussian, Normal
 
@@ -40,7 +40,7 @@ def kl_divergence(p, q, *, order: int = 64) -> Float[Array, "*batch"]:
     """
     _check_pair(p, q)
     batch = jnp.broadcast_shapes(p.batch_shape, q.batch_shape)
-    p, q = fill(p, batch), fill(q, batch)
+    p, q = broadcast_leaves(p, batch), broadcast_leaves(q, batch)
     if isinstance(p, Normal):
         return _kl_normal(p.loc, p.scale, q.loc, q.scale)
     if isinstance(p, Gaussian):
@@ -101,13 +101,13 @@ def _expectations(p, q, order: int):
     """E[a_p / a_q], E[|centre difference|^2 / a_q], E[log a_q / a_p] under t of p."""
     own, other = _time_likelihood(p), _time_likelihood(q)
     if own is None or other is None:
-        return over_batch(_integrals, p, q)
-    floor = known(other[1])
+        return map_over_batch(_integrals, p, q)
+    floor = concrete_value(other[1])
     if floor is not None and not floor.any():
         return _exact(p, q, own, other[0], order)
     if floor is not None and floor.all():
-        return over_batch(_integrals, p, q)
-    exact, integrals = _exact(p, q, own, other[0], order), over_batch(_integrals, p, q)
+        return map_over_batch(_integrals, p, q)
+    exact, integrals = _exact(p, q, own, other[0], order), map_over_batch(_integrals, p, q)
     return tuple(jnp.where(other[1] == 0, a, b) for a, b in zip(exact, integrals, strict=True))
 
 
@@ -150,7 +150,7 @@ def _tilted(p, q, sharpness, power_q):
 
 def _centre_distance(p, q, t):
     """log |L_q^-1 (centre_p - centre_q)|^2 at t (one axis in front of the batch), and whether it is only rounding."""
-    here, there = (expand(x, t.ndim).condition_time(t).loc for x in (p, q))
+    here, there = (expand_leaves(x, t.ndim).condition_time(t).loc for x in (p, q))
     difference = here - there
     size = jnp.abs(here) + jnp.abs(there) + jnp.abs(p.loc)[None] + jnp.abs(q.loc)[None]
     same = (jnp.abs(difference) <= _SAME_CURVE * jnp.finfo(size.dtype).eps * size).all(-1)
@@ -189,6 +189,6 @@ def _integrals(p, q):
 
 def _integral(log_f, search, dtype):
     grid = jnp.asarray(SEARCH_GRID, dtype)
-    panels = adaptive_panels(log_f, peaks(search, grid, _PEAKS), search=search)
+    panels = adaptive_panels(log_f, find_peaks(search, grid, _PEAKS), search=search)
     total = jnp.where(jnp.isneginf(panels.log_total), 0, jnp.exp(panels.log_total))
     return jnp.where(diverges(search, panels), jnp.inf, total)

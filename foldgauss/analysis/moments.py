@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import expand, fill, known, over_batch
+from foldgauss._numerics.batch import broadcast_leaves, concrete_value, expand_leaves, map_over_batch
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.quadrature import gauss_hermite, normal_rule, peaks
+from foldgauss.analysis.quadrature import find_peaks, gauss_hermite, normal_rule
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 
@@ -32,7 +32,7 @@ def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*
 
     **Source:** the laws of total mean and covariance given t. **Raises:** nothing of its own.
     """
-    dist = fill(dist, dist.batch_shape)
+    dist = broadcast_leaves(dist, dist.batch_shape)
     mean_f, cov_f, cross = _fold_moments(dist, order)
     mean = jnp.concatenate([dist.loc + mean_f, dist.time_loc[..., None]], axis=-1)
     sigma = dist.scale_tril @ jnp.swapaxes(dist.scale_tril, -1, -2)
@@ -51,7 +51,7 @@ def entropy(dist) -> Float[Array, "*batch"]:
 
     **Source:** the chain rule, H(t) + H(s | t), with eq:cond_dens.
     """
-    dist = fill(dist, dist.batch_shape)
+    dist = broadcast_leaves(dist, dist.batch_shape)
     dim = dist.loc.shape[-1]
     log_det = jnp.log(jnp.diagonal(dist.scale_tril, axis1=-2, axis2=-1)).sum(-1)
     gaussian = 0.5 * (dim + 1) * _LOG_2PI_E + jnp.log(dist.time_scale) + log_det
@@ -81,7 +81,7 @@ def mean_log_envelope(dist) -> Float[Array, "*batch"]:
         return jnp.zeros_like(dist.time_loc)
     if not isinstance(envelope, TimeLikelihood):
         return _expected_envelope(dist, lambda log_a: log_a)
-    floor = known(envelope.floor)
+    floor = concrete_value(envelope.floor)
     if floor is not None and not floor.any():
         return -0.5 * envelope.power
     floored = _expected_envelope(dist, lambda log_a: log_a)
@@ -103,7 +103,7 @@ def mode(dist) -> Float[Array, "*batch d"]:
         return _ridge(dist, dist.time_loc)
     if not isinstance(envelope, TimeLikelihood):
         return _ridge(dist, _highest_time(dist))
-    filled = fill(dist, batch)
+    filled = broadcast_leaves(dist, batch)
     envelope, dim = filled.envelope, dist.loc.shape[-1]
     slope = envelope.power * dim * (1 - envelope.floor)  # of the ridge at its own time, in tau^2 / 4, plus 2
     unique = jnp.where(envelope.floor > 0, slope <= 2, slope < 2)
@@ -120,7 +120,7 @@ def _fold_moments(dist, order: int):
         return _polynomial_moments(dist.fold.coefficients, dist.time_scale)
     z, weights = (jnp.asarray(x, dist.loc.dtype) for x in gauss_hermite(order))
     z = z.reshape(-1, *(1,) * dist.time_scale.ndim)
-    values = expand(dist.fold, dist.time_scale.ndim + 1)(z * dist.time_scale[None])
+    values = expand_leaves(dist.fold, dist.time_scale.ndim + 1)(z * dist.time_scale[None])
     mean = jnp.tensordot(weights, values, axes=1)
     centred = values - mean[None]
     covariance = jnp.tensordot(weights, centred[..., :, None] * centred[..., None, :], axes=1)
@@ -153,14 +153,14 @@ def _expected_envelope(dist, function) -> Float[Array, "*batch"]:
 
 
 def _log_envelope(dist, tau: Float[Array, " tau"]) -> Float[Array, " tau *batch"]:
-    dist = fill(dist, dist.batch_shape)
+    dist = broadcast_leaves(dist, dist.batch_shape)
     rank = dist.time_loc.ndim + 1
     tau = tau.reshape(-1, *(1,) * (rank - 1))
     if isinstance(dist.envelope, TimeLikelihood):  # knows tau only, which t = time_loc + .. may lose in rounding
         zero, one = jnp.zeros_like(dist.time_loc)[None], jnp.ones_like(dist.time_scale)[None]
-        return expand(dist.envelope, rank).log_a(tau, time_loc=zero, time_scale=one)
+        return expand_leaves(dist.envelope, rank).log_a(tau, time_loc=zero, time_scale=one)
     t = dist.time_loc[None] + dist.time_scale[None] * tau
-    envelope = expand(dist.envelope, rank)
+    envelope = expand_leaves(dist.envelope, rank)
     return envelope.log_a(t, time_loc=dist.time_loc[None], time_scale=dist.time_scale[None])
 
 
@@ -171,7 +171,7 @@ def _ridge(dist, t) -> Float[Array, "*batch d"]:
 
 def _refuse_no_mode(unique, envelope, dim: int) -> None:
     """Raise where values are known and say that the mode is not unique."""
-    unique, power, floor = (known(x) for x in (unique, envelope.power, envelope.floor))
+    unique, power, floor = (concrete_value(x) for x in (unique, envelope.power, envelope.floor))
     if unique is None or unique.all():
         return
     power, floor = np.broadcast_arrays(power, floor)
@@ -188,8 +188,8 @@ def _refuse_no_mode(unique, envelope, dim: int) -> None:
 
 def _highest_time(dist) -> Float[Array, "*batch"]:
     """Where the ridge is highest under an envelope of the user's: searched for in tau from -40 to 40."""
-    tau, tied = over_batch(_highest_tau, dist)
-    refused = known(tied)
+    tau, tied = map_over_batch(_highest_tau, dist)
+    refused = concrete_value(tied)
     if refused is not None and refused.any():
         got = "an envelope whose ridge is as high, or higher, elsewhere"
         raise invalid("mode", expected="a unique mode", got=got, cure="Use mean.")
@@ -203,7 +203,7 @@ def _highest_tau(dist):
     def log_ridge(tau):
         return -0.5 * tau**2 - 0.5 * dim * _log_envelope(dist, tau)
 
-    best = peaks(log_ridge, grid, 2)
+    best = find_peaks(log_ridge, grid, 2)
     heights = jnp.where(jnp.isnan(best), -jnp.inf, log_ridge(jnp.where(jnp.isnan(best), 0, best)))
     ends = log_ridge(grid[:: grid.size - 1]).max()
     return best[0], jnp.maximum(heights[1], ends) > heights[0] - _TIE

@@ -24,11 +24,11 @@ _STEADY = 0.02  # a crossing is narrow if speed and phi(tau) vary by no more, re
 ROUNDING = 64  # roundings that a solved equation may be off
 
 
-def centre_at(parent, tau) -> Gaussian:
+def gaussian_at(parent, tau) -> Gaussian:
     return parent.condition_time(parent.time_loc + parent.time_scale * tau)
 
 
-def spikes_of(parent, s) -> tuple[Panels, Array]:
+def crossing_panels(parent, s) -> tuple[Panels, Array]:
     """Panels (spikes, panels) where the curve of one space coordinate crosses s, in z instead of tau.
 
         p(s, tau) dtau = phi(z) phi(tau) / |dF / dtau| dz,   F(tau, z) = c(tau) + z width(tau) - s = 0
@@ -71,10 +71,10 @@ def spikes_of(parent, s) -> tuple[Panels, Array]:
 
 
 def _crossing(parent, s, tau, z):
-    """F(tau, z) of `spikes_of`, and its slope in tau."""
+    """F(tau, z) of `crossing_panels`, and its slope in tau."""
 
     def gap(tau):
-        at = centre_at(parent, tau)
+        at = gaussian_at(parent, tau)
         return at.loc[..., 0] - s[0] + z * (jnp.exp(at.log_scale) * parent.scale_tril[0, 0])
 
     return jax.jvp(gap, (tau,), (jnp.ones_like(tau),))
@@ -84,7 +84,7 @@ def _crossings(parent, s) -> tuple[Array, Array]:
     """tau where the curve of one space coordinate passes s, the _SPIKES of most mass; log of the mass of the others."""
 
     def gap(tau):
-        return centre_at(parent, tau).loc[..., 0] - s[0]
+        return gaussian_at(parent, tau).loc[..., 0] - s[0]
 
     # With its turning points known, the curve passes once or not at all between one tau and the next.
     grid = jnp.asarray(SEARCH_GRID, s.dtype)
@@ -136,11 +136,11 @@ def _is_narrow(parent, s, at, z):
     return (solved & steady & near & (slope != 0)).all(-1)  # NaN is none of it
 
 
-def modes_of(parent, s, spikes: Panels):
+def crossing_modes(parent, s, spikes: Panels):
     """tau and log-density of the peak of each spike: where z = 0, moved up the slope of phi(tau) / width."""
     tau = spikes.nodes[:, _SPIKE_PANELS // 2, 7]
     _, slope = _crossing(parent, s, tau, 0.0)
-    log_scale, growth = jax.jvp(lambda tau: centre_at(parent, tau).log_scale, (tau,), (jnp.ones_like(tau),))
+    log_scale, growth = jax.jvp(lambda tau: gaussian_at(parent, tau).log_scale, (tau,), (jnp.ones_like(tau),))
     per_z = jnp.exp(log_scale) * parent.scale_tril[0, 0] / jnp.where(slope == 0, 1, jnp.abs(slope))
     move = -(tau + growth) * per_z
     height = -0.5 * tau**2 + 0.5 * move**2 - 2 * _HALF_LOG_2PI - log_scale - jnp.log(parent.scale_tril[0, 0])

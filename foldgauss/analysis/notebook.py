@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._numerics.batch import parts_of
+from foldgauss._numerics.batch import ranked_leaves
 from foldgauss.analysis.plot import plot_density, plot_history
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class _Bells(NamedTuple):
     scale: np.ndarray
 
 
-def never_raising(draw: Callable[..., "Figure"]) -> Callable[..., bytes | None]:
+def png_or_none(draw: Callable[..., "Figure"]) -> Callable[..., bytes | None]:
     """The figure as a PNG; None where it cannot be had: no matplotlib, numbers that are traced or not finite."""
 
     @functools.wraps(draw)
@@ -49,7 +49,7 @@ def never_raising(draw: Callable[..., "Figure"]) -> Callable[..., bytes | None]:
     return png
 
 
-@never_raising
+@png_or_none
 def distribution_png(dist) -> "Figure":
     """Of one space coordinate the density; of more, each against time, and paths in space; of a batch, some."""
     if dist.batch_shape == () and dist.event_shape == (2,):
@@ -63,7 +63,7 @@ def distribution_png(dist) -> "Figure":
     return _drawn(_part(dist, dist.batch_shape, chosen), np.full(len(chosen), 1 / len(chosen)), _name(dist) + batch)
 
 
-@never_raising
+@png_or_none
 def mixture_png(mixture: Any) -> "Figure":
     """As of one distribution; of many components the heaviest, of a batch of mixtures the first."""
     weights = np.asarray(mixture.weights, float)
@@ -77,7 +77,7 @@ def mixture_png(mixture: Any) -> "Figure":
     return _drawn(_part(mixture.components, (*mixture.batch_shape, len(first)), chosen), first[chosen], text)
 
 
-@never_raising
+@png_or_none
 def history_png(history: Any) -> "Figure":
     """The course of a fit, against its seconds and its steps."""
     figure = _figure(2, height=2 * _HEIGHT - 1)
@@ -102,7 +102,7 @@ def _part(dist, batch: tuple[int, ...], chosen: np.ndarray):
     at = np.unravel_index(chosen, batch)
     leaves = [
         jnp.asarray(np.broadcast_to(np.asarray(leaf), batch + leaf.shape[leaf.ndim - event :])[at])
-        for leaf, event in parts_of(dist)
+        for leaf, event in ranked_leaves(dist)
     ]
     return jax.tree.unflatten(jax.tree.structure(dist), leaves)
 

@@ -13,12 +13,12 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import expand, parts_of
+from foldgauss._numerics.batch import expand_leaves, ranked_leaves
 from foldgauss._numerics.triangular import UNROLLED_SIZE, solve_lower
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.gaussian import Gaussian
 
-__all__ = ["chunked", "components_first", "pair_log_prob"]
+__all__ = ["map_in_chunks", "move_components_first", "pair_log_prob"]
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 
@@ -44,17 +44,17 @@ class _QuickTimeLikelihood(AbstractEnvelope):
         return jnp.maximum(decay, log_floor) + jnp.log(1 + share)
 
 
-def components_first(components, rank: int):
+def move_components_first(components, rank: int):
     """Batch (*batch, k) to (k, 1, *batch), `rank` that of *batch: what points (n, *batch) broadcast against.
 
     With the components in front, sums over them run over whole vectors of points.
     """
     in_front = lambda leaf: jnp.expand_dims(jnp.moveaxis(leaf, rank, 0), 1)  # noqa: E731
-    return jax.tree.map(in_front, expand(components, rank + 1))
+    return jax.tree.map(in_front, expand_leaves(components, rank + 1))
 
 
 def pair_log_prob(first, rows: Float[Array, "n *batch d"]) -> Float[Array, "k n *batch"]:
-    """log p_k(x) of each point and component; `first` as `components_first` gives it."""
+    """log p_k(x) of each point and component; `first` as `move_components_first` gives it."""
     is_closed = isinstance(first, Gaussian) or (first.fold.is_closed and first.envelope.is_closed)
     if not is_closed or rows.shape[-1] > UNROLLED_SIZE:
         return first.log_prob(rows[None])
@@ -94,7 +94,7 @@ def _values(dist, rows: Array) -> Array:
     log_density = -(half_square + log_rest) - (log_det + len(x) * _HALF_LOG_2PI)
     # Neither inf - inf nor 0 * inf on the way is a NaN of the user's: it is far away. What was one stays one.
     reached = jnp.where((half_square < jnp.inf) & (log_rest < jnp.inf), log_density, -jnp.inf)
-    return reached + _nan_of([(rows[None], 1)]) + _nan_of(parts_of(dist))
+    return reached + _nan_of([(rows[None], 1)]) + _nan_of(ranked_leaves(dist))
 
 
 def _nan_of(parts: list[tuple[Array, int]]) -> Array:
@@ -115,7 +115,7 @@ def _pairs_jvp(structure, primals, tangents):
     return _pairs(structure, *primals), tangent
 
 
-def chunked(pairs, finish, rows: Float[Array, "n ..."], size: int) -> Array:
+def map_in_chunks(pairs, finish, rows: Float[Array, "n ..."], size: int) -> Array:
     """`finish(pairs(rows))`, by `size` rows at a time; in a gradient a chunk is done again instead of kept.
 
     `finish` puts the rows in front.

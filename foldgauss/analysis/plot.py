@@ -51,7 +51,7 @@ def plot_density(
     `dist` is not a single distribution in the plane.
     """
     _check_plane(dist)
-    pyplot = needed_pyplot("plot_density")
+    pyplot = import_pyplot("plot_density")
     ax = pyplot.subplots()[1] if ax is None else ax
     loc, scale = float(dist.time_loc), float(dist.time_scale)
     t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
@@ -90,7 +90,7 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
     if not len(history):
         raise invalid("history", expected="at least one step", got="none")
     if axes is None:
-        axes = needed_pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
+        axes = import_pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
     drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
     steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
     for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
@@ -136,7 +136,7 @@ def plot_tradeoff(
     **Raises:** ImportError that names the extra if matplotlib is missing.
     """
     if axes is None:
-        made = needed_pyplot("plot_tradeoff").subplots(1, len(panels), sharey=True, squeeze=False, layout="constrained")
+        made = import_pyplot("plot_tradeoff").subplots(1, len(panels), sharey=True, squeeze=False, layout="constrained")
         axes = made[1][0]
     axes = np.atleast_1d(axes)
     groups = list(dict.fromkeys(axis for axis, _ in names))
@@ -283,7 +283,7 @@ def _check_plane(dist) -> None:
         raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
 
 
-def needed_pyplot(caller: str):
+def import_pyplot(caller: str):
     try:
         from matplotlib import pyplot
     except ImportError as error:

@@ -21,10 +21,10 @@ __all__ = [
     "Panels",
     "adaptive_panels",
     "diverges",
+    "find_peaks",
     "gauss_hermite",
+    "is_within_any",
     "normal_rule",
-    "peaks",
-    "within_any",
 ]
 
 _Log = Callable[[Float[Array, "..."]], Float[Array, "..."]]
@@ -201,7 +201,7 @@ class Panels(eqx.Module):
 def adaptive_panels(
     log_f: _Log, guides: Float[Array, " guides"], *, search: _Log | None = None, spikes: Panels | None = None
 ) -> Panels:
-    """Panels for the integral of exp(log_f) over [-REACH, REACH], fine around `guides` (see `peaks`).
+    """Panels for the integral of exp(log_f) over [-REACH, REACH], fine around `guides` (see `find_peaks`).
 
     `search` is `log_f` without derivatives, where `log_f` has parameters to be differentiated. `spikes` (panels of
     shape (spikes, panels)) are taken over as they are, each in place of log_f from its first edge to its last.
@@ -233,7 +233,9 @@ def diverges(log_f: _Log, panels: Panels) -> Array:
     return ends + float(np.log(REACH)) > panels.log_total - 20.0
 
 
-def peaks(log_f: _Log, grid: Float[Array, " grid"], count: int, *, score: _Log | None = None) -> Float[Array, " count"]:
+def find_peaks(
+    log_f: _Log, grid: Float[Array, " grid"], count: int, *, score: _Log | None = None
+) -> Float[Array, " count"]:
     """The `count` best local maxima of `log_f` (by `score`, if given), found on a grid and refined to rounding.
 
     NaN where there are fewer. **Shapes:** `log_f` is elementwise.
@@ -263,7 +265,7 @@ def _golden(log_f: _Log, low: Array, high: Array) -> Array:
     return 0.5 * (low + high)
 
 
-def within_any(holes: tuple[Array, Array], x: Array) -> Array:
+def is_within_any(holes: tuple[Array, Array], x: Array) -> Array:
     """Whether x lies strictly inside one of the intervals."""
     low, high = (lax.expand_dims(edge, range(1, x.ndim + 1)) for edge in holes)
     return ((x[None] > low) & (x[None] < high)).any(0)
@@ -301,7 +303,7 @@ def _found_panels(log_f: _Log, guides: Array, holes: tuple[Array, Array] | None)
 
 def _estimates(log_f: _Log, holes, left: Array, right: Array) -> Array:
     log_error = _log_error(_log_width(left, right), log_f(_nodes(left, right)))
-    return log_error if holes is None else jnp.where(within_any(holes, 0.5 * (left + right)), -jnp.inf, log_error)
+    return log_error if holes is None else jnp.where(is_within_any(holes, 0.5 * (left + right)), -jnp.inf, log_error)
 
 
 def _log_error(log_half: Array, log_values: Array) -> Array:

@@ -14,7 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from foldgauss._runtime.checks import is_integer, is_within, short_repr
-from foldgauss._runtime.machine import machine
+from foldgauss._runtime.machine import describe_machine
 from foldgauss.analysis.plot import Panel
 from foldgauss.cli.app.shared import WrongUse, err, out, write_json
 from foldgauss.io._atomic import atomic_path
@@ -72,7 +72,7 @@ class Record:
     rows: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     fronts: dict[str, Any] = dataclasses.field(default_factory=dict)
     left_out: dict[str, str] = dataclasses.field(default_factory=dict)
-    machine: dict[str, Any] = dataclasses.field(default_factory=machine)
+    machine: dict[str, Any] = dataclasses.field(default_factory=describe_machine)
 
     def __post_init__(self) -> None:
         if not self.path.exists() or self.anew:

@@ -117,7 +117,7 @@ def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, kn
     """Write a compact file with what is known of where it comes from, `about`; `known`: whether its PSNR is."""
     about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
-    save_compact(target, made.quantised, metadata=about | {"loss_db": round(made.loss_db, 4)})
+    save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
 
 
 def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:

@@ -272,7 +272,7 @@ class _Run:
             "seconds": round(spent.wall, 3),
             "cpu_seconds": round(spent.cpu, 3),
             "bytes": num_bytes,
-            "floats": shown.num_floats,
+            "floats": shown.num_parameters,
             "gaussians": shown.num_gaussians,
             "frames_per_second": round(rate, 2),
             "command": self.words.of(point, self.clip.num_frames, self.clip.size),

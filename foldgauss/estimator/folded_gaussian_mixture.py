@@ -21,7 +21,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.estimator.chunks import Chunks, Piece, Survey, chunks_of, is_chunked, picked, survey, variances_of
 from foldgauss.estimator.em.components import Parameters, log_likelihoods, pairs_of
@@ -197,7 +197,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def _checked(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, both of the dtype that is fitted in."""
-        check_process()
+        check_not_forked()
         X = validate_data(self, X, dtype=[np.float64, np.float32], ensure_min_samples=2 if reset else 1, reset=reset)
         weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
         self._check_sizes(X.shape[1], int((weights > 0).sum()), weights.sum(), reset)
@@ -205,7 +205,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
 
     def _checked_chunks(self, X, sample_weight, double: bool) -> "_ChunkedRows":
         """Chunks of rows, after a first pass through them."""
-        check_process()
+        check_not_forked()
         chunks = chunks_of(X, sample_weight)
         found, sizes = survey(chunks)
         if found.num_rows < 2:
@@ -481,7 +481,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return sum(total for total, _ in parts) / num, num
 
     def _chunks(self, X) -> Chunks:
-        check_process()
+        check_not_forked()
         check_is_fitted(self)
         return chunks_of(X, width=self.n_features_in_)
 
@@ -536,7 +536,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
-        check_process()
+        check_not_forked()
         with precision(self._params.curve.dtype):
             x, component = self.to_mixture().sample(jax.random.key(seed), (n_samples,), return_component=True)
             x, component = np.asarray(x), np.asarray(component)
@@ -561,7 +561,7 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), made)
 
     def _scaled(self, X) -> np.ndarray:
-        check_process()
+        check_not_forked()
         check_is_fitted(self)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
         return self._scaling.apply(_time_last(X, self._column(X.shape[1])))

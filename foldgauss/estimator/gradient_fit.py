@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from foldgauss._runtime.checks import invalid, is_integer
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import CallableEnvelope
 from foldgauss.estimator.em.loop import EMStatus
 from foldgauss.mixture import FoldedMixture
@@ -73,7 +73,7 @@ def fit_gradient(
         raise invalid("mixture", expected="one FoldedMixture", got=type(mixture).__name__, cure="No batch of mixtures.")
     if not is_integer(steps, 1):
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
-    check_process()
+    check_not_forked()
     dtype = mixture.logits.dtype
     x = jnp.asarray(x, dtype)
     if x.ndim != 2 or x.shape[1:] != mixture.event_shape:

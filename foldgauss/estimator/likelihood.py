@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss._numerics.triangular import solve_upper_matrix
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.estimator.time_profile import Profile, Space, maximise
@@ -530,7 +530,7 @@ def _held_out(plan: _Plan, parts) -> Float[Array, " degrees"]:
 
 
 def _points(x) -> Float[Array, "n d"]:
-    check_process()
+    check_not_forked()
     x = jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
     if x.ndim != 2 or x.shape[1] < 2:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from foldgauss._runtime.file_lock import Held, alone
+from foldgauss._runtime.file_lock import LockHeld, hold_lock
 from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, not_writable
 
 #: Seconds after which an unfinished file beside an output is one that a killed process left.
@@ -29,8 +29,8 @@ def only_writer(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     file = path.with_name(f".{_short(path.name)}.lock")
     with ExitStack() as stack:
         try:
-            stack.enter_context(alone(file))
-        except Held as error:
+            stack.enter_context(hold_lock(file))
+        except LockHeld as error:
             raise OutputError(
                 f"path: expected an output that nobody else is writing, got {str(path)!r}, which another {what} is. "
                 "Wait for that one, or choose another name."

@@ -26,13 +26,13 @@ from foldgauss.io.models.model_file import load_model
 from foldgauss.io.models.video_model import read_origin
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
-from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantise
+from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantize
 from foldgauss.video.editing.chain import edit
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import TIME_ADAM, FitState
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 from foldgauss.video.selection.selectors import Selection
 
 from .branches import ONLY
@@ -58,8 +58,8 @@ def tiny_model(
     if not plain:
         lasting = np.arange(num) % 2 == 0
         leaves["coefficients"][lasting] = 0
-        leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, LASTING
-        leaves["opacity_logit"][: num // 2] = OPAQUE
+        leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, STATIC_LOG_TIME_SCALE
+        leaves["opacity_logit"][: num // 2] = OPAQUE_LOGIT
         leaves["color_dc"][:], leaves["log_scale"][: num - 1] = leaves["color_dc"][0], leaves["log_scale"][0]
     splats = FoldedSplats(**leaves, envelope=TimeLikelihood(np.float32(2), np.float32(0)))
     return VideoModel(splats, FrameTimes.uniform(frames), (4, 6), 25.0, RenderOptions(), "over")
@@ -337,7 +337,7 @@ def _quantised() -> tuple:
         names = column_names(model.degree, described.facts.shared)
         rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_whole(name)}
         described = dataclasses.replace(described, facts=dataclasses.replace(described.facts, cells=cells))
-        found.append(quantise(described, np.arange(model.num_gaussians, dtype=np.int32) % 4, rules))
+        found.append(quantize(described, np.arange(model.num_gaussians, dtype=np.int32) % 4, rules))
     return tuple(found)
 
 
@@ -357,8 +357,8 @@ def stream_changed(data: bytes, random: Random) -> bytes:
 
 def numbers_changed(data: bytes, random: Random) -> bytes:
     """The numbers themselves changed, and coded as the writer codes them."""
-    quantised = random.choice(_quantised())
-    columns = {name: own.copy() for name, own in quantised.columns.items()}
+    quantized = random.choice(_quantised())
+    columns = {name: own.copy() for name, own in quantized.columns.items()}
     values = (0, 1, -1, 2, 3, 4, 31, 255, 2**12, 2**20, 2**30 - 1, 1 - 2**30)
     for _ in range(random.randrange(1, 4)):
         name = random.choice(sorted(columns))
@@ -369,7 +369,7 @@ def numbers_changed(data: bytes, random: Random) -> bytes:
             own[random.randrange(len(own))] = random.choice(values)
         else:
             own[:] = random.choice(values)
-    rules = dict(quantised.rules)
+    rules = dict(quantized.rules)
     if random.randrange(3) == 0:
         name = random.choice(sorted(rules))
         numbers = (0.0, 1.0, -1.0, 60.0, -60.0, 1e9, -1e9, 1e10, 1e-300)
@@ -381,10 +381,10 @@ def numbers_changed(data: bytes, random: Random) -> bytes:
         for name in columns.keys() & {"duration", "x0", "y0", "x1", "y1"}:
             columns[name][:] = -(2**29) if name == "duration" else 2**30 - 1
             rules[name] = Rule(0.0, 60.0)
-    intervals = quantised.intervals.copy()
+    intervals = quantized.intervals.copy()
     if len(intervals) and random.randrange(4) == 0:
         intervals[random.randrange(len(intervals))] = random.choice(values)
-    changed = dataclasses.replace(quantised, columns=columns, rules=rules, intervals=intervals)
+    changed = dataclasses.replace(quantized, columns=columns, rules=rules, intervals=intervals)
     try:
         with np.errstate(all="ignore"):
             return compact.packed(changed, {"clip": "a"})

@@ -27,18 +27,18 @@ from foldgauss.video.compression.quantize import (
     _degrees,
     _log,
     column_names,
-    dequantise,
+    dequantize,
     describe,
     is_whole,
     legendre,
     lower_paths,
     path_matrix,
-    quantise,
+    quantize,
     span_of,
 )
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.row_layout import shift_path
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 
 
 def clip_of(model, noise=6.0):
@@ -49,9 +49,9 @@ def clip_of(model, noise=6.0):
 
 
 def fine(model, exponent=-22.0):
-    """Quantised by even steps of 2^exponent."""
+    """Quantized by even steps of 2^exponent."""
     rules = {name: Rule(0.0, exponent) for name in column_names(model.degree) if not is_whole(name)}
-    return quantise(describe(model), np.zeros(model.num_gaussians, np.int32), rules)
+    return quantize(describe(model), np.zeros(model.num_gaussians, np.int32), rules)
 
 
 def same(one, other):
@@ -71,7 +71,7 @@ def pictures(model):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 7])
 def test_fine_steps_give_the_picture_back(degree):
     model = soft_model(degree=degree, options=RenderOptions())
-    again = dequantise(fine(model))
+    again = dequantize(fine(model))
     for t in (0.0, 0.37, 1.0):
         np.testing.assert_allclose(again.render(t), model.render(t), atol=2e-3)
     assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
@@ -91,14 +91,14 @@ def test_envelopes_and_compositings(tmp_path, how):
 
 def test_the_order_of_gaussians_is_kept():
     model = soft_model()
-    np.testing.assert_allclose(dequantise(fine(model)).splats.opacity_logit, model.splats.opacity_logit, atol=1e-5)
+    np.testing.assert_allclose(dequantize(fine(model)).splats.opacity_logit, model.splats.opacity_logit, atol=1e-5)
 
 
 def test_frame_times_and_cut_are_kept():
     model = soft_model()
     logits = np.float32([0.1, -0.3, 3.5, 0.0, 0.2, 40.0])
     model = eqx.tree_at(lambda m: m.frame_times.logits, model, logits)
-    again = dequantise(fine(model))
+    again = dequantize(fine(model))
     np.testing.assert_allclose(again.frame_times.times(), model.frame_times.times(), atol=1e-3)
 
 
@@ -111,8 +111,8 @@ def of_kinds(model, seed=0):
     leaves = {
         "coefficients": (np.asarray(splats.coefficients) * coefficients + 0).astype(np.float32),
         "time_loc_logit": np.where(lasting, np.float32(0), splats.time_loc_logit),
-        "log_time_scale": np.where(lasting, LASTING, splats.log_time_scale),
-        "opacity_logit": np.where(np.arange(num) % 2 == 0, OPAQUE, splats.opacity_logit),
+        "log_time_scale": np.where(lasting, STATIC_LOG_TIME_SCALE, splats.log_time_scale),
+        "opacity_logit": np.where(np.arange(num) % 2 == 0, OPAQUE_LOGIT, splats.opacity_logit),
         "color_dc": np.asarray(splats.color_dc)[np.arange(num) // 4],
     }
     for name, leaf in leaves.items():
@@ -135,8 +135,8 @@ def crowd(model, copies=10, seed=1):
 
 def same_kinds(again, model):
     assert (again.splats.degrees <= model.splats.degrees).all()
-    np.testing.assert_array_equal(again.splats.lasting, model.splats.lasting)
-    np.testing.assert_array_equal(again.splats.solid, model.splats.solid)
+    np.testing.assert_array_equal(again.splats.static, model.splats.static)
+    np.testing.assert_array_equal(again.splats.opaque, model.splats.opaque)
     index = [np.unique(own.splats.color_dc, axis=0, return_inverse=True)[1].ravel() for own in (again, model)]
     pairs = np.unique(np.stack(index), axis=1)
     assert pairs.shape[1] == index[0].max() + 1 == index[1].max() + 1
@@ -148,11 +148,11 @@ def test_kinds_are_kept(tmp_path):
     again = load_video_model(save_compact(tmp_path / "m.fgz", fine(model)))
     same_kinds(again, model)
     np.testing.assert_array_equal(again.splats.degrees, model.splats.degrees)
-    assert again.num_floats == model.num_floats
-    lasting = model.splats.lasting
+    assert again.num_parameters == model.num_parameters
+    lasting = model.splats.static
     assert lasting.sum() == 14
-    assert model.splats.solid.sum() == 20
-    np.testing.assert_array_equal(again.splats.log_time_scale[lasting], LASTING)
+    assert model.splats.opaque.sum() == 20
+    np.testing.assert_array_equal(again.splats.log_time_scale[lasting], STATIC_LOG_TIME_SCALE)
     np.testing.assert_array_equal(np.asarray(again.splats.time_loc_logit)[lasting].view(np.int32), 0)
     absent = np.arange(3) >= model.splats.degrees[:, None]
     np.testing.assert_array_equal(np.asarray(again.splats.coefficients).view(np.int32)[absent], 0)
@@ -164,12 +164,12 @@ def test_kinds_are_kept(tmp_path):
 def test_kinds_outlive_fitting_anew(tmp_path, passes):
     model = of_kinds(soft_model(degree=3, options=RenderOptions()))
     made = compress(model, clip_of(model), passes=passes)
-    again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantised))
+    again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
     same(again, made.model)
-    assert again.splats.lasting.sum() >= 12
-    assert again.splats.solid.sum() >= 18
+    assert again.splats.static.sum() >= 12
+    assert again.splats.opaque.sum() >= 18
     assert len(np.unique(again.splats.color_dc, axis=0)) <= 10
-    assert again.num_floats <= model.num_floats
+    assert again.num_parameters <= model.num_parameters
 
 
 @pytest.mark.parametrize("told", ["faint", "coarse"])
@@ -182,7 +182,7 @@ def test_few_that_are_left_can_be_read(tmp_path, told):
         model = eqx.tree_at(lambda m: m.splats.opacity_logit, model, opacity)
     made = compress(model, max_loss_db=0.2 if told == "faint" else 40)
     assert made.model.num_gaussians < model.num_gaussians / 4
-    same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantised)), made.model)
+    same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantized)), made.model)
 
 
 def test_a_power_that_saves_little_goes():
@@ -191,7 +191,7 @@ def test_a_power_that_saves_little_goes():
     np.testing.assert_array_equal(_degrees(saved), [1, 0, 2])
     model = soft_model(degree=3)
     coarse = fine(model, -7.0)
-    degrees = dequantise(coarse).splats.degrees
+    degrees = dequantize(coarse).splats.degrees
     np.testing.assert_array_equal(degrees, coarse.columns["degree"])
     assert 0 < (degrees < 3).sum() < len(degrees)
     place = lower_paths(coarse, describe(model))
@@ -244,7 +244,7 @@ def test_fitting_anew_pays(how):
         alpha = 255 - (over_white - pictures(best)).mean(-1, keepdims=True)
         clip = np.concatenate([np.minimum(clip, alpha), alpha], -1).round().astype(np.uint8)
     plain, mended = (compress(model, clip, max_loss_db=0.2, passes=passes) for passes in (0, 30))
-    assert len(packed(mended.quantised)) < 0.95 * len(packed(plain.quantised))
+    assert len(packed(mended.quantized)) < 0.95 * len(packed(plain.quantized))
     lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
     assert lost == pytest.approx(mended.loss_db, abs=1e-9)
     assert lost <= 0.2
@@ -252,7 +252,7 @@ def test_fitting_anew_pays(how):
 
 def test_a_greater_loss_makes_a_smaller_file():
     model = soft_model(options=RenderOptions())
-    sizes = [len(packed(compress(model, max_loss_db=loss).quantised)) for loss in (0.02, 0.2, 2.0)]
+    sizes = [len(packed(compress(model, max_loss_db=loss).quantized)) for loss in (0.02, 0.2, 2.0)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.85 * sizes[0]
 
@@ -279,21 +279,21 @@ def test_loss_out_of_reach(monkeypatch):
 
 
 def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
-    quantised = compress(soft_model(options=RenderOptions())).quantised
-    path = save_compact(tmp_path / "m.fgz", quantised, metadata={"clip": "x", "bad": float("nan")})
+    quantized = compress(soft_model(options=RenderOptions())).quantized
+    path = save_compact(tmp_path / "m.fgz", quantized, metadata={"clip": "x", "bad": float("nan")})
     again = load_compact(path)
     assert packed(again, read_metadata(path)) == path.read_bytes()
-    same(dequantise(again), dequantise(quantised))
-    same(load_video_model(path), dequantise(quantised))
+    same(dequantize(again), dequantize(quantized))
+    same(load_video_model(path), dequantize(quantized))
     assert read_metadata(path) == {"clip": "x", "bad": None}
 
 
 def test_a_decoded_model_by_the_same_rules_is_the_same_file():
     """Quantising is a projection: what was rounded is not rounded further."""
-    quantised = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantised
-    columns = quantised.columns
-    again = quantise(describe(dequantise(quantised)), columns["class"], quantised.rules, columns["cell"])
-    assert packed(again) == packed(quantised)
+    quantized = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantized
+    columns = quantized.columns
+    again = quantize(describe(dequantize(quantized)), columns["class"], quantized.rules, columns["cell"])
+    assert packed(again) == packed(quantized)
 
 
 def test_logarithm_is_one():
@@ -339,7 +339,7 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
         model = crowd(model)
     if how == "crowd of kinds":
         model = of_kinds(model)
-    path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantised)
+    path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantized)
     decoder = Path(html.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
@@ -373,7 +373,7 @@ def only(model, keep):
 def test_one_gaussian(tmp_path):
     model = only(soft_model(options=RenderOptions()), np.array([20]))
     made = compress(model, clip_of(model))
-    path = save_compact(tmp_path / "m.fgz", made.quantised)
+    path = save_compact(tmp_path / "m.fgz", made.quantized)
     same(load_video_model(path), made.model)
     assert path.stat().st_size < 2500
 
@@ -580,10 +580,10 @@ def test_streams_of_a_stranger(tmp_path, good):
     ("name", "number"), [("without", 4), ("without", -1), ("degree", 4), ("degree", -1), ("shade", 10), ("shade", -1)]
 )
 def test_kinds_of_a_stranger(tmp_path, name, number):
-    quantised = fine(of_kinds(soft_model(degree=3)), -12.0)
-    columns = quantised.columns | {name: quantised.columns[name].copy()}
+    quantized = fine(of_kinds(soft_model(degree=3)), -12.0)
+    columns = quantized.columns | {name: quantized.columns[name].copy()}
     columns[name][7] = number
-    data = packed(dataclasses.replace(quantised, columns=columns))
+    data = packed(dataclasses.replace(quantized, columns=columns))
     refused(tmp_path, data, "compact model")
 
 
@@ -592,7 +592,7 @@ def test_a_byte_for_every_eight_gaussians(tmp_path):
     described = describe(only(soft_model(degree=0), np.full(100_000, 20)))
     origins = {name: float(value[0]) for name, value in described.values.items()}
     rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0) if not is_whole(name)}
-    path = save_compact(tmp_path / "m.fgz", quantise(described, np.zeros(100_000, np.int32), rules))
+    path = save_compact(tmp_path / "m.fgz", quantize(described, np.zeros(100_000, np.int32), rules))
     assert 100_000 / 8 <= path.stat().st_size < 100_000 / 8 + 30
     assert load_video_model(path).num_gaussians == 100_000
     shorter = resealed(path.read_bytes())  # the same without spaces
@@ -600,12 +600,12 @@ def test_a_byte_for_every_eight_gaussians(tmp_path):
 
 
 def test_names(tmp_path):
-    quantised = fine(soft_model())
+    quantized = fine(soft_model())
     with pytest.raises(ValueError, match=r"path: expected a name ending in .fgz"):
-        save_compact(tmp_path / "m.safetensors", quantised)
+        save_compact(tmp_path / "m.safetensors", quantized)
     with pytest.raises(ValueError, match="foldgauss compress"):
         save_video_model(tmp_path / "m.fgz", soft_model())
-    path = save_compact(tmp_path / "m.fgz", quantised)
+    path = save_compact(tmp_path / "m.fgz", quantized)
     plain = path.rename(tmp_path / "other.name")  # told by its bytes
     assert load_video_model(plain).num_gaussians == 40
     with pytest.raises(FileNotFoundError):

@@ -23,9 +23,9 @@ from foldgauss.io.page import html as page_module
 from foldgauss.io.page.html import _fine, bundled
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, edit, fit, layers
-from foldgauss.video.compression.quantize import dequantise
+from foldgauss.video.compression.quantize import dequantize
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import time_logits
 
 #: What the brush is made of.
 MODULES = ("gaussians", "selection", "timeline")
@@ -155,7 +155,7 @@ def test_gaussians_beyond_proportion_get_even_steps():
     thin = np.array(model.splats.log_scale)
     thin[5] = -40.0, -45.0
     model = eqx.tree_at(lambda m: m.splats.log_scale, model, thin)
-    again = dequantise(_fine(model))
+    again = dequantize(_fine(model))
     np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=0.02)
 
 
@@ -278,7 +278,7 @@ MODELS = {
     "floor, no path": lambda fitted: soft_model(floor=0.1, degree=0, options=RenderOptions()),
     "degree 4, round": lambda fitted: soft_model(degree=4, options=RenderOptions(support_radius=1.5)),
     "scale cutoff": lambda fitted: _with(soft_model(options=RenderOptions()), scale_cutoff=0.03),
-    "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(time_logits(7, (3,)))),
+    "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(make_time_logits(7, (3,)))),
     "tall": lambda fitted: soft_model(size=(64, 36), options=RenderOptions()),
     "one frame": lambda fitted: soft_model(num_frames=1, options=RenderOptions()),
 }
@@ -538,7 +538,7 @@ def segmented(**how):
     parts = [soft_model(seed=k, num_frames=num, options=RenderOptions(), **how) for k, num in enumerate(LENGTHS)]
     logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5]).astype(np.float32)
     parts[1] = _with(parts[1], frame_times=FrameTimes(logits))  # of its own, learned times
-    parts[3] = _with(parts[3], frame_times=FrameTimes(time_logits(4, (2,))))  # a cut within it
+    parts[3] = _with(parts[3], frame_times=FrameTimes(make_time_logits(4, (2,))))  # a cut within it
     return SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
 
 

@@ -30,11 +30,11 @@ from foldgauss.io.exchange.ply import (
 from foldgauss.io.exchange.ply_format import FormatError, read_ply, write_ply
 from foldgauss.render import Gaussians3D, RenderOptions, Splats2D, cpu
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit, psnr
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns as columns_of
 from foldgauss.video.models.row_layout import pack, unpack
-from foldgauss.video.models.shots import time_logits
-from foldgauss.video.models.splats import LASTING
+from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
 
 NUM, DEGREE, FRAMES = 60, 3, 5
 HALF_WIDTH = math.tan(0.6911112 / 2)  # of the published frame, at distance 1
@@ -263,17 +263,17 @@ def test_what_lasts_lasts_in_every_format(tmp_path, power):
     model = random_model(power=power, num=20)
     rows = pack(model.splats)
     place = columns_of(DEGREE)
-    rows[::2, place["time_loc_logit"]], rows[::2, place["log_time_scale"]] = 0, LASTING
+    rows[::2, place["time_loc_logit"]], rows[::2, place["log_time_scale"]] = 0, STATIC_LOG_TIME_SCALE
     model = dataclasses.replace(model, splats=unpack(rows, DEGREE, model.splats.envelope))
-    assert model.splats.lasting.sum() == 10
+    assert model.splats.static.sum() == 10
     path = write_vegas_ply(tmp_path / "v.ply", model)
     for again in (read_vegas_ply(path), read_vegas_ply(without_note(path), size=model.size)):
-        np.testing.assert_array_equal(again.splats.lasting, model.splats.lasting)
+        np.testing.assert_array_equal(again.splats.static, model.splats.static)
     own = np.exp(np.sort(rows[::2, place["log_scale"]]))
     write_pseudomesh(tmp_path / "mesh", model, times=[0.0, 1.0])
     for k, t in enumerate((0.0, 1.0)):
         alive = np.flatnonzero(np.asarray(model.splats.at(jnp.float32(t)).opacity) > 0)
-        here = np.flatnonzero(model.splats.lasting[alive])
+        here = np.flatnonzero(model.splats.static[alive])
         assert len(here) == 10
         scene = read_3dgs_ply(write_3dgs_ply(tmp_path / f"{k}.ply", model, t, depth_step=0))
         edges = read_pseudomesh(tmp_path / "mesh").triangles[k].edges
@@ -661,7 +661,7 @@ def test_structured_rows_are_plain_numbers(tmp_path):
 
 
 def test_within_a_cut_it_is_the_nearer_frame():
-    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(time_logits(7, [3])))
+    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(make_time_logits(7, [3])))
     times = np.asarray(model.frame_times.times())
     for share, k in ((0.1, 2), (0.9, 3)):
         inside = (1 - share) * times[2] + share * times[3]

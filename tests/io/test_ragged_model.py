@@ -16,7 +16,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, Selection, VideoModel, edit, layers
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.row_layout import unpack
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 
 NUM, NUM_FRAMES = 50, 5
 #: Bytes of a Gaussian besides coefficients, times, colour and shape; those of frame times and envelope.
@@ -37,8 +37,8 @@ def ragged_model(
     splats = unpack(rows, degree, TimeLikelihood(1.7, 0.01))
     splats.coefficients[np.arange(degree) >= degrees[:, None]] = 0
     splats.time_loc_logit[np.broadcast_to(lasting, num)] = 0
-    splats.log_time_scale[np.broadcast_to(lasting, num)] = LASTING
-    splats.opacity_logit[np.broadcast_to(solid, num)] = OPAQUE
+    splats.log_time_scale[np.broadcast_to(lasting, num)] = STATIC_LOG_TIME_SCALE
+    splats.opacity_logit[np.broadcast_to(solid, num)] = OPAQUE_LOGIT
     for leaf, rows in ((splats.color_dc, num_colors), (splats.log_scale, num_shapes)):
         if rows is not None:
             own = rng.normal(size=(rows, leaf.shape[1])).astype(np.float32)
@@ -99,14 +99,14 @@ def test_the_same_model_in_the_bytes_that_it_needs(tmp_path, name):
     degrees = np.asarray(degrees).astype(int)
     model = ragged_model(degrees, lasting, num_colors, num_shapes)
     np.testing.assert_array_equal(model.splats.degrees, degrees)
-    np.testing.assert_array_equal(model.splats.lasting, np.broadcast_to(lasting, len(degrees)))
+    np.testing.assert_array_equal(model.splats.static, np.broadcast_to(lasting, len(degrees)))
     path = save_video_model(tmp_path / "m.safetensors", model)
     again = load_video_model(path)
     same(model, again)
     assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
     assert tensor_bytes(path) == PLAIN * len(degrees) + SHARED + sum(parts)
-    assert 0 <= 4 * model.num_floats - tensor_bytes(path) < 4 * 3  # kinds and indices, each rounded up
-    assert model.num_floats == again.num_floats
+    assert 0 <= 4 * model.num_parameters - tensor_bytes(path) < 4 * 3  # kinds and indices, each rounded up
+    assert model.num_parameters == again.num_parameters
     first = path.read_bytes()
     assert save_video_model(path, again).read_bytes() == first
 
@@ -114,7 +114,7 @@ def test_the_same_model_in_the_bytes_that_it_needs(tmp_path, name):
 @pytest.mark.parametrize("solid", [True, ALTERNATING], ids=["all", "half"])
 def test_no_opacity_of_those_that_are_solid(tmp_path, solid):
     model = ragged_model(np.full(NUM, 3), solid=solid)
-    np.testing.assert_array_equal(model.splats.solid, np.broadcast_to(solid, NUM))
+    np.testing.assert_array_equal(model.splats.opaque, np.broadcast_to(solid, NUM))
     path = save_video_model(tmp_path / "m.safetensors", model)
     same(model, load_video_model(path))
     clear = NUM - np.broadcast_to(solid, NUM).sum()
@@ -135,11 +135,11 @@ def test_round_trip_law(tmp_path, num, degree, share, num_colors, num_shapes, se
     rng = np.random.default_rng(seed)
     degrees = np.where(rng.random(num) < share, rng.integers(0, degree + 1, num), 0)
     model = ragged_model(degrees, rng.random(num) < share, num_colors, num_shapes, degree=degree, seed=seed)
-    model.splats.opacity_logit[rng.random(num) < share] = OPAQUE
+    model.splats.opacity_logit[rng.random(num) < share] = OPAQUE_LOGIT
     path = save_video_model(tmp_path / "m", model)
     same(model, load_video_model(path))
     assert tensor_bytes(path) <= (PLAIN + 28 + 8 * degree) * num + SHARED
-    assert 0 <= 4 * model.num_floats - tensor_bytes(path) < 4 * 3
+    assert 0 <= 4 * model.num_parameters - tensor_bytes(path) < 4 * 3
 
 
 @pytest.mark.parametrize(
@@ -149,22 +149,22 @@ def test_round_trip_law(tmp_path, num, degree, share, num_colors, num_shapes, se
         ("coefficients", 1e-45),
         ("time_loc_logit", -0.0),
         ("time_loc_logit", 1e-45),
-        ("log_time_scale", np.nextafter(LASTING, np.float32(0))),
+        ("log_time_scale", np.nextafter(STATIC_LOG_TIME_SCALE, np.float32(0))),
         ("color_dc", -0.0),
         ("log_scale", -0.0),
-        ("opacity_logit", np.nextafter(OPAQUE, np.float32(0))),
+        ("opacity_logit", np.nextafter(OPAQUE_LOGIT, np.float32(0))),
     ],
 )
 def test_what_differs_in_a_bit_is_kept(tmp_path, leaf, value):
     """Gaussian 3 is all but one of those that have nothing but a place: the bit is not lost with theirs."""
     model = ragged_model(np.zeros(NUM, int), True, 1, solid=True, degree=2)
     model.splats.color_dc[:] = model.splats.log_scale[:] = 0
-    without = model.num_floats
+    without = model.num_parameters
     getattr(model.splats, leaf)[3] = value
     path = save_video_model(tmp_path / "m", model)
     same(model, load_video_model(path))
     assert "kinds" in str(read_header(path)["tensors"].keys())
-    assert model.num_floats > without
+    assert model.num_parameters > without
 
 
 def test_no_kinds_beyond_their_room(tmp_path):
@@ -230,7 +230,7 @@ def test_layers_of_edited_videos(tmp_path):
     described = [layer["model"].get("stored") for layer in read_header(path)["header"]["layers"]]
     assert described[0] == described[2] == {"powers": 0, "timed": 0, "clear": NUM, "colors": 4}
     assert described[1].keys() == {"powers", "timed", "clear"}
-    assert video.num_floats == 2 * still.num_floats + moving.num_floats
+    assert video.num_parameters == 2 * still.num_parameters + moving.num_parameters
 
 
 def test_a_selection_fits_the_model_before_and_after(tmp_path):
@@ -344,8 +344,8 @@ def _at(place, value):
         ({"kinds": _at(slice(None), 255)}, "greatest degree in kinds"),
         ({"kinds": _at(0, 2 + 64 + 128)}, "expected 60 powers, as many as are stored, got 59"),
         ({"kinds": _at(slice(None), 3)}, "expected 60 powers, as many as are stored, got 150"),
-        ({"kinds": _at(0, 3 + 128)}, "expected 40 Gaussians that light comes through, as many as are stored, got 41"),
-        ({"kinds": _at(0, 3 + 64)}, "expected 25 Gaussians that do not last, as many as are stored, got 26"),
+        ({"kinds": _at(0, 3 + 128)}, "expected 40 Gaussians that are not opaque, as many as are stored, got 41"),
+        ({"kinds": _at(0, 3 + 64)}, "expected 25 Gaussians that are not static, as many as are stored, got 26"),
         ({"color_index": _at(-1, 6)}, "color_index: expected a whole number from 0 to 5, got 6"),
         ({"color_index": _at(0, 255)}, "color_index: .* got 255"),
         ({"shape_index": _at(7, 4)}, "shape_index: expected a whole number from 0 to 3, got 4"),
@@ -392,7 +392,7 @@ def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     assert "6, shared by 50 Gaussians" in told
     assert "4, shared by 50 Gaussians" in told
     assert "10 of 50 Gaussians, no light comes through" in told
-    assert f"{load_video_model(path).num_floats:,}" in told
+    assert f"{load_video_model(path).num_parameters:,}" in told
     assert f"{path.stat().st_size:,} bytes" in told
     run("info", save_video_model(tmp_path / "whole.safetensors", ragged_model(np.full(NUM, 3))))
     told = capsys.readouterr().out

@@ -28,7 +28,7 @@ from foldgauss.io.models.model_file import read_header
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 from foldgauss.video.tradeoff import halved
 
 FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
@@ -38,9 +38,9 @@ def ragged(model):
     """With kinds, shared colours and shapes: stored in another form than it has in memory."""
     splats, lasting = model.splats, np.arange(NUM) % 2 == 0
     leaves = {name: np.array(getattr(splats, name)) for name in ("time_loc_logit", "log_time_scale", "coefficients")}
-    leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, LASTING
+    leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, STATIC_LOG_TIME_SCALE
     leaves["coefficients"][:, 1:] = 0
-    leaves["opacity_logit"] = np.where(lasting, OPAQUE, np.asarray(splats.opacity_logit))
+    leaves["opacity_logit"] = np.where(lasting, OPAQUE_LOGIT, np.asarray(splats.opacity_logit))
     leaves["color_dc"] = np.asarray(splats.color_dc)[np.arange(NUM) % 3]
     return dataclasses.replace(model, splats=dataclasses.replace(splats, **leaves))
 
@@ -80,7 +80,16 @@ def test_each_segment_is_the_model_of_its_file_to_the_bit(work):
     for (first, file), segment in zip(sources(work), video.segments, strict=True):
         own = load_video_model(file)
         same(own, segment.model)
-        for name in ("num_frames", "num_gaussians", "degree", "num_floats", "size", "fps", "options", "compositing"):
+        for name in (
+            "num_frames",
+            "num_gaussians",
+            "degree",
+            "num_parameters",
+            "size",
+            "fps",
+            "options",
+            "compositing",
+        ):
             assert getattr(segment, name) == getattr(own, name), name
         assert (segment.first, dict(segment.metadata)) == (first, {"mean_psnr": 30.0 + first, "seed": first})
     assert read_metadata(work / "long.safetensors") == {"clip": "long.mp4"}

@@ -15,9 +15,8 @@ import pytest
 from scenes import KINDS, check_slope, scene
 
 from foldgauss._runtime import threads as _threads
-from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project, render
-from foldgauss.render import api as door
-from foldgauss.render.footprint import pixel_centres
+from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, api, cpu, project, render
+from foldgauss.render.footprint import pixel_centers
 from foldgauss.render.reference import splat_alpha
 
 #: Engine "pallas" takes no ceiling of 1 and, interpreted, long to compile: test_pallas.py.
@@ -29,7 +28,7 @@ OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, tra
 def near_a_threshold(splats, size, options):
     """Pixels where some alpha is within 1e-4 of the cutoff: there float32 may fall on either side."""
     loose = RenderOptions(alpha_cutoff=1e-8, low_pass=options.low_pass)
-    centres = pixel_centres(size, jnp.float32)
+    centres = pixel_centers(size, jnp.float32)
     if splats.opacity.size == 0:
         return np.zeros(size, bool)
     alphas = jax.lax.map(lambda splat: splat_alpha(splat, centres, loose), splats)
@@ -374,7 +373,7 @@ def test_the_slower_callback_draws_the_same(channels, monkeypatch):
     splats = dataclasses.replace(splats, color=color)
     draw = jax.value_and_grad(lambda own: jnp.sum(render(own, size, engine="cpu") ** 2))
     value, gradient = draw(splats)
-    monkeypatch.setattr(door, "buffer_callback", None)
+    monkeypatch.setattr(api, "buffer_callback", None)
     jax.clear_caches()
     again, same = draw(splats)
     assert value == again
@@ -404,7 +403,7 @@ def test_exact_options_are_the_formula(engine, compositing):
         splats = Splats2D(splats.mean, splats.factor, opacity, splats.color)
         options = RenderOptions.exact()
         picture = render(splats, size, background=BACKGROUND, compositing=compositing, engine=engine, options=options)
-    offsets = np.asarray(pixel_centres(size, np.float32), np.float64)[:, :, None] - np.asarray(splats.mean)
+    offsets = np.asarray(pixel_centers(size, np.float32), np.float64)[:, :, None] - np.asarray(splats.mean)
     inverse = np.linalg.inv(np.asarray(splats.factor) @ np.asarray(splats.factor).transpose(0, 2, 1))
     alpha = np.asarray(opacity) * np.exp(-0.5 * np.einsum("hwni,nij,hwnj->hwn", offsets, inverse, offsets))
     behind = np.cumprod(1 - alpha, axis=-1) if compositing == "over" else np.ones_like(alpha)

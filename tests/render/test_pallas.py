@@ -52,7 +52,7 @@ def test_several_rounds_are_one(tile):
     plan = pallas._plan(leaves, size, "over", options)
     if tile == 16:
         number, *_ = jax.jit(functools.partial(pallas._forward, plan))(leaves)
-        assert int(number) > tiles.KEPT_ROUNDS
+        assert int(number) > tiles.STORED_ROUNDS
     grads, picture = grads_and_picture("pallas", size, "over", options, *leaves_for(splats, judgement, size))
     check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
 

@@ -108,7 +108,7 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
     splats, size = scene("huge")
     leaves, weights = leaves_of(splats), weights_for(size)
-    calls, grads = counted(monkeypatch, "_draw_round"), []
+    calls, grads = counted(monkeypatch, "_composite_round"), []
     for options in (RenderOptions(), RenderOptions(list_capacity=capacity)):
         plan = xla._plan(leaves, size, "over", options)
         del calls[:]

@@ -9,7 +9,7 @@ from clips import moving_blobs
 
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting.state import planar, to_model
-from foldgauss.video.models.background import checked_background, composited, random_background
+from foldgauss.video.models.background import check_background, composite, random_background
 from foldgauss.video.models.renderer import VideoRenderer
 
 CONFIG = FitConfig(num_gaussians=800, steps=250)
@@ -32,15 +32,15 @@ def fitted():
 
 def test_composited_by_hand():
     frame = np.array([[[100, 50, 0, 128], [0, 0, 0, 0], [9, 8, 7, 255], [0, 0, 0, 51]]], np.uint8)
-    over = composited(frame, np.float32([1, 0.5, 0]))
+    over = composite(frame, np.float32([1, 0.5, 0]))
     assert over.tolist() == [[[227, 114, 0], [255, 128, 0], [9, 8, 7], [204, 102, 0]]]
-    np.testing.assert_array_equal(composited(frame, np.float32([0, 0, 0])), frame[..., :3])
+    np.testing.assert_array_equal(composite(frame, np.float32([0, 0, 0])), frame[..., :3])
 
 
 def test_targets_are_the_frames_over_the_background():
     frame, background = clip()[2], np.float32([0.2, 0.7, 1.0])
     target = np.moveaxis(planar(frame, background), 0, -1)
-    np.testing.assert_allclose(255 * target, composited(frame, background), atol=0.51)
+    np.testing.assert_allclose(255 * target, composite(frame, background), atol=0.51)
     np.testing.assert_array_equal(
         planar(frame[..., :3].copy(), background), planar(frame[..., :3].copy(), 0 * background)
     )
@@ -66,7 +66,7 @@ def test_drawn_on_black_unless_told_otherwise(fitted):
     np.testing.assert_allclose(255 * slow.clip(0, 1), VideoRenderer(model, background=GREEN).frame(0.0), atol=2)
     for wrong in ((0, 0), (0, 0, 2), "red", (0, 0, np.nan)):
         with pytest.raises(ValueError, match="background: expected red, green and blue"):
-            checked_background(wrong)
+            check_background(wrong)
 
 
 def test_backgrounds_depend_on_seed_and_step():

@@ -10,7 +10,7 @@ import pytest
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
-from foldgauss.video.models.conditioning import Shape, condition, pull_back, update_windows
+from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, update_windows
 from foldgauss.video.models.row_layout import columns, pack, unpack
 from foldgauss.video.models.splats import FoldedSplats
 
@@ -39,7 +39,7 @@ def random_splats(num=300, degree=3, power=2.0, floor=0.0, seed=0) -> FoldedSpla
 def twin(splats, power, floor):
     rows, window = pack(splats), np.empty((splats.num_gaussians, 2), np.float32)
     update_windows(rows, np.arange(len(rows)), window)
-    shape = Shape(splats.degree, power, floor, SIZE)
+    shape = ConditioningSpec(splats.degree, power, floor, SIZE)
     return rows, shape, condition(rows, window, T, shape)
 
 
@@ -91,7 +91,7 @@ def test_gradients(degree, power, floor):
 
     grad = np.zeros_like(rows)
     d_factor = 2 * weights[1] @ done.factor  # of sum(W * F F^T), W symmetric
-    d_time = pull_back(rows, done, (weights[0], d_factor, weights[2], weights[3]), shape, grad)
+    d_time = backpropagate(rows, done, (weights[0], d_factor, weights[2], weights[3]), shape, grad)
     for name, place in columns(degree).items():
         truth = np.asarray(getattr(by_splats, name)).reshape(len(rows), -1)
         largest = max(np.abs(truth).max(initial=0), 1e-3)

@@ -39,9 +39,9 @@ from foldgauss.video.fitting.steppers.jax_loss import losses, similarity
 from foldgauss.video.fitting.steppers.jax_step import _splats, adam, alive_at, lowered
 from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper, OnDevice
 from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
-from foldgauss.video.models.conditioning import Shape, condition, update_windows
-from foldgauss.video.models.kinds import LASTS, SOLID
+from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.sparse_storage import OPAQUE_BIT, STATIC_BIT
 
 #: Nothing in it is black: at a colour of 0 the slope is one thing or another by rounding.
 FRAMES = moving_blobs(height=32, width=40) // 2 + 40
@@ -202,8 +202,8 @@ def test_adam_is_that_of_the_cpu(unit_time):
     second = (rng.normal(size=(num, width)) ** 2).astype(np.float32)
     counts = rng.integers(0, 30_000, num).astype(np.int32)
     counts[:50] = np.arange(50)
-    kinds = rng.integers(0, 4, num).astype(np.uint8) + LASTS * rng.integers(0, 2, num).astype(np.uint8)
-    kinds |= (SOLID * rng.integers(0, 2, num)).astype(np.uint8)
+    kinds = rng.integers(0, 4, num).astype(np.uint8) + STATIC_BIT * rng.integers(0, 2, num).astype(np.uint8)
+    kinds |= (OPAQUE_BIT * rng.integers(0, 2, num)).astype(np.uint8)
     touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
     arrays = rows, grad, first, second, counts
     how = {"kinds": kinds, "unit_time": unit_time}
@@ -232,7 +232,7 @@ def test_conditioning_is_that_of_the_cpu(power, floor):
 
     for t in np.float32([0.0, 0.37, 1.0]):
         alive, splats = conditioned(state.rows, t)
-        judge = condition(state.rows, window, t, Shape(3, power, floor, plan.size))
+        judge = condition(state.rows, window, t, ConditioningSpec(3, power, floor, plan.size))
         np.testing.assert_array_equal(np.flatnonzero(alive), judge.alive)
         splats = jax.tree.map(lambda leaf, keep=judge.alive: np.asarray(leaf)[keep], splats)
         close(splats.mean, judge.mean)

@@ -20,10 +20,19 @@ from foldgauss.video.fitting.pruning.description_length import MOST_SOLID, frame
 from foldgauss.video.fitting.pruning.description_length import cut as cut_rows
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
 from foldgauss.video.fitting.pruning.scores import PruningScores, measured
-from foldgauss.video.models.conditioning import Shape, condition, update_windows
-from foldgauss.video.models.kinds import LASTS, SOLID, degrees_of, forget, is_solid, kinds_of, lasts, numbers_of
+from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns, pack
-from foldgauss.video.models.splats import OPAQUE
+from foldgauss.video.models.sparse_storage import (
+    OPAQUE_BIT,
+    STATIC_BIT,
+    clear_absent_moments,
+    count_parameters,
+    find_kinds,
+    get_degrees,
+    is_opaque,
+    is_static,
+)
+from foldgauss.video.models.splats import OPAQUE_LOGIT
 from foldgauss.video.selection.contributions import Contributions
 
 STEPS = 700
@@ -52,7 +61,7 @@ def weights(model) -> np.ndarray:
     lit = Contributions(model)
     out = np.zeros((model.num_frames, model.num_gaussians))
     for k in range(model.num_frames):
-        light = lit.frame(k)
+        light = lit.at_frame(k)
         out[k, light.alive] = light.total
     return out
 
@@ -63,10 +72,10 @@ def weights(model) -> np.ndarray:
 def test_a_still_costs_what_one_frame_costs():
     _, one, _, _ = fitted("one")
     frames, many, _, _ = fitted("still")
-    assert many.num_floats < 1.1 * one.num_floats
+    assert many.num_parameters < 1.1 * one.num_parameters
     seen = weights(many).sum(0)
     assert seen[many.splats.degrees == 0].sum() > 0.99 * seen.sum()
-    assert seen[many.splats.lasting].sum() > 0.99 * seen.sum()
+    assert seen[many.splats.static].sum() > 0.99 * seen.sum()
     assert evaluate(many, frames).mean_psnr > 45
 
 
@@ -86,7 +95,7 @@ def test_what_is_still_beside_it_stands_still():
     _, model, _, _ = fitted("line")
     still_ones = np.asarray(model.splats.color_dc)[:, 0] < 0
     seen = weights(model).sum(0)
-    assert seen[still_ones & model.splats.lasting].sum() > 0.5 * seen[still_ones].sum()
+    assert seen[still_ones & model.splats.static].sum() > 0.5 * seen[still_ones].sum()
 
 
 def test_gaussians_end_at_a_cut():
@@ -119,7 +128,7 @@ def _scene(degree=2, power=1.0, floor=0.0):
     config = FitConfig(num_gaussians=120, steps=250, degree=degree, power=power, floor=floor)
     model = fit(frames, config).model
     rows = pack(model.splats)
-    shape = Shape(degree, power, floor, SIZE)
+    shape = ConditioningSpec(degree, power, floor, SIZE)
     times = np.asarray(model.frame_times.times())
     drawn = {"compositing": "over", "options": model.options}
     return frames, rows, shape, times, drawn
@@ -250,11 +259,11 @@ def test_neighbours_that_err_alike_count_once():
 
 def test_kinds_are_those_of_the_stored_model():
     _, model, state, _ = fitted("line")
-    kinds = model.splats.degrees + LASTS * model.splats.lasting + SOLID * model.splats.solid
-    np.testing.assert_array_equal(kinds_of(state.rows, model.degree), kinds)
-    np.testing.assert_array_equal(lasts(state.kinds), model.splats.lasting)
-    np.testing.assert_array_equal(is_solid(state.kinds), model.splats.solid)
-    assert (degrees_of(state.kinds) >= model.splats.degrees).all()  # a power may be there and be 0
+    kinds = model.splats.degrees + STATIC_BIT * model.splats.static + OPAQUE_BIT * model.splats.opaque
+    np.testing.assert_array_equal(find_kinds(state.rows, model.degree), kinds)
+    np.testing.assert_array_equal(is_static(state.kinds), model.splats.static)
+    np.testing.assert_array_equal(is_opaque(state.kinds), model.splats.opaque)
+    assert (get_degrees(state.kinds) >= model.splats.degrees).all()  # a power may be there and be 0
 
 
 def test_what_a_kind_has_not_got_never_moves():
@@ -264,16 +273,16 @@ def test_what_a_kind_has_not_got_never_moves():
         pass
     at, kinds = columns(config.degree), state.kinds
     powers = np.repeat(np.arange(1, config.degree + 1), 2)
-    assert (degrees_of(kinds) < config.degree).any()
-    assert (state.rows[:, at["coefficients"]][powers > degrees_of(kinds)[:, None]] == 0).all()
-    assert lasts(kinds).any()
-    assert is_solid(kinds).any()
-    assert (state.rows[is_solid(kinds), at["opacity_logit"].start] == OPAQUE).all()
+    assert (get_degrees(kinds) < config.degree).any()
+    assert (state.rows[:, at["coefficients"]][powers > get_degrees(kinds)[:, None]] == 0).all()
+    assert is_static(kinds).any()
+    assert is_opaque(kinds).any()
+    assert (state.rows[is_opaque(kinds), at["opacity_logit"].start] == OPAQUE_LOGIT).all()
 
 
 def test_forgotten_moments_are_those_of_numbers_that_are_gone():
     first, second = np.ones((2, 3, 11 + 4), np.float32)
-    forget(first, second, np.array([2, 1 + SOLID, LASTS], np.uint8), 2)
+    clear_absent_moments(first, second, np.array([2, 1 + OPAQUE_BIT, STATIC_BIT], np.uint8), 2)
     at = columns(2)
     assert first[:, at["coefficients"]].tolist() == [[1, 1, 1, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
     assert second[:, at["log_time_scale"].start].tolist() == [1, 1, 0]
@@ -331,7 +340,7 @@ def test_shared_numbers_stay_shared():
         rows = np.unique(state.rows[:, at[leaf]], axis=0)
         assert len(rows) == len(np.unique(palette.index)) < len(state.rows) / 2
     model = to_model(state, config, SIZE, 25.0)
-    assert model.num_floats < numbers_of(state.kinds) - len(state.rows)
+    assert model.num_parameters < count_parameters(state.kinds) - len(state.rows)
 
 
 def test_turned_by_a_quarter_is_the_same(scene):
@@ -393,7 +402,7 @@ def test_at_least_one_is_left():
     rows = state.rows[:3]
     window = np.empty((3, 2), np.float32)
     update_windows(rows, np.arange(3), window)
-    shape = Shape(3, 1.0, 0.0, SIZE)
+    shape = ConditioningSpec(3, 1.0, 0.0, SIZE)
     times = np.asarray(model.frame_times.times())
     ledger = measured(rows, window, times, shape, _target(noise()), compositing="over", options=model.options)
     dear = Economy(bits=1e12, most_dropped=1.0)
@@ -403,12 +412,12 @@ def test_at_least_one_is_left():
 def test_numbers_are_those_that_are_stored():
     """Of each kind, one Gaussian among others of its own, so that kinds are told."""
     model = _fitted_model()
-    kinds = kinds_of(pack(model.splats), model.degree)
+    kinds = find_kinds(pack(model.splats), model.degree)
     assert len(np.unique(kinds)) > 5
     alone = dataclasses.replace(model.splats, color_dc=distinct(model, 3), log_scale=distinct(model, 2))
     whole = dataclasses.replace(model, splats=alone)
     others = 2 + model.num_frames - 1  # of the envelope and the frame times
-    assert whole.num_floats == numbers_of(kinds) + -(-len(kinds) // 4) + others
+    assert whole.num_parameters == count_parameters(kinds) + -(-len(kinds) // 4) + others
 
 
 def distinct(model, width) -> np.ndarray:
@@ -430,7 +439,7 @@ def test_no_light_coming_through_costs_what_it_says(scene):
     cost = []
     for i in chosen:
         changed = rows.copy()
-        changed[i, at] = OPAQUE
+        changed[i, at] = OPAQUE_LOGIT
         cost.append(_error(changed, frames, shape, times, drawn) - before)
     assert len(cost) >= 8
     assert np.corrcoef(told[chosen], cost)[0, 1] > 0.97
@@ -443,20 +452,20 @@ def test_few_become_solid_at_once():
     ledger, kinds = _measured(rows, frames, shape, times, drawn), np.full(len(rows), shape.degree, np.uint8)
     how = {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
     made = cut_rows(rows, kinds, ledger, Economy(bits=1e6, most_dropped=1e-9), **how)
-    solid = is_solid(made.kinds)
+    solid = is_opaque(made.kinds)
     assert 0 < solid.sum() <= np.ceil(MOST_SOLID * len(rows))
     told = ledger.solid(1 / (1 + np.exp(-rows[:, columns(2)["opacity_logit"].start].astype(float))))[made.stay]
     assert told[solid].max() <= told[~solid].min()
     again = cut_rows(made.rows, made.kinds, _measured(made.rows, frames, shape, times, drawn), Economy(), **how)
-    assert is_solid(again.kinds).sum() >= is_solid(made.kinds)[again.stay].sum()  # those that are stay so
+    assert is_opaque(again.kinds).sum() >= is_opaque(made.kinds)[again.stay].sum()  # those that are stay so
 
 
 def test_opacities_stay_where_they_are_asked_for():
     frames, rows, shape, times, drawn = _scene()
     ledger, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
     kinds, how = np.full(len(rows), shape.degree, np.uint8), {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
-    assert is_solid(cut_rows(rows, kinds, ledger, dear, **how).kinds).any()
-    assert not is_solid(cut_rows(rows, kinds, ledger, dear, **how, solid=False).kinds).any()
+    assert is_opaque(cut_rows(rows, kinds, ledger, dear, **how).kinds).any()
+    assert not is_opaque(cut_rows(rows, kinds, ledger, dear, **how, solid=False).kinds).any()
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.6, 2.0])
@@ -465,13 +474,13 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     row, at = np.zeros((1, 11 + 2), np.float32), columns(1)
     row[:, at["log_scale"]], row[:, at["opacity_logit"]] = np.log([0.12, 0.08]), 1.0
     row[:, at["color_dc"]], row[:, at["log_time_scale"]] = 1.0, np.log(sigma)
-    shape, times = Shape(1, 1.0, 0.0, SIZE), np.linspace(0, 1, 9)
+    shape, times = ConditioningSpec(1, 1.0, 0.0, SIZE), np.linspace(0, 1, 9)
     drawn = {"compositing": "over", "options": FitConfig().options}
     own = _pictures(row, shape, times, drawn)
     ledger = _mean_ledger((own, row, shape, times, drawn), draws=4)
     assert ledger.misses[0] == 0
     made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0, solid=False)
-    assert made.kinds.tolist() == [LASTS]
+    assert made.kinds.tolist() == [STATIC_BIT]
     cost = _error(made.rows, own, shape, times, drawn)
     assert cost == pytest.approx(ledger.lasting(ledger.mean_log_envelope)[0], rel=0.5, abs=1e-6)
 
@@ -479,7 +488,7 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
 def test_refitting_keeps_what_a_gaussian_is():
     frames, model, _, _ = fitted("line")
     again = refitted(model, lambda k, _: _target(frames)(k), 2)
-    np.testing.assert_array_equal(again.splats.lasting, model.splats.lasting)
+    np.testing.assert_array_equal(again.splats.static, model.splats.static)
     assert (again.splats.degrees <= model.splats.degrees).all()
     assert evaluate(again, frames).mean_psnr > 45
 
@@ -541,7 +550,7 @@ def test_the_description_gets_shorter():
         config = FitConfig(num_gaussians=200, steps=600, economy=economy)
         model = fit(frames, config).model
         squares = [((a.astype(float) - b) ** 2).mean() for a, b in zip(frames, model.frames(), strict=True)]
-        return 8 * model.num_floats + frames.size / 2 * np.log2(1 + np.mean(squares) * 12)
+        return 8 * model.num_parameters + frames.size / 2 * np.log2(1 + np.mean(squares) * 12)
 
     assert length(Economy()) < length(None)
 
@@ -565,7 +574,7 @@ def test_the_smallest_at_a_psnr():
     plain = fit(frames, FitConfig(num_gaussians=300, steps=STEPS, degree=1)).model
     assert smallest.history[-1].stopped_by == "smallest_at_psnr"
     assert 34 <= evaluate(smallest.model, frames).mean_psnr < 35.5
-    assert smallest.model.num_floats < 0.35 * plain.num_floats
+    assert smallest.model.num_parameters < 0.35 * plain.num_parameters
 
 
 def test_what_is_shown_over_black_counts():

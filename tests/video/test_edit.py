@@ -15,9 +15,9 @@ from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, RenderOptions, cpu
 from foldgauss.video import Clock, EditedVideo, FrameTimes, SelectedGaussians, Selection, VideoModel, edit, layers
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import time_logits
 
 MODEL = soft_model()
 TIMES = np.asarray(MODEL.frame_times.times())
@@ -477,7 +477,7 @@ def test_clocks_follow_one_another():
 
 def test_shots():
     """Between two shots the nearer one's frame is seen, by an object's own clock, too; and no leaves say that."""
-    model = dataclasses.replace(MODEL, frame_times=FrameTimes(time_logits(8, [4])))
+    model = dataclasses.replace(MODEL, frame_times=FrameTimes(make_time_logits(8, [4])))
     times = np.asarray(model.frame_times.times())
     assert times[4] - times[3] > 0.5
     late = edit(model).select(OBJECT).retime(shift=0.02).video()

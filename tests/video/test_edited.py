@@ -43,7 +43,7 @@ def test_it_is_asked_as_a_model_is():
     video = edit(MODEL).select(OBJECT).scale(1.5).video()
     assert (video.num_frames, video.size, video.fps) == (MODEL.num_frames, MODEL.size, MODEL.fps)
     assert (video.options, video.compositing, video.num_gaussians) == (MODEL.options, "over", NUM)
-    assert video.num_floats == MODEL.num_floats
+    assert video.num_parameters == MODEL.num_parameters
     image = video.render(0.31, background=(0.2, 0.4, 0.6))
     assert image.shape == (*SIZE, 3)
     played = VideoRenderer(video, background=(0.2, 0.4, 0.6)).frame(0.31)

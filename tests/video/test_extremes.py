@@ -29,7 +29,7 @@ from foldgauss.video.fitting.config import chosen_num_gaussians
 from foldgauss.video.fitting.initialize import CORE, ROUNDS, _even_chance
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.optical_flow import Motion
-from foldgauss.video.models.shots import is_cut, out_of_cuts, time_logits
+from foldgauss.video.models.frame_times import is_cut, make_time_logits, snap_to_shots
 
 SIZE = (24, 32)
 
@@ -154,11 +154,11 @@ def test_one_frame_has_one_time():
     times = FrameTimes.uniform(1).times()
     np.testing.assert_array_equal(times, [0])
     assert times.dtype == np.float32
-    assert time_logits(1, []).shape == is_cut(times).shape == (0,)
+    assert make_time_logits(1, []).shape == is_cut(times).shape == (0,)
     np.testing.assert_array_equal(interpolated_times(np.asarray(times), 5), [0])
     np.testing.assert_array_equal(times_at(np.asarray(times), np.array([[0.0, 0.7], [-1.0, 3.0]])), np.zeros((2, 2)))
     np.testing.assert_array_equal(played_positions(1, 2.4, speed=-0.5), [0])
-    np.testing.assert_array_equal(out_of_cuts(np.array([0.0, 0.3, 1.0], np.float32), times), [0, 0, 0])
+    np.testing.assert_array_equal(snap_to_shots(np.array([0.0, 0.3, 1.0], np.float32), times), [0, 0, 0])
 
 
 def test_one_frame_is_shown_at_all_times(still):
@@ -192,7 +192,7 @@ def test_one_frame_has_all_its_gaussians(still):
 def test_one_frame_in_a_compact_file(tmp_path, still, passes):
     frames, model = still
     made = compress(model, frames, max_loss_db=0.5, passes=passes)
-    loaded = load_video_model(save_compact(tmp_path / "m.fgz", made.quantised))
+    loaded = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
     assert loaded.num_frames == 1
     assert evaluate(model, frames).mean_psnr - evaluate(loaded, frames).mean_psnr <= 0.5
 
@@ -219,7 +219,7 @@ def test_pictures_in_turn_have_no_dark_between_them():
     ("num_frames", "cuts"), [(2, [1]), (3, [2]), (5, [1, 3]), (9, [2, 3, 5, 6, 8]), (6, [1, 2, 3]), (8, [3])]
 )
 def test_gaps_stand_only_where_they_are_seen_as_cuts(num_frames, cuts):
-    logits = time_logits(num_frames, cuts)
+    logits = make_time_logits(num_frames, cuts)
     found = np.flatnonzero(is_cut(FrameTimes(logits).times())) + 1
     assert found.tolist() == (cuts if logits.any() else [])
     assert logits.any() == (2 * len(cuts) < num_frames - 1)

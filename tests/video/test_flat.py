@@ -7,8 +7,8 @@ from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FrameTimes, VideoModel, edit, layers
+from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import time_logits
 from foldgauss.video.segmented.flatten import flatten_video
 
 
@@ -31,7 +31,7 @@ def test_plain_models_stay_as_they_are():
 def _with_a_cut():
     model = soft_model()
     shared = (model.size, model.fps, model.options, model.compositing)
-    return VideoModel(model.splats, FrameTimes(time_logits(7, (3,))), *shared)
+    return VideoModel(model.splats, FrameTimes(make_time_logits(7, (3,))), *shared)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foldgauss.video import FrameTimes, interpolated_times, played_positions, remapped_positions, times_at
-from foldgauss.video.models.shots import is_cut, out_of_cuts, time_logits
+from foldgauss.video.models.frame_times import is_cut, make_time_logits, snap_to_shots
 
 
 @settings(deadline=None, max_examples=50)
@@ -51,15 +51,15 @@ def test_interpolation():
 
 
 def test_nothing_lies_between_shots():
-    times = np.asarray(FrameTimes(time_logits(8, [3])).times())
+    times = np.asarray(FrameTimes(make_time_logits(8, [3])).times())
     np.testing.assert_array_equal(np.flatnonzero(is_cut(times)), [2])
     assert times[3] - times[2] > 20 * (times[1] - times[0])
     between = interpolated_times(times, 4)[8:13]
     np.testing.assert_array_equal(between, times[[2, 2, 3, 3, 3]])
-    np.testing.assert_array_equal(FrameTimes(time_logits(8, [])).times(), FrameTimes.uniform(8).times())
+    np.testing.assert_array_equal(FrameTimes(make_time_logits(8, [])).times(), FrameTimes.uniform(8).times())
     assert not is_cut(np.array([0.0, 1.0])).any()
     t = np.array([0.0, times[1] / 2, times[2], 0.6 * times[2] + 0.4 * times[3], 0.4 * times[2] + 0.6 * times[3], 1.0])
-    held = np.asarray(out_of_cuts(t, times))
+    held = np.asarray(snap_to_shots(t, times))
     np.testing.assert_array_equal(held[[3, 4]], times[[2, 3]])
     np.testing.assert_array_equal(held[[0, 1, 2, 5]], t[[0, 1, 2, 5]].astype(np.float32))
 
@@ -74,7 +74,7 @@ def test_bad_input():
 def test_positions_become_times():
     times = np.array([0.0, 0.2, 1.0], np.float32)
     np.testing.assert_allclose(times_at(times, np.array([0.5, 1.5, -3.0, 9.0])), [0.1, 0.6, 0, 1], atol=1e-7)
-    cut = np.asarray(FrameTimes(time_logits(8, [3])).times())
+    cut = np.asarray(FrameTimes(make_time_logits(8, [3])).times())
     np.testing.assert_array_equal(times_at(cut, np.array([2.4, 2.6])), cut[[2, 3]])
 
 

@@ -24,13 +24,13 @@ def test_numbers_are_counted_one_by_one(made):
     """What a Gaussian has that is not what it would have anyway, by the leaves; the budget is used up to a rest."""
     leaves = ("loc", "log_scale", "angle_logit", "opacity_logit", "color_dc")
     counted = sum(np.size(getattr(model.splats, name)) for model in made.models for name in leaves)
-    assert made.num_floats == counted == 5 * FLOATS * 40 + FLOATS * 2
+    assert made.num_parameters == counted == 5 * FLOATS * 40 + FLOATS * 2
     assert [model.num_gaussians for model in made.models] == [41, 41, 40, 40, 40]
     for model in made.models:
-        assert model.splats.lasting.all()
+        assert model.splats.static.all()
         assert model.degree == 0
         # As a file counts, but for a byte of kind each: that all are alike need be said once.
-        assert model.num_floats - 9 * model.num_gaussians <= model.num_gaussians / 4 + 3
+        assert model.num_parameters - 9 * model.num_gaussians <= model.num_gaussians / 4 + 3
 
 
 def test_results_are_as_a_video_models(made):
@@ -117,7 +117,7 @@ def test_settings_without_meaning_are_refused(change, named):
 
 @pytest.mark.parametrize("num", [44, 0, -9, 100.5, "900"])
 def test_too_few_numbers(num):
-    with pytest.raises(ValueError, match="num_floats: expected a whole number >= 45, one Gaussian in each frame"):
+    with pytest.raises(ValueError, match="num_parameters: expected a whole number >= 45, one Gaussian in each frame"):
         independent_frames(FRAMES, num, QUICK)
 
 
@@ -131,6 +131,6 @@ def test_folds_pay_where_things_move():
     """What the paper says of eq:miragevideo: at equal numbers it does worse, knowing nothing of other frames."""
     frames = moving_blobs(24, 48, 64)
     model = fit(frames, FitConfig(num_gaussians=300, steps=2400)).model
-    alone = independent_frames(frames, model.num_floats, FitConfig(steps=300))
-    assert alone.num_floats <= model.num_floats
+    alone = independent_frames(frames, model.num_parameters, FitConfig(steps=300))
+    assert alone.num_parameters <= model.num_parameters
     assert evaluate(model, frames).mean_psnr > evaluate(alone, frames).mean_psnr + 3

@@ -33,8 +33,8 @@ from foldgauss.video import (
     psnr,
     times_at,
 )
+from foldgauss.video.models.frame_times import is_cut, make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import is_cut, time_logits
 from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED
 from foldgauss.video.tradeoff import frames_per_second
@@ -74,14 +74,18 @@ def at(clip, position):
 def test_one_segment_is_the_model_to_the_bit(kind):
     model = learned(soft_model())
     if kind == "cut":
-        model = dataclasses.replace(model, frame_times=FrameTimes(time_logits(7, [3])))
+        model = dataclasses.replace(model, frame_times=FrameTimes(make_time_logits(7, [3])))
     elif kind == "edited":
         model = edit(model).select(np.arange(NUM) < 12).move((0.1, 0.0), times=(0.2, 0.7)).video()
     elif kind == "alone":
         model = soft_model(num_frames=1)
     clip = SegmentedVideo.from_models([(0, model)])
     assert (clip.size, clip.fps, clip.num_frames) == (model.size, model.fps, model.num_frames)
-    assert (clip.num_gaussians, clip.degree, clip.num_floats) == (model.num_gaussians, model.degree, model.num_floats)
+    assert (clip.num_gaussians, clip.degree, clip.num_parameters) == (
+        model.num_gaussians,
+        model.degree,
+        model.num_parameters,
+    )
     np.testing.assert_array_equal(list(clip.frames()), list(model.frames()))
     green = {"size": (30, 48), "background": (0.0, 0.5, 0.0)}
     np.testing.assert_array_equal(list(clip.frames(**green)), list(model.frames(**green)))
@@ -120,7 +124,7 @@ def test_between_frames_it_goes_by_the_segments_own_times():
 
 
 def test_a_cut_within_a_segment_is_kept():
-    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(time_logits(7, [3])))
+    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(make_time_logits(7, [3])))
     clip = SegmentedVideo.from_models([(0, soft_model(num_frames=5)), (5, model)])
     for position, frame in ((7.4, 2), (7.6, 3)):
         np.testing.assert_array_equal(at(clip, position), image(model, model.frame_times.times()[frame]))
@@ -214,8 +218,8 @@ def test_what_is_given_for_one_time():
     for position, number in ((4, 0), (6, 1), (20, 3)):
         t = position / 22
         own = parts[number]
-        expected = own.stage(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
-        for found in (clip.at(t), VideoRenderer(clip).splats(t), VideoRenderer(clip).shown(t)):
+        expected = own.prepare(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
+        for found in (clip.at(t), VideoRenderer(clip).splats(t), VideoRenderer(clip).dominant_splats(t)):
             np.testing.assert_array_equal(found.mean, expected.mean)
             np.testing.assert_array_equal(found.opacity, expected.opacity)
     np.testing.assert_array_equal(clip.render(0.3), np.moveaxis(image(clip, 0.3), 0, -1))
@@ -310,7 +314,7 @@ def test_played_through_each_segment_is_loaded_once(way):
     assert loaded == []
     playback = VideoRenderer(clip)
     for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
-        assert len(playback._stage._ready) <= MAX_PREPARED
+        assert len(playback._prepared._ready) <= MAX_PREPARED
     assert loaded == [0, 1, 2, 3][::way]
     assert not alive()  # a stage needs no model
 

@@ -129,7 +129,7 @@ def test_bad_sets():
 def weights(model, k):
     """The definition, pixel by pixel: (num_gaussians, height, width), float64."""
     lit, options = Contributions(model), model.options
-    splats = lit.frame(k).splats
+    splats = lit.at_frame(k).splats
     y, x = np.mgrid[: model.size[0], : model.size[1]] + 0.5
     found, light = np.zeros((lit.num_gaussians, *model.size)), np.ones(model.size)
     for i, mean, factor, opacity in zip(splats.alive, splats.mean, splats.factor, splats.opacity, strict=True):
@@ -266,12 +266,12 @@ def test_nothing_is_followed_across_a_cut():
 @pytest.mark.parametrize(
     ("mask", "options", "match"),
     [
-        (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask with something in it"),
-        ({}, {}, "^mask: expected a mask with something in it"),
+        (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask that is not empty"),
+        ({}, {}, "^mask: expected a mask that is not empty"),
         (np.ones((48, 48), bool), {"frame": 0}, "^mask: expected the aspect of the model's 48x72, got 48x48"),
-        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* Of labels"),
-        (np.full((48, 72), 1.5), {"frame": 0}, r"shares in \[0, 1\]"),
-        (np.full((48, 72), np.nan), {"frame": 0}, r"shares in \[0, 1\]"),
+        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* From labels"),
+        (np.full((48, 72), 1.5), {"frame": 0}, r"fractions in \[0, 1\]"),
+        (np.full((48, 72), np.nan), {"frame": 0}, r"fractions in \[0, 1\]"),
         (np.ones((48, 72), bool), {}, "frame=k"),
         (np.ones((5, 48, 72), bool), {}, "^mask: expected one of shape .*, or 12 of them"),
         (np.ones(5, bool), {"frame": 0}, "^mask: expected one of shape"),
@@ -283,7 +283,7 @@ def test_nothing_is_followed_across_a_cut():
         (np.ones((48, 72), bool), {"frames": (3, 3)}, "^frames"),
         (np.ones((48, 72), bool), {"frames": (0, 13)}, "^frames"),
         (np.ones((48, 72), bool), {"frames": 3}, "^frames.*frame=k"),
-        ({0: np.ones((48, 72), bool)}, {"frame": 0}, "frames named once"),
+        ({0: np.ones((48, 72), bool)}, {"frame": 0}, "frames given once"),
         ({0: np.ones((2, 48, 72), bool)}, {}, "^mask: expected bool"),
         ({99: np.ones((48, 72), bool)}, {}, "^frame"),
         (np.ones((48, 72), bool), {"frame": 0, "threshold": 0}, "^threshold"),
@@ -395,7 +395,7 @@ def test_bad_clicks():
     for click in ((-1, 5), (72, 5), (5, 48), (np.nan, 1), (1,), "here"):
         with pytest.raises(ValueError, match=r"^click: expected \(x, y\)"):
             by_click(MODEL, click, frame=0)
-    with pytest.raises(ValueError, match=r"^click: expected a place where something is drawn"):
+    with pytest.raises(ValueError, match=r"^click: expected a pixel where something is rendered"):
         by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0)
 
 

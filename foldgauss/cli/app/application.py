@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from foldgauss import __version__
-from foldgauss._runtime.interrupts import leaving_at_once
+from foldgauss._runtime.interrupts import use_default_signals
 from foldgauss.cli.app.help import App, Command, Group
 from foldgauss.cli.app.registry import COMMANDS
 
@@ -79,7 +79,7 @@ def root(
 
 def loaded(*names: str) -> dict[str, Any]:
     """The commands by name, these imported, or all where none is named; there may be none of such a name."""
-    with leaving_at_once():
+    with use_default_signals():
         for name in names or COMMANDS:
             if name in COMMANDS:
                 importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")

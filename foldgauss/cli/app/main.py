@@ -3,7 +3,7 @@
 import sys
 import warnings
 
-from foldgauss._runtime.interrupts import ending_well
+from foldgauss._runtime.interrupts import raise_on_sigterm
 from foldgauss.cli.app.application import Stopped, WrongUse, app, as_option, err, loaded
 
 WRONG_USE, FAILURE = 2, 1
@@ -11,7 +11,7 @@ WRONG_USE, FAILURE = 2, 1
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command and exit: 0 fine, 2 wrong use, 1 failure, 143 for SIGTERM; one-line errors unless --debug."""
-    with ending_well():
+    with raise_on_sigterm():
         _run(arguments)
 
 

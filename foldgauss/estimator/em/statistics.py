@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite_columns
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.chunks import Chunks, Piece
 from foldgauss.estimator.em.components import Pairs, Parameters, log_likelihoods, pairs_of
@@ -138,7 +138,7 @@ def summed(function: Callable, points: Points | Blocks, *arguments):
 
 
 def _sums_of_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
-    check_process()
+    check_not_forked()
     total, last = None, None
     with precision(dtype):
         for block in blocks_of(map(prepare, pieces), size, num_components, devices):

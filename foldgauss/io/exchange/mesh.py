@@ -24,8 +24,8 @@ from foldgauss.io.media.video_file import DEFAULT_FPS, natural_order
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
-from foldgauss.video.models.background import BLACK, checked_background
-from foldgauss.video.models.renderer import Drawable, VideoRenderer, to_bytes
+from foldgauss.video.models.background import BLACK, check_background
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer, to_bytes
 
 #: What is not in an `.obj`: times of the frames, size and rate of the video, how it is drawn.
 NOTES = "pseudomesh.json"
@@ -89,7 +89,7 @@ class Pseudomesh:
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The picture of a frame over `background`. Raises ValueError for a size or a background that is none."""
         size = self.size if size is None else tuple(size)
-        splats, behind = self.splats(number, size), checked_background(background, self.compositing)
+        splats, behind = self.splats(number, size), check_background(background, self.compositing)
         leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
         drawn = {"compositing": self.compositing, "options": self.options}
         return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
@@ -115,7 +115,7 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 def write_pseudomesh(
     folder: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
     overwrite: bool = False,

@@ -26,8 +26,8 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, pixels_per_unit
 from foldgauss.render.camera import FIELD_OF_VIEW, THICKNESS
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.renderer import Drawable, VideoRenderer
-from foldgauss.video.models.splats import LASTING, SH_C0, FoldedSplats
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
@@ -167,7 +167,9 @@ def _with_power(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
     """log sigma_t that gives an envelope of the `other` power the same values; what lasts is 1 with either."""
-    return np.where(log_time_scale == LASTING, log_time_scale, log_time_scale + 0.5 * np.log(other / power))
+    return np.where(
+        log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
+    )
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:
@@ -292,7 +294,7 @@ def _float64(leaf: object) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- 3DGS
 
 
-def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
+def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
     """The Gaussians that a model draws at time t, flat in space, front first, for programs that sort by depth.
 
     A `VideoRenderer` in place of the model saves the making of one for each of many times. Where segments of a video
@@ -330,7 +332,7 @@ def frame_gaussians(model: Drawable | VideoRenderer, t: float, *, depth_step: fl
 
 def _alive(playback: VideoRenderer, t: float) -> tuple[np.ndarray, ...]:
     """(mean, factor, opacity, color) of what is drawn at time t (or near it, in a cut), in model space, float64."""
-    splats = playback.shown(t)
+    splats = playback.dominant_splats(t)
     seen = np.asarray(splats.opacity) > 0
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     mean, factor, opacity, color = (_float64(leaf)[seen] for leaf in leaves)
@@ -379,7 +381,7 @@ def write_gaussians_ply(
 
 def write_3dgs_ply(
     path: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     t: float,
     *,
     depth_step: float = DEPTH_STEP,
@@ -402,7 +404,7 @@ def write_3dgs_ply(
 
 def write_3dgs_frames(
     folder: str | os.PathLike,
-    model: Drawable,
+    model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
     depth_step: float = DEPTH_STEP,
@@ -433,13 +435,13 @@ def write_3dgs_frames(
     return folder
 
 
-def _check_covers(model: Drawable) -> None:
+def _check_covers(model: RenderableVideo) -> None:
     if model.compositing != "over":
         cure = "Fit it with --compositing over."
         raise invalid("model's compositing", expected="over, as viewers blend", got=model.compositing, cure=cure)
 
 
-def checked_times(model: Drawable, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
+def checked_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
     """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)

@@ -1,4 +1,4 @@
-"""Compact model files, .fgz: quantised, entropy-coded, checked, and decoded to the same bits everywhere.
+"""Compact model files, .fgz: quantized, entropy-coded, checked, and decoded to the same bits everywhere.
 
 The layout is in docs/format.md. Files may come from strangers: a checksum finds damage, no number is trusted before it
 has been held against the bytes that are there, and nothing but `ModelFileError` is raised for what a file says.
@@ -26,10 +26,10 @@ from foldgauss.video.compression.quantize import (
     MOST_CELL_BITS,
     MOST_SHARED,
     Facts,
-    Quantised,
+    Quantized,
     Rule,
     column_names,
-    dequantise,
+    dequantize,
     is_whole,
 )
 from foldgauss.video.models.video_model import VideoModel
@@ -45,14 +45,14 @@ _MOST_PER_BYTE = 8
 _SIDE = 1 << 20  # no picture is longer: a decoder holds it in memory
 
 
-def save_compact(path: str | os.PathLike, quantised: Quantised, *, metadata: dict | None = None) -> Path:
-    """Write a quantised model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
+def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
+    """Write a quantized model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
     """
-    path = checked_path(path, "path, quantised")
+    path = checked_path(path, "path, quantized")
     check_compact_name(path)
-    data = packed(quantised, metadata)
+    data = packed(quantized, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -64,19 +64,19 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
         raise invalid(parameter, expected=f"a name ending in {COMPACT_SUFFIX}", got=repr(str(path)))
 
 
-def packed(quantised: Quantised, metadata: dict | None = None) -> bytes:
+def packed(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    facts, walk = quantised.facts, Walk(quantised.rules, quantised.facts)
+    facts, walk = quantized.facts, Walk(quantized.rules, quantized.facts)
     streams, described = [], []
     for name in column_names(facts.degree, facts.shared):
-        numbers = quantised.columns[name]
+        numbers = quantized.columns[name]
         column = walk.column(name)
         streams.append(range_coder.encode(_steps(numbers, facts) if name == "cell" else numbers, column))
         walk.add(name, numbers)
-        rule = quantised.rules.get(name)
+        rule = quantized.rules.get(name)
         own = [] if is_whole(name) else [rule.origin, rule.exponent, *rule.slopes]
         described.append([len(streams[-1]), *own])
-    intervals = quantised.intervals
+    intervals = quantized.intervals
     streams.append(range_coder.encode(intervals, range_coder.Column.plain(len(intervals))))
     header = dataclasses.asdict(facts) | {
         "num_frames": len(intervals) + 1,
@@ -113,8 +113,8 @@ def is_compact(path: str | os.PathLike) -> bool:
         return False
 
 
-def load_compact(path: str | os.PathLike) -> Quantised:
-    """The numbers in a compact file; `foldgauss.video.compression.quantize.dequantise` makes the model of them.
+def load_compact(path: str | os.PathLike) -> Quantized:
+    """The numbers in a compact file; `foldgauss.video.compression.quantize.dequantize` makes the model of them.
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
@@ -126,7 +126,7 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
     """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
     path = checked_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
-        model = dequantise(load_compact(path))
+        model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise _unreadable(path, "one with numbers beyond float32")
     return model
@@ -138,7 +138,7 @@ def compact_metadata(path: str | os.PathLike) -> dict:
     return _header(path, path.read_bytes())[0]["metadata"]
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[Quantised, dict]:
+def _unpacked(path: Path, data: bytes) -> tuple[Quantized, dict]:
     header, body = _header(path, data)
     try:
         return _decoded(header, body, len(data)), header["metadata"]
@@ -182,7 +182,7 @@ def _no_number(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
+def _decoded(header: dict, body: bytes, whole_length: int) -> Quantized:
     facts = _facts(header)
     num, num_frames = facts.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
@@ -202,7 +202,7 @@ def _decoded(header: dict, body: bytes, whole_length: int) -> Quantised:
         walk.add(name, columns[name])
         start += length
     intervals = range_coder.decode(body[start:], range_coder.Column.plain(num_frames - 1))
-    return Quantised(facts, rules, columns, intervals)
+    return Quantized(facts, rules, columns, intervals)
 
 
 def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:

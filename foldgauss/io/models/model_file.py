@@ -14,7 +14,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.io._atomic import atomic_path
 
 FORMAT = "foldgauss-model"
@@ -272,7 +272,7 @@ def load_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]
     Raises `ModelFileError` as `load_model`.
     """
     kind, skeleton = _described(path, kind_name, header, tensors)
-    check_process()
+    check_not_forked()
     filled = _filled(skeleton, path, prefix)
     try:
         return kind.from_stored(filled)

@@ -210,7 +210,7 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         num_frames=int(timeline["num_frames"]),
         num_gaussians=sum(int(model["num_gaussians"]) for model in models.values()),
         degree=max(int(model["degree"]) for model in models.values()),
-        num_floats=sum(_num_floats(spec) for key, spec in tensors.items() if key.startswith(tuple(models))),
+        num_parameters=sum(_num_parameters(spec) for key, spec in tensors.items() if key.startswith(tuple(models))),
         size=(int(height), int(width)),
         fps=float(timeline["fps"]),
         options=RenderOptions(**timeline["options"]),
@@ -224,7 +224,7 @@ def _num_frames(tensors: dict[str, dict], prefix: str) -> int:
     return tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
 
 
-def _num_floats(spec: dict) -> int:
-    """As `VideoModel.num_floats` counts a leaf."""
+def _num_parameters(spec: dict) -> int:
+    """As `VideoModel.num_parameters` counts a leaf."""
     count = math.prod(spec["shape"])
     return -(-count * int(spec["dtype"][1:]) // 32) if spec["dtype"].startswith("U") else count

@@ -1,4 +1,4 @@
-// Decoder of compact model files (.fgz): see docs/format.md. The same bits as foldgauss.video.compression.quantize.dequantise, whose
+// Decoder of compact model files (.fgz): see docs/format.md. The same bits as foldgauss.video.compression.quantize.dequantize, whose
 // operations it repeats in their order. Runs in browsers and elsewhere; no dependency.
 
 const FEATURES = ["class", "size", "stretch", "duration", "opacity"];

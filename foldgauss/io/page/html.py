@@ -23,9 +23,9 @@ from foldgauss.io._atomic import atomic_path, checked_path
 from foldgauss.io.media.video_file import Clip
 from foldgauss.io.models.compact import is_compact, packed
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.video.compression.quantize import Quantised, Rule, column_names, describe, is_whole, quantise
+from foldgauss.video.compression.quantize import Quantized, Rule, column_names, describe, is_whole, quantize
 from foldgauss.video.editing.edited_video import EditedVideo
-from foldgauss.video.models.background import BLACK, composited
+from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -38,11 +38,11 @@ LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
 _IMPORT = re.compile(r'^import (?:\{[^}]*\}|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
-#: Binary logarithms of the steps, for pages that quantise a model: to a hundredth of what each number is measured by.
+#: Binary logarithms of the steps, for pages that quantize a model: to a hundredth of what each number is measured by.
 _EVEN = -18.0
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
-Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantised
+Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantized
 Model = Loaded | str | os.PathLike
 Frames = Clip | UInt8[np.ndarray, "num_frames height width channels"]
 
@@ -83,7 +83,7 @@ def warn_of_size(page: str, has_original: bool) -> None:
 def html_page(model: Model, *, original: Frames | None = None, quality: int = QUALITY, title: str | None = None) -> str:
     """The page as text.
 
-    `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantised
+    `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantized
     finely, and so is each segment of a video in segments: see docs/player.md for how near the picture comes.
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
 
@@ -136,7 +136,7 @@ def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
             yield _block(f"model-{number}", packed(_fine(_flattened(number, segment.model))))
-    elif isinstance(model, Quantised):
+    elif isinstance(model, Quantized):
         yield _block("model", packed(model))
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
@@ -161,15 +161,15 @@ def _up_to(blocks: Iterable[str], most: float) -> Iterator[str]:
         yield block
 
 
-def _fine(model: VideoModel) -> Quantised:
+def _fine(model: VideoModel) -> Quantized:
     """All its Gaussians in their own order, by steps so fine that the picture stays."""
     described = describe(model)
     classes = np.zeros(model.num_gaussians, np.int32)
     try:
-        return quantise(described, classes, _rules(model.degree))
+        return quantize(described, classes, _rules(model.degree))
     except ValueError:  # Gaussians so thin that steps in proportion would be beyond the format
         names = [name for name in column_names(model.degree) if not is_whole(name)]
-        return quantise(described, classes, {name: Rule(0.0, _EVEN) for name in names})
+        return quantize(described, classes, {name: Rule(0.0, _EVEN) for name in names})
 
 
 def _rules(degree: int) -> dict[str, Rule]:
@@ -205,13 +205,13 @@ def _pictures(original: Frames, model: Loaded, quality: int) -> list[bytes]:
 
 
 def _size_and_number(model: Loaded) -> tuple[tuple[int, int], int]:
-    if isinstance(model, Quantised):
+    if isinstance(model, Quantized):
         return tuple(model.facts.size), len(model.intervals) + 1
     return tuple(model.size), model.num_frames
 
 
 def _webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
-    opaque = frame if frame.shape[-1] == 3 else composited(frame, np.float32(BLACK))
+    opaque = frame if frame.shape[-1] == 3 else composite(frame, np.float32(BLACK))
     done, data = cv2.imencode(".webp", opaque[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not done:
         raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)

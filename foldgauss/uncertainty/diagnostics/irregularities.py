@@ -15,8 +15,8 @@ from foldgauss.uncertainty.posterior.exact import exact_times
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import drawn_log_likelihood
 from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import evaluate
-from foldgauss.video.models.shots import is_cut
 from foldgauss.video.models.video_model import VideoModel
 
 #: An increment is measured by the median of those up to this many intervals before and after it.
@@ -88,7 +88,7 @@ def irregularities(
 
     Told are those that are so in at least the share `probability` of the draws. The local median is that of the `reach`
     intervals before and after, as far as the shot goes, in the same draw: a pace that changes smoothly, in the clip or
-    as learned, is even. Cuts (`shots.is_cut`) are not flagged, and end the neighbourhood. Intervals
+    as learned, is even. Cuts (`frame_times.is_cut`) are not flagged, and end the neighbourhood. Intervals
     between two frames whose times were held are not judged, nor are those of a frame that does not tell its time
     (`FrameTimePosterior.identified`).
 
@@ -186,7 +186,7 @@ def _some(posterior: FrameTimePosterior) -> Float64[np.ndarray, "draws num_frame
 
 
 def cuts(posterior: FrameTimePosterior) -> Bool[np.ndarray, "intervals"]:
-    """Which intervals are cuts, by the posterior means (`foldgauss.video.models.shots.is_cut`)."""
+    """Which intervals are cuts, by the posterior means (`foldgauss.video.models.frame_times.is_cut`)."""
     return np.asarray(is_cut(posterior.mean().astype(np.float32)))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.plot import needed_pyplot
+from foldgauss.analysis.plot import import_pyplot
 from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, cuts, even_pace, intervals, irregularities
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
@@ -51,7 +51,7 @@ def plot_times(
     if fitted is not None and np.shape(fitted) != (num_frames,):
         raise invalid("fitted", expected=f"{num_frames} times", got=f"shape {np.shape(fitted)}")
     if axes is None:
-        pyplot = needed_pyplot("plot_times")
+        pyplot = import_pyplot("plot_times")
         axes = pyplot.subplots(2, 1, sharex=True, layout="constrained", figsize=(9, 6))[1]
     flagged = irregularities(posterior) if flagged is None else flagged
     frames, (even, unit) = np.arange(num_frames), even_pace(posterior)
@@ -151,7 +151,7 @@ def plot_pairs(
     if num > _MOST_PAIRS:
         raise invalid("frames", expected=f"at most {_MOST_PAIRS}", got=num)
     if axes is None:
-        pyplot = needed_pyplot("plot_pairs")
+        pyplot = import_pyplot("plot_pairs")
         size = max(1.9 * num, 3.5)
         axes = pyplot.subplots(num, num, sharex="col", layout="constrained", figsize=(size, size), squeeze=False)[1]
     (_, unit), draws = even_pace(posterior), posterior.draws
@@ -208,7 +208,7 @@ def plot_trace(
         frames = list(dict.fromkeys(int(k) for k in worst))
     frames = _drawn_frames(posterior, frames)
     if axes is None:
-        pyplot = needed_pyplot("plot_trace")
+        pyplot = import_pyplot("plot_trace")
         axes = pyplot.subplots(
             len(frames), 2, sharex="col", sharey="row", layout="constrained", squeeze=False,
             figsize=(9, 0.6 + 2.2 * len(frames)), width_ratios=(4, 1),
@@ -264,7 +264,7 @@ def plot_correlation(seen: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axe
 
 
 def _axes(ax, caller: str, size: tuple[float, float]):
-    return needed_pyplot(caller).subplots(layout="constrained", figsize=size)[1] if ax is None else ax
+    return import_pyplot(caller).subplots(layout="constrained", figsize=size)[1] if ax is None else ax
 
 
 def _bar_width(num: int) -> float:

@@ -13,7 +13,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu
-from foldgauss.render.weights import weights
+from foldgauss.render.weights import build_weight_matrix
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.residuals import Screen
 from foldgauss.video.models.background import BLACK
@@ -58,7 +58,9 @@ class ColorEquations:
         alive = self._stage.at(t)
         leaves = alive.mean, alive.factor, alive.opacity, alive.color, _behind
         model = self.screen.model
-        found = weights(cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options))
+        found = build_weight_matrix(
+            cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options)
+        )
         indices = alive.alive.astype(np.int32)[found.indices]
         shape = (found.shape[0], self.num)
         return scipy.sparse.csr_array((found.data.astype(np.float64), indices, found.indptr), shape=shape)

@@ -12,7 +12,7 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu
 from foldgauss.video.editing.edited_video import EditedVideo
-from foldgauss.video.models.background import BLACK, composited
+from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -69,7 +69,7 @@ class Screen:
             cure = "Make it 8-bit colour." if fits else "Read it at that size."
             raise invalid("video", expected=expected, got=f"{frames.dtype} {frames.shape}", cure=cure)
         if frames.shape[3] == 4:
-            frames = np.stack([composited(frame, np.zeros(3, np.float32)) for frame in frames])
+            frames = np.stack([composite(frame, np.zeros(3, np.float32)) for frame in frames])
         self.model, self.frames = model, np.ascontiguousarray(frames)
         self.playback = VideoRenderer(model)
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_within, short_repr
-from foldgauss._runtime.file_lock import Held, alone
+from foldgauss._runtime.file_lock import LockHeld, hold_lock
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.posterior.exact import ExactTimes, exact_times
@@ -341,8 +341,8 @@ def only_run(backend: Path | None) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if backend is not None:
             try:
-                stack.enter_context(alone(_running(backend, ".lock")))
-            except Held as error:
+                stack.enter_context(hold_lock(_running(backend, ".lock")))
+            except LockHeld as error:
                 raise BlockingIOError(
                     f"backend: expected a file that no other run is writing, got {str(backend)!r}, which one is. "
                     "Wait for that one, or choose another file."

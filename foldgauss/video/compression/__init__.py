@@ -1,1 +1,1 @@
-"""Compact models: quantisation within a stated loss, sort order, sensitivity and fine-tuning."""
+"""Compact models: quantization within a stated loss, sort order, sensitivity and fine-tuning."""

@@ -10,10 +10,10 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import UNIT_TIME, LearningRates
-from foldgauss.video.models.conditioning import condition, narrow_windows, pull_back, update_windows
-from foldgauss.video.models.kinds import kinds_of
+from foldgauss.video.models.conditioning import apply_scale_cutoff, backpropagate, condition, update_windows
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.row_layout import columns, unpack
+from foldgauss.video.models.sparse_storage import find_kinds
 from foldgauss.video.models.video_model import VideoModel
 
 #: Rates fall exponentially from and to these shares of a fit's first ones: the model is near its best.
@@ -41,12 +41,12 @@ def refitted(
     fit.
     """
     stage = PreparedModel(model, model.size)
-    rows, window, shape = stage.rows, stage.window, stage.shape
+    rows, window, shape = stage.rows, stage.window, stage.spec
     rates, own = np.zeros(rows.shape[1], np.float32), LearningRates()
     for name, place in columns(model.degree).items():
         rates[place] = getattr(own, name) if free is None or name in free else 0.0
     first, second, grad = np.zeros_like(rows), np.zeros_like(rows), np.zeros_like(rows)
-    kinds = kinds_of(rows, model.degree)  # what a Gaussian has not got stays away
+    kinds = find_kinds(rows, model.degree)  # what a Gaussian has not got stays away
     palette, colors = Codebook.of(shared, 3), columns(model.degree)["color_dc"]  # what is shared learns as one
     counts, times = np.zeros(len(rows), np.int32), np.asarray(model.frame_times.times())
     drawn = {"compositing": model.compositing, "options": model.options}
@@ -62,7 +62,7 @@ def refitted(
             continue
         trace = cpu.forward(done.mean, done.factor, done.opacity, done.color, behind, model.size, **drawn)
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
-        pull_back(rows, done, cpu.backward(trace, by_image)[:4], shape, grad)
+        backpropagate(rows, done, cpu.backward(trace, by_image)[:4], shape, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
         palette.step(rows[:, colors], grad[:, colors], done.alive, rate * rates[colors])
         sparse_adam(rows, grad, first, second, counts, done.alive, rates * rate, kinds=kinds, unit_time=UNIT_TIME)
@@ -70,6 +70,6 @@ def refitted(
             update_windows(rows, done.alive, window)
             if model.scale_cutoff > 0:
                 near = window[done.alive]
-                narrow_windows(rows[done.alive], near, shape, model.scale_cutoff)
+                apply_scale_cutoff(rows[done.alive], near, shape, model.scale_cutoff)
                 window[done.alive] = near
     return eqx.tree_at(lambda m: m.splats, model, unpack(rows, model.degree, model.splats.envelope))

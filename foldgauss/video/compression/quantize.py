@@ -23,7 +23,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
-from foldgauss.video.models.splats import LASTING, OPAQUE, TAU_MAX, FoldedSplats
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
 #: Above, sums of Legendre polynomials lose digits; no fit here goes beyond 7.
@@ -38,7 +38,11 @@ _FIRST = (*WHOLE, *FEATURES[1:], "time")
 COLORS = ("luma", "blue", "green")
 #: Columns that a bit of `without` says a Gaussian has no number in: the bit, the value that it has instead, and what
 #: that counts as among the features (sigma_t = 1, the clip's length; an opacity of 0.98).
-ABSENT = {"duration": (1, float(LASTING), 0.0), "time": (1, 0.5, 0.0), "opacity": (2, float(OPAQUE), 4.0)}
+ABSENT = {
+    "duration": (1, float(STATIC_LOG_TIME_SCALE), 0.0),
+    "time": (1, 0.5, 0.0),
+    "opacity": (2, float(OPAQUE_LOGIT), 4.0),
+}
 #: More shared colours than this are not told apart from colours of each one's own; cells have no more bits.
 MOST_SHARED, MOST_CELL_BITS = 4096, 24
 #: Orthonormal axes of colour, rows: brightness, blue against red, green against both.
@@ -127,7 +131,7 @@ class Facts:
 
 
 @dataclasses.dataclass(frozen=True)
-class Quantised:
+class Quantized:
     """A model as whole numbers: equal numbers are equal models, to the bit."""
 
     facts: Facts
@@ -185,14 +189,14 @@ class Unrolling:
         self.values[name] = value
 
 
-def values_of(quantised: Quantised) -> dict[str, Float[np.ndarray, " num"]]:
+def values_of(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
     """The values of all columns, of each Gaussian."""
-    facts, unrolling = quantised.facts, Unrolling(quantised.rules, quantised.facts)
+    facts, unrolling = quantized.facts, Unrolling(quantized.rules, quantized.facts)
     for name in column_names(facts.degree, facts.shared):
-        unrolling.add(name, quantised.columns[name], unrolling.halves(name))
+        unrolling.add(name, quantized.columns[name], unrolling.halves(name))
     values = unrolling.values
     if facts.shared:
-        values |= {name: values[name][quantised.columns["shade"]] for name in COLORS}
+        values |= {name: values[name][quantized.columns["shade"]] for name in COLORS}
     return values
 
 
@@ -242,9 +246,9 @@ def in_clip(time: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     return np.minimum(np.maximum(time, 2.0**-24), 1 - 2.0**-24)
 
 
-def dequantise(quantised: Quantised) -> VideoModel:
+def dequantize(quantized: Quantized) -> VideoModel:
     """The model, the same bits everywhere."""
-    facts, v = quantised.facts, values_of(quantised)
+    facts, v = quantized.facts, values_of(quantized)
     time = in_clip(v["time"])
     place = _monomials(v, time, facts)
     log_scale = np.stack([v["size"] + v["stretch"], v["size"] - v["stretch"]], 1)
@@ -265,7 +269,7 @@ def dequantise(quantised: Quantised) -> VideoModel:
         color_dc=single(color),
         envelope=TimeLikelihood(np.float32(facts.power), np.float32(facts.floor)),
     )
-    times = FrameTimes(single(quantised.intervals * TIME_STEP))
+    times = FrameTimes(single(quantized.intervals * TIME_STEP))
     shared = (facts.size, facts.fps, facts.options, facts.compositing, facts.scale_cutoff)
     return VideoModel(splats, times, *shared)
 
@@ -381,7 +385,7 @@ def describe(model: VideoModel) -> Described:
     }
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
     place = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
-    own = swapped, turn, splats.lasting + 2 * splats.solid.astype(np.int32), shade
+    own = swapped, turn, splats.static + 2 * splats.opaque.astype(np.int32), shade
     return Described(facts, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
 
 
@@ -452,12 +456,12 @@ def path_matrix(
     return out
 
 
-def quantise(
+def quantize(
     described: Described,
     classes: Int32[np.ndarray, " num"],
     rules: dict[str, Rule],
     cells: Int32[np.ndarray, " num"] | None = None,
-) -> Quantised:
+) -> Quantized:
     """Round every column by its rule; each is rounded against what is decoded of those before it.
 
     `cells`: where to count places from (default: the cells that they are in).
@@ -478,7 +482,7 @@ def quantise(
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
     logits = described.logits - described.logits.max(initial=-np.inf)
-    return Quantised(facts, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
+    return Quantized(facts, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
 
 
 def cells_of(described: Described) -> Int32[np.ndarray, " num"]:
@@ -494,12 +498,12 @@ def _degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarray, " nu
     return worth.max(axis=0, initial=0).astype(np.int32)
 
 
-def lower_paths(quantised: Quantised, described: Described) -> Float[np.ndarray, "num degree+1 2"]:
+def lower_paths(quantized: Quantized, described: Described) -> Float[np.ndarray, "num degree+1 2"]:
     """Paths not rounded, seen from the times that a decoder has, as powers of u; of the degrees that are stored."""
-    facts, values = quantised.facts, values_of(quantised)
+    facts, values = quantized.facts, values_of(quantized)
     path = _paths(described, values)
     place = np.stack([np.stack([path[f"{axis}{k}"] for axis in "xy"], 1) for k in range(facts.degree + 1)], 1)
-    place[np.arange(facts.degree + 1) > quantised.columns["degree"][:, None]] = 0
+    place[np.arange(facts.degree + 1) > quantized.columns["degree"][:, None]] = 0
     return path_matrix(in_clip(values["time"]), values["duration"], facts) @ place
 
 

@@ -25,23 +25,23 @@ from foldgauss.video.compression.quantize import (
     COLORS,
     FEATURES,
     Described,
-    Quantised,
+    Quantized,
     Rule,
     cells_for,
     cells_of,
     column_names,
-    dequantise,
+    dequantize,
     describe,
     in_clip,
     is_whole,
     lower_paths,
-    quantise,
+    quantize,
     shades,
     values_of,
 )
 from foldgauss.video.compression.sensitivity import sensitivities
 from foldgauss.video.compression.sort_order import free_order, overlaps
-from foldgauss.video.models.background import BLACK, composited, random_background
+from foldgauss.video.models.background import BLACK, composite, random_background
 from foldgauss.video.models.metrics import psnr as psnr_of
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.splats import SH_C0
@@ -80,7 +80,7 @@ _SOLID = 0.03  # of light left: less is none
 
 @dataclasses.dataclass(frozen=True)
 class Compressed:
-    """A model's compact form: `quantised`, the `model` it decodes to, and what was measured.
+    """A model's compact form: `quantized`, the `model` it decodes to, and what was measured.
 
     `loss_db`: mean PSNR of the frames before (`psnr`) less after, dB, none counted as more than `EXACT_PSNR`.
     `measured_by`: "clip", or "model" where the loss
@@ -88,7 +88,7 @@ class Compressed:
     left out.
     """
 
-    quantised: Quantised
+    quantized: Quantized
     model: VideoModel
     loss_db: float
     psnr: float
@@ -123,7 +123,7 @@ def compress(
     Raises ValueError for anything but a `VideoModel` (bake edits first), for one with numbers that are not finite, with
     several envelopes or a degree above 15, for frames that do not fit, and for a loss out of reach.
 
-    Example: `save_compact("clip.fgz", compress(model, clip.frames).quantised)`.
+    Example: `save_compact("clip.fgz", compress(model, clip.frames).quantized)`.
     """
     check_model(model)
     if not is_within(max_loss_db, "(0, 60]"):
@@ -143,13 +143,13 @@ def compress(
     if made is None:
         made = _rounded(_Plan(_ordered(model, loss, max_loss_db)), loss, max_loss_db, on_step)
     dropped = model.num_gaussians - made.model.num_gaussians
-    return Compressed(made.quantised, made.model, made.loss_db, loss.psnr, loss.measured_by, dropped)
+    return Compressed(made.quantized, made.model, made.loss_db, loss.psnr, loss.measured_by, dropped)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Try:
     factor: float
-    quantised: Quantised
+    quantized: Quantized
     model: VideoModel
     loss_db: float
 
@@ -159,11 +159,11 @@ def _rounded(plan: "_Plan", loss: "_Loss", most: float, on_step: Callable) -> _T
     tried = np.unique(np.linspace(0, loss.num_frames - 1, TRIED_FRAMES).round().astype(int))
 
     def at(factor: float, which: Int[np.ndarray, " some"]) -> _Try:
-        quantised = plan.at(factor, plan.kept(factor))
-        model = dequantise(quantised)
+        quantized = plan.at(factor, plan.kept(factor))
+        model = dequantize(quantized)
         found = loss(model, which)
         on_step("rounding", found)
-        return _Try(factor, quantised, model, found)
+        return _Try(factor, quantized, model, found)
 
     fine, coarse = _FINEST, _COARSEST
     while coarse - fine > _CLOSE:
@@ -207,19 +207,19 @@ def _mended(
     plan = _Plan(_ordered(left, loss, most))
     best, tried = None, {}
     for _ in range(_TRIES):
-        quantised = plan.at(factor)
+        quantized = plan.at(factor)
         described = plan.described
         for what, free, share in (("paths and colours", PATH_AND_COLOR, 0.5), ("colours", COLOR, 0.25)):
-            begun = _freed(quantised, described, path=free is PATH_AND_COLOR)
+            begun = _freed(quantized, described, path=free is PATH_AND_COLOR)
             again = mend(begun, share, f"mending {what}", free=free, seed=1, shared=described.shade)
-            described = _settled(quantised, again, path=free is PATH_AND_COLOR, before=described)
-            columns = quantised.columns
-            quantised = quantise(described, columns["class"], quantised.rules, columns["cell"])
-        decoded = dequantise(quantised)
+            described = _settled(quantized, again, path=free is PATH_AND_COLOR, before=described)
+            columns = quantized.columns
+            quantized = quantize(described, columns["class"], quantized.rules, columns["cell"])
+        decoded = dequantize(quantized)
         tried[factor] = found = loss(decoded, every)
         on_step("mended", found)
         if found <= most and (best is None or factor > best.factor):
-            best = _Try(factor, quantised, decoded, found)
+            best = _Try(factor, quantized, decoded, found)
             if found > _ENOUGH * most:
                 break
         factor = _next(tried, most, least)
@@ -280,20 +280,20 @@ def _some(model: VideoModel, kept: Bool[np.ndarray, " num"] | Int[np.ndarray, " 
     return eqx.tree_at(lambda m: m.splats, model, splats)
 
 
-def _freed(quantised: Quantised, described: Described, *, path: bool) -> VideoModel:
+def _freed(quantized: Quantized, described: Described, *, path: bool) -> VideoModel:
     """The model as decoded, but with colours, and paths if asked for, not rounded."""
-    model = dequantise(quantised)
+    model = dequantize(quantized)
     color = np.stack([described.values[name] for name in COLORS], 1) @ AXES
     splats = eqx.tree_at(lambda s: s.color_dc, model.splats, color.astype(np.float32))
     if path:
-        place = lower_paths(quantised, described).astype(np.float32)
+        place = lower_paths(quantized, described).astype(np.float32)
         splats = eqx.tree_at(lambda s: (s.loc, s.coefficients), splats, (place[:, 0], place[:, 1:]))
     return eqx.tree_at(lambda m: m.splats, model, splats)
 
 
-def _settled(quantised: Quantised, again: VideoModel, *, path: bool, before: Described) -> Described:
+def _settled(quantized: Quantized, again: VideoModel, *, path: bool, before: Described) -> Described:
     """What is to be rounded next: the numbers that were rounded, which stay, and those of `again` for the others."""
-    now, values = describe(again), values_of(quantised)
+    now, values = describe(again), values_of(quantized)
     values = {name: values[name] for name in before.values} | {name: now.values[name] for name in COLORS}
     values["time"] = in_clip(values["time"])
     # Paths that stay are rounded again from the same place, hence to the same numbers.
@@ -302,7 +302,7 @@ def _settled(quantised: Quantised, again: VideoModel, *, path: bool, before: Des
 
 
 class _Loss:
-    """What quantisation costs, in dB; and, given the clip, the pictures that mending aims at."""
+    """What quantization costs, in dB; and, given the clip, the pictures that mending aims at."""
 
     def __init__(self, model: VideoModel, frames: np.ndarray | None, reference: float | None):
         self._model, self._frames, self.num_frames = model, frames, model.num_frames
@@ -317,7 +317,7 @@ class _Loss:
         if frames.dtype != np.uint8:
             raise invalid("frames", expected="uint8", got=frames.dtype)
         self.measured_by = "clip"
-        self._shown = frames if frames.shape[-1] == 3 else [composited(frame, np.float32(BLACK)) for frame in frames]
+        self._shown = frames if frames.shape[-1] == 3 else [composite(frame, np.float32(BLACK)) for frame in frames]
         self._before = np.array([psnr_of(*pair) for pair in zip(self._shown, pictures, strict=True)])
         self._before = np.minimum(self._before, EXACT_PSNR)
         self.psnr = float(self._before.mean())
@@ -338,7 +338,7 @@ class _Loss:
         opaque = self._frames.shape[-1] == 3
         behind = np.zeros(3, np.float32) if summed or opaque else random_background(0, step)
         frame = self._frames[k]
-        picture = frame if opaque else composited(frame, behind)
+        picture = frame if opaque else composite(frame, behind)
         return np.ascontiguousarray(np.moveaxis(picture, -1, 0) * np.float32(1 / 255)), behind
 
 
@@ -402,7 +402,7 @@ class _Plan:
         kept[np.argmax(self._own)] = True
         return kept
 
-    def at(self, factor: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantised:
+    def at(self, factor: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantized:
         """The Gaussians `kept` (None: all), steps times 2^factor; the error of a number is then about 4^factor / 12."""
         kept = np.ones(len(self._own), bool) if kept is None else kept
         described = subset(self.described, kept)
@@ -418,7 +418,7 @@ class _Plan:
             if name in COLORS and shared:
                 slopes = ()
             rules[name] = Rule(origin, round(factor - exponent, 4), slopes)
-        return quantise(described, self._classes[kept], rules)
+        return quantize(described, self._classes[kept], rules)
 
 
 def subset(described: Described, kept: Bool[np.ndarray, " num"]) -> Described:

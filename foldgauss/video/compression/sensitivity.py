@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from foldgauss.render import cpu
 from foldgauss.video.compression.quantize import AXES, Described, path_matrix
-from foldgauss.video.models.conditioning import pull_back
+from foldgauss.video.models.conditioning import backpropagate
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.selection.contributions import Contributions
 
@@ -31,12 +31,12 @@ def sensitivities(
     total: dict[str, np.ndarray] = {name: np.zeros(num) for name in to_columns.names}
     best = np.zeros(num)
     for k in range(len(lit.times)):
-        light = lit.frame(k)
+        light = lit.at_frame(k)
         if len(light.alive):
             signs = rng.integers(0, 2, shape, dtype=np.int8) * np.float32(2 * LEVELS) - np.float32(LEVELS)
             rows = np.zeros((num, 11 + 2 * degree), np.float32)
-            stage = lit.stage
-            pull_back(stage.rows, light.splats, cpu.backward(light.trace, signs)[:4], stage.shape, rows)
+            stage = lit.prepared
+            backpropagate(stage.rows, light.splats, cpu.backward(light.trace, signs)[:4], stage.spec, rows)
             for name, gradient in to_columns(rows[light.alive].astype(np.float64), light.alive).items():
                 total[name][light.alive] += gradient**2
             best[light.alive] = np.maximum(best[light.alive], light.total)

@@ -79,7 +79,7 @@ def overlaps(lit: Contributions) -> Overlaps:
     keys, costs = np.full(1 << 20, _EMPTY, np.int64), np.zeros(1 << 20)
     options, used = lit.model.options, 0
     for k in range(len(lit.times)):
-        done, offset = lit.frame(k).splats, (k % stride, k // stride % stride)
+        done, offset = lit.at_frame(k).splats, (k % stride, k // stride % stride)
         light, count = np.ones(rows, np.float32), np.zeros(rows, np.int32)
         seen = np.float32(options.low_pass), np.float32(options.alpha_cutoff)
         _layered(done.mean, done.factor, done.opacity, done.alive, offset, stride, *seen, light, count, *layers)

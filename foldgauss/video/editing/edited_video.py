@@ -23,10 +23,9 @@ from foldgauss.video.editing.overlays import (
     padded_size,
 )
 from foldgauss.video.models.background import BLACK
-from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.frame_times import FrameTimes, is_cut, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.shots import is_cut, out_of_cuts
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel, check_time
 
 
@@ -124,22 +123,22 @@ class EditedVideo(eqx.Module):
         return max(layer.model.splats.degree for layer in self.layers)
 
     @property
-    def num_floats(self) -> int:
+    def num_parameters(self) -> int:
         """Numbers stored, masks not counted."""
-        return sum(layer.model.num_floats for layer in self.layers)
+        return sum(layer.model.num_parameters for layer in self.layers)
 
     def with_options(self, options: RenderOptions) -> "EditedVideo":
         """The same, drawn with other constants: those of all layers."""
         own = (dataclasses.replace(layer, model=layer.model.with_options(options)) for layer in self.layers)
         return dataclasses.replace(self, layers=tuple(own))
 
-    def stage(self, size: tuple[int, int]) -> "PreparedEditedVideo":
+    def prepare(self, size: tuple[int, int]) -> "PreparedEditedVideo":
         """Made ready to be conditioned many times, for pictures of `size`."""
         return PreparedEditedVideo(self, size)
 
     def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, front to back, in pixels of a picture of `size` (default: its own); NumPy leaves."""
-        return self.stage(self.size if size is None else size).splats(float(t))
+        return self.prepare(self.size if size is None else size).splats(float(t))
 
     def render(
         self,
@@ -247,9 +246,9 @@ class PreparedEditedVideo:
         nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
         return jax.tree.map(lambda leaf: leaf[nearest_first], _together(moments))
 
-    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
-        """One picture, see `foldgauss.video.models.renderer.Staged`."""
-        return [(1.0, self.splats(out_of_cuts(t, self._times)))]
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
+        """One picture, see `foldgauss.video.models.renderer.PreparedVideo`."""
+        return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
     def _camera_at(self, t: float) -> Camera:
         camera = self._camera
@@ -278,7 +277,7 @@ class _PreparedLayer:
 
     def at(self, t: float) -> "_ConditionedLayer":
         """The layer's Gaussians at the video's time t, edited."""
-        moment = _ConditionedLayer(*self._conditioned(t), self._stage.shape.size, self._stage.shape.aspect)
+        moment = _ConditionedLayer(*self._conditioned(t), self._stage.spec.size, self._stage.spec.aspect)
         for overlay, mask in zip(self._layer.overlays, self._masks, strict=True):
             progress = overlay.progress(t)
             if is_active(overlay, progress):
@@ -298,7 +297,7 @@ class _PreparedLayer:
     def _own_time(self, clocks: tuple[Retiming, ...], t: float) -> float:
         for clock in reversed(clocks):  # the last edit is asked first: it retimes all that the others made
             t = clock.own_time(t)
-        return float(out_of_cuts(t, self._times)) if self._holds_frames else t
+        return float(snap_to_shots(t, self._times)) if self._holds_frames else t
 
 
 def _by_clocks(layer: Layer) -> list[tuple[tuple[Retiming, ...], Bool[np.ndarray, " num"] | None]]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.video.models.kinds import DEGREES, LASTS, SOLID
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 
 CHUNK = 2048  # rows per task
 #: The unit of time of Gaussians that last, whose sigma_t says nothing: the standard deviation of all times of a clip.
@@ -38,15 +38,15 @@ def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits
         taken = min(counts[i], len(unbias) - 1)
         unbias1, unbias2 = unbias[taken, 0], unbias[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
-        lasts, powers = kinds[i] & lasting, kinds[i] & degrees
-        if lasts:  # its times stay
+        is_static, powers = kinds[i] & lasting, kinds[i] & degrees
+        if is_static:  # its times stay
             g[time], g[spread] = _f(0.0), _f(0.0)
         if kinds[i] & solid:
             g[opacity] = _f(0.0)
         for c in range(fold + 2 * powers, width):
             g[c] = _f(0.0)
         if unit > _f(0.0):
-            wide = (_f(LASTING_TIME) if lasts else math.exp(row[spread])) / unit
+            wide = (_f(LASTING_TIME) if is_static else math.exp(row[spread])) / unit
             own[time] = rates[time] * wide
             short, power = _f(1.0) / wide, _f(1.0)
             for c in range(fold, width, 2):
@@ -76,7 +76,7 @@ def sparse_adam(
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps each row
     has taken; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which columns a row has, by
-    `kinds.kinds_of` (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the
+    `sparse_storage.find_kinds` (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the
     fold are those at sigma_t = `unit_time`, and others' as `config.LearningRates` says.
     """
     place = columns(0)  # the fold comes last, so its degree moves none of these
@@ -96,7 +96,7 @@ def sparse_adam(
             second,
             counts,
             kinds,
-            (LASTS, SOLID, DEGREES),
+            (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK),
             rates,
             np.float32(unit_time),
             at,

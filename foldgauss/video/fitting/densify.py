@@ -7,7 +7,7 @@ from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig, most_gaussians
 from foldgauss.video.fitting.growth import GradientStatistics, Growth, dim, grown
 from foldgauss.video.fitting.state import FitState
-from foldgauss.video.models.kinds import kinds_of
+from foldgauss.video.models.sparse_storage import find_kinds
 
 
 def changes_at(growth: Growth, step: int) -> bool:
@@ -48,7 +48,7 @@ def _replace(state: FitState, config: FitConfig, growth: Growth, size: tuple[int
         np.concatenate([part[stay], np.zeros_like(born)]) for part in (state.first, state.second)
     )
     state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
-    state.kinds = np.concatenate([state.kinds[stay], kinds_of(born, config.degree)])
+    state.kinds = np.concatenate([state.kinds[stay], find_kinds(born, config.degree)])
     state.young = np.concatenate([state.young[stay], np.zeros(len(born), bool)])
     state.colors, state.shapes = Codebook.of(None, 3), Codebook.of(None, 2)  # those born have their own
     state.statistics = GradientStatistics.zeros(len(state.rows))

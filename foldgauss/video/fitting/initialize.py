@@ -11,7 +11,7 @@ import scipy
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
 from foldgauss.video.fitting.optical_flow import Motion, fitted_folds
-from foldgauss.video.models.splats import LASTING, SH_C0, TAU_MAX, FoldedSplats
+from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 
 #: Share of the starts that is spread evenly, so that flat parts are covered too.
 EVEN_SHARE = 0.15
@@ -85,7 +85,7 @@ def initialize(
     position, density = drawn(home, share_of, rng)
     splats, spread = make(home, position)
     still = steady(frames, home, position) if lasting else np.zeros(num_gaussians, bool)
-    splats, spread = without_end(splats, still), np.where(still, np.exp(LASTING), spread)
+    splats, spread = without_end(splats, still), np.where(still, np.exp(STATIC_LOG_TIME_SCALE), spread)
     alive = num_alive(times[home], spread, times)[home]
     scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     order = rng.permutation(num_gaussians)  # depth has nothing to do with time
@@ -195,7 +195,7 @@ def without_end(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
     return dataclasses.replace(
         splats,
         time_loc_logit=np.where(which, np.float32(0), splats.time_loc_logit),
-        log_time_scale=np.where(which, LASTING, splats.log_time_scale),
+        log_time_scale=np.where(which, STATIC_LOG_TIME_SCALE, splats.log_time_scale),
         coefficients=np.where(which[:, None, None], np.float32(0), splats.coefficients),
     )
 

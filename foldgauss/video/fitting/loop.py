@@ -11,7 +11,7 @@ import numpy as np
 
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss._runtime.threads import check_process
+from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
@@ -50,11 +50,16 @@ from foldgauss.video.fitting.steppers.engines import choose_engine
 from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.models.background import random_background
-from foldgauss.video.models.conditioning import Conditioned, Shape, condition, pull_back, update_windows
-from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.kinds import kinds_at_start, kinds_of
+from foldgauss.video.models.conditioning import (
+    ConditionedSplats,
+    ConditioningSpec,
+    backpropagate,
+    condition,
+    update_windows,
+)
+from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import columns, pack
-from foldgauss.video.models.shots import time_logits
+from foldgauss.video.models.sparse_storage import find_initial_kinds, find_kinds
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
@@ -131,7 +136,7 @@ def fit_steps(
 
     `motion`: the frames' own, where it is known from before; finding it takes some hundredths of a second a frame.
     """
-    check_process()
+    check_not_forked()
     check_frames(frames)
     if frames.shape[3] == 4 and config.compositing == "sum":
         cure = "Sums let all light through: drop the alpha, or take 'over'."
@@ -321,7 +326,7 @@ def _started(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, f
     begun, num_frames = time.perf_counter(), len(frames)
     motion = flow.motion if config.follow_motion else None
     if logits is None:
-        logits = time_logits(num_frames, motion.cuts() if motion is not None else [])
+        logits = make_time_logits(num_frames, motion.cuts() if motion is not None else [])
     logits = np.array(logits, np.float32)
     rows = pack(_splats(frames, config, logits, motion))
     return FitState(
@@ -329,7 +334,7 @@ def _started(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, f
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
-        kinds=kinds_at_start(rows, config.degree),
+        kinds=find_initial_kinds(rows, config.degree),
         young=np.zeros(len(rows), bool),
         colors=Codebook.of(None, 3),
         shapes=Codebook.of(None, 2),
@@ -365,7 +370,7 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
         first=np.zeros_like(rows),
         second=np.zeros_like(rows),
         counts=np.zeros(len(rows), np.int32),
-        kinds=kinds_of(rows, config.degree),
+        kinds=find_kinds(rows, config.degree),
         young=np.zeros(len(rows), bool),
         colors=Codebook.of(None, 3),
         shapes=Codebook.of(None, 2),
@@ -458,8 +463,8 @@ class _Stepper:
         self.num_frames, height, width, _ = frames.shape
         self.levels = levels(config, (height, width))
         own = config.degree, config.power, config.floor
-        self.shapes = [Shape(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
-        self.shapes.append(Shape(*own, (height, width)))
+        self.shapes = [ConditioningSpec(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
+        self.shapes.append(ConditioningSpec(*own, (height, width)))
         self.rates = Rates(config)
         self.flow = _Flow(frames) if flow is None else flow
         self.between = _Between(frames, config, self.flow.motion) if config.interpolation_fraction > 0 else None
@@ -557,13 +562,13 @@ class _Stepper:
         state: FitState,
         k: int,
         t: np.float32,
-        shape: Shape,
+        shape: ConditioningSpec,
         *,
         squared: bool,
         mirrored: bool,
         views: list[tuple[np.ndarray, np.ndarray]] | None,
         share: float | None = None,
-    ) -> tuple[ImageLoss, Conditioned, float]:
+    ) -> tuple[ImageLoss, ConditionedSplats, float]:
         """Loss of frame k, or of what lies `share` of the way to the next; gradients are added to `self.grad`, dL/dt is
         returned.
 
@@ -592,12 +597,12 @@ class _Stepper:
         if mirrored:
             d_mean, d_factor = _mirrored(d_mean, d_factor, 0)
         if views is not None:
-            seen = trace.seen
+            seen = trace.visible
             half = np.float32(shape.size[::-1]) / 2
             views.append((done.alive[seen], cpu.screen_gradient(d_mean[seen] * half)))
-        return loss, done, pull_back(rows, done, (d_mean, d_factor, *others), shape, self.grad)
+        return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad)
 
-    def _drawn(self, done: Conditioned, shape: Shape) -> cpu.Trace:
+    def _drawn(self, done: ConditionedSplats, shape: ConditioningSpec) -> cpu.Trace:
         return cpu.forward(
             done.mean,
             done.factor,

@@ -31,7 +31,7 @@ class IndependentFrames:
     """A clip as one model per frame: what `VideoModel` is without folds, times and anything shared.
 
     `models` are video models of one frame each; `steps` and `seconds` are those of all fits together. `frames`, `size`,
-    `num_frames`, `num_gaussians` and `num_floats` are as a video model's, so `evaluate` takes it in its place.
+    `num_frames`, `num_gaussians` and `num_parameters` are as a video model's, so `evaluate` takes it in its place.
     """
 
     models: tuple[VideoModel, ...]
@@ -52,7 +52,7 @@ class IndependentFrames:
         return sum(model.num_gaussians for model in self.models)
 
     @property
-    def num_floats(self) -> int:
+    def num_parameters(self) -> int:
         """Numbers that must be stored: `FLOATS` for each Gaussian. No m_t, sigma_t or fold, and no frame times."""
         return FLOATS * self.num_gaussians
 
@@ -66,18 +66,18 @@ class IndependentFrames:
 
 def independent_frames(
     frames: UInt8[np.ndarray, "num_frames height width channels"],
-    num_floats: int,
+    num_parameters: int,
     config: FitConfig | None = None,
     *,
     fps: float = 25.0,
     on_frame: Callable[[int, VideoModel], None] = lambda k, model: None,
 ) -> IndependentFrames:
-    r"""Fit each frame alone, with as many Gaussians in all as `num_floats` numbers have room for.
+    r"""Fit each frame alone, with as many Gaussians in all as `num_parameters` numbers have room for.
 
     $$ \mathcal G^{t_1}_{\mathrm{MiraGe}} \cup \dots \cup \mathcal G^{t_n}_{\mathrm{MiraGe}} $$
 
     **Shapes:** `frames` uint8 (num_frames, height, width, 3), or with alpha (..., 4), as `fit` takes them. Frames get
-    `num_floats` // 9 Gaussians in equal parts, the first ones what is left over.
+    `num_parameters` // 9 Gaussians in equal parts, the first ones what is left over.
 
     `config` is the fit's of each frame: starts, loss, coarse levels, rates (see `FASTER`), compositing. Its `steps` are
     of each frame (default `DEFAULT_STEPS`); its `minutes` are for all, divided evenly by the measured pace. What is
@@ -87,7 +87,7 @@ def independent_frames(
     **Raises** ValueError for frames that cannot be fitted, for fewer numbers than a Gaussian in each frame takes, and
     for settings that would change the numbers of Gaussians, or that need other frames.
 
-    **Example:** `independent_frames(frames, model.num_floats, FitConfig(minutes=2))`, beside `model = fit(...).model`.
+    **Example:** `independent_frames(frames, model.num_parameters, FitConfig(minutes=2))`.
 
     **Source:** VeGaS, eq:miragevideo: the family that folds are to improve on.
     """
@@ -95,10 +95,10 @@ def independent_frames(
     config = FitConfig() if config is None else config
     _check_config(config)
     num_frames, least = len(frames), FLOATS * len(frames)
-    if not is_integer(num_floats, least):
+    if not is_integer(num_parameters, least):
         expected = f"a whole number >= {least:,}, one Gaussian in each frame"
-        raise invalid("num_floats", expected=expected, got=repr(num_floats))
-    each, more = divmod(int(num_floats) // FLOATS, num_frames)
+        raise invalid("num_parameters", expected=expected, got=repr(num_parameters))
+    each, more = divmod(int(num_parameters) // FLOATS, num_frames)
     allowance, models, steps = _Allowance(config, num_frames), [], 0
     alone = dataclasses.replace(config, degree=0, power=0.0, floor=0.0, minutes=None, steps=None)
     rates = {name: FASTER * rate for name, rate in dataclasses.asdict(config.rates).items()}
@@ -121,7 +121,7 @@ def _check_config(config: FitConfig) -> None:
     for name in ("num_gaussians", "max_gaussians", "max_size_mb", "target_psnr", "growth", "economy"):
         value = getattr(config, name)
         if value is not None:
-            raise invalid(f"config.{name}", expected="None", got=value, cure="num_floats says how many there are.")
+            raise invalid(f"config.{name}", expected="None", got=value, cure="num_parameters says how many there are.")
     if config.interpolation_fraction > 0:
         cure = "Nothing lies between frames that share nothing."
         raise invalid("config.interpolation_fraction", expected="0", got=config.interpolation_fraction, cure=cure)

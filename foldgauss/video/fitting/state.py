@@ -80,7 +80,7 @@ class FitState:
     first: np.ndarray  # Adam's moments, likewise
     second: np.ndarray
     counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
-    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `kinds.kinds_of`
+    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `sparse_storage.find_kinds`
     young: np.ndarray  # bool (num,): born the last time that stock was taken
     colors: Codebook  # which colours are one and the same
     shapes: Codebook  # likewise of the two standard deviations

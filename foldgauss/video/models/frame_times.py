@@ -1,18 +1,29 @@
-"""Learned occurrence times of the frames (eq:frame_fitting)."""
+"""Occurrence times of the frames (eq:frame_fitting): learned inside a shot, with a gap at every cut between two shots.
+
+The gap keeps a Gaussian of one shot from being alive in the next one.
+"""
+
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Float32
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss._runtime.threads import check_process
-from foldgauss.video.models.shots import is_cut
+from foldgauss._runtime.threads import check_not_forked
+
+#: Length of the gap between two shots, in frames: `GAP` plus `GAP_SHOTS` times the longer shot. A Gaussian in the
+#: middle of a shot has vanished in the next one for sigma_t up to 1.15 shots, whose envelope shrinks it by at most a
+#: tenth at the ends of its own shot.
+GAP, GAP_SHOTS = 8.0, 3.0
+#: An interval longer than the median one by this factor is a cut. Learned times move neighbours less than that.
+CUT_RATIO = 6.0
 
 
 class FrameTimes(eqx.Module):
-    r"""Times of n frames in [0, 1], learned through n - 1 softmax weights; one frame alone is at 0.
+    r"""Times of n frames in [0, 1], learned through n - 1 softmax weights; a single frame is at 0.
 
     $$ t_k = \sum_{i \le k} \frac{e^{w_i}}{\sum_j e^{w_j}}, \qquad t_0 = 0,\; t_{n-1} = 1 $$
 
@@ -37,28 +48,61 @@ class FrameTimes(eqx.Module):
     def times(self) -> Float[Array, "num_frames"]:
         """The times t_k: 0 at the first frame, exactly 1 at the last, never decreasing.
 
-        Neighbours are equal only where a weight is too small for the dtype to show.
+        Neighbours are equal only where a weight is too small for the dtype.
         """
-        check_process()
+        check_not_forked()
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 
     def cut_after(self, k: int) -> bool:
-        """Whether between frames k and k + 1 nothing lies. Raises ValueError for a frame that is none, or the last."""
+        """Whether there is a cut between frames k and k + 1. Raises ValueError unless both are frames of the clip."""
         check_frame_before(k, self.num_frames)
         return bool(is_cut(self.times())[k])
 
 
 def check_frame_before(k: object, num_frames: int) -> None:
-    """Raise unless `k` is the number of a frame that another one follows."""
+    """Raise unless `k` is the number of a frame before the last one."""
     if not is_integer(k, 0) or k > num_frames - 2:
         raise invalid("k", expected=f"the number of a frame before the last of {num_frames}", got=short_repr(k))
+
+
+def make_time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " intervals"]:
+    """Softmax weights (num_frames - 1,) of evenly spaced frame times with a gap before each of the frames `cuts`.
+
+    There are no gaps if at least half of the intervals are cuts (a slide show): the gap would be the median interval,
+    and `is_cut` could not detect it.
+    """
+    logits = np.zeros(num_frames - 1, np.float32)
+    if 2 * len(cuts) >= num_frames - 1:
+        return logits
+    lengths = np.diff([0, *cuts, num_frames])
+    for cut, before, after in zip(cuts, lengths[:-1], lengths[1:], strict=True):
+        logits[cut - 1] = np.log(GAP + GAP_SHOTS * max(before, after))
+    return logits
+
+
+def is_cut(times: Float[ArrayLike, " num_frames"]) -> Bool[Array, " intervals"]:
+    """Which intervals between frame times are cuts: a NumPy array for NumPy times (JAX would round float64)."""
+    arrays = jnp if isinstance(times, jax.Array) else np
+    intervals = arrays.diff(arrays.asarray(times))
+    return intervals > CUT_RATIO * arrays.median(intervals) if len(intervals) else arrays.zeros(0, bool)
+
+
+@jax.jit
+def snap_to_shots(t: Float[ArrayLike, "*batch"], times: Float[ArrayLike, " num_frames"]) -> Float[Array, "*batch"]:
+    """t, or the nearer frame's time where t lies in the gap of a cut. A single frame covers all times."""
+    t, times = jnp.asarray(t), jnp.asarray(times)
+    if len(times) == 1:
+        return jnp.full_like(t, times[0])
+    k = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    nearer = jnp.where(t - times[k] < times[k + 1] - t, times[k], times[k + 1])
+    return jnp.where(is_cut(times)[k] & (t < times[k + 1]), nearer, t)
 
 
 def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
     """`upsample` frames per original interval, evenly spaced between t_k and t_{k+1}, and the last frame.
 
-    At a cut nothing lies between: the first half of the frames there is the one before it, the rest the one after.
+    At a cut the first half of the new frames repeats the frame before it, the second half the frame after it.
     Shape ((n - 1) * upsample + 1,). Source: VeGaS, the sentence after eq:frame_fitting.
     """
     if upsample < 1:
@@ -71,19 +115,19 @@ def times_at(
 ) -> Float[np.ndarray, "*batch"]:
     """The times of continuous frame positions: 2.5 is half way from frame 2 to frame 3.
 
-    Positions are held within the clip. At a cut nothing lies between: the nearer frame's time. Shapes: as `positions`.
+    Positions are clipped to the clip; those in the gap of a cut get the nearer frame's time. Shapes: as `positions`.
     """
     times, positions = np.asarray(times), np.clip(np.asarray(positions, np.float64), 0, len(times) - 1)
-    cut = np.append(np.asarray(is_cut(times)), False)  # after the last frame nothing comes
+    cut = np.append(np.asarray(is_cut(times)), False)  # no interval follows the last frame
     positions = np.where(cut[positions.astype(int)], np.floor(positions + 0.5), positions)
     return np.interp(positions, np.arange(len(times)), times).astype(times.dtype)
 
 
 def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Float[np.ndarray, " shown"]:
-    """Frame positions that are shown one after another, from the first frame to the last; backwards for speed < 0.
+    """Frame positions of the output frames, from the first frame to the last; backwards for speed < 0.
 
-    `rate` is that of the pictures over that of the frames, `speed` how fast time goes by: 0.25 is slow motion. The last
-    frame is shown only where the step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
+    `rate` is the output's frame rate over the clip's, `speed` the playback speed: 0.25 is slow motion. The last frame
+    is included only if a step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
     """
     _check_rate(rate)
     if not (np.isfinite(speed) and speed != 0):
@@ -96,10 +140,10 @@ def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Flo
 def remapped_positions(
     remap: Float[ArrayLike, "points 2"], fps: float, rate: float = 1.0
 ) -> Float[np.ndarray, " shown"]:
-    """Frame positions that are shown when the clip's time is a piecewise linear function of the pictures' time.
+    """Frame positions of the output frames if the clip's time is a piecewise linear function of the output's time.
 
-    `remap` has rows (second shown, second of the clip), the first column rising from 0; `fps` is the clip's, `rate` as
-    in `played_positions`. Raises ValueError for anything else.
+    `remap` has rows (second of the output, second of the clip), the first column rising from 0; `fps` is the clip's,
+    `rate` as in `played_positions`. Raises ValueError for anything else.
     Example: `remapped_positions([[0, 0], [1, 1], [3, 1], [4, 2]], fps=25)` holds second 1 for two seconds.
     """
     _check_rate(rate)

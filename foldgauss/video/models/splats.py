@@ -1,6 +1,4 @@
-"""Folded splats: the trainable leaves of a video, as Folded-Gaussians with opacity and colour."""
-
-from typing import TYPE_CHECKING
+"""Folded splats: Folded-Gaussians with opacity and colour, the trainable parameters of a video."""
 
 import equinox as eqx
 import jax
@@ -8,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from foldgauss._numerics.batch import known
+from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import invalid
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
@@ -16,21 +14,18 @@ from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
 from foldgauss.mixture import FoldedMixture
 from foldgauss.render import Splats2D
 
-if TYPE_CHECKING:
-    pass
-
 #: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
 SH_C0 = 0.28209479177387814
-#: A Gaussian is drawn only where exp(-tau^2 / 2) exceeds this, as in the published VeGaS.
+#: A Gaussian is rendered only where exp(-tau^2 / 2) exceeds this, as in the published VeGaS.
 TIME_CUTOFF = 0.01
 #: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
 TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
-#: log sigma_t of a Gaussian that is there throughout the clip: with m_t = 0.5 its |tau| is at most 1/2048, and the
-#: envelope, of power 2 or less, is 1 to 3e-7. Neither is stored.
-LASTING = np.float32(np.log(1024))
-#: Logit of the opacity of a Gaussian that no light comes through, 0.9997. It is not stored.
-OPAQUE = np.float32(8)
-#: Opacity of a mixture's heaviest component as a splat: below 1, whose logit is infinite.
+#: log sigma_t of a static Gaussian, which is alive throughout the clip: with m_t = 0.5, |tau| is at most 1/2048, and an
+#: envelope of power <= 2 is 1 to within 3e-7. Neither parameter is stored.
+STATIC_LOG_TIME_SCALE = np.float32(np.log(1024))
+#: Opacity logit of an opaque Gaussian (opacity 0.9997). It is not stored.
+OPAQUE_LOGIT = np.float32(8)
+#: Opacity of the splat of a mixture's heaviest component; 1 would have an infinite logit.
 PEAK_OPACITY = 0.99
 
 
@@ -73,22 +68,19 @@ class FoldedSplats(eqx.Module):
 
     @property
     def degrees(self) -> Int[np.ndarray, " num"]:
-        """Of each Gaussian: its last power whose coefficients are not both 0. Higher ones are not stored.
-
-        A coefficient of -0 counts: it is not the bits that an absent one is restored with.
-        """
-        kept = _holds_bits(self.coefficients).any(axis=2)
+        """Each Gaussian's last power whose coefficients are not both +0: higher powers are not stored."""
+        kept = _has_bits(self.coefficients).any(axis=2)
         return (kept * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
 
     @property
-    def lasting(self) -> Bool[np.ndarray, " num"]:
-        """Who is there throughout the clip: m_t = 0.5 and log sigma_t = `LASTING` exactly. Neither is stored."""
-        return (np.asarray(self.log_time_scale) == LASTING) & ~_holds_bits(self.time_loc_logit)
+    def static(self) -> Bool[np.ndarray, " num"]:
+        """Which Gaussians have m_t = 0.5 and log sigma_t = `STATIC_LOG_TIME_SCALE` exactly: neither is stored."""
+        return (np.asarray(self.log_time_scale) == STATIC_LOG_TIME_SCALE) & ~_has_bits(self.time_loc_logit)
 
     @property
-    def solid(self) -> Bool[np.ndarray, " num"]:
-        """Whom no light comes through: an opacity's logit of `OPAQUE` exactly, which is not stored."""
-        return np.asarray(self.opacity_logit) == OPAQUE
+    def opaque(self) -> Bool[np.ndarray, " num"]:
+        """Which Gaussians have an opacity logit of `OPAQUE_LOGIT` exactly: it is not stored."""
+        return np.asarray(self.opacity_logit) == OPAQUE_LOGIT
 
     def gaussians(self) -> FoldedGaussian:
         """The batch of Folded-Gaussians, batch shape (num,), event shape (3,)."""
@@ -105,8 +97,8 @@ class FoldedSplats(eqx.Module):
     def from_mixture(cls, mixture: FoldedMixture, *, color: ArrayLike) -> "FoldedSplats":
         """A mixture's components as splats, in their order: `gaussians()` is `mixture.components`.
 
-        Weights become opacities, `w_k / max w` times `PEAK_OPACITY`: in this model they scale what is seen. So
-        `to_mixture` is the inverse. The density itself, as a picture, is `density_image`.
+        Weights become opacities, `w_k / max w` times `PEAK_OPACITY`; `to_mixture` is the inverse. To render the
+        density itself, use `density_image`.
 
         Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
         folds and a time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0.
@@ -119,10 +111,12 @@ class FoldedSplats(eqx.Module):
             got = f"event {mixture.event_shape}, batch {mixture.batch_shape}"
             raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Index its leaves.")
         time_loc, dtype, num = components.time_loc, components.loc.dtype, mixture.num_components
-        outside = known((time_loc <= 0) | (time_loc >= 1))
+        outside = concrete_value((time_loc <= 0) | (time_loc >= 1))
         if outside is not None and outside.any():
-            cure = "A video's time is [0, 1]: move and scale the mixture's."
-            raise invalid("mixture.components.time_loc", expected="times in (0, 1)", got=known(time_loc), cure=cure)
+            cure = "A video's time is [0, 1]: shift and scale the mixture's."
+            raise invalid(
+                "mixture.components.time_loc", expected="times in (0, 1)", got=concrete_value(time_loc), cure=cure
+            )
         log_scale, angle = _axes(components.scale_tril)
         log_weights = mixture.log_weights
         log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
@@ -134,7 +128,7 @@ class FoldedSplats(eqx.Module):
             log_time_scale=jnp.log(components.time_scale),
             coefficients=_coefficients(components.fold, num, dtype),
             opacity_logit=log_opacity - jnp.log(-jnp.expm1(log_opacity)),
-            color_dc=(_checked_color(color, num, dtype) - 0.5) / SH_C0,
+            color_dc=(_check_color(color, num, dtype) - 0.5) / SH_C0,
             envelope=_as_time_likelihood(components.envelope),
         )
 
@@ -148,8 +142,8 @@ class FoldedSplats(eqx.Module):
     def at(self, t: Float[Array, ""], *, scale_cutoff: float = 0.0) -> Splats2D:
         """The splats of time t, in model space: every Gaussian conditioned on t (eq:vegas_equiv_cond).
 
-        A Gaussian too far away in time (`TIME_CUTOFF`), or with a standard deviation not above `scale_cutoff` by then,
-        keeps its place with opacity 0.
+        A Gaussian too far away in time (`TIME_CUTOFF`), or with a standard deviation not above `scale_cutoff` at t,
+        gets opacity 0.
         """
         folded = self.gaussians()
         conditional = folded.condition_time(t)
@@ -162,8 +156,8 @@ class FoldedSplats(eqx.Module):
         return Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
 
 
-def _holds_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
-    """Where a number has other bits than 0 has."""
+def _has_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
+    """Where values differ from +0 in their bits; -0 does."""
     leaf = np.asarray(leaf)
     return (leaf != 0) | np.signbit(leaf)
 
@@ -171,7 +165,7 @@ def _holds_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
 def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]) -> Float[Array, "num 2 2"]:
     """Lower-triangular factor of R(angle) diag(scale)^2 R(angle)^T, in closed form.
 
-    The determinant is the product of the scales, so nothing is subtracted and the factor exists for any scales > 0.
+    The determinant is the product of the scales: without subtraction, the factor exists for all scales > 0.
     Source: R and S of eq:mirage.
     """
     first, second = scale[:, 0], scale[:, 1]
@@ -185,14 +179,14 @@ def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]
 def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
     """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
 
-    Closed-form singular values of [[p, 0], [q, r]]. The angle counts modulo pi, and is from [pi/2, 3 pi/2].
+    Closed-form singular values of [[p, 0], [q, r]]. The angle is in [pi/2, 3 pi/2]; it is unique modulo pi.
     """
     p, q, r = tril[:, 0, 0], tril[:, 1, 0], tril[:, 1, 1]
     first = 0.5 * (jnp.hypot(p + r, q) + jnp.hypot(p - r, q))
     log_scale = jnp.stack([jnp.log(first), jnp.log(p) + jnp.log(r) - jnp.log(first)], axis=-1)
     twice_cross, difference = 2 * p * q, (p - r) * (p + r) - q * q
-    round_one = (twice_cross == 0) & (difference == 0)  # any angle will do; a gradient there has no meaning
-    return log_scale, jnp.pi + 0.5 * jnp.arctan2(twice_cross, jnp.where(round_one, 1, difference))
+    isotropic = (twice_cross == 0) & (difference == 0)  # any angle is right, and has no meaningful gradient
+    return log_scale, jnp.pi + 0.5 * jnp.arctan2(twice_cross, jnp.where(isotropic, 1, difference))
 
 
 def _coefficients(fold: AbstractFold, num: int, dtype) -> Float[Array, "num degree 2"]:
@@ -214,13 +208,12 @@ def _as_time_likelihood(envelope: AbstractEnvelope) -> TimeLikelihood:
     return envelope
 
 
-def _checked_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
+def _check_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
     color = jnp.asarray(color, dtype)
     if color.shape not in ((3,), (num, 3)):
-        raise invalid(
-            "color", expected=f"shape (3,) or ({num}, 3)", got=f"shape {color.shape}", cure="RGB about [0, 1]."
-        )
-    values = known(color)
+        got, cure = f"shape {color.shape}", "RGB in [0, 1]."
+        raise invalid("color", expected=f"shape (3,) or ({num}, 3)", got=got, cure=cure)
+    values = concrete_value(color)
     if values is not None and not (values >= 0).all():
-        raise invalid("color", expected="numbers >= 0", got=values.tolist(), cure="Light is not taken away.")
+        raise invalid("color", expected="values >= 0", got=values.tolist())
     return jnp.broadcast_to(color, (num, 3))

@@ -15,7 +15,7 @@ from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.frame_times import check_frame_before, times_at
-from foldgauss.video.models.renderer import Staged, VideoRenderer
+from foldgauss.video.models.renderer import PreparedVideo, VideoRenderer
 from foldgauss.video.models.video_model import VideoModel, check_time
 
 #: Models that are held ready at once; more only where more are seen: half way from the last frame of one fade to the
@@ -38,7 +38,7 @@ class Segment:
     num_frames: int
     num_gaussians: int
     degree: int
-    num_floats: int
+    num_parameters: int
     size: tuple[int, int]
     fps: float
     options: RenderOptions
@@ -153,9 +153,9 @@ class SegmentedVideo:
         return max(segment.degree for segment in self.segments)
 
     @property
-    def num_floats(self) -> int:
+    def num_parameters(self) -> int:
         """Numbers stored, of all segments."""
-        return sum(segment.num_floats for segment in self.segments)
+        return sum(segment.num_parameters for segment in self.segments)
 
     @property
     def frame_times(self) -> SegmentedTimes:
@@ -177,7 +177,7 @@ class SegmentedVideo:
 
         return SegmentedVideo([changed(segment) for segment in self.segments])
 
-    def stage(self, size: tuple[int, int]) -> "PreparedSegmentedVideo":
+    def prepare(self, size: tuple[int, int]) -> "PreparedSegmentedVideo":
         """Made ready to be conditioned many times, for pictures of `size`."""
         return PreparedSegmentedVideo(self, size)
 
@@ -187,7 +187,7 @@ class SegmentedVideo:
         In a fade they are those of the model that is seen more of.
         """
         check_time(t)
-        return self.stage(self.size if size is None else size).splats(float(t))
+        return self.prepare(self.size if size is None else size).splats(float(t))
 
     def render(
         self,
@@ -251,7 +251,7 @@ class PreparedSegmentedVideo:
 
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):
         self._video, self._size = video, tuple(size)
-        self._ready: OrderedDict[int, tuple[Staged, np.ndarray]] = OrderedDict()
+        self._ready: OrderedDict[int, tuple[PreparedVideo, np.ndarray]] = OrderedDict()
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, of the segment that is seen most; NumPy leaves."""
@@ -260,26 +260,26 @@ class PreparedSegmentedVideo:
         stage, time = self._at(number, position, MAX_PREPARED)
         return stage.splats(time)
 
-    def parts(self, t: float) -> list[tuple[float, Splats2D]]:
-        """The pictures of the segments that are seen at time t, see `foldgauss.video.models.renderer.Staged`."""
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
+        """The pictures of the segments that are seen at time t, see `foldgauss.video.models.renderer.PreparedVideo`."""
         position, parts = self._video.position(t), []
         weights = self._video.weights(position)
         for number, weight in weights:
             stage, time = self._at(number, position, max(len(weights), MAX_PREPARED))
-            parts += [(weight * own, splats) for own, splats in stage.parts(time)]
+            parts += [(weight * own, splats) for own, splats in stage.weighted_splats(time)]
         return parts
 
-    def _at(self, number: int, position: float, most: int) -> tuple[Staged, np.ndarray]:
+    def _at(self, number: int, position: float, most: int) -> tuple[PreparedVideo, np.ndarray]:
         """A segment made ready, one of at `most` so many, and its own time at a position in the whole clip."""
         stage, times = self._prepared(number, most)
         return stage, times_at(times, position - self._video.segments[number].first)
 
-    def _prepared(self, number: int, most: int) -> tuple[Staged, np.ndarray]:
+    def _prepared(self, number: int, most: int) -> tuple[PreparedVideo, np.ndarray]:
         if number not in self._ready:
             while len(self._ready) >= most:
                 self._ready.popitem(last=False)  # before the next is loaded, so that there is room for it
             model = self._video.segments[number].model
-            self._ready[number] = model.stage(self._size), np.asarray(model.frame_times.times())
+            self._ready[number] = model.prepare(self._size), np.asarray(model.frame_times.times())
         self._ready.move_to_end(number)
         return self._ready[number]
 

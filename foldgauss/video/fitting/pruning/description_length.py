@@ -13,19 +13,19 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.pruning.scores import ROUNDING, PruningScores
-from foldgauss.video.models.kinds import (
-    LASTS,
-    NUMBERS,
-    OF_OPACITY,
-    OF_POWER,
-    OF_TIME,
-    SOLID,
-    degrees_of,
-    is_solid,
-    lasts,
-)
 from foldgauss.video.models.row_layout import columns, shift_path
-from foldgauss.video.models.splats import LASTING, OPAQUE
+from foldgauss.video.models.sparse_storage import (
+    BASE_PARAMETERS,
+    OPACITY_PARAMETERS,
+    OPAQUE_BIT,
+    POWER_PARAMETERS,
+    STATIC_BIT,
+    TIME_PARAMETERS,
+    get_degrees,
+    is_opaque,
+    is_static,
+)
+from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 
 #: What a fit gains by falling rates, and makes up for what was dropped, in dB over the whole plan: a round aims so much
 #: lower; and so much higher, in dB, that the end is not missed by a hair.
@@ -161,10 +161,10 @@ class _Book:
         self._rows, self._kinds, self._ledger, self._degree, self._pixels = rows, kinds, ledger, degree, pixels
         self._grown = np.zeros(len(rows)) if sized else ledger.mean_log_envelope
         self._at, num = columns(degree), len(rows)
-        own, lasting = degrees_of(kinds), lasts(kinds)
+        own, lasting = get_degrees(kinds), is_static(kinds)
         place = np.concatenate([rows[:, self._at["loc"]], rows[:, self._at["coefficients"]]], 1)
         self._place = place.reshape(num, degree + 1, 2).astype(float) * pixels
-        added = np.full((num, degree + 1, 2, 2), np.inf)  # by degree, whether it lasts, whether it is solid
+        added = np.full((num, degree + 1, 2, 2), np.inf)  # by degree, whether it is static, whether it is opaque
         for lower in range(degree + 1):
             which = np.flatnonzero(own > lower)
             if len(which):
@@ -174,10 +174,15 @@ class _Book:
         added[lasting, :, 1], added[lasting, :, 0] = added[lasting, :, 0], np.inf
         opacity = 1 / (1 + np.exp(-rows[:, self._at["opacity_logit"].start].astype(float)))
         added[:, :, :, 1] = added[:, :, :, 0] + (ledger.solid(opacity)[:, None, None] if solid else np.inf)
-        self._solid = is_solid(kinds)
+        self._solid = is_opaque(kinds)
         added[self._solid, :, :, 1], added[self._solid, :, :, 0] = added[self._solid, :, :, 0], np.inf
-        powers = OF_POWER * np.arange(degree + 1)[:, None, None]
-        numbers = NUMBERS + powers - OF_TIME * np.array([0, 1])[:, None] - OF_OPACITY * np.array([0, 1])
+        powers = POWER_PARAMETERS * np.arange(degree + 1)[:, None, None]
+        numbers = (
+            BASE_PARAMETERS
+            + powers
+            - TIME_PARAMETERS * np.array([0, 1])[:, None]
+            - OPACITY_PARAMETERS * np.array([0, 1])
+        )
         self._added, self._numbers = added.reshape(num, -1), numbers.ravel()
 
     def _chosen(self, price: float, most_dropped: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -212,12 +217,12 @@ class _Book:
         stays, best, added = self._chosen(price, most_dropped)
         stay = np.flatnonzero(stays)
         lower, lasting, solid = np.unravel_index(best[stay], (self._degree + 1, 2, 2))
-        kinds = (lower + LASTS * lasting + SOLID * solid).astype(np.uint8)
+        kinds = (lower + STATIC_BIT * lasting + OPAQUE_BIT * solid).astype(np.uint8)
         return Cut(stay, self._changed(stay, lower, lasting == 1, solid == 1), kinds, added, price)
 
     def _changed(self, stay: np.ndarray, lower: np.ndarray, lasting: np.ndarray, solid: np.ndarray) -> np.ndarray:
-        rows, own, at = self._rows[stay].copy(), degrees_of(self._kinds[stay]), self._at
-        place, now = self._place[stay], lasting & ~lasts(self._kinds[stay])
+        rows, own, at = self._rows[stay].copy(), get_degrees(self._kinds[stay]), self._at
+        place, now = self._place[stay], lasting & ~is_static(self._kinds[stay])
         for degree in range(self._degree):
             here = np.flatnonzero((lower == degree) & (own > degree))
             if len(here):
@@ -225,8 +230,8 @@ class _Book:
         logit = rows[now, at["time_loc_logit"].start].astype(float)
         place[now] = shift_path(place[now], 0.5 - 1 / (1 + np.exp(-logit)))
         rows[now, at["log_scale"]] += self._grown[stay[now], None].astype(np.float32)
-        rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, LASTING
-        rows[solid, at["opacity_logit"].start] = OPAQUE
+        rows[now, at["time_loc_logit"].start], rows[now, at["log_time_scale"].start] = 0, STATIC_LOG_TIME_SCALE
+        rows[solid, at["opacity_logit"].start] = OPAQUE_LOGIT
         moved = now | (lower < own)
         anew = (place[moved] / self._pixels).astype(np.float32)
         rows[moved, at["loc"]] = anew[:, 0]

@@ -17,9 +17,9 @@ from foldgauss.video.fitting.pruning.description_length import Cut, allowed_erro
 from foldgauss.video.fitting.pruning.scores import PruningScores, measured
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr, planar
 from foldgauss.video.models.background import random_background
-from foldgauss.video.models.conditioning import Shape, condition, update_windows
-from foldgauss.video.models.kinds import forget, kinds_at_start, numbers_of
+from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.sparse_storage import clear_absent_moments, count_parameters, find_initial_kinds
 
 #: Gaussians born in all are so many times those at the start at most.
 MOST_BORN = 4
@@ -36,7 +36,12 @@ class Pruner:
     """What a fit with an economy does between its steps. All of it changes the state in place."""
 
     def __init__(
-        self, frames: np.ndarray, config: FitConfig, shape: Shape, coarse: float, motion: Callable[[], Motion]
+        self,
+        frames: np.ndarray,
+        config: FitConfig,
+        shape: ConditioningSpec,
+        coarse: float,
+        motion: Callable[[], Motion],
     ):
         """`shape` is that of whole frames, `coarse` the share of the plan with smaller ones."""
         self._frames, self._config, self._shape, self._coarse, self._motion = frames, config, shape, coarse, motion
@@ -83,12 +88,12 @@ class Pruner:
 
     def _trimmed(self, state: FitState) -> bool:
         config, ledger = self._config, self._ledger(state)
-        wanted, size = config.economy.psnr, numbers_of(state.kinds)
+        wanted, size = config.economy.psnr, count_parameters(state.kinds)
         room = ledger.squared_error * (10 ** (max(self._psnr(state, ledger) - wanted, 0.0) / 10) - 1)
         for share in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
             tried = dataclasses.replace(state)
             _keep(tried, self._cut(tried, ledger, share * room), config.degree)
-            fewer = numbers_of(tried.kinds) < (1 - LEAST_TRIM) * size
+            fewer = count_parameters(tried.kinds) < (1 - LEAST_TRIM) * size
             if fewer and mean_psnr(tried, config, self._frames) >= wanted:
                 for field in dataclasses.fields(state):
                     setattr(state, field.name, getattr(tried, field.name))
@@ -127,7 +132,7 @@ class Pruner:
             setattr(state, name, np.concatenate([getattr(state, name), np.zeros_like(new)])[order])
         state.counts = np.concatenate([state.counts, np.zeros(num, np.int32)])[order]
         state.young = np.concatenate([state.young, np.ones(num, bool)])[order]
-        state.kinds = np.concatenate([state.kinds, kinds_at_start(new, config.degree)])[order]
+        state.kinds = np.concatenate([state.kinds, find_initial_kinds(new, config.degree)])[order]
 
     def _squares(self, rows: np.ndarray, window: np.ndarray, k: int, t: float) -> Float32[np.ndarray, "height width"]:
         """Squared errors of frame k, summed over the channels."""
@@ -188,7 +193,7 @@ def _keep(state: FitState, made: Cut, degree: int) -> None:
     for name in ("first", "second", "counts", "young"):
         setattr(state, name, getattr(state, name)[made.stay])
     state.colors, state.shapes = state.colors.kept(made.stay), state.shapes.kept(made.stay)
-    forget(state.first, state.second, state.kinds, degree)
+    clear_absent_moments(state.first, state.second, state.kinds, degree)
 
 
 def _long_axis_first(state: FitState, degree: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.video.models.conditioning import Shape, condition
+from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
@@ -150,7 +150,7 @@ def measured(
     rows: Float32[np.ndarray, "num width"],
     window: Float32[np.ndarray, "num 2"],
     times: Float[np.ndarray, " num_frames"],
-    shape: Shape,
+    shape: ConditioningSpec,
     target: Target,
     *,
     compositing: str,
@@ -219,7 +219,7 @@ def _products(residual: np.ndarray, before: np.ndarray | None) -> list[float]:
     return [in_time, down, along]
 
 
-def _log_envelope(tau: np.ndarray, shape: Shape) -> np.ndarray:
+def _log_envelope(tau: np.ndarray, shape: ConditioningSpec) -> np.ndarray:
     with np.errstate(divide="ignore"):
         return np.logaddexp(np.log(shape.floor), np.log1p(-shape.floor) - 0.5 * shape.power * tau**2)
 

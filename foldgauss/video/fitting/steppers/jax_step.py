@@ -18,13 +18,13 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
-from foldgauss.render.tiles import on_screen
+from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, LASTING_TIME, UNBIAS
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import TIME_ADAM, frame_times, update_times
 from foldgauss.video.fitting.steppers.jax_loss import losses
-from foldgauss.video.models.kinds import DEGREES, LASTS, SOLID
 from foldgauss.video.models.row_layout import columns, unpack
+from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 from foldgauss.video.models.splats import TAU_MAX
 
 #: The axis of the mesh that views are shared out over.
@@ -285,7 +285,7 @@ def _screen_gradient(plan: Plan, splats: Splats2D, by_splats: Splats2D, alive) -
     """Of `GradientStatistics.add`: the largest over the views; -1 where none shows a Gaussian."""
     half = np.float32(plan.size[::-1]) / 2
     size = jnp.hypot(by_splats.mean[..., 0] * half[0], by_splats.mean[..., 1] * half[1])
-    shows = jax.vmap(lambda own: on_screen(own.mean, own.factor, own.opacity, plan.size, plan.options))(splats)
+    shows = jax.vmap(lambda own: find_visible(own.mean, own.factor, own.opacity, plan.size, plan.options))(splats)
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
 
 
@@ -324,9 +324,9 @@ def _learns(kinds: UInt8[Array, " num"], degree: int) -> Bool[Array, "num width"
     kinds = kinds.astype(jnp.int32)[:, None]
     column = np.arange(place["coefficients"].stop, dtype=np.int32)[None, :]
     of_time = (column == place["time_loc_logit"].start) | (column == place["log_time_scale"].start)
-    gone = of_time & ((kinds & LASTS) > 0)
-    gone |= (column == place["opacity_logit"].start) & ((kinds & SOLID) > 0)
-    return ~(gone | (column >= place["coefficients"].start + 2 * (kinds & DEGREES)))
+    gone = of_time & ((kinds & STATIC_BIT) > 0)
+    gone |= (column == place["opacity_logit"].start) & ((kinds & OPAQUE_BIT) > 0)
+    return ~(gone | (column >= place["coefficients"].start + 2 * (kinds & DEGREE_MASK)))
 
 
 def _in_own_time(rows, kinds, degree: int, unit_time: float) -> Float[Array, "num width"]:
@@ -334,9 +334,9 @@ def _in_own_time(rows, kinds, degree: int, unit_time: float) -> Float[Array, "nu
     factors, place = jnp.ones_like(rows), columns(degree)
     if unit_time == 0:
         return factors
-    lasts = (kinds.astype(jnp.int32) & LASTS) > 0
+    is_static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
     spread = jnp.exp(rows[:, place["log_time_scale"].start])
-    wide = jnp.where(lasts, np.float32(LASTING_TIME), spread) / np.float32(unit_time)
+    wide = jnp.where(is_static, np.float32(LASTING_TIME), spread) / np.float32(unit_time)
     factors, power = factors.at[:, place["time_loc_logit"].start].set(wide), jnp.ones_like(wide)
     for column in range(place["coefficients"].start, place["coefficients"].stop, 2):
         power = power * (1 / wide)

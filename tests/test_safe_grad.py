@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss._numerics.safe_grad import far_reaching
+from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import CallableFold, PolynomialFold
 
@@ -20,7 +20,7 @@ def _toy(root, x, small):
 
 
 def _far(x, small):
-    return far_reaching(_toy, x, small)
+    return evaluate_with_safe_grad(_toy, x, small)
 
 
 def test_slopes_are_true_where_they_fit_and_saturate_where_not():
@@ -62,9 +62,9 @@ def test_what_is_known_is_not_differentiated():
 
     watched.defvjp(lambda x: (x, None), backward)
     function = lambda root, x, y: x * watched(y) * (1.0 if root is None else root * root)  # noqa: E731
-    assert jax.grad(lambda x: far_reaching(function, x, jnp.float32(3)))(jnp.float32(2)) == 3
+    assert jax.grad(lambda x: evaluate_with_safe_grad(function, x, jnp.float32(3)))(jnp.float32(2)) == 3
     assert count == 0
-    assert jax.grad(lambda y: far_reaching(function, jnp.float32(2), y))(jnp.float32(3)) == 2
+    assert jax.grad(lambda y: evaluate_with_safe_grad(function, jnp.float32(2), y))(jnp.float32(3)) == 2
     assert count == 1
 
 
@@ -149,7 +149,7 @@ def _forward_overflows(root, x, small):
 
 def test_forward_mode_is_true_where_backward_needs_no_help():
     x, small = jnp.float32(1e-25), jnp.float32(1e-30)
-    function = lambda x, s: far_reaching(_forward_overflows, x, s)  # noqa: E731
+    function = lambda x, s: evaluate_with_safe_grad(_forward_overflows, x, s)  # noqa: E731
     assert np.isinf(jax.jvp(lambda x: _forward_overflows(None, x, small), (x,), (jnp.float32(1.0),))[1])
     for jit in (lambda f: f, jax.jit):
         slope = jit(lambda x: jax.jvp(lambda x: function(x, small), (x,), (jnp.float32(1.0),))[1])(x)
@@ -166,8 +166,8 @@ def _deep(root, x, y, small):
 def test_deep_roots_are_reached():
     x, y, small = jnp.float32(1e-35), jnp.float32(1e-20), jnp.float32(1e-35)
     for jit in (lambda f: f, jax.jit):
-        slope = jit(jax.grad(lambda x: far_reaching(_deep, x, y, small)))(x)
+        slope = jit(jax.grad(lambda x: evaluate_with_safe_grad(_deep, x, y, small)))(x)
         np.testing.assert_allclose(slope, 1e35, rtol=1e-5)
         np.testing.assert_allclose(
-            jit(jax.vmap(jax.grad(lambda x: far_reaching(_deep, x, y, small))))(x[None]), 1e35, rtol=1e-5
+            jit(jax.vmap(jax.grad(lambda x: evaluate_with_safe_grad(_deep, x, y, small))))(x[None]), 1e35, rtol=1e-5
         )
