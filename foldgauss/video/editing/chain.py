@@ -52,7 +52,7 @@ from foldgauss.video.editing.overlays import (
     TriangleFunction,
     polar_decompose,
 )
-from foldgauss.video.editing.span import NEVER, Span, When, check_when, make_span
+from foldgauss.video.editing.span import NEVER, Span, When, check_when, make_frame_span, restrict_span
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.selectors import Selection, select
 
@@ -88,7 +88,7 @@ class Edit:
     center, clocks, functions, depth. `video()` is a plain `VideoModel` if all edits could be baked. Gaussians that are
     not selected stay the same to the bit, and an edit that changes nothing (a factor 1, an angle 0) is skipped.
 
-    Each edit takes `frame=`, `frames=` or `times=`, with `ease=` and `curve=`, as `make_span`; without, it always
+    Each edit takes `frame=`, `frames=` or `times=`, with `ease=` and `curve=`, as `make_frame_span`; without, it always
     applies. Frame numbers are those of `video().frame_times`, and spans are in the video's time, whatever clocks its
     objects have.
 
@@ -560,7 +560,9 @@ class Edit:
 
     def _span(self, when: When) -> Span | None:
         check_when(when)
-        return make_span(self._frame_times(), **when) if self._window is None else self._window.own_span(**when)
+        if self._window is not None:
+            return self._window.own_span(**when)
+        return restrict_span(make_frame_span(self._frame_times(), **when), self._frame_times())
 
     @property
     def _num_frames(self) -> int:

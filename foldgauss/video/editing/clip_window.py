@@ -65,9 +65,8 @@ class ClipWindow:
         return max(self.num_frames - 1, 1)
 
     def own_span(self, **when: Unpack[When]) -> Span | None:
-        """`make_span` for the clip's frames and times, in own time; `NEVER` if it contains no frame of the segment."""
-        frame_span = make_frame_span(self.frame_times, **when)
-        return None if frame_span is None else restrict_span(frame_span, self.times, self.first)
+        """The span, for the clip's frames and times, in own time; `NEVER` if it contains no frame of the segment."""
+        return restrict_span(make_frame_span(self.frame_times, **when), self.times, self.first)
 
     def position(self, own_time: float) -> float:
         """The clip's frame position at an own time."""

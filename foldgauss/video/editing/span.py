@@ -17,7 +17,7 @@ CURVES = ("linear", "smooth")
 
 
 class When(TypedDict, total=False):
-    """When an edit acts: the keyword arguments of `make_span`. None given: always."""
+    """When an edit acts: the keyword arguments of `make_frame_span`. None given: always."""
 
     frame: int
     frames: tuple[int | None, int | None]
@@ -32,7 +32,7 @@ class Span:
 
     The interval is `start` <= t < `stop`, None for no end. Inside, progress is 1, or it is interpolated between the
     knots `times` and `values` and passed through `curve`: "linear", or "smooth", s^2 (3 - 2 s). Outside it is 0.
-    `make_span` makes one from frame numbers.
+    `make_frame_span` and `restrict_span` make one from frame numbers.
 
     **Units:** model time. **Example:** `Span(0.4, 0.6).progress(0.5)  # 1.0`
 
@@ -81,37 +81,8 @@ class Span:
 NEVER = Span(2.0, 3.0)
 
 
-def make_span(
-    frame_times: Float[np.ndarray, " num_frames"],
-    *,
-    frame: int | None = None,
-    frames: tuple[int | None, int | None] | None = None,
-    times: tuple[float, float] | None = None,
-    ease: float | tuple[float, float] = 0,
-    curve: str = "linear",
-) -> Span | None:
-    """The span of one frame, of frames (first, stop) or of times (start, stop); None for always.
-
-    A frame reaches half way to its neighbours: frame k covers |position - k| < 0.5, where `position` is the frame
-    number interpolated between the frame times. So the span contains its frames, every other frame stays the same to
-    the bit, and frames that are interpolated near it show the edit. `frames` includes first and excludes stop. None,
-    the first or the last frame as an end means that the span has no end there.
-
-    `ease`: the number of frames over which the edit comes in and goes out, inside the span; or one number for each.
-    Where the span has no end, there is no easing.
-
-    **Example:** `make_span(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
-
-    **Raises:** ValueError for more than one of `frame`, `frames` and `times`, for values outside the clip, and for
-    `ease` without a span or longer than it.
-    """
-    knots = np.asarray(frame_times, np.float64)
-    frame_span = make_frame_span(knots, frame=frame, frames=frames, times=times, ease=ease, curve=curve)
-    return None if frame_span is None else restrict_span(frame_span, knots)
-
-
 def check_when(when: When) -> None:
-    """Raise ValueError for a name that is no keyword of `make_span`."""
+    """Raise ValueError for a name that is no keyword of `make_frame_span`."""
     for name in when:
         if name not in When.__annotations__:
             near = difflib.get_close_matches(name, When.__annotations__, 1)
@@ -141,7 +112,21 @@ def make_frame_span(
     ease: float | tuple[float, float] = 0,
     curve: str = "linear",
 ) -> FrameSpan | None:
-    """As `make_span`, in frame positions."""
+    """The span of one frame, of frames (first, stop) or of times (start, stop); None for always.
+
+    A frame reaches half way to its neighbours: frame k covers |position - k| < 0.5, where `position` is the frame
+    number interpolated between the frame times. So the span contains its frames, every other frame stays the same to
+    the bit, and frames that are interpolated near it show the edit. `frames` includes first and excludes stop. None,
+    the first or the last frame as an end means that the span has no end there.
+
+    `ease`: the number of frames over which the edit comes in and goes out, inside the span; or one number for each.
+    Where the span has no end, there is no easing. `curve`: as in `Span`.
+
+    **Example:** `make_frame_span(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
+
+    **Raises:** ValueError for more than one of `frame`, `frames` and `times`, for values outside the clip, and for
+    `ease` without a span or longer than it.
+    """
     knots = np.asarray(frame_times, np.float64)
     num_given = sum(x is not None for x in (frame, frames, times))
     check_one_of("curve", curve, CURVES)
@@ -182,12 +167,16 @@ def _span_positions(knots: np.ndarray, frame, frames, times) -> tuple[float, flo
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
 
 
-def restrict_span(frame_span: FrameSpan, frame_times: Float[np.ndarray, " num_frames"], first: int = 0) -> Span:
+def restrict_span(
+    frame_span: FrameSpan | None, frame_times: Float[np.ndarray, " num_frames"], first: int = 0
+) -> Span | None:
     """A clip's span in the own time of a segment whose frames, at `frame_times`, begin with the clip's frame `first`.
 
-    At the frames and between them progress is that of the clip; `NEVER` where the span contains no frame of the
-    segment.
+    At the frames and between them progress is that of the clip; `NEVER` if the span contains no frame of the segment.
+    None, always, stays None.
     """
+    if frame_span is None:
+        return None
     knots, last = np.asarray(frame_times, np.float64), len(frame_times) - 1
     # From here on positions count from the segment's first frame.
     begin, end, rise, fall = frame_span.begin - first, frame_span.end - first, frame_span.rise, frame_span.fall

@@ -14,7 +14,7 @@ from foldgauss.video.editing.layer_edits import gather_layer
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
 from foldgauss.video.editing.span import NEVER, Span, distinct_knots
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
+from foldgauss.video.segmented.segmented_video import MAX_PREPARED, SegmentedVideo
 from foldgauss.video.selection.selectors import by_time
 
 Video = VideoModel | EditedVideo | SegmentedVideo
@@ -63,7 +63,7 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
         return _stack_segment(videos, timeline, number)
 
     return SegmentedVideo(
-        [segment.edited(load(k), functools.partial(load, k)) for k, segment in enumerate(lead.segments)]
+        [segment.with_model(load(k), functools.partial(load, k)) for k, segment in enumerate(lead.segments)]
     )
 
 
