@@ -21,9 +21,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.io import read_video, save_compact, save_video_model
+from foldgauss.io import Clip, read_video, save_compact, save_video_model
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit, psnr
 from foldgauss.video.selection.contributions import Contributions, sum_contributions
@@ -130,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(parser, arguments)
     if options.model is not None and options.clip is None:
         parser.error("--model needs --clip")
-    facts, figures = _common.machine(), {}
+    facts, figures = _common.describe_machine(), {}
     for name in CLIPS if options.clip is None else (options.clip,):
         clip = read_video(sample_clip(name), size=options.size)
         if options.model is not None:

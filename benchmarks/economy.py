@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--degrees", default=",".join(map(str, DEGREES)), help="[1,3,7,0]")
     parser.add_argument("--model", type=Path, help="write the economical model here")
     options = _common.parse(parser, arguments)
-    facts, figures, rows = _common.machine(), {}, []
+    facts, figures, rows = _common.describe_machine(), {}, []
     clip = read_video(sample_clip(options.clip), size=options.size)
     begun = time.perf_counter()
     result = fit(clip.frames, FitConfig(steps=options.steps, economy=Economy(psnr=options.psnr)), fps=clip.fps)
@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
         "fit",
         "degree",
         "Gaussians",
-        "numbers stored",
+        "parameters stored",
         "PSNR",
         "seconds",
     )
@@ -116,7 +116,9 @@ def main(arguments: list[str] | None = None) -> None:
         table.add_row(what + mark, str(degree), f"{num:,}", f"{floats:,}", f"{reached:.2f}", f"{seconds:.0f}")
     console.print(table)
     ratio = off[3] / rows[0][3]
-    console.print(f"* the smallest of the sweep that reaches it: {ratio:.2f} times the numbers of the economical one")
+    console.print(
+        f"* the smallest of the sweep that reaches it: {ratio:.2f} times the parameters of the economical one"
+    )
     figures |= {"economy: numbers": rows[0][3], "off: numbers": off[3], "off / economy": ratio}
     figures["rows"] = json.dumps(rows)
     _common.finish(options.json, figures, facts, setting={"clip": options.clip, "size": options.size})

@@ -458,7 +458,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--plot", type=Path, metavar="FILE", help="PNG of the lines [with --all: rasterizer.png]")
     options = _common.parse(parser, arguments)
     names = options.scene or (SCENES if options.all else DEFAULT_SCENES)
-    facts, figures, lines = _common.machine(), {}, {}
+    facts, figures, lines = _common.describe_machine(), {}, {}
     with contextlib.ExitStack() as stack:
         compiled = None
         if _rivals.has_compiler():

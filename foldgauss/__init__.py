@@ -21,7 +21,7 @@ for _kind, _location in {
     "distribution": "foldgauss.analysis.notebook:distribution_png",
     "mixture": "foldgauss.analysis.notebook:mixture_png",
     "history": "foldgauss.analysis.notebook:history_png",
-    "video": "foldgauss.io.page.html:notebook_frame",
+    "video": "foldgauss.io.page.player_page:make_notebook_iframe",
 }.items():
     notebook_hooks.register(_kind, _location)
 

@@ -317,7 +317,7 @@ def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, opt
 
 def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys, monkeypatch):
     def full(*given):
-        raise OutputError("path: expected room for 'summary.json', got none.")
+        raise OutputError("path: expected free space for 'summary.json', got none.")
 
     monkeypatch.setattr(many, "write_json", full)
     assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK) == 1

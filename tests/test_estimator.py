@@ -360,7 +360,7 @@ def test_auto_begins_with_every_component_at_work(monkeypatch):
         begun.append(params)
         return params, model
 
-    monkeypatch.setattr(estimator, "pruned", nothing_goes)
+    monkeypatch.setattr(estimator, "prune_mixture", nothing_goes)
     x, _ = _tracks()
     _quiet(FoldedGaussianMixture(degree=1, max_components=12, init_params="trajectories", random_state=0), x)
     assert begun[0].log_weights.shape == (12,)

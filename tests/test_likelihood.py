@@ -10,7 +10,7 @@ from scipy import stats
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.estimator.likelihood import FitStatus, _cv_parts, _student_quantile, bootstrap, fit, select_degree
+from foldgauss.estimator.likelihood import FitStatus, _assign_folds, _student_quantile, bootstrap, fit, select_degree
 from foldgauss.estimator.time_profile import Ascent, Profile, _step
 from foldgauss.fold import PolynomialFold
 
@@ -67,7 +67,7 @@ def test_hermite_polynomials_convert_to_powers():
 @pytest.mark.parametrize("covariance", ["full", "diagonal"])
 def test_closed_form_is_generalised_least_squares(x64, covariance):
     x, weights = _points(), jnp.linspace(0.5, 2.0, 60)
-    result = fit(x, degree=3, weights=weights, time_loc=0.35, time_scale=0.28, covariance=covariance).checked()
+    result = fit(x, degree=3, weights=weights, time_loc=0.35, time_scale=0.28, covariance=covariance).check()
     beta, sigma, errors = _numpy_fit(x, weights, 3, 0.35, 0.28, 1.0, 1e-3)
     sigma = np.diag(np.diag(sigma)) if covariance == "diagonal" else sigma
     dist, close = result.distribution, lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
@@ -81,7 +81,7 @@ def test_closed_form_is_generalised_least_squares(x64, covariance):
 
 def test_own_estimates_of_time_are_mean_and_standard_deviation(x64):
     x, weights = _points(), jnp.linspace(0.5, 2.0, 60)
-    dist = fit(x, degree=2, weights=weights).checked().distribution
+    dist = fit(x, degree=2, weights=weights).check().distribution
     mean = np.average(x[:, -1], weights=weights)
     np.testing.assert_allclose(dist.time_loc, mean, rtol=1e-14)
     scale = np.sqrt(np.average((x[:, -1] - mean) ** 2, weights=weights))
@@ -89,7 +89,7 @@ def test_own_estimates_of_time_are_mean_and_standard_deviation(x64):
 
 
 def test_the_truth_is_found_in_float32():
-    dist = fit(_points(20_000), degree=2).checked().distribution
+    dist = fit(_points(20_000), degree=2).check().distribution
     np.testing.assert_allclose(dist.loc, LOC, atol=0.02)
     np.testing.assert_allclose(dist.fold.coefficients, BEND, atol=0.03)
     np.testing.assert_allclose(dist.scale_tril, TRIL, atol=0.01)
@@ -98,8 +98,8 @@ def test_the_truth_is_found_in_float32():
 def test_weights_are_repetitions_and_absent_rows_may_be_nan(x64):
     x = _points(12)
     weights = jnp.array([1, 2, 3, 1, 2, 1, 1, 1, 4, 1, 0, 0])
-    repeated = fit(jnp.asarray(np.repeat(x, weights, axis=0)), degree=1).checked()
-    weighted = fit(x.at[10:].set(jnp.nan), degree=1, weights=weights).checked()
+    repeated = fit(jnp.asarray(np.repeat(x, weights, axis=0)), degree=1).check()
+    weighted = fit(x.at[10:].set(jnp.nan), degree=1, weights=weights).check()
     for a, b in zip(jax.tree.leaves(weighted), jax.tree.leaves(repeated), strict=True):
         np.testing.assert_allclose(np.abs(a), np.abs(b), rtol=1e-10, atol=1e-12)  # a QR is unique up to signs
 
@@ -108,7 +108,7 @@ def test_fit_moves_with_the_units_of_space_and_time():
     x = _points(20_000)
     dist = fit(x, degree=2).distribution
     stretch, shift = jnp.array([1e18, 1e-12, 1e4]), jnp.array([1e18, 1e-12, 1e7])
-    moved = fit(x * stretch[None] + shift[None], degree=2).checked()
+    moved = fit(x * stretch[None] + shift[None], degree=2).check()
     # Offsets of 1e3 time scales cost 10 bits of t, no more.
     np.testing.assert_allclose((moved.distribution.loc - shift[:2]) / stretch[:2], dist.loc, atol=2e-3)
     bend = moved.distribution.fold.coefficients / stretch[None, :2] * stretch[2] ** jnp.array([[1.0], [2.0]])
@@ -135,7 +135,7 @@ def _covered(keys, power, floor):
         loc = jnp.asarray(LOC)[None]
         right = inside(low, jnp.concatenate([loc, bend]), high)
         mirrored = inside(low, jnp.concatenate([loc, bend * jnp.array([[-1.0], [1.0]])]), high)
-        low, high = result.centre_interval(t)
+        low, high = result.center_interval(t)
         return right, mirrored, inside(low, truth.condition_time(t).loc, high), result.status
 
     return jax.vmap(one)(keys)
@@ -187,7 +187,7 @@ def test_gradient_of_the_profile_is_its_slope(x64):
 
 def test_joint_fit_is_the_highest_point_around(x64):
     x = _points(60)
-    joint = fit(x, degree=2, time="joint").checked()
+    joint = fit(x, degree=2, time="joint").check()
     near = jnp.linspace(-0.3, 0.3, 13)
     loc, log_scale = (z.ravel() for z in jnp.meshgrid(near, near))
     dist = joint.distribution
@@ -233,7 +233,7 @@ def test_a_floor_bounds_the_ridge(x64):
 
 def test_bootstrap_knows_the_errors_of_a_plain_normal(x64):
     n = 50
-    result = fit(_points(n, power=0.0), degree=1, power=0.0).checked()  # own is joint where a = 1
+    result = fit(_points(n, power=0.0), degree=1, power=0.0).check()  # own is joint where a = 1
     replicates = bootstrap(result, jax.random.key(0), 300)
     scale = float(result.distribution.time_scale)
     errors = replicates.standard_errors
@@ -252,7 +252,7 @@ def test_bootstrap_knows_the_errors_of_a_plain_normal(x64):
 def test_bootstrap_agrees_with_fresh_data(x64):
     fits = jax.jit(jax.vmap(lambda key: fit(_dist().sample(key, (80,)), degree=2, time="joint")))
     fresh = fits(jax.random.split(jax.random.key(1), 1000)).distribution
-    truth = fit(_points(5000), degree=2, time="joint").checked()
+    truth = fit(_points(5000), degree=2, time="joint").check()
     again = eqx.tree_at(lambda r: r.num_points, truth, jnp.asarray(80.0))
     errors = bootstrap(again, jax.random.key(2), 1000, batch_size=200).standard_errors
     for name in ("time_loc", "time_scale", "loc"):
@@ -297,7 +297,7 @@ def test_degenerate_data_have_a_status_and_nan(x64):
 
 def test_checked_says_what_to_try():
     with pytest.raises(ValueError, match=r"TOO_FEW_POINTS.*Lower degree"):
-        fit(jnp.zeros((1, 3)), degree=2).checked()
+        fit(jnp.zeros((1, 3)), degree=2).check()
     assert int(fit(jnp.zeros((0, 3)), degree=2).status) == FitStatus.TOO_FEW_POINTS
 
 
@@ -365,7 +365,7 @@ def test_select_degree_finds_the_true_degree_as_often_as_it_should(x64):
 def test_held_out_score_is_what_a_loop_over_the_parts_gives(x64):
     x = _points(60)
     scores = select_degree(x, 1, "cv").scores
-    parts, total = _cv_parts(x, jax.random.key(0)), 0.0
+    parts, total = _assign_folds(x, jax.random.key(0)), 0.0
     for part in range(5):
         trained = fit(x, degree=1, weights=jnp.where(parts == part, 0.0, 1.0)).distribution
         total -= 2 * trained.log_prob(x[parts == part]).sum()

@@ -44,7 +44,8 @@ from foldgauss.cli.app.shared import (
     write_json,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
+from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.video_model import load_video_model, read_metadata, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
@@ -53,7 +54,7 @@ from foldgauss.video.models.metrics import Evaluation
 from foldgauss.video.models.sparse_storage import stored_counts, to_stored
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
-from foldgauss.video.tradeoff import frames_per_second
+from foldgauss.video.tradeoff import measure_frame_rate
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
@@ -237,7 +238,7 @@ def evaluate_command(
         on_white = evaluate_with_progress(model, clip.frames, background=(1.0, 1.0, 1.0))
         figures["mean_psnr_on_white"] = round(on_white.mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
-    figures["frames_per_second"] = round(frames_per_second(model), 1)
+    figures["frames_per_second"] = round(measure_frame_rate(model), 1)
     if json_path is not None:
         write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
     _print_segments(model, scores) if isinstance(model, SegmentedVideo) else print_frames(scores)

@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io.media.labels import read_labels
-from foldgauss.io.media.video_file import Clip, centre_window, image_paths, image_size, read_video
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.image_files import image_paths, image_size
+from foldgauss.io.media.masks import read_labels
+from foldgauss.io.media.resizing import center_window
+from foldgauss.io.media.video_reading import read_video
 
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]
@@ -143,7 +146,7 @@ def davis(
             cure="Frames and masks are of different resolutions: unpack the data set again.",
         )
     if center_crop is not None:
-        masks = np.ascontiguousarray(masks[:, *centre_window(whole, center_crop)])
+        masks = np.ascontiguousarray(masks[:, *center_window(whole, center_crop)])
     return MaskedClip(clip, masks)
 
 

@@ -10,7 +10,7 @@ from typing import Any, Self, TextIO
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.analysis.plot import plot_history
-from foldgauss.io._atomic import atomic_path, not_writable
+from foldgauss.io._atomic import atomic_path, output_error
 from foldgauss.io.figures import write_figure
 from foldgauss.video.fitting.loop import FitInfo, FitState
 
@@ -59,7 +59,7 @@ class HistoryFile:
             self._file.write(_text(info_line(info)))
             self._file.flush()
         except OSError as error:
-            raise not_writable(self.path, error) from error
+            raise output_error(self.path, error) from error
 
     def _opened(self) -> TextIO:
         return open(self.path, "a" if self._append else "w", encoding="utf-8")

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from foldgauss.io.media.frame_index import LazyFrames
-from foldgauss.io.media.video_file import Clip
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.lazy_frames import LazyFrames
 
 
 def fingerprint(clip: Clip) -> dict[str, Any]:
@@ -15,12 +15,12 @@ def fingerprint(clip: Clip) -> dict[str, Any]:
     return {"num_frames": clip.num_frames, "size": list(clip.size), "frames_digest": digest}
 
 
-def provenance(clip: Clip, seed: int) -> dict[str, Any]:
+def describe_source(clip: Clip, seed: int) -> dict[str, Any]:
     """What is noted in a model's file of where it comes from."""
     return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
 
 
-def are_others(about: Mapping[str, Any], clip: Clip) -> bool:
+def has_other_frames(about: Mapping[str, Any], clip: Clip) -> bool:
     """Whether `clip` has other frames than a model's file says `about` its own; False where it says nothing.
 
     Of a clip that is read lazily, as of a model in segments, frames are compared as they are before they are scaled.

@@ -247,7 +247,7 @@ def test_cut_lists_keep_the_gradient():
 def test_other_tiles_are_refused_with_a_cure():
     leaves, size = leaves_of("one")
     cpu.forward(*leaves, size, options=RenderOptions(tile_size=16))
-    with pytest.raises(ValueError, match=r"options.tile_size.*slower"):
+    with pytest.raises(ValueError, match=r"options.tile_size.*other sizes"):
         cpu.forward(*leaves, size, options=RenderOptions(tile_size=8))
 
 
@@ -263,7 +263,7 @@ def test_channels_that_do_not_fit_are_refused(colors, background):
 def test_gradients_that_do_not_fit_are_refused(shape):
     leaves, size = leaves_of("one")
     trace = cpu.forward(*leaves, size)
-    with pytest.raises(ValueError, match=r"^grad_image: expected the picture's shape \(3, 17, 16\)"):
+    with pytest.raises(ValueError, match=r"^grad_image: expected the image's shape \(3, 17, 16\)"):
         cpu.backward(trace, np.zeros(shape, np.float32))
 
 

@@ -103,8 +103,8 @@ def test_cpu_in_chunks(monkeypatch):
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     weights = np.random.default_rng(0).normal(size=(3, *size)).astype(np.float32)
     results = []
-    for chunk in (cpu.CHUNK, 32):
-        monkeypatch.setattr(cpu, "CHUNK", chunk)
+    for chunk in (cpu.SPLATS_PER_TASK, 32):
+        monkeypatch.setattr(cpu, "SPLATS_PER_TASK", chunk)
         trace = cpu.forward(*leaves, size)
         results.append([trace.image, *cpu.backward(trace, weights)])
     for one, two in zip(*results, strict=True):

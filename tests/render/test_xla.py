@@ -69,7 +69,7 @@ def test_more_pairs_than_room_is_no_loss(monkeypatch):
     """Eager, too: the room is counted, and bounded."""
     splats, size = scene("huge")
     truth = draw(splats, size)
-    monkeypatch.setattr(tiles, "MOST_SLOTS", 64)
+    monkeypatch.setattr(tiles, "MAX_SLOTS", 64)
     np.testing.assert_allclose(draw(splats, size), truth, atol=1e-6)
 
 

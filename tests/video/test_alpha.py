@@ -8,7 +8,8 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
-from foldgauss.video.fitting.state import planar, to_model
+from foldgauss.video.fitting.schedule import to_planes
+from foldgauss.video.fitting.state import to_model
 from foldgauss.video.models.background import check_background, composite, random_background
 from foldgauss.video.models.renderer import VideoRenderer
 
@@ -39,10 +40,10 @@ def test_composited_by_hand():
 
 def test_targets_are_the_frames_over_the_background():
     frame, background = clip()[2], np.float32([0.2, 0.7, 1.0])
-    target = np.moveaxis(planar(frame, background), 0, -1)
+    target = np.moveaxis(to_planes(frame, background), 0, -1)
     np.testing.assert_allclose(255 * target, composite(frame, background), atol=0.51)
     np.testing.assert_array_equal(
-        planar(frame[..., :3].copy(), background), planar(frame[..., :3].copy(), 0 * background)
+        to_planes(frame[..., :3].copy(), background), to_planes(frame[..., :3].copy(), 0 * background)
     )
 
 

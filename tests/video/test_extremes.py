@@ -8,7 +8,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.io import load_video_model, save_compact, save_video_model
-from foldgauss.uncertainty import evidence
+from foldgauss.uncertainty import likelihood_profiles
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -200,7 +200,7 @@ def test_one_frame_in_a_compact_file(tmp_path, still, passes):
 def test_one_frame_tells_no_times(still):
     frames, model = still
     with pytest.raises(ValueError, match="at least 3 frames"):
-        evidence(model, frames)
+        likelihood_profiles(model, frames)
 
 
 # -------------------------------------------------------------------------------------------- alternating
@@ -209,7 +209,7 @@ def test_one_frame_tells_no_times(still):
 def test_pictures_in_turn_have_no_dark_between_them():
     """Most intervals are cuts: gaps there would be the usual interval, and what is shown within them nothing."""
     frames = alternating("AABAABAAB", np.maximum(pictures_of(2), 100))
-    assert len(Motion.of(frames).cuts()) == 5
+    assert len(Motion.from_frames(frames).find_cuts()) == 5
     model = fit(frames, FitConfig(num_gaussians=600, steps=150)).model
     shown = np.stack(list(model.frames(interpolated_times(np.asarray(model.frame_times.times()), 4))))
     assert shown.mean((1, 2, 3)).min() > 0.5 * frames.mean((1, 2, 3)).min()

@@ -1,7 +1,6 @@
 """The fit on small clips: it learns, repeats itself to the bit, stops and goes on."""
 
 import dataclasses
-import sys
 import time
 
 import jax
@@ -13,10 +12,11 @@ from test_motion import panning
 from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
+from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.config import chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
-
-fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
+from foldgauss.video.fitting.steppers import cpu_stepper
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
 
@@ -101,10 +101,11 @@ def test_a_frame_twice_in_a_batch_counts_twice(monkeypatch):
     for batch in ([1], [1, 1]):
         config = dataclasses.replace(CONFIG, batch_size=len(batch))
         state = start(frames, config)
-        monkeypatch.setattr(fit_module, "_update_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m))
-        stepper = fit_module._Stepper(frames, config, state)
-        monkeypatch.setattr(stepper, "_batch", lambda step, batch=batch: np.array(batch))
-        stepper(state, 0.0)
+        monkeypatch.setattr(
+            cpu_stepper, "update_frame_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m)
+        )
+        monkeypatch.setattr(cpu_stepper, "choose_views", lambda *given, batch=batch: np.array(batch))
+        CpuStepper(frames, config, state).step(state, 0.0)
         steps.append((seen["t"], state.rows.copy()))
     assert abs(steps[0][0][1]) > 0
     np.testing.assert_allclose(steps[0][0], steps[1][0], rtol=1e-5)
@@ -342,14 +343,14 @@ def test_bad_frames(frames):
 
 def test_time_left_is_that_of_the_steps(monkeypatch):
     """A start that takes its time says nothing about the steps: those of this clip take milliseconds each."""
-    start = fit_module.start
+    start = fit_module._start
 
     def slow(*given):
         state = start(*given)
         state.seconds += 1000
         return state
 
-    monkeypatch.setattr(fit_module, "start", slow)
+    monkeypatch.setattr(fit_module, "_start", slow)
     infos = [info for _, info in fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=20))]
     assert all(info.seconds_left == np.inf for info in infos[:5])  # not known yet
     assert all(0 < info.seconds_left < 200 for info in infos[5:-1])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
-from foldgauss.io._atomic import check_writable, checked_path
+from foldgauss.io._atomic import check_path, check_writable
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.model_file import (
     ModelFileError,
@@ -51,7 +51,7 @@ def join_segments(
 
     Example: `join_segments("long.safetensors", [(0, "a.safetensors"), (95, "b.safetensors")])`
     """
-    path = checked_path(path, "path, sources")
+    path = check_path(path, "path, sources")
     files, entries, specs, segments = [], [], {}, []
     for number, source in enumerate(sources):
         first, file = _source(number, source)
@@ -105,7 +105,7 @@ def _source(number: int, source: object) -> tuple[int, Path]:
         raise invalid(f"sources[{number}]", expected=expected, got=short_repr(source)) from None
     if not is_integer(first, 0):
         raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
-    file = checked_path(file, "path, sources")
+    file = check_path(file, "path, sources")
     if is_compact(file):
         raise _unfit(file, "a compact one", "Join the models before they are compressed.")
     return int(first), file
@@ -121,7 +121,7 @@ def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
 
 def is_segmented(path: str | os.PathLike) -> bool:
     """Whether a file holds a video in segments; no tensor is read. Raises as `load_video_model`."""
-    path = checked_path(path)
+    path = check_path(path)
     return not is_compact(path) and read_header(path)["kind"] == SEGMENTED
 
 

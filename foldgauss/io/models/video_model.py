@@ -13,7 +13,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io._atomic import checked_path
+from foldgauss.io._atomic import check_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import ModelFileError, load_part, read_header, register_model, save_model
 from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
@@ -43,7 +43,7 @@ def save_video_model(
     """
     if isinstance(model, Edit):
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
-    checked_path(path, "path, model")
+    check_path(path, "path, model")
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
         expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
         raise invalid("model", expected=expected, got=type(model).__name__)
@@ -75,7 +75,7 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
 
     Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
     """
-    path = checked_path(path)
+    path = check_path(path)
     if is_compact(path):
         return load_compact_model(path)
     about = read_header_of_kind(path, VIDEO, EDITED, SEGMENTED)
@@ -86,7 +86,7 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
 
 def read_metadata(path: str | os.PathLike) -> dict:
     """What was noted when a model's file was written, of either kind. Raises as `load_video_model`."""
-    path = checked_path(path)
+    path = check_path(path)
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 

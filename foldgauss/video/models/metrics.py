@@ -80,10 +80,7 @@ def evaluate(
 
     Example: `evaluate(model, clip.frames).mean_psnr`.
     """
-    expected = (model.num_frames, *model.size)
-    if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4) or frames.dtype != np.uint8:
-        wanted = f"uint8 {(*expected, 3)}, or 4 with alpha"
-        raise invalid("frames", expected=wanted, got=f"{frames.dtype} {frames.shape}")
+    check_frames(model, frames)
     scores = []
     for k, image in enumerate(model.frames(background=background)):
         target = np.asarray(frames[k])
@@ -92,3 +89,11 @@ def evaluate(
         if on_frame is not None:
             on_frame(image)
     return Evaluation(*map(tuple, zip(*scores, strict=True)))
+
+
+def check_frames(model: RenderableVideo, frames: np.ndarray) -> None:
+    """Raise unless `frames` are uint8 frames of the model's number and size, with or without alpha."""
+    expected = (model.num_frames, *model.size)
+    if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4) or frames.dtype != np.uint8:
+        wanted = f"uint8 {(*expected, 3)}, or 4 with alpha"
+        raise invalid("frames", expected=wanted, got=f"{frames.dtype} {frames.shape}")

@@ -19,11 +19,18 @@ import numpy as np
 from jaxtyping import UInt8
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss.io._atomic import atomic_path, checked_path
-from foldgauss.io.media.video_file import Clip
-from foldgauss.io.models.compact import is_compact, packed
+from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.video.compression.quantize import Quantized, Rule, column_names, describe, is_whole, quantize
+from foldgauss.video.compression.quantize import (
+    Quantized,
+    Rule,
+    column_names,
+    compute_columns,
+    is_integral,
+    quantize,
+)
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.video_model import VideoModel
@@ -61,7 +68,7 @@ def write_html(
 
     Example: `write_html("clip.html", model, original=clip.frames)`.
     """
-    path = checked_path(path, "path, model")
+    path = check_path(path, "path, model")
     if path.suffix.lower() != HTML_SUFFIX:
         raise invalid("path", expected=f"a name ending in {HTML_SUFFIX}", got=repr(str(path)))
     page = html_page(model, original=original, quality=quality, title=path.stem if title is None else title)
@@ -99,7 +106,7 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
     return _assembled(_model_blocks(model, plain), pictures, name if title is None else title)
 
 
-def notebook_frame(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
+def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
     """The page in a frame of a notebook; None where it would be too large, or there is no page of such a model."""
     try:
         page = _assembled(_up_to(_model_blocks(model, model), LARGEST_IN_NOTEBOOK), [], "foldgauss")
@@ -119,7 +126,7 @@ def notebook_frame(model: VideoModel | EditedVideo | SegmentedVideo) -> str | No
 def _loaded(model: Model) -> tuple[Loaded, str]:
     """The model, and a name for it."""
     if isinstance(model, str | os.PathLike):
-        path = checked_path(model, "model")
+        path = check_path(model, "model")
         name = read_origin(path).get("clip", path.stem)
         return load_video_model(path), name
     if not isinstance(model, Loaded):
@@ -135,13 +142,13 @@ def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
-            yield _block(f"model-{number}", packed(_fine(_flattened(number, segment.model))))
+            yield _block(f"model-{number}", pack_compact(quantize_finely(_flattened(number, segment.model))))
     elif isinstance(model, Quantized):
-        yield _block("model", packed(model))
+        yield _block("model", pack_compact(model))
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
-        yield _block("model", packed(_fine(flatten_video(loaded))))
+        yield _block("model", pack_compact(quantize_finely(flatten_video(loaded))))
 
 
 def _flattened(number: int, model: VideoModel | EditedVideo) -> VideoModel:
@@ -161,14 +168,14 @@ def _up_to(blocks: Iterable[str], most: float) -> Iterator[str]:
         yield block
 
 
-def _fine(model: VideoModel) -> Quantized:
+def quantize_finely(model: VideoModel) -> Quantized:
     """All its Gaussians in their own order, by steps so fine that the picture stays."""
-    described = describe(model)
+    described = compute_columns(model)
     classes = np.zeros(model.num_gaussians, np.int32)
     try:
         return quantize(described, classes, _rules(model.degree))
     except ValueError:  # Gaussians so thin that steps in proportion would be beyond the format
-        names = [name for name in column_names(model.degree) if not is_whole(name)]
+        names = [name for name in column_names(model.degree) if not is_integral(name)]
         return quantize(described, classes, {name: Rule(0.0, _EVEN) for name in names})
 
 
@@ -206,7 +213,7 @@ def _pictures(original: Frames, model: Loaded, quality: int) -> list[bytes]:
 
 def _size_and_number(model: Loaded) -> tuple[tuple[int, int], int]:
     if isinstance(model, Quantized):
-        return tuple(model.facts.size), len(model.intervals) + 1
+        return tuple(model.info.size), len(model.intervals) + 1
     return tuple(model.size), model.num_frames
 
 
@@ -222,7 +229,7 @@ def _webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> by
 
 
 def _assembled(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
-    script, style = bundled("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
+    script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
     blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
     parts = {
         "policy": _policy(script, style),
@@ -258,7 +265,7 @@ def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def bundled(entry: str) -> str:
+def bundle_script(entry: str) -> str:
     """A module and all that it imports, each once, as one script without imports; texts become strings."""
     done: dict[str, str] = {}
 

@@ -18,9 +18,10 @@ from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import atomic_folder, check_replaceable
-from foldgauss.io.exchange.ply import checked_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
-from foldgauss.io.exchange.ply_format import facts_error, format_error
-from foldgauss.io.media.video_file import DEFAULT_FPS, natural_order
+from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
+from foldgauss.io.exchange.ply_file import facts_error, format_error
+from foldgauss.io.media.frame_rate import DEFAULT_FPS
+from foldgauss.io.media.image_files import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
@@ -138,7 +139,7 @@ def write_pseudomesh(
 
     **Source:** VeGaS eq:traingle_face; Waczyńska et al. 2024, GaMeS (pseudomesh).
     """
-    folder, times = Path(folder), checked_times(model, times)
+    folder, times = Path(folder), check_times(model, times)
     check = partial(check_replaceable, folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
     check()
     with atomic_folder(folder, check=check) as temporary:
@@ -213,7 +214,7 @@ def read_pseudomesh(
         raise FileNotFoundError(
             f"path: expected a folder, got {str(folder)!r}, which is missing. Check the current folder."
         )
-    paths = sorted(folder.glob("*.obj"), key=lambda path: natural_order(path.name)) if folder.is_dir() else []
+    paths = sorted(folder.glob("*.obj"), key=lambda path: natural_sort_key(path.name)) if folder.is_dir() else []
     if not paths:
         cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
         raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)

@@ -328,3 +328,25 @@ def _encoded(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequenc
     yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
     for columns in elements.values():
         yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()
+
+
+# ---------------------------------------------------------------------------------------------- layouts
+
+
+def is_vegas(ply: Ply) -> bool:
+    """Whether a PLY file is a published VeGaS video, by the columns that only those have."""
+    return {"m_0", "sigma_0", "rot_0"} <= set(ply.names("vertex"))
+
+
+def is_3dgs(ply: Ply) -> bool:
+    """Whether a PLY file is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
+    return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(ply.names("vertex"))
+
+
+def to_float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:
+    """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
+    with np.errstate(over="ignore"):
+        leaf = np.ascontiguousarray(leaf, np.float32)
+    if not np.isfinite(leaf).all():
+        raise format_error(ply.path, expected=f"a {name} that float32 holds in model space", got="a larger one")
+    return leaf

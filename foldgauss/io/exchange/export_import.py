@@ -8,18 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import OutputError, atomic_folder, check_replaceable, check_writable, checked_path
-from foldgauss.io.exchange.mesh import write_pseudomesh
-from foldgauss.io.exchange.ply import (
-    AXES,
-    DEPTH_STEP,
-    read_vegas_ply,
-    write_3dgs_frames,
-    write_3dgs_ply,
-    write_vegas_ply,
-)
-from foldgauss.io.exchange.ply_format import format_error
-from foldgauss.io.page.html import HTML_SUFFIX, QUALITY, Frames, write_html
+from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_replaceable, check_writable
+from foldgauss.io.exchange.gaussians_ply import AXES, DEPTH_STEP, write_3dgs_frames, write_3dgs_ply
+from foldgauss.io.exchange.ply_file import format_error
+from foldgauss.io.exchange.pseudomesh import write_pseudomesh
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
+from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, Frames, write_html
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
@@ -67,7 +61,7 @@ def export(
         cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     check_one_of("format", format, FORMATS)
-    out = checked_path(out, "model, format, out")
+    out = check_path(out, "model, format, out")
     of_scenes = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
     of_pages = {"original": original, "quality": quality, "title": title}
     given = {name: value for name, value in of_scenes.items() if value is not None}
@@ -132,7 +126,7 @@ def import_model(
 
     **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
     """
-    path = checked_path(path)
+    path = check_path(path)
     if path.is_dir() or path.suffix.lower() == ".obj":
         cure = "Draw frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
         raise format_error(path, expected="a .ply file with a video", got="a folder or a mesh", cure=cure)

@@ -11,7 +11,7 @@ from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikeliho
 from foldgauss.estimator.em.loop import EMStatus
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.gradient_fit import fit_gradient
-from foldgauss.estimator.model_selection import _parts, select_mixture
+from foldgauss.estimator.model_selection import _assign_folds, select_mixture
 from foldgauss.mixture import FoldedMixture
 
 
@@ -33,7 +33,7 @@ def test_size_and_degree_are_found(criterion):
 
 def test_groups_stay_whole():
     groups = np.repeat(np.arange(10), 7)
-    parts = _parts(70, 5, groups)
+    parts = _assign_folds(70, 5, groups)
     assert all(len(set(parts[groups == g])) == 1 for g in range(10))
     assert (np.bincount(parts) == 14).all()
 
@@ -102,7 +102,7 @@ def test_gradients_that_run_away_leave_the_last_good_mixture():
     """Steps far too long: what is returned has a finite likelihood nevertheless."""
     x = _two_parabolas()
     for rate in (3.0, 30.0):
-        result = fit_gradient(_start(), x, steps=20, optimiser=optax.sgd(rate))
+        result = fit_gradient(_start(), x, steps=20, optimizer=optax.sgd(rate))
         assert np.isfinite(result.mixture.log_prob(x).mean())
         assert np.isfinite(result.mixture.components.time_scale).all()
 
