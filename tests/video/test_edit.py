@@ -771,7 +771,10 @@ def test_functions_cannot_write_to_what_they_are_given():
 def test_broken_triangles():
     flat = lambda v, t: np.repeat(v[:, :1], 3, 1)  # noqa: E731
     for function, message in (
-        (flat, "vertices: expected triangles whose three vertices span a plane, got 40 without area, the first at index 0"),
+        (
+            flat,
+            "vertices: expected triangles whose three vertices span a plane, got 40 without area, the first at index 0",
+        ),
         (lambda v, t: v * np.nan, "vertices: expected finite numbers"),
         (lambda v, t: v[1:], r"vertices: expected numbers of shape \(40, 3, 3\)"),
         (lambda v, t: None, "vertices: expected numbers of shape"),
