@@ -78,7 +78,7 @@ def _run(points, params, envelope, model, total=N, **options):
 
 
 @pytest.mark.parametrize("power", ENVELOPES)
-def test_density_is_the_mixtures(x64, power):
+def test_density_matches_mixture(x64, power):
     params, x = _params(), _data()
     mixture = to_mixture(params, NO_SCALING, ENVELOPES[power])
     density = components.log_likelihoods(
@@ -119,7 +119,7 @@ def test_gram_is_the_sum_over_pairs(x64):
 @pytest.mark.parametrize(
     "covariance", ["full", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("diag", "spherical", "tied"))]
 )
-def test_promises_of_time_are_slopes_of_the_profile(x64, covariance):
+def test_newton_gain_matches_profile_derivatives(x64, covariance):
     """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)
     if covariance != "full":
@@ -139,7 +139,7 @@ def test_promises_of_time_are_slopes_of_the_profile(x64, covariance):
     assert (np.asarray(promise) > 0).all()
 
 
-def test_sums_seen_from_elsewhere(x64):
+def test_changing_the_reference_equals_recomputing(x64):
     """A linear map of the sums equals sums made there, with the same shares."""
     here, there, points = _params(), _params(seed=5), make_points(_data(), np.ones(N), K)
     shares = jnp.asarray(np.random.default_rng(3).dirichlet(np.ones(K), points.x.shape[:3]))
@@ -164,7 +164,7 @@ def test_sums_seen_from_elsewhere(x64):
         ),
     ],
 )
-def test_likelihood_never_falls(x64, power, covariance):
+def test_likelihood_never_decreases(x64, power, covariance):
     params = _params()._replace(tril=jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
     run = _run(make_points(_data(), np.ones(N), K), params, ENVELOPES[power], _model(covariance), tol=0, max_steps=60)
     history = np.array(run.history)
@@ -173,7 +173,7 @@ def test_likelihood_never_falls(x64, power, covariance):
     assert (np.diff(history) >= -1e-10 * np.abs(history[1:])).all()
 
 
-def test_moments_of_time_would_let_the_likelihood_fall(x64):
+def test_moment_updates_of_time_can_decrease_the_likelihood(x64):
     """Power check of the test above: from its end, plain moments of time go down."""
     envelope, model, points = ENVELOPES["1"], _model(), make_points(_data(), np.ones(N), K)
     params = _run(points, _params(), envelope, model, tol=1e-8, max_steps=60).params
@@ -187,7 +187,7 @@ def test_moments_of_time_would_let_the_likelihood_fall(x64):
     assert by_moments(params)[1] < before - 1e-3
 
 
-def test_lower_degrees_stay_lower(x64):
+def test_coefficients_above_the_degree_stay_zero(x64):
     degrees = np.array([0, 1, 2])
     params = _params()._replace(
         curve=_params().curve * jnp.asarray(1.0 * (np.arange(3)[None, :, None] <= degrees[:, None, None]))
@@ -199,7 +199,7 @@ def test_lower_degrees_stay_lower(x64):
     assert (curve[2] != 0).all()
 
 
-def test_restarts_in_one_program_are_the_single_runs(x64):
+def test_vectorized_restarts_equal_single_runs(x64):
     points, options = make_points(_data(), np.ones(N), K), {"total": N, "tol": 1e-6, "max_steps": 60}
     starts = [_params(seed=s) for s in (0, 1)]
     both = run_em(jax.tree.map(lambda *z: jnp.stack(z), *starts), points, Constant(), _model(), **options)
@@ -211,7 +211,7 @@ def test_restarts_in_one_program_are_the_single_runs(x64):
     assert select_best(both).log_likelihood == max(run.log_likelihood for run in both)
 
 
-def test_any_envelope_can_be_fitted_with(x64):
+def test_custom_envelope_can_be_fitted(x64):
     """A user's own envelope, equal to the built-in: the same run."""
     own = plain_envelope(lambda t, m, s: 1e-3 + (1 - 1e-3) * jnp.exp(-0.5 * ((t - m) / s) ** 2))
     points = make_points(_data(), np.ones(N), K)
@@ -222,7 +222,7 @@ def test_any_envelope_can_be_fitted_with(x64):
 # --- data that determine nothing ----------------------------------------------------------------------------
 
 
-def test_dead_component_is_reset_and_told():
+def test_empty_component_is_reset():
     params = _params(np.float32)
     params = params._replace(time_loc=params.time_loc.at[0].set(1e3))  # out of reach: no mass
     points, model = (
@@ -247,7 +247,7 @@ def test_nan_is_never_convergence():
     assert select_best([run, run._replace(status=EMStatus.NOT_CONVERGED, log_likelihood=-1e9)]).log_likelihood == -1e9
 
 
-def test_singular_component_is_told():
+def test_singular_component_sets_status():
     x = np.repeat(_data()[:K], 20, axis=0).astype(np.float32)  # three points, many times
     points = make_points(x, np.ones(len(x), np.float32), K)
     params = _params(np.float32)

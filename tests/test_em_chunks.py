@@ -123,7 +123,7 @@ class _Changing:
         pytest.param({"init_params": "random", "annealing": 0.1, "time_column": 0}, marks=pytest.mark.slow),
     ],
 )
-def test_chunks_are_fitted_as_one_array(options):
+def test_chunks_equal_one_array(options):
     """Weights of zero among them, and 1e6 away from zero."""
     x, weights = _tracks(offset=1e6), _weights()
     whole = _fit(x, weights, **options)
@@ -134,7 +134,7 @@ def test_chunks_are_fitted_as_one_array(options):
         assert (np.diff(parted.lower_bounds_) > -1e-9).all()
 
 
-def test_any_kind_of_chunks_will_do(tmp_path):
+def test_all_kinds_of_chunks_are_equivalent(tmp_path):
     x, weights = _tracks(), _weights()
     parts, masses = np.split(x, CUTS), np.split(weights, CUTS)
     x.tofile(tmp_path / "rows")
@@ -152,7 +152,7 @@ def test_any_kind_of_chunks_will_do(tmp_path):
     _assert_same(_fit(x), _fit(parts, 1.0), 1e-9)
 
 
-def test_columns_are_scaled_each_by_its_own_spread():
+def test_columns_are_scaled_by_their_standard_deviation():
     x = _tracks() * [100.0, 1.0] + [7.0, 0.0]
     whole, parted = _fit(x, time_column=0), _fit(np.split(x, CUTS), time_column=0)
     np.testing.assert_allclose(parted._scaling.scale, whole._scaling.scale, rtol=1e-12)
@@ -171,7 +171,7 @@ def test_float32_chunks_are_fitted_in_float32():
 
 
 @pytest.mark.parametrize("ordered", [2**20, 300])
-def test_starts_look_at_the_same_rows(monkeypatch, ordered):
+def test_initialization_draws_the_same_rows(monkeypatch, ordered):
     """Where a start looks at some rows only; by either way of drawing them."""
     monkeypatch.setattr(initialization, "_MAX_POINTS", 100)
     monkeypatch.setattr(initialization, "_MAX_PERMUTED", ordered)
@@ -191,7 +191,7 @@ def test_starts_look_at_the_same_rows(monkeypatch, ordered):
     assert not np.allclose(np.sort(seen[2][0], axis=0), np.sort(seen[3][0], axis=0))
 
 
-def test_of_equal_ends_the_first_is_kept():
+def test_first_of_equal_runs_is_selected():
     """Up to rounding, which hangs on how points are chunked."""
     params = _fit(X, max_iter=1)._params
     run = loop.Run(params, 2.0, [2.0], 1, loop.EMStatus.CONVERGED, 0)
@@ -204,7 +204,7 @@ def test_of_equal_ends_the_first_is_kept():
     assert loop.select_best([lost, lost]).log_likelihood == -np.inf
 
 
-def test_a_draw_of_many_is_fair_and_without_repetition():
+def test_large_draws_are_uniform_without_duplicates():
     rng = np.random.RandomState(0)
     num = 2**21  # without care some 95 would be drawn twice
     numbers = initialization.draw_subset(num, rng)
@@ -213,7 +213,7 @@ def test_a_draw_of_many_is_fair_and_without_repetition():
     assert abs(numbers.mean() / num - 0.5) < 5 / np.sqrt(12 * initialization._MAX_POINTS)
 
 
-def test_a_warm_start_goes_on_with_chunks():
+def test_warm_start_continues_with_chunks():
     x = _tracks()
     begun = _fit(x, max_iter=2, warm_start=True)
     reached = begun.lower_bound_
@@ -222,7 +222,7 @@ def test_a_warm_start_goes_on_with_chunks():
     assert begun.lower_bounds_[0] > reached
 
 
-def test_what_pruning_asks_of_points_is_the_same_of_blocks():
+def test_pruning_statistics_of_blocks_equal_those_of_points():
     x, weights = _tracks(), _weights()
     fitted, there = _fit(x, weights, max_iter=1), weights > 0
     chunks = open_chunks(np.split(x, CUTS), np.split(weights, CUTS))
@@ -240,7 +240,7 @@ def test_what_pruning_asks_of_points_is_the_same_of_blocks():
         np.testing.assert_allclose(value, prune.log_likelihood(fitted._params, points, fitted._envelope), rtol=1e-12)
 
 
-def test_variances_are_of_centred_numbers():
+def test_variances_are_accurate_far_from_zero():
     x = 1e8 + np.random.default_rng(0).normal(size=(1000, 2)) * [1.0, 1e-3]
     weights = _weights(1000)
     found, sizes = summarize_rows(open_chunks(np.array_split(x, 77), weights))
@@ -254,7 +254,7 @@ def test_variances_are_of_centred_numbers():
 # --- what is known of chunks ----------------------------------------------------------------------------------
 
 
-def test_scores_and_labels_of_chunks():
+def test_predictions_of_chunks_equal_those_of_rows():
     x = _tracks()
     fitted, parts = _fit(x), np.split(x, CUTS)
     for name in ("score", "bic", "aic"):
@@ -269,7 +269,7 @@ def test_scores_and_labels_of_chunks():
     np.testing.assert_array_equal(np.concatenate(list(labels)), fitted.predict(x))
 
 
-def test_chunks_are_chosen_among_by_information():
+def test_select_mixture_takes_chunks():
     x = _tracks()
     options = {"n_components": [3], "degrees": [2]}
     estimator = FoldedGaussianMixture(**OPTIONS)
@@ -286,7 +286,7 @@ def _dask():
     return pytest.importorskip("dask.array", reason="dask is not installed")
 
 
-def test_a_dask_array_is_fitted_as_one_array():
+def test_dask_array_equals_one_array():
     array = _dask()
     x, weights = _tracks(offset=1e6), _weights()
     rows = array.from_array(x, chunks=((70, 10, 0, 160, 1, 259, 100), 2))
@@ -341,7 +341,7 @@ def _same_with(client, rows, alone):
         np.testing.assert_array_equal(getattr(parted, name), getattr(alone, name))
 
 
-def test_workers_sum_to_the_same_bits():
+def test_workers_give_equal_bits():
     rows = _dask().from_array(_tracks(), chunks=(101, 2))
     alone = _fit(rows, _weights())
     with _workers(processes=False) as client:
@@ -350,7 +350,7 @@ def test_workers_sum_to_the_same_bits():
 
 
 @pytest.mark.slow
-def test_workers_in_processes_sum_to_the_same_bits(monkeypatch):
+def test_worker_processes_give_equal_bits(monkeypatch):
     monkeypatch.undo()  # processes have their own constants
     rows = _dask().from_array(_tracks(200_000, np.float32), chunks=(66_000, 2))
     options = {"max_iter": 5}
@@ -393,19 +393,19 @@ _NAN = np.where(np.arange(20)[:, None] == 17, np.nan, X[:20])
         ([X], "heavy", "sample_weight, chunk 0: expected"),
     ],
 )
-def test_chunks_that_cannot_be_fitted_are_named(data, weights, match):
+def test_invalid_chunks_raise(data, weights, match):
     data = (part for part in [X]) if data == "once" else data
     with pytest.raises(ValueError, match=match):
         _fit(data, weights)
 
 
-def test_rows_that_change_from_pass_to_pass_are_told():
+def test_rows_that_change_between_passes_raise():
     left = iter([[X, X], [X, X], [X]])  # the first is taken by the check that there are several passes
     with pytest.raises(ValueError, match="X: expected the same rows in each pass, got 100 at first and 50 now"):
         _fit(_Changing(left))
 
 
-def test_dask_arrays_that_cannot_be_fitted_are_told():
+def test_invalid_dask_arrays_raise():
     array = _dask()
     rows = array.from_array(X, chunks=(20, 1))
     for data, weights, match in [
@@ -430,7 +430,7 @@ def test_dask_arrays_that_cannot_be_fitted_are_told():
             _fit(data, weights)
 
 
-def test_chunks_unlike_those_fitted_are_told():
+def test_prediction_checks_chunks():
     fitted = _fit(X, max_iter=1)
     with pytest.raises(ValueError, match="X, chunk 1: expected 2 columns, got 1"):
         fitted.score([X, X[:, :1]])
@@ -444,7 +444,7 @@ def test_chunks_unlike_those_fitted_are_told():
         fitted.partial_fit([X])
 
 
-def test_rows_are_not_taken_for_chunks():
+def test_rows_and_chunks_are_told_apart():
     for rows in (X, X.tolist(), list(X), lambda: [X], [], "text", {"a": X}, None, [[1, 2], [3, 4]], X[None]):
         assert not is_chunked(rows)
     for chunks in ([X], (X, X), _Files([X]), (part for part in [X])):

@@ -94,11 +94,11 @@ def name_of(row):
         ([], [], []),
     ],
 )
-def test_front(cost, quality, expected):
+def test_pareto_front(cost, quality, expected):
     assert pareto_front(cost, quality) == expected
 
 
-def test_front_is_what_nothing_beats():
+def test_pareto_front_is_not_dominated():
     rng = np.random.default_rng(0)
     for _ in range(50):
         cost, quality = rng.integers(1, 9, 30), rng.integers(20, 40, 30)
@@ -127,7 +127,7 @@ def test_knee(cost, quality, expected):
     assert knee([c**2 for c in cost], [2 * q for q in quality]) == expected
 
 
-def test_each_turn_changes_one_thing_and_has_a_command():
+def test_each_variant_changes_one_setting_and_has_a_command():
     made, left = plan_points(BASE, tuple(AXES), 132, (320, 640))
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
@@ -159,7 +159,7 @@ def test_each_turn_changes_one_thing_and_has_a_command():
         ({"num_frames": 3}, "batch", "3 frames"),
     ],
 )
-def test_turns_that_a_clip_cannot_have_are_left_out(where, axis, why):
+def test_variants_that_do_not_apply_are_skipped(where, axis, why):
     where = {"num_frames": FRAMES, "has_alpha": False} | where
     made, left = plan_points(BASE, (axis,), where["num_frames"], SIZE, has_alpha=where["has_alpha"])
     assert {one.name.split()[0] for one in left} == {axis}
@@ -293,7 +293,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
         assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
 
 
-def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
+def test_killed_run_resumes(clip, tmp_path, capsys, monkeypatch):
     target, axes = tmp_path / "results", "time"
     arguments = ["tradeoff", str(clip), "--out", str(target), "--axes", axes, *QUICK]
     process = subprocess.Popen([sys.executable, "-m", "foldgauss", *arguments], stderr=subprocess.DEVNULL)

@@ -272,7 +272,7 @@ def info(model_path: ModelFile) -> None:
         **_economies(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": _about_times(np.asarray(model.frame_times.times())),
-        "numbers stored": f"{model.num_parameters:,}",
+        "parameters stored": f"{model.num_parameters:,}",
         "file": _size_of(model_path, model),
     }
     if isinstance(model, EditedVideo):
@@ -300,7 +300,7 @@ def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> N
         "segments": f"{len(model.segments):,}{joints}",
         "Gaussians": f"{model.num_gaussians:,} in all",
         "fold": f"polynomial of degree {model.degree}",
-        "numbers stored": f"{model.num_parameters:,}",
+        "parameters stored": f"{model.num_parameters:,}",
         "file": _size_of(model_path, model),
     }
     _print_facts(model_path, figures, about)
@@ -330,10 +330,10 @@ def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
     if any((splats.degrees < splats.degree).any() for splats in parts):
         counts = zip(*np.unique(degrees, return_counts=True), strict=True)
         told["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
-    if lasting := sum(int(splats.static.sum()) for splats in parts):
-        told["lasting"] = f"{lasting:,} of {len(degrees):,} Gaussians, throughout the clip"
-    if solid := sum(int(splats.opaque.sum()) for splats in parts):
-        told["solid"] = f"{solid:,} of {len(degrees):,} Gaussians, no light comes through"
+    if static := sum(int(splats.static.sum()) for splats in parts):
+        told["static"] = f"{static:,} of {len(degrees):,} Gaussians, throughout the clip"
+    if opaque := sum(int(splats.opaque.sum()) for splats in parts):
+        told["opaque"] = f"{opaque:,} of {len(degrees):,} Gaussians, without transmittance"
     counted = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
     for what, name in (("colors", "colours"), ("shapes", "shapes")):
         # Where most have their own, what is alike is so by chance, as of rounded numbers.

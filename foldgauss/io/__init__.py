@@ -1,4 +1,9 @@
-"""Files: clips in and out, model files, other programs' formats, pictures. Every output appears whole or not at all."""
+"""Reading and writing files; every output appears whole or not at all.
+
+Clips, images and masks (`read_video`, `write_video`, `index_video`, `read_masks`), models (`save_video_model`,
+`load_video_model`, `save_compact`), formats of other programs (`export`, `import_model`), the HTML player
+(`write_html`), and the history of a fit. `foldgauss.io.datasets` holds sample clips.
+"""
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.exchange.export_import import export, import_model

@@ -280,9 +280,9 @@ def _find_cells(num, block, first, end):
 @inline
 def _aligned_empty(size):
     """An array of `size` floats that starts on a cache line, so that no vector of 16 straddles two."""
-    room = np.empty(size + TILE, np.float32)
-    skip = (-room.ctypes.data // 4) % TILE
-    return room[skip : skip + size]
+    buffer = np.empty(size + TILE, np.float32)
+    skip = (-buffer.ctypes.data // 4) % TILE
+    return buffer[skip : skip + size]
 
 
 @kernel
@@ -358,8 +358,8 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
                 place = e * _u(2 * LANES)
                 store(marks, place, load(marks, place) + weight)
                 place += _u(LANES)
-                drawn, most = select(transmittance > stop, alpha, none), load(marks, place)
-                store(marks, place, select(drawn > most, drawn, most))
+                visible, most = select(transmittance > stop, alpha, none), load(marks, place)
+                store(marks, place, select(visible > most, visible, most))
             transmittance = transmittance - attenuation * weight
             c_0th = c_0th + weight * broadcast(block[color + e])
             if channels > _u(1):

@@ -88,10 +88,10 @@ def _walk(
             for k in range(tile_start[n], used[n]):
                 one = geometry[entries[listed[k]]]
                 dy = _f(y) + _f(0.5) - one[y_]
-                room = one[log_] - one[r_] * dy * one[r_] * dy
-                if room >= one[least_]:
+                bound = one[log_] - one[r_] * dy * one[r_] * dy
+                if bound >= one[least_]:
                     which[num] = entries[listed[k]]
-                    on_row[num] = one[p_], one[q_] * dy + one[p_] * (_f(left) + _f(0.5) - one[x_]), room, one[least_]
+                    on_row[num] = one[p_], one[q_] * dy + one[p_] * (_f(left) + _f(0.5) - one[x_]), bound, one[least_]
                     num += 1
             for x in range(left, min(left + tile, width)):
                 pixel, transmittance, found = y * width + x, _f(1), _i(0)

@@ -418,7 +418,7 @@ COMPACT = Target(
     _read_compact,
     (ModelFileError,),
     {
-        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact", "_steps"),
+        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact", "_wrapped_differences"),
         "foldgauss.io.models.column_contexts": (),
         "foldgauss.io.models.video_model": (
             ONLY,

@@ -153,7 +153,7 @@ def _read_vegas(path: Path) -> None:
 
 
 _PLY = {
-    "foldgauss.io.exchange.ply_file": ("write_ply", "_encoded"),
+    "foldgauss.io.exchange.ply_file": ("write_ply", "_encode"),
 }
 _PLY_MUTATIONS = (numbers_changed, note_changed, counted, columns_changed)
 
@@ -267,7 +267,7 @@ OBJ = Target(
     lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"]), _from_the_end(_mesh()["frame_0000.obj"])],
     _read_mesh,
     (FormatError,),
-    {"foldgauss.io.exchange.pseudomesh": (*_MESH["foldgauss.io.exchange.pseudomesh"], "_notes", "_checked_notes")},
+    {"foldgauss.io.exchange.pseudomesh": (*_MESH["foldgauss.io.exchange.pseudomesh"], "_read_notes", "_check_notes")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 400 * size,
     (line_changed,),
@@ -305,8 +305,8 @@ NOTES = Target(
     {
         "foldgauss.io.exchange.pseudomesh": (
             *_MESH["foldgauss.io.exchange.pseudomesh"],
-            "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parsed_vertex",
-            "_parsed_face", "_check_soup",
+            "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parse_vertex",
+            "_parse_face", "_check_soup",
         )
     },
     lambda data: 0,

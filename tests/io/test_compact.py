@@ -69,7 +69,7 @@ def pictures(model):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 7])
-def test_fine_steps_give_the_picture_back(degree):
+def test_fine_steps_reproduce_the_image(degree):
     model = soft_model(degree=degree, options=RenderOptions())
     again = dequantize(fine(model))
     for t in (0.0, 0.37, 1.0):
@@ -161,7 +161,7 @@ def test_kinds_are_kept(tmp_path):
 
 
 @pytest.mark.parametrize("passes", [0, 2])
-def test_kinds_outlive_fitting_anew(tmp_path, passes):
+def test_kinds_survive_fine_tuning(tmp_path, passes):
     model = of_kinds(soft_model(degree=3, options=RenderOptions()))
     made = compress(model, clip_of(model), passes=passes)
     again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
@@ -173,7 +173,7 @@ def test_kinds_outlive_fitting_anew(tmp_path, passes):
 
 
 @pytest.mark.parametrize("told", ["faint", "coarse"])
-def test_few_that_are_left_can_be_read(tmp_path, told):
+def test_file_with_few_gaussians_left_can_be_read(tmp_path, told):
     """Cells are counted anew, for those that stay."""
     model = crowd(soft_model(degree=3), 40)
     if told == "faint":
@@ -185,7 +185,7 @@ def test_few_that_are_left_can_be_read(tmp_path, told):
     same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantized)), made.model)
 
 
-def test_a_power_that_saves_little_goes():
+def test_power_that_saves_little_is_dropped():
     """Its squared error, in steps, against what a number's bits are worth."""
     saved = np.array([[9.0, 9.0, 9.0], [1.0, 0.5, 0.2], [0.8, 0.2, 4.0]])
     np.testing.assert_array_equal(_choose_degrees(saved), [1, 0, 2])
@@ -230,7 +230,7 @@ def test_loss_without_the_clip_is_that_of_an_independent_error():
 
 
 @pytest.mark.parametrize("how", ["opaque", "alpha", "sum"])
-def test_fitting_anew_pays(how):
+def test_fine_tuning_makes_smaller_files(how):
     """A model that is not at its best: what is gained pays for coarser steps, within the loss allowed."""
     best = soft_model(options=RenderOptions(), compositing="sum" if how == "sum" else "over")
     if how == "sum":  # where they add up to no more than white
@@ -257,7 +257,7 @@ def test_a_greater_loss_makes_a_smaller_file():
     assert sizes[-1] < 0.85 * sizes[0]
 
 
-def test_gaussians_that_nobody_sees_are_left_out():
+def test_invisible_gaussians_are_dropped():
     model = soft_model(options=RenderOptions())
     hidden = eqx.tree_at(
         lambda m: m.splats.opacity_logit,
@@ -296,7 +296,7 @@ def test_a_decoded_model_by_the_same_rules_is_the_same_file():
     assert pack_compact(again) == pack_compact(quantized)
 
 
-def test_logarithm_is_one():
+def test_logarithm_matches_numpy():
     x = np.concatenate([np.random.default_rng(0).uniform(0, 1, 1000), [2.0**-40, 0.5, 1.0, 0.7071067811865476]])
     np.testing.assert_allclose(_log(x), np.log(x), rtol=1e-13, atol=1e-13)
 
@@ -404,7 +404,7 @@ def test_extremes_of_values(leaf, value):
     assert all(np.isfinite(one).all() for one in jax.tree.leaves(made.model))
 
 
-def test_numbers_that_are_not_finite_are_refused():
+def test_nan_and_infinities_are_rejected():
     model = soft_model()
     for value in (np.nan, np.inf):
         broken = eqx.tree_at(lambda m: m.splats.loc, model, model.splats.loc.copy())
@@ -413,7 +413,7 @@ def test_numbers_that_are_not_finite_are_refused():
             compress(broken)
 
 
-def test_what_the_format_does_not_hold_is_refused():
+def test_models_that_the_format_cannot_hold_are_rejected():
     model = soft_model()
     powers = eqx.tree_at(lambda m: m.splats.envelope, model, TimeLikelihood(np.linspace(1, 2, model.num_gaussians)))
     with pytest.raises(ValueError, match=r"several|different"):
@@ -459,7 +459,7 @@ def refused(tmp_path, data, match):
         load_video_model(path)
 
 
-def test_truncated(tmp_path, good):
+def test_truncated_file_is_rejected(tmp_path, good):
     for length in (*range(4, 24), 60, len(good) // 2, len(good) - 1):
         refused(tmp_path, good[:length], "compact model")
 
@@ -472,13 +472,13 @@ def test_damaged_everywhere(tmp_path, good):
         refused(tmp_path, bytes(data), "compact model")
 
 
-def test_later_version(tmp_path, good):
+def test_later_version_is_rejected(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 9
     refused(tmp_path, bytes(data), r"expected a compact model of version 2, .* got version 9 .* Update foldgauss")
 
 
-def test_version_before(tmp_path, good):
+def test_earlier_version_is_rejected(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 1
     refused(
@@ -530,14 +530,14 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("scale_cutoff", True),
     ],
 )
-def test_header_of_a_stranger(tmp_path, good, key, value):
+def test_forged_header_is_rejected(tmp_path, good, key, value):
     def change(header):
         header[key] = value
 
     refused(tmp_path, resealed(good, change), "compact model")
 
 
-def test_columns_of_a_stranger(tmp_path, good):
+def test_forged_columns_are_rejected(tmp_path, good):
     def changed(own):
         return lambda header: header["columns"].__setitem__(5, own)
 
@@ -560,7 +560,7 @@ def test_columns_of_a_stranger(tmp_path, good):
         refused(tmp_path, resealed(good, lambda header, key=key: header.pop(key)), "compact model")
 
 
-def test_streams_of_a_stranger(tmp_path, good):
+def test_forged_streams_are_rejected(tmp_path, good):
     """With the right checksum: they decode to something or are refused, in no time and memory of note."""
     rng, path = np.random.default_rng(1), tmp_path / "m.fgz"
     start = len(MAGIC) + 12 + int.from_bytes(good[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
@@ -579,7 +579,7 @@ def test_streams_of_a_stranger(tmp_path, good):
 @pytest.mark.parametrize(
     ("name", "number"), [("without", 4), ("without", -1), ("degree", 4), ("degree", -1), ("shade", 10), ("shade", -1)]
 )
-def test_kinds_of_a_stranger(tmp_path, name, number):
+def test_forged_kinds_are_rejected(tmp_path, name, number):
     quantized = fine(of_kinds(soft_model(degree=3)), -12.0)
     columns = quantized.columns | {name: quantized.columns[name].copy()}
     columns[name][7] = number
@@ -587,7 +587,7 @@ def test_kinds_of_a_stranger(tmp_path, name, number):
     refused(tmp_path, data, "compact model")
 
 
-def test_a_byte_for_every_eight_gaussians(tmp_path):
+def test_file_has_a_byte_for_every_eight_gaussians(tmp_path):
     """All alike, they need next to nothing, and the file is filled up: none may claim more than its length allows."""
     described = compute_columns(only(soft_model(degree=0), np.full(100_000, 20)))
     origins = {name: float(value[0]) for name, value in described.values.items()}

@@ -140,7 +140,7 @@ def test_support_radius(kind, radius):
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
 @pytest.mark.parametrize("kind", ["plain", "curtain", "tiny", "one pixel", "none"])
-def test_statistics(kind, compositing):
+def test_visibility(kind, compositing):
     """Against the weights of a dense picture, in double precision."""
     leaves, size = leaves_of(kind)
     options = RenderOptions()
@@ -167,7 +167,7 @@ def test_statistics(kind, compositing):
     np.testing.assert_allclose(trace.transmittance, light, atol=1e-4)
 
 
-def test_statistics_see_what_is_hidden():
+def test_hidden_splats_have_small_contribution():
     """The comparison above has power: in a curtain most splats contribute nothing, and the first ones most."""
     leaves, size = leaves_of("curtain")
     contribution, largest_alpha = cpu.forward(*leaves, size, visibility=True).visibility
@@ -176,7 +176,7 @@ def test_statistics_see_what_is_hidden():
     np.testing.assert_array_equal(contribution == 0, largest_alpha == 0)
 
 
-def test_light_is_what_the_background_gets():
+def test_transmittance_is_the_weight_of_the_background():
     leaves, size = leaves_of("plain")
     white = cpu.forward(*leaves[:3], np.zeros_like(leaves[3]), np.ones(3, np.float32), size)
     np.testing.assert_array_equal(white.image[1], white.transmittance)
@@ -211,7 +211,7 @@ def test_bits_do_not_depend_on_threads(kind, channels):
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-def test_several_frames_are_as_one_by_one(compositing):
+def test_several_frames_equal_single_frames(compositing):
     """To the bit; the frames may have different numbers of splats."""
     leaves, size = leaves_of("plain")
     frames = [[leaf[k:] for leaf in leaves[:4]] + leaves[4:] for k in (0, 20, len(leaves[0]))]
@@ -229,7 +229,7 @@ def test_no_frames():
     assert cpu.backward_frames([], []) == []
 
 
-def test_cut_lists_keep_the_gradient():
+def test_trimmed_lists_keep_the_gradient():
     """Behind the last light nothing is kept, and nothing is lost: the gradient is that of the whole list."""
     leaves, size = leaves_of("curtain")
     weights = np.ones((3, *size), np.float32)
@@ -244,7 +244,7 @@ def test_cut_lists_keep_the_gradient():
         np.testing.assert_array_equal(one[:first], other[:first])
 
 
-def test_other_tiles_are_refused_with_a_cure():
+def test_other_tile_sizes_raise():
     leaves, size = leaves_of("one")
     cpu.forward(*leaves, size, options=RenderOptions(tile_size=16))
     with pytest.raises(ValueError, match=r"options.tile_size.*other sizes"):
@@ -252,7 +252,7 @@ def test_other_tiles_are_refused_with_a_cure():
 
 
 @pytest.mark.parametrize(("colors", "background"), [(0, 0), (2, 3), (3, 2), (3, 0)])
-def test_channels_that_do_not_fit_are_refused(colors, background):
+def test_mismatched_channels_raise(colors, background):
     leaves, size = leaves_of("one")
     leaves[3:] = np.zeros((1, colors), np.float32), np.zeros(background, np.float32)
     with pytest.raises(ValueError, match=r"color, background: expected .* at least one channel"):
@@ -260,7 +260,7 @@ def test_channels_that_do_not_fit_are_refused(colors, background):
 
 
 @pytest.mark.parametrize("shape", [(2, 17, 16), (3, 16, 16), (17, 16, 3), (17, 16)])
-def test_gradients_that_do_not_fit_are_refused(shape):
+def test_mismatched_gradients_raise(shape):
     leaves, size = leaves_of("one")
     trace = cpu.forward(*leaves, size)
     with pytest.raises(ValueError, match=r"^grad_image: expected the image's shape \(3, 17, 16\)"):
@@ -322,7 +322,7 @@ def test_exponential():
 
 
 @pytest.mark.parametrize("changed", range(5))
-def test_arrays_that_do_not_fit_are_refused(changed):
+def test_mismatched_arrays_raise(changed):
     """The kernels check no bounds."""
     num = 200
     leaves = [np.zeros(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, 3), (3,))]

@@ -1,4 +1,4 @@
-"""A new order of Gaussians: cheap to tell, and the same pictures."""
+"""Reordering of Gaussians for compression: constraints, costs, and unchanged images."""
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ def far_apart(one, other):
     return min(psnr(a, b) for a, b in zip(one.frames(), other.frames(), strict=True))
 
 
-def test_sweeps_keep_pairs_in_order():
+def test_constrained_sort_keeps_pairs_in_order():
     rng = np.random.default_rng(0)
     cell = rng.integers(0, 16, 300)
     front, back = np.sort(rng.integers(0, 300, (2, 500)), axis=0)
@@ -40,7 +40,7 @@ def test_sweeps_keep_pairs_in_order():
     np.testing.assert_array_equal(cell[sort_constrained(cell, none, none)], np.sort(cell))
 
 
-def test_pictures_stay():
+def test_reordering_within_no_budget_keeps_images():
     model = narrow(soft_model(options=RenderOptions()))
     lit, cell = Contributions(model), np.random.default_rng(1).integers(0, 4, model.num_gaussians)
     order = sort_by_cell(cell, find_overlaps(lit), 0.0)
@@ -50,7 +50,7 @@ def test_pictures_stay():
     assert far_apart(in_order(model, mixed), model) < 40  # where any may pass any
 
 
-def test_costs_are_what_changing_places_costs():
+def test_overlap_cost_is_the_error_of_swapping():
     """Of two Gaussians, by the pictures."""
     model = in_order(soft_model(options=RenderOptions()), np.array([20, 30]))
     lit = Contributions(model)

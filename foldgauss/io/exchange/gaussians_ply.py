@@ -40,18 +40,18 @@ _SMALLEST = 1e-20  # of a standard deviation, whose logarithm must be finite
 
 
 def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
-    """The Gaussians that a model draws at time t, flat in space, front first, for programs that sort by depth.
+    """The Gaussians that a model renders at time t, flat in space, front first, for programs that sort by depth.
 
-    A `VideoRenderer` in place of the model saves the making of one for each of many times. Where segments of a video
-    fade one into the other, they are those of the one that is seen more of.
+    For many times, pass a `VideoRenderer` instead of the model, so that it is made once. Where two segments of a video
+    cross-fade, the Gaussians are those of the segment with the larger weight.
 
     **Shapes:** leaves of `Gaussians3D` of the Gaussians alive at t, NumPy. **Units:** model space (see
     `foldgauss.render.camera`); `depth_step` in its units too.
 
-    All Gaussians of a frame lie in one plane and cover each other by their order. Here each stands `depth_step` behind
-    the one before, and is larger by as much as it is farther from the front camera, so that this camera sees the very
-    picture of the model, and everything that sorts by depth blends it in the model's order. From elsewhere the
-    layers shift against each other by `depth_step` times their number; 0 puts all into the plane.
+    All Gaussians of a frame lie in one plane and occlude each other in array order. Here each is placed `depth_step`
+    behind the one before, and is larger by as much as it is farther from the front camera, so that this camera sees
+    exactly the image of the model, and programs that sort by depth blend in the model's order. From elsewhere the
+    layers shift against each other by `depth_step` times their number; 0 puts all of them into the plane.
 
     **Raises:** ValueError for a step or a time outside [0, 1].
 
@@ -63,9 +63,9 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
         raise invalid("depth_step", expected="a depth in [0, 1] of the frame's longer side", got=repr(depth_step))
     if not is_within(float(t), "[0, 1]"):
         raise invalid("t", expected="a time in [0, 1]", got=repr(t))
-    playback = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
-    mean, factor, opacity, color = _visible_splats(playback, float(t))
-    height, width = playback.model.size
+    renderer = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
+    mean, factor, opacity, color = _visible_splats(renderer, float(t))
+    height, width = renderer.model.size
     distance = -float(Camera.front(height / width).position[2])
     depth = depth_step * np.arange(len(mean))
     grown = (1 + depth / distance)[:, None]
@@ -75,13 +75,13 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
     return Gaussians3D(*(leaf.astype(np.float32) for leaf in (mean, flat, opacity, color)))
 
 
-def _visible_splats(playback: VideoRenderer, t: float) -> tuple[np.ndarray, ...]:
-    """(mean, factor, opacity, color) of what is drawn at time t (or near it, in a cut), in model space, float64."""
-    splats = playback.dominant_splats(t)
+def _visible_splats(renderer: VideoRenderer, t: float) -> tuple[np.ndarray, ...]:
+    """(mean, factor, opacity, color) of the Gaussians visible at t (near it, at a cut), in model space, float64."""
+    splats = renderer.dominant_splats(t)
     seen = np.asarray(splats.opacity) > 0
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     mean, factor, opacity, color = (np.asarray(leaf, np.float64)[seen] for leaf in leaves)
-    (height, width), unit = playback.size, pixels_per_unit(playback.size)
+    (height, width), unit = renderer.size, pixels_per_unit(renderer.size)
     return (mean - [width / 2, height / 2]) / unit, factor / unit, opacity, color
 
 
@@ -133,12 +133,12 @@ def write_3dgs_ply(
     axes: str = "y-down",
     sh_degree: int = 3,
 ) -> Path:
-    """Write the picture of time t as a 3DGS PLY file; returns the path.
+    """Write the frame at time t as a 3DGS PLY file; returns the path.
 
-    `frame_gaussians` says what stands where, `write_gaussians_ply` how it is written.
+    See `frame_gaussians` for the geometry and `write_gaussians_ply` for the layout.
 
-    **Raises:** as these two, and ValueError for a model with compositing "sum", whose Gaussians cover nothing: viewers
-    draw no such picture.
+    **Raises:** as these two, and ValueError for a model with compositing "sum", whose Gaussians do not occlude: viewers
+    cannot render it.
 
     **Example:** `write_3dgs_ply("frame.ply", model, 0.5)`
     """
@@ -158,7 +158,7 @@ def write_3dgs_frames(
     overwrite: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> Path:
-    """Write pictures of a video as 3DGS PLY files frame_0000.ply, frame_0001.ply, ...; returns the folder.
+    """Write frames of a video as 3DGS PLY files frame_0000.ply, frame_0001.ply, ...; returns the folder.
 
     `times` (default: the model's frame times), in [0, 1]. The folder appears whole or not at all; one that holds files
     is refused unless `overwrite`, and even then if it holds anything else. `on_frame` is called after each.
@@ -171,10 +171,10 @@ def write_3dgs_frames(
     _check_compositing(model)
     check = partial(check_replaceable, folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply")
     check()
-    playback = VideoRenderer(model)
+    renderer = VideoRenderer(model)
     with atomic_folder(folder, check=check) as temporary:
         for number, t in enumerate(times):
-            gaussians = frame_gaussians(playback, t, depth_step=depth_step)
+            gaussians = frame_gaussians(renderer, t, depth_step=depth_step)
             write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, axes=axes, sh_degree=sh_degree)
             on_frame()
     return folder
@@ -187,7 +187,7 @@ def _check_compositing(model: RenderableVideo) -> None:
 
 
 def check_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
-    """The times asked for, or those of the model's frames. Raises ValueError unless they are one or more in [0, 1]."""
+    """The given times, or the model's frame times. Raises ValueError unless there is at least one, all in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)
     if found.ndim != 1 or found.size == 0 or not ((found >= 0) & (found <= 1)).all():
@@ -198,8 +198,8 @@ def check_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[
 def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians3D:
     """The Gaussians of a 3DGS PLY file, in model space if the file has the `axes` given; NumPy leaves.
 
-    **Shapes:** see `Gaussians3D`; factor = R diag(scales), columns in the file's order. Colour is that of degree 0,
-    what is seen from all sides on average: `f_rest` is left out, and so is any other column.
+    **Shapes:** see `Gaussians3D`; factor = R diag(scales), columns in the file's order. The color is that of degree 0,
+    the mean over all directions: `f_rest` and any other columns are ignored.
 
     **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged, of another kind, or has a quaternion of
     length 0; ValueError for unknown axes.

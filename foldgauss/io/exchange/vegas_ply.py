@@ -35,22 +35,22 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 VEGAS_POWER = 2.0
 
 
-#: Standard deviations, in its units, above which alone the published code draws a Gaussian.
+#: Standard deviations, in its units, above which the published code renders a Gaussian.
 VEGAS_SCALE_CUTOFF = 1e-4
 
 
-#: What the published code keeps in `scale_1`, across the plane, does not show; an eps of this size is written there.
+#: `scale_1`, across the plane, has no effect on the image; this eps is written.
 _VEGAS_ACROSS = math.log(1e-8)
 
 
-#: Our own facts about a model in a comment of the header: other programs skip it.
+#: Prefix of our metadata in a comment of the header, which other programs skip.
 _NOTE = "foldgauss "
 
 
 def read_vegas_ply(
     path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
 ) -> VideoModel:
-    r"""A video from the PLY file of the published VeGaS code, with the picture that its formulas give.
+    r"""A video from the PLY file of the published VeGaS code, rendered as its formulas define.
 
     **Shapes:** element `vertex` with x, z, f_dc_0..2, opacity, scale_0, scale_2, rot_0, m_0, sigma_0 and
     w1_0..(2 degree - 1) (pairs (x, z) per power of u = m_t - t), element `time` with time_func_0..(num_frames - 2).
@@ -69,9 +69,9 @@ def read_vegas_ply(
     read: the published renderer puts every Gaussian on the plane y = 0 and takes an eps for the scale across it.
 
     `size` = (height, width) and `fps` are not in such a file and must be given, the first always, the second where 25
-    is wrong; files that `write_vegas_ply` made carry both. What is drawn follows the published constants: power 2, low
+    is wrong; files that `write_vegas_ply` made carry both. Rendering follows the published constants: power 2, low
     pass 0.3 px^2, alpha up to 0.99 and from 1/255 on, exp(-tau^2 / 2) > 0.01, and standard deviations above 1e-4 of its
-    units (`VideoModel.scale_cutoff`). Files of our own carry what the model had instead.
+    units (`VideoModel.scale_cutoff`). Files written by foldgauss record the model's own values instead.
 
     **Raises:** `FileNotFoundError`, and `FormatError` for a file that is damaged, of another kind, with colours that
     depend on the view, or without a size.
@@ -108,20 +108,20 @@ def read_vegas_ply(
 
 
 def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
-    r"""Write a video as the published VeGaS code keeps it; returns the path. See `read_vegas_ply` for the layout.
+    r"""Write a video in the format of the published VeGaS code; returns the path. See `read_vegas_ply` for the layout.
 
     The envelope has power 2 there. That of another power p > 0 is the same function of time with
 
     $$ \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2)) $$
 
-    Leaves, sigma_t and the power among them, come back here to float32 rounding. The published code draws it with its
+    Leaves, sigma_t and the power among them, come back here to float32 rounding. The published code renders it with its
     own constants: a Gaussian up to 3.03 sigma_t' from m_t, where it is a hundredth as wide as at its widest (at p = 1
     the model itself ends at a tenth); a model that was fitted with another low pass than 0.3 px^2 (the presets' is 0.1)
     a little softer; and Gaussians whose scale, after the envelope, is below 1e-4 of its units (a fifth of a pixel at
     1280 wide) not at all.
 
-    **Raises:** ValueError for a model that the published code cannot draw: an envelope of power 0, a floor, compositing
-    "sum", one frame alone; `OutputError` where the path cannot be written.
+    **Raises:** ValueError for a model that the published code cannot render: an envelope of power 0, a floor,
+    compositing "sum", one frame alone; `OutputError` where the path cannot be written.
 
     **Example:** `write_vegas_ply("point_cloud.ply", load_video_model("holiday.safetensors"))`
 
@@ -162,7 +162,7 @@ def _convert_time_scale(
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:
-    """One unit of the published space in model units: both know the frame's width."""
+    """One unit of the published space in model units."""
     height, width = size
     return min(1.0, width / height) / (2 * math.tan(FIELD_OF_VIEW / 2))
 
@@ -192,7 +192,7 @@ def _degree(ply: Ply) -> int:
 
 
 def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
-    """The frames' weights: columns of one row, or rows of one column."""
+    """The weights of the frame times: columns of one row, or rows of one column."""
     names = sorted(ply.names("time"), key=lambda name: (len(name), name))
     weights = ply.columns("time", names)
     if 1 not in weights.shape or weights.size == 0:
@@ -207,7 +207,7 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
 def _fill_in(
     ply: Ply, size: tuple[int, int] | None, fps: float | None
 ) -> tuple[tuple[int, int], float, RenderOptions, float, float]:
-    """What the file's columns do not say: as given, or as our own writer noted it, or the published."""
+    """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
     note = _read_note(ply)
     if size is None and "size" not in note:
         cure = "Give the size of the video that it was made from, such as size=(480, 854)."
@@ -231,7 +231,7 @@ def _fill_in(
 
 
 def _read_note(ply: Ply) -> dict:
-    """What `write_vegas_ply` noted in a comment; nothing in files of others."""
+    """The metadata that `write_vegas_ply` stores in a comment; empty for files of other programs."""
     texts = [comment[len(_NOTE) :] for comment in ply.comments if comment.startswith(_NOTE)]
     try:
         note = json.loads(texts[0]) if texts else {}
@@ -264,4 +264,4 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
     if not (np.asarray(envelope.power) > 0).all():
         cure = "Fit it with another --power."
-        raise invalid("model's power", expected="above 0, as envelopes of a VeGaS file wane", got="0", cure=cure)
+        raise invalid("model's power", expected="above 0, as VeGaS files require", got="0", cure=cure)

@@ -1,6 +1,6 @@
-"""What is known of a column of a compact file before its numbers: the contexts that they are coded in.
+"""The contexts in which the columns of a compact file are entropy-coded.
 
-Both sides walk the columns in their order and come to the same, since all of it follows from columns before.
+Encoder and decoder derive them, column by column, from the columns before.
 """
 
 import dataclasses

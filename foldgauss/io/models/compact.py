@@ -1,7 +1,7 @@
 """Compact model files, .fgz: quantized, entropy-coded, checked, and decoded to the same bits everywhere.
 
-The layout is in docs/format.md. Files may come from strangers: a checksum finds damage, no number is trusted before it
-has been held against the bytes that are there, and nothing but `ModelFileError` is raised for what a file says.
+The layout is in docs/format.md. Files are not trusted: a checksum detects damage, counts are checked
+against the size of the file, and invalid content raises only `ModelFileError`.
 """
 
 import dataclasses
@@ -35,14 +35,14 @@ from foldgauss.video.compression.quantize import (
 from foldgauss.video.models.video_model import VideoModel
 
 COMPACT_SUFFIX = ".fgz"
-#: As PNG's: a byte that no text has, line ends of both kinds that a careless transfer would change, an end of file.
+#: As in PNG: a byte that is not ASCII, line ends of both kinds, which a transfer as text would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
 VERSION = 2
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
-#: No byte may hold more Gaussians or frames, so that a small file cannot ask for much memory: filled up with spaces.
+#: Limit of Gaussians and frames per byte, so that a small file cannot claim much memory; files are padded with spaces.
 _MOST_PER_BYTE = 8
-_SIDE = 1 << 20  # no picture is longer: a decoder holds it in memory
+_SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
 def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
@@ -71,7 +71,7 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     for name in column_names(info.degree, info.shared):
         numbers = quantized.columns[name]
         column = walk.column(name)
-        streams.append(range_coder.encode(_steps(numbers, info) if name == "cell" else numbers, column))
+        streams.append(range_coder.encode(_wrapped_differences(numbers, info) if name == "cell" else numbers, column))
         walk.add(name, numbers)
         rule = quantized.rules.get(name)
         own = [] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes]
@@ -92,7 +92,7 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
-def _steps(cells: np.ndarray, info: CompactInfo) -> np.ndarray:
+def _wrapped_differences(cells: np.ndarray, info: CompactInfo) -> np.ndarray:
     """From each cell to the next, around the end."""
     return np.diff(cells, prepend=0) & ((1 << sum(info.cells)) - 1)
 
@@ -105,7 +105,7 @@ def _cells(steps: np.ndarray, info: CompactInfo) -> np.ndarray:
 
 
 def is_compact(path: str | os.PathLike) -> bool:
-    """Whether a file starts as compact ones do; False for one that is missing or cannot be read."""
+    """Whether a file starts with the magic bytes of compact files; False for one that cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(4) == MAGIC[:4]
@@ -119,7 +119,7 @@ def load_compact(path: str | os.PathLike) -> Quantized:
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
     path = check_path(path)
-    return _unpacked(path, path.read_bytes())[0]
+    return _unpack(path, path.read_bytes())[0]
 
 
 def load_compact_model(path: str | os.PathLike) -> VideoModel:
@@ -133,22 +133,22 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
 
 
 def compact_metadata(path: str | os.PathLike) -> dict:
-    """What `save_compact` was given as `metadata`. Raises as `load_compact`."""
+    """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
     path = check_path(path)
     return _header(path, path.read_bytes())[0]["metadata"]
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[Quantized, dict]:
+def _unpack(path: Path, data: bytes) -> tuple[Quantized, dict]:
     header, body = _header(path, data)
     try:
-        return _decoded(header, body, len(data)), header["metadata"]
+        return _decode(header, body, len(data)), header["metadata"]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         text = " ".join(str(error).split())[:200]
         raise _unreadable(path, f"one that does not fit together ({type(error).__name__}: {text})") from error
 
 
 def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
-    """The header and what follows it, once the file is known to be whole."""
+    """The header and the bytes after it, once the checksum is verified."""
     if not data.startswith(MAGIC):
         got = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
         raise _unreadable(path, got)
@@ -182,7 +182,7 @@ def _no_number(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _decoded(header: dict, body: bytes, whole_length: int) -> Quantized:
+def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     info = _info(header)
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
@@ -210,7 +210,7 @@ def _decoded(header: dict, body: bytes, whole_length: int) -> Quantized:
 
 
 def _check_numbers(name: str, numbers: np.ndarray, info: CompactInfo) -> None:
-    """Numbers that others are looked up by."""
+    """Check the columns that are used as indices."""
     most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}.get(name)
     if most is not None:
         _check(numbers.min() >= 0 and numbers.max() <= most, name, "numbers out of range")

@@ -1,4 +1,4 @@
-"""Selections on disk: which Gaussians, and of which model."""
+"""Selection files: a mask of Gaussians, with a digest of the model that it belongs to."""
 
 import dataclasses
 import hashlib
@@ -21,7 +21,7 @@ SELECTION = "selection"
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Kept:
-    """What the file holds: the mask, and the digest of the model that it is for."""
+    """The content of the file: the mask, and the digest of its model."""
 
     mask: np.ndarray
     digest: str = dataclasses.field(metadata={"static": True})

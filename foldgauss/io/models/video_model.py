@@ -69,9 +69,9 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
 
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
-    """Read a fitted, an edited or a segmented video, or a compact file (told by its first bytes, not by its name).
+    """Read a fitted, an edited or a segmented video, or a compact file (detected from its first bytes).
 
-    Of segments no more than the header is read: see `SegmentedVideo`, which loads them as they are drawn.
+    Of segments no more than the header is read: see `SegmentedVideo`, which loads them on access.
 
     Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
     """
@@ -93,7 +93,7 @@ def read_metadata(path: str | os.PathLike) -> dict:
 def read_origin(path: str | os.PathLike) -> dict:
     """`read_metadata`, without those of `fit`'s notes that are of another kind than `fit` writes: none are there.
 
-    A file may come from a stranger, and metadata are free.
+    Metadata are free and not trusted.
     """
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
 
@@ -111,7 +111,7 @@ def _is_range(value: object) -> bool:
     return value[1] is None or value[1] > (value[0] or 0)
 
 
-#: What `fit` and `compress` note of a model's clip and are asked for later, and how it is told.
+#: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
     "clip": _is_text,
     "frames_digest": _is_text,
