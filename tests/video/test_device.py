@@ -1,4 +1,4 @@
-"""Fits whose steps are one program on a JAX device: as those of the CPU's kernels, and never by way of the host."""
+"""Fits by one compiled JAX program per step: equal to the CPU's, without calls to the host."""
 
 import copy
 import dataclasses
@@ -116,13 +116,13 @@ def compare_steps(config: FitConfig, progress: float, level: int = -1, outside: 
 
 
 @pytest.mark.parametrize("progress", [0.1, 1.0], ids=["image loss", "squared loss"])
-def test_a_step_is_that_of_the_cpu(progress):
+def test_step_matches_the_cpu(progress):
     _, there = compare_steps(CONFIG, progress)
     assert there.statistics is None
     assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
 
 
-def test_a_step_of_growing_batches_is_that_of_the_cpu():
+def test_step_of_growing_batches_matches_the_cpu():
     """Twice the views of a pass, all rows by momentum, statistics, and rows that are not in use."""
     here, there = compare_steps(GROWING, 0.1, outside=7)
     for one, other in zip(there.statistics, here.statistics, strict=True):
@@ -136,7 +136,7 @@ def test_a_step_of_growing_batches_is_that_of_the_cpu():
 
 
 @pytest.mark.slow
-def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
+def test_coarse_step_matches_the_cpu(monkeypatch):
     monkeypatch.setattr("foldgauss.video.fitting.schedule.MIN_SIDE", 16)
     assert [level.size for level in plan_levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
     compare_steps(CONFIG, 0.1, level=0)
@@ -154,7 +154,7 @@ def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
     ],
     ids=str,
 )
-def test_steps_of_other_settings(changes):
+def test_steps_of_other_settings_match_the_cpu(changes):
     compare_steps(dataclasses.replace(CONFIG, **changes), 0.1)
 
 
@@ -171,7 +171,7 @@ def pictures_of(seed=0, shape=(2, 23, 31, 3)):
 
 
 @pytest.mark.parametrize(("ssim_fraction", "squared"), [(0.2, False), (0.0, False), (0.2, True)])
-def test_losses_are_those_of_the_cpu(ssim_fraction, squared):
+def test_losses_match_the_cpu(ssim_fraction, squared):
     """Values, errors and gradients."""
     rendered, target = pictures_of()
     rendered[0, 3:9, 4:9] = target[0, 3:9, 4:9]  # where |x - y| has a kink
@@ -189,14 +189,14 @@ def test_losses_are_those_of_the_cpu(ssim_fraction, squared):
         close(np.moveaxis(gradient[k], -1, 0), judge.gradient)
 
 
-def test_similarity_is_that_of_the_cpu():
+def test_ssim_matches_the_cpu():
     rendered, target = (np.ascontiguousarray(one[0, ..., 0]) for one in pictures_of())
     own = jax.jit(ssim)(rendered[..., None], target[..., None])
     close(own[..., 0], ssim_map(rendered, target))
 
 
 @pytest.mark.parametrize("unit_time", [0.0, 0.06])
-def test_adam_is_that_of_the_cpu(unit_time):
+def test_adam_matches_the_cpu(unit_time):
     """Of rows with any number of steps behind them, of all kinds; those that took no part stay to the bit."""
     rng, num, width = np.random.default_rng(0), 400, 17
     rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
@@ -217,7 +217,7 @@ def test_adam_is_that_of_the_cpu(unit_time):
 
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
-def test_conditioning_is_that_of_the_cpu(power, floor):
+def test_conditioning_matches_the_cpu(power, floor):
     """The fold equation's home, `FoldedGaussian.condition_time`, as the step calls it, against the fused twin."""
     config = dataclasses.replace(CONFIG, power=power, floor=floor)
     state = warm_state(config, steps=5)
@@ -244,7 +244,7 @@ def test_conditioning_is_that_of_the_cpu(power, floor):
         assert not np.asarray(find_alive(program, state.rows, np.int32(7), t))[7:].any()
 
 
-def test_it_learns_as_well_as_the_cpu():
+def test_quality_matches_the_cpu():
     scores = {
         engine: evaluate(fit(FRAMES, dataclasses.replace(CONFIG, engine=engine)).model, FRAMES).mean_psnr
         for engine in ("xla", "cpu")
@@ -254,7 +254,7 @@ def test_it_learns_as_well_as_the_cpu():
 
 
 @pytest.mark.slow
-def test_pallas_steps_are_those_of_xla():
+def test_pallas_step_matches_xla():
     """Interpreted here; the same step but for the engine."""
     own = {}
     for engine in ("pallas", "xla"):
@@ -271,7 +271,7 @@ def test_pallas_steps_are_those_of_xla():
 # ------------------------------------------------------------------------------------------- on the device
 
 
-def test_what_a_step_consumes_is_gone():
+def test_step_donates_its_arrays():
     state = start(FRAMES, CONFIG)
     step = JaxStepper(FRAMES, CONFIG, state, "xla")
     before = jax.tree.leaves(state.held.arrays)
@@ -292,7 +292,7 @@ def test_what_a_step_consumes_is_gone():
         pytest.param("xla", GROWING, id="xla-growing", marks=pytest.mark.slow),
     ],
 )
-def test_no_step_asks_the_host(engine, config):
+def test_step_does_not_call_the_host(engine, config):
     """For a GPU the whole step is one program: triton's are the only calls out of it."""
     step = JaxStepper(FRAMES, config, start(FRAMES, config), "xla")
     program = dataclasses.replace(step.programs[-1], engine=engine)
@@ -322,7 +322,7 @@ def compiled_by(function) -> int:
     return len(count)
 
 
-def test_births_and_deaths_compile_nothing():
+def test_densification_compiles_nothing():
     steps, numbers = fit_steps(FRAMES, GROWING), []
     numbers.append(next(steps)[0].num_gaussians)
 
@@ -337,7 +337,7 @@ def test_births_and_deaths_compile_nothing():
     assert compiled_by(lambda: jax.jit(lambda x: x + 17)(1.0)) == 1  # it would have been seen
 
 
-def test_the_same_are_born_as_on_the_cpu():
+def test_densification_matches_the_cpu():
     """From one state, at the step of the first births: clones, halves at the same places, and moments that are 0."""
     kept, after = None, {}
     for state, _ in fit_steps(FRAMES, dataclasses.replace(GROWING, engine="cpu")):
@@ -358,7 +358,7 @@ def test_the_same_are_born_as_on_the_cpu():
     assert after["xla"].first[~born].any(axis=1).all()
 
 
-def test_only_what_is_looked_at_is_fetched(monkeypatch):
+def test_only_arrays_that_are_read_are_fetched(monkeypatch):
     fetched, fetch = [], HeldArrays.fetch
     monkeypatch.setattr(HeldArrays, "fetch", lambda self, name: fetched.append(name) or fetch(self, name))
     steps = fit_steps(FRAMES, CONFIG)
@@ -375,7 +375,7 @@ def test_only_what_is_looked_at_is_fetched(monkeypatch):
         state.rowz  # noqa: B018
 
 
-def test_what_is_set_is_taken_over():
+def test_assigned_arrays_are_used():
     steps = fit_steps(FRAMES, CONFIG)
     state, _ = next(steps)
     place = columns(CONFIG.degree)["loc"]
@@ -414,7 +414,7 @@ def stepped(state: FitState) -> FitState:
     return state
 
 
-def test_four_devices_are_as_one(tmp_path):
+def test_four_devices_match_one(tmp_path):
     """Frames of a batch are shared out; sums over devices differ by rounding alone."""
     flags = "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0"
     kept, done = tmp_path / "kept.safetensors", tmp_path / "done.safetensors"
@@ -439,7 +439,7 @@ def test_four_devices_are_as_one(tmp_path):
 # ---------------------------------------------------------------------------------------------- the door
 
 
-def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
+def test_auto_is_the_cpu_without_a_gpu(monkeypatch):
     assert choose_engine(FRAMES, FitConfig()) == "cpu"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert choose_engine(FRAMES, FitConfig()) == "xla"
@@ -458,13 +458,13 @@ def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
     ],
     ids=str,
 )
-def test_what_it_does_not_know_is_refused(changes, message):
+def test_unsupported_settings_are_refused(changes, message):
     """Before anything is computed."""
     with pytest.raises(ValueError, match=message):
         choose_engine(FRAMES, dataclasses.replace(CONFIG, **changes))
 
 
-def test_a_fit_refuses_it(monkeypatch):
+def test_fit_refuses_unsupported_settings(monkeypatch):
     monkeypatch.setattr(sys.modules["foldgauss.video.fitting.loop"], "_warm_up", lambda *_: pytest.fail("too late"))
     with pytest.raises(ValueError, match="with an economy"):
         next(fit_steps(FRAMES, dataclasses.replace(CONFIG, economy=Economy())))
@@ -482,7 +482,7 @@ def test_unknown_engines_are_refused():
 
 
 @pytest.mark.parametrize("config", [CONFIG, GROWING], ids=["plain", "growing"])
-def test_a_stopped_fit_goes_on_to_the_same_bits(config, tmp_path):
+def test_resuming_keeps_the_bits(config, tmp_path):
     """From a checkpoint, written while the arrays are on the device."""
     path = tmp_path / "kept.safetensors"
     config = dataclasses.replace(config, steps=min(config.steps, 40))
@@ -497,7 +497,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(config, tmp_path):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_a_fit_that_comes_apart_is_taken_back():
+def test_diverging_fit_backs_off():
     config = dataclasses.replace(CONFIG, rates=LearningRates(log_scale=3e38), steps=12)
     with pytest.warns(DivergenceWarning, match="the fit diverged at step"):
         done = [(np.isfinite(state.rows).all(), info.step) for state, info in fit_steps(FRAMES, config)]
@@ -516,7 +516,7 @@ def test_minutes_targets_and_plans():
     assert info.stopped_by == "target_psnr"
 
 
-def test_room_grows_with_what_has_none():
+def test_capacity_doubles_where_it_is_not_enough():
     """Without a bound of the user's there is room for some times as many, then for twice that."""
     config = dataclasses.replace(GROWING, max_gaussians=None)
     stepper = JaxStepper.__new__(JaxStepper)
@@ -545,7 +545,7 @@ def test_the_command(tmp_path, capsys):
 # -------------------------------------------------------------------------------------- its own benchmark
 
 
-def test_figures_of_a_gpu_are_not_measured_without_one(capsys):
+def test_gpu_benchmark_requires_a_gpu(capsys):
     with pytest.raises(SystemExit):
         gpu.main([])
     assert "expected a GPU that JAX sees, got none" in capsys.readouterr().err

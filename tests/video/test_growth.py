@@ -1,4 +1,4 @@
-"""Births, deaths and resets: each criterion acts, on the Gaussians it names and on no others."""
+"""Densification: each criterion clones, splits, prunes or resets the Gaussians that meet it, and no others."""
 
 import dataclasses
 
@@ -52,7 +52,7 @@ def test_nothing_happens_below_the_thresholds():
 
 
 @pytest.mark.parametrize("criterion", ["screen", "time"])
-def test_a_small_one_is_cloned(criterion):
+def test_small_gaussians_are_cloned(criterion):
     rows = gaussians()
     stay, born = change(rows, statistics(**{criterion: {3: 2.1e-4}}))
     assert stay.tolist() == [0, 1, 2, 3, 4]
@@ -60,7 +60,7 @@ def test_a_small_one_is_cloned(criterion):
 
 
 @pytest.mark.parametrize("criterion", ["screen", "time"])
-def test_a_large_one_is_split(criterion):
+def test_large_gaussians_are_split(criterion):
     rows = gaussians(scale=LARGE)
     stay, born = change(rows, statistics(**{criterion: {1: 2.1e-4}}))
     assert stay.tolist() == [0, 2, 3, 4]
@@ -71,7 +71,7 @@ def test_a_large_one_is_split(criterion):
     assert not np.array_equal(born[0, PLACE["loc"]], born[1, PLACE["loc"]])
 
 
-def test_either_axis_makes_it_large():
+def test_either_axis_makes_a_gaussian_large():
     rows = gaussians()
     rows[2, PLACE["log_scale"]] = np.log([SMALL, LARGE])
     assert 2 not in change(rows, statistics(screen={2: 1e-3}))[0]
@@ -93,7 +93,7 @@ def test_halves_are_drawn_from_their_parent():
     np.testing.assert_allclose(away.mean(0), 0, atol=5 * scales[0] / np.sqrt(2 * num))
 
 
-def test_the_mean_is_over_the_steps_in_which_it_was_seen():
+def test_gradients_are_averaged_over_steps_in_which_it_was_seen():
     sums = OfGrowth().build(Sizes(3, 0, 0, growing=True))
     by_time = np.float32([-4e-4, 4e-4, 0])
     sums.add([(np.array([0]), np.float32([3e-4]))], by_time)
@@ -105,7 +105,7 @@ def test_the_mean_is_over_the_steps_in_which_it_was_seen():
     assert len(born) == 2  # 0 by 4e-4 / 2 of the screen's and by time's 4e-4; 2 by 7e-4 / 1
 
 
-def test_the_faint_are_pruned():
+def test_faint_gaussians_are_pruned():
     rows = gaussians()
     rows[[1, 4], PLACE["opacity_logit"]] = np.log(0.0099 / 0.9901)
     rows[2, PLACE["opacity_logit"]] = np.log(0.0101 / 0.9899)
@@ -114,7 +114,7 @@ def test_the_faint_are_pruned():
     assert len(born) == 0  # its clone is as faint
 
 
-def test_the_big_are_pruned_late():
+def test_big_gaussians_are_pruned_late():
     rows = gaussians()
     rows[0, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 0.1 * EXTENT])
     rows[1, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 20 / 3 / PIXELS])
@@ -125,7 +125,7 @@ def test_the_big_are_pruned_late():
     assert change(rows, statistics(), step=3100, growth=few)[0].tolist() == [1, 2, 3, 4]
 
 
-def test_the_most_restless_go_first_where_there_is_no_room():
+def test_largest_gradients_come_first_at_the_limit():
     rows = gaussians(6)
     rows[4, PLACE["log_scale"]] = np.log(LARGE)
     wanted = statistics(6, screen={0: 3e-4, 2: 9e-4}, time={3: 5e-4, 4: 8e-4})
@@ -137,7 +137,7 @@ def test_the_most_restless_go_first_where_there_is_no_room():
         assert len(change(rows, wanted, max_num=most)[1]) == 0
 
 
-def test_one_is_always_left():
+def test_one_gaussian_always_stays():
     rows = gaussians(opacity_logit=-9.0)
     rows[3, PLACE["opacity_logit"]] = -8
     assert change(rows, statistics())[0].tolist() == [3]
@@ -152,7 +152,7 @@ def test_halves_depend_on_seed_and_step_alone():
     assert not np.array_equal(born(), born(step=700))
 
 
-def test_dimming():
+def test_reset_lowers_opacities_and_clears_moments():
     rows, moments = gaussians(), [np.ones((5, 11 + 2 * DEGREE), np.float32) for _ in range(2)]
     rows[2, PLACE["opacity_logit"]] = -7
     before = rows.copy()
@@ -251,7 +251,7 @@ def run(config, kept=None):
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_a_fit_grows_when_it_should():
+def test_fit_grows_on_schedule():
     numbers, state = run(CONFIG)
     changed = [step for step in range(2, 61) if numbers[step - 1] != numbers[step - 2]]
     assert changed
@@ -263,7 +263,7 @@ def test_a_fit_grows_when_it_should():
 
 @pytest.mark.usefixtures("unscaled")
 @pytest.mark.parametrize("criterion", ["screen_gradient", "time_gradient"])
-def test_either_gradient_alone_makes_it_grow(criterion):
+def test_either_gradient_alone_densifies(criterion):
     off = {"screen_gradient": 1e9, "time_gradient": 1e9, "reset_every": 1000}
     growth = dataclasses.replace(QUICK, **off)
     assert max(run(dataclasses.replace(CONFIG, growth=growth))[0]) == 150
@@ -272,7 +272,7 @@ def test_either_gradient_alone_makes_it_grow(criterion):
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_caps():
+def test_limits_bound_growth():
     numbers, _ = run(dataclasses.replace(CONFIG, max_gaussians=170))
     assert max(numbers) == 170
     small = dataclasses.replace(CONFIG, max_size_mb=0.015)
@@ -281,7 +281,7 @@ def test_caps():
     assert max(run(small)[0]) == most
 
 
-def test_caps_bound_the_start_too():
+def test_limits_bound_the_start():
     config = FitConfig(num_gaussians=500, max_gaussians=300)
     assert chosen_num_gaussians(config, 5, 24, 40) == 300
     assert chosen_num_gaussians(dataclasses.replace(config, max_size_mb=0.01), 5, 24, 40) < 100
@@ -311,7 +311,7 @@ def test_new_gaussians_come_last_with_empty_moments():
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_a_reset_dims_the_fit():
+def test_fit_resets_opacities_on_schedule():
     highest = {}
     for state, info in fit_steps(FRAMES, CONFIG):
         highest[info.step] = state.rows[:, PLACE["opacity_logit"]].max()
@@ -321,7 +321,7 @@ def test_a_reset_dims_the_fit():
     assert highest[60] > highest[40] + 0.3
 
 
-def test_the_screen_gradient_is_in_units_of_half_the_picture():
+def test_screen_gradient_is_in_units_of_half_the_image():
     """Against finite differences: the loss as one Gaussian's mean moves by a share of half the picture."""
     config = FitConfig(num_gaussians=1, degree=0, seed=3, ssim_fraction=0.0, growth=Growth(), follow_motion=False)
     frames = moving_blobs(2, 24, 40)
@@ -351,7 +351,7 @@ def test_the_screen_gradient_is_in_units_of_half_the_picture():
 
 @pytest.mark.usefixtures("unscaled")
 @pytest.mark.parametrize("stop", [7, 10, 23, 45])
-def test_a_stopped_fit_goes_on_to_the_same_bits(stop):
+def test_resuming_keeps_the_bits(stop):
     whole = run(CONFIG)
     for state, info in fit_steps(FRAMES, CONFIG):
         if info.step == stop:
@@ -364,7 +364,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(stop):
         np.testing.assert_array_equal(one, other)
 
 
-def test_who_is_outside_the_picture_is_not_seen():
+def test_gaussians_outside_the_image_are_not_seen():
     config = dataclasses.replace(CONFIG, growth=Growth(), initialization="uniform", follow_motion=False)
     state = start(FRAMES, config)
     state.rows[:, PLACE["coefficients"]] = 0

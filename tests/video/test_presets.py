@@ -1,4 +1,4 @@
-"""Presets: the published recipe as far as it can be read off, its starts, its two cameras; and drafts."""
+"""Presets: the published recipe, its initialization and its two cameras; drafts."""
 
 import dataclasses
 
@@ -96,7 +96,7 @@ def test_uniform_starts_are_as_published():
     np.testing.assert_allclose(sigmoid(splats.opacity_logit), 0.1, rtol=1e-5)
 
 
-def test_uniform_starts_are_as_wide_as_their_neighbours_are_far():
+def test_uniform_starts_are_as_wide_as_the_distance_to_neighbors():
     splats = uniform(60)
     far = np.sort(np.linalg.norm(splats.loc[:, None] - splats.loc[None], axis=-1), axis=1)[:, 1:4].mean(1)
     np.testing.assert_allclose(np.exp(splats.log_scale), np.stack([far, far], -1), rtol=1e-4)
@@ -128,7 +128,7 @@ def splats_in_pixels(size, num=40):
     return [np.float32(leaf) for leaf in leaves]
 
 
-def test_the_camera_opposite_sees_the_mirrored_picture():
+def test_opposite_camera_sees_the_mirrored_image():
     """And so does `render.camera`'s."""
     size = (24, 40)
     mean, factor, *others = splats_in_pixels(size)
@@ -169,7 +169,7 @@ def test_a_pass_sees_every_frame_from_both_sides():
     assert passes[0].tolist() != passes[1].tolist()
 
 
-def test_views_from_the_back_are_taken_for_what_they_are():
+def test_mirrored_views_are_learned():
     """An uneven clip is learned from both sides: were a target or a gradient not mirrored, it would not be."""
     config = FitConfig(num_gaussians=400, steps=200)
     one, two = (
@@ -183,7 +183,7 @@ def test_views_from_the_back_are_taken_for_what_they_are():
 # --------------------------------------------------------------------------------------------------- steps
 
 
-def test_all_take_part_where_only_alive_is_off():
+def test_dense_updates_move_all_gaussians():
     short = {"num_gaussians": 300, "steps": 12, "rates": PRESETS["paper"]["rates"]}
     for sparse_updates in (True, False):
         for state, info in fit_steps(FRAMES, FitConfig(sparse_updates=sparse_updates, **short)):
@@ -193,7 +193,7 @@ def test_all_take_part_where_only_alive_is_off():
 
 
 @pytest.mark.parametrize("decayed", ["all", "loc"])
-def test_which_rates_fall(decayed):
+def test_decayed_selects_the_rates(decayed):
     """Where the last step's rate is 0, only what does not fall still moves."""
     config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, decayed=decayed)
     state = start(FRAMES, config)

@@ -1,4 +1,4 @@
-"""The control of folds: every frame its own Gaussians, counted as they would be stored."""
+"""The per-frame baseline: every frame has its own Gaussians, and parameters are counted as stored."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ def made():
     return independent_frames(FRAMES, 5 * PARAMETERS * 40 + PARAMETERS * 2 + 5, QUICK, fps=12.0)
 
 
-def test_numbers_are_counted_one_by_one(made):
+def test_parameters_are_counted_as_stored(made):
     """What a Gaussian has that is not what it would have anyway, by the leaves; the budget is used up to a rest."""
     leaves = ("loc", "log_scale", "angle_logit", "opacity_logit", "color_dc")
     counted = sum(np.size(getattr(model.splats, name)) for model in made.models for name in leaves)
@@ -33,7 +33,7 @@ def test_numbers_are_counted_one_by_one(made):
         assert model.num_parameters - 9 * model.num_gaussians <= model.num_gaussians / 4 + 3
 
 
-def test_results_are_as_a_video_models(made):
+def test_result_evaluates_like_a_video_model(made):
     scores = evaluate(made, FRAMES)
     by_hand = [psnr(frame, next(model.frames())) for frame, model in zip(FRAMES, made.models, strict=True)]
     assert scores.psnr == tuple(by_hand)
@@ -76,7 +76,7 @@ def test_alpha():
     assert evaluate(made, clear, background=(1.0, 1.0, 1.0)).mean_psnr > 18  # over black it would be 5 to the right
 
 
-def test_minutes_are_divided_by_the_last_pace():
+def test_minutes_are_divided_by_the_last_speed():
     budget = _StepBudget(FitConfig(minutes=1), 3)
     budget.record(30, 3.0)  # the pilot: 0.1 s a step
     assert budget.plan(0) == 190
@@ -116,12 +116,12 @@ def test_settings_without_meaning_are_refused(change, named):
 
 
 @pytest.mark.parametrize("num", [44, 0, -9, 100.5, "900"])
-def test_too_few_numbers(num):
+def test_too_few_parameters(num):
     with pytest.raises(ValueError, match="num_parameters: expected a whole number >= 45, one Gaussian in each frame"):
         independent_frames(FRAMES, num, QUICK)
 
 
-def test_frames_that_are_none():
+def test_bad_frames():
     with pytest.raises(ValueError, match="frames: expected a uint8 array"):
         independent_frames(FRAMES[0], 9000, QUICK)
 

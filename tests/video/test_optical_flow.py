@@ -1,4 +1,4 @@
-"""Tracks of a clip whose motion is known, their folds, and cuts."""
+"""Optical flow of clips whose motion is known: tracks, folds, cuts and interpolated frames."""
 
 import cv2
 import numpy as np
@@ -45,7 +45,7 @@ def test_tracks_follow_a_panning_camera(step):
     )
 
 
-def test_what_lies_between_two_frames():
+def test_interpolated_frame_matches_the_motion():
     """Of a texture that moves by 4 pixels a frame it is the same texture, moved by a share of that."""
     finer = panning(9, (1.0, 0.5))
     seen = np.ascontiguousarray(finer[::4])
@@ -61,7 +61,7 @@ def test_what_lies_between_two_frames():
     assert np.abs(small - same)[inner].mean() < 3
 
 
-def test_between_frames_something_passes_before_something():
+def test_interpolation_beats_plain_warping_at_occlusions():
     """Closer to the truth than frames moved by the flow at the pixel itself, at every time between."""
     finer = passing(9, before=(1.0, 0.0), behind=(-1.0, 0.0))
     seen = np.ascontiguousarray(finer[::4])
@@ -133,7 +133,7 @@ def test_folds_of_known_tracks(degree):
         assert rms[0] > 0.3
 
 
-def test_maps_shrink_to_their_share_of_memory(monkeypatch):
+def test_maps_shrink_to_the_memory_limit(monkeypatch):
     frames = panning(4, (2.0, 0.0))
     assert Motion.from_frames(frames).small.shape == (4, 96, 160, 3)
     monkeypatch.setattr(motion, "MAP_BYTES", 0)  # as where the clip is long: then the share of the frames' bytes counts
