@@ -1,6 +1,6 @@
-"""The Folded-Gaussian FN(m, Sigma, a, f) (the paper's "Folded-Gaussians").
+"""The Folded-Gaussian distribution FN(m, Sigma, a, f) of the VeGaS paper.
 
-Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *centre* is bent along a curve in time.
+It is not the |X| "folded normal" of scipy and numpyro: here the *center* of a Gaussian moves along a curve in time.
 """
 
 import equinox as eqx
@@ -45,14 +45,14 @@ class FoldedGaussian(eqx.Module):
         s | t ~ N(loc + f(time_loc - t), a(t) Sigma),      Sigma = scale_tril scale_tril^T
         FN(x) = N(s | t) N(t)
 
-    Mind the sign of the fold's argument. The default envelope is the paper's text, `TimeLikelihood(power=1)`;
-    the paper's published code is `TimeLikelihood(power=2)`.
+    Note the sign of the fold's argument. The default envelope is that of the paper's text, `TimeLikelihood(power=1)`;
+    the paper's published code uses `TimeLikelihood(power=2)`.
 
     **Shapes:** `loc` (*batch, d-1); exactly one of `scale_tril`, `covariance_matrix`, `precision_matrix`
     (*batch, d-1, d-1) and `scale` (*batch, d-1), the paper's standard deviations per coordinate; `time_loc`,
     `time_scale` (*batch,); leading dimensions broadcast. `event_shape == (d,)`. `fold` is a fold (None is
     `ZeroFold`) or any callable from one scalar u to (d-1,). `envelope` is an envelope or any callable from scalars
-    (t, time_loc, time_scale) to log a; for one that gives a itself there is `envelope.plain_envelope`.
+    (t, time_loc, time_scale) to log a; wrap a callable that returns a itself in `envelope.plain_envelope`.
 
     **Units:** space for `loc` and `scale_tril`, time for `time_loc` and `time_scale`.
 
@@ -66,8 +66,9 @@ class FoldedGaussian(eqx.Module):
         x = dist.sample(jax.random.key(0), (1000,))  # (1000, 2)
         dist.condition_time(0.8).loc                 # [0.09] = f(0.5 - 0.8)
 
-    **Source:** eq:foldgauss with eq:cond_dens. **Raises:** ValueError naming the parameter, on shapes always,
-    on values (positive `time_scale`, a proper factor or covariance) unless traced or `validate_args=False`.
+    **Source:** eq:foldgauss with eq:cond_dens. **Raises:** ValueError that names the parameter. Shapes
+    are always checked, values (positive `time_scale`, a valid factor or covariance) unless they are traced or
+    `validate_args=False`.
     """
 
     loc: Float[Array, "*#batch d-1"]
@@ -104,16 +105,16 @@ class FoldedGaussian(eqx.Module):
         if validate_args:
             check_positive("time_scale", time_scale)
         fold = ZeroFold(loc.shape[-1]) if fold is None else as_fold(fold)
-        fold = _checked_fold(cast(fold, dtype), loc)
+        fold = _check_fold(cast(fold, dtype), loc)
         envelope = TimeLikelihood(power=1.0) if envelope is None else envelope
-        envelope = cast(_checked_envelope(envelope), dtype)
-        # Every leaf is given the whole batch, so that slices, `vmap` over the distribution, and an axis that
-        # `vmap` over this constructor puts in front, are all well defined.
+        envelope = cast(_as_checked_envelope(envelope), dtype)
+        # Every leaf has all batch dimensions, so that slices, `vmap` over the distribution, and an axis that `vmap`
+        # over this constructor adds in front are well defined.
         parts = [(loc, 1), (tril, 2), (time_loc, 0), (time_scale, 0)]
         batch = check_batch([*parts, *ranked_leaves(fold), *ranked_leaves(envelope)])
         self.loc, self.scale_tril, self.time_loc, self.time_scale = broadcast(parts, batch)
         self.envelope = broadcast_leaves(envelope, batch)
-        # But a network's parameters are not copied per component: they keep axes of size 1.
+        # Parameters of a callable (say a network) are not copied per component: they keep axes of size 1.
         self.fold = expand_leaves(fold, len(batch)) if isinstance(fold, CallableFold) else broadcast_leaves(fold, batch)
 
     @property
@@ -126,7 +127,7 @@ class FoldedGaussian(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """Broadcast leading dimensions of all leaves, the fold's and the envelope's included."""
+        """Broadcast leading dimensions of all leaves, including those of the fold and the envelope."""
         return batch_shape_of(ranked_leaves(self))
 
     @property
@@ -138,7 +139,7 @@ class FoldedGaussian(eqx.Module):
         return Normal(self.time_loc, self.time_scale, validate_args=False)
 
     def condition_time(self, t: Float[Array, "*#batch"]) -> Gaussian:
-        """The Gaussian of space at time t. This is the one home of the fold equation.
+        """The Gaussian of space at time t. The fold equation is implemented here only.
 
             s | t ~ N(loc + f(time_loc - t), a(t) Sigma)
 
@@ -146,15 +147,14 @@ class FoldedGaussian(eqx.Module):
 
         **Example:** `dist.condition_time(0.25).sample(key)`
 
-        **Source:** eq:cond_dens, eq:cond_proof. **Raises:** nothing; a t far away only underflows
-        `scale_tril`.
+        **Source:** eq:cond_dens, eq:cond_proof. Far from `time_loc` only `scale_tril` underflows.
         """
         t = as_value(t, self.loc.dtype)
         dist = expand_leaves(self, t.ndim)
         (t,) = align([(t, 0)], dist.time_loc.ndim)
         shift = evaluate_shift(dist.fold, dist.time_loc - t)
         log_a = dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
-        largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would make inf - inf of the density
+        largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would give inf - inf in the density
         log_a = jnp.clip(log_a, -largest, largest)
         return Gaussian(dist.loc + shift, dist.scale_tril, log_scale=0.5 * log_a, validate_args=False)
 
@@ -182,11 +182,11 @@ class FoldedGaussian(eqx.Module):
     def _scaled_log_prob(self, root: Array | None, s: Array, t: Array) -> Float[Array, "*#batch"]:
         """root^2 log FN((s, t)), as `Gaussian.scaled_log_prob`."""
         log_time = self.time_marginal.scaled_log_prob(root, t)
-        overflown = jnp.isinf(self.condition_time(t).loc).any(-1)
-        # Double where: at a time so far away that the fold overflows, gradients are taken at f(0) instead.
-        near, time_loc = align([(t, 0), (self.time_loc, 0)], overflown.ndim)
-        log_space = self.condition_time(jnp.where(overflown, time_loc, near)).scaled_log_prob(root, s)
-        unreachable = overflown | jnp.isneginf(log_space) | jnp.isneginf(log_time)
+        overflow = jnp.isinf(self.condition_time(t).loc).any(-1)
+        # Double where: at times where the fold overflows, gradients are taken at f(0) instead.
+        near, time_loc = align([(t, 0), (self.time_loc, 0)], overflow.ndim)
+        log_space = self.condition_time(jnp.where(overflow, time_loc, near)).scaled_log_prob(root, s)
+        unreachable = overflow | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
 
     def logpdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
@@ -198,17 +198,17 @@ class FoldedGaussian(eqx.Module):
         return jnp.exp(self.log_prob(x))
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws x = (s, t): first t, then s given t; differentiable in all parameters.
+        """Random samples x = (s, t): first t, then s given t; differentiable in all parameters.
 
         **Shapes:** -> (*sample_shape, *batch, d), time last.
 
         **Example:** `dist.sample(jax.random.key(0), (1000,))`
 
-        **Source:** eq:foldgauss, read as a recipe. **Raises:** nothing.
+        **Source:** eq:foldgauss, by ancestral sampling.
         """
         check_not_forked()
         time_key, space_key = jax.random.split(key)
-        # Every batch element draws its own t, also where only loc or the fold carries the batch.
+        # Every batch element has its own t, even where only loc or the fold has batch dimensions.
         shape = (*sample_shape, *self.batch_shape)
         noise = jax.random.normal(time_key, shape, self.loc.dtype)
         noise, time_loc, time_scale = align([(noise, 0), (self.time_loc, 0), (self.time_scale, 0)])
@@ -217,20 +217,20 @@ class FoldedGaussian(eqx.Module):
         return jnp.concatenate([s, t[..., None]], axis=-1)
 
     def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
-        """The draws of `sample`, with their `log_prob`. **Shapes:** -> (*sample_shape, *batch, d) and without d."""
+        """Samples and their `log_prob`. **Shapes:** -> (*sample_shape, *batch, d) and (*sample_shape, *batch)."""
         x = self.sample(key, sample_shape)
         return x, self.log_prob(x)
 
     # --- derivatives and whitening ----------------------------------------------------------------------------
 
     def grad_log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d"]:
-        """The score in x, d log FN(x) / dx.
+        """The gradient of `log_prob` in x, d log FN(x) / dx.
 
         **Shapes:** x (*sample, *batch, d) -> the same. **Example:** `dist.grad_log_prob(dist.mode)  # 0`
 
         **Source:** eq:foldgauss, differentiated. **Raises:** as `log_prob`.
         """
-        return jax.grad(lambda x: self.log_prob(x).sum())(self._whole(x))
+        return jax.grad(lambda x: self.log_prob(x).sum())(self._broadcast_value(x))
 
     def observed_information(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d d"]:
         """The negative Hessian of `log_prob` in x: a precision matrix where the density is locally Gaussian.
@@ -241,13 +241,13 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:foldgauss, differentiated twice. **Raises:** as `log_prob`.
         """
-        x = self._whole(x)
+        x = self._broadcast_value(x)
         directions = jnp.eye(x.shape[-1], dtype=x.dtype)
         column = lambda e: jax.jvp(self.grad_log_prob, (x,), (jnp.broadcast_to(e, x.shape),))[1]  # noqa: E731
         return -jax.vmap(column, out_axes=-1)(directions)
 
     def fold_to_normal(self, x: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
-        """Whitened x, standard normal if x is a draw, and the log-determinant: unfold, then scale.
+        """Whiten x: subtract the fold, then scale. Samples of the distribution become standard normal.
 
             z = (L^-1 (s - loc - f(time_loc - t)) / sqrt(a(t)), (t - time_loc) / time_scale),   log |dz/dx|
 
@@ -257,9 +257,9 @@ class FoldedGaussian(eqx.Module):
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of x is not d.
         """
-        x = self._whole(x)
+        x = self._broadcast_value(x)
         at = self.condition_time(x[..., -1])
-        z, log_det = _whitened(at, x[..., :-1])
+        z, log_det = _whiten(at, x[..., :-1])
         loc, scale = (jnp.broadcast_to(y, log_det.shape) for y in (self.time_loc, self.time_scale))
         z = jnp.concatenate([z, ((x[..., -1] - loc) / scale)[..., None]], axis=-1)
         return z, log_det - jnp.log(scale)
@@ -269,18 +269,18 @@ class FoldedGaussian(eqx.Module):
 
         **Shapes:** z (*sample, *batch, d) -> the same and (*sample, *batch).
 
-        **Example:** `dist.normal_to_fold(jax.random.normal(key, (1000, 3)))[0]  # draws`
+        **Example:** `dist.normal_to_fold(jax.random.normal(key, (1000, 3)))[0]  # samples`
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of z is not d.
         """
-        z = self._whole(z)
+        z = self._broadcast_value(z)
         loc, scale = (jnp.broadcast_to(y, z.shape[:-1]) for y in (self.time_loc, self.time_scale))
         t = loc + scale * z[..., -1]
-        s, log_det = _coloured(self.condition_time(t), z[..., :-1])
+        s, log_det = _unwhiten(self.condition_time(t), z[..., :-1])
         return jnp.concatenate([s, t[..., None]], axis=-1), log_det + jnp.log(scale)
 
-    def _whole(self, x) -> Array:
-        """A checked value, with all batch dimensions."""
+    def _broadcast_value(self, x) -> Array:
+        """x, checked, with all batch dimensions."""
         x = as_value(x, self.loc.dtype)
         check_event("x", x, self.event_shape)
         return jnp.broadcast_to(x, (*jnp.broadcast_shapes(x.shape[:-1], self.batch_shape), *self.event_shape))
@@ -292,12 +292,12 @@ class FoldedGaussian(eqx.Module):
 
             E s = loc + E f(u),  Cov s = E[a] Sigma + Cov f(u),  Cov(s, t) = -E[f(u) u],  u ~ N(0, time_scale^2)
 
-        Exact for zero and polynomial folds; `order` is that of the Gauss-Hermite rule for others. E[a] is exact for
-        the built-in envelopes, a fixed quadrature for others.
+        Exact for zero and polynomial folds; others use a Gauss-Hermite rule of `order` nodes. E[a] is exact for the
+        built-in envelopes; others use a fixed quadrature.
 
         **Shapes:** (*batch, d) and (*batch, d, d). **Example:** `mean, covariance = dist.moments()`
 
-        **Source:** eq:cond_dens, by total mean and covariance. **Raises:** nothing.
+        **Source:** eq:cond_dens, by total mean and covariance.
         """
         return moments.moments(self, order)
 
@@ -313,17 +313,17 @@ class FoldedGaussian(eqx.Module):
 
     @property
     def covariance_matrix(self) -> Float[Array, "*batch d d"]:
-        """Cov x of space and time together, as `moments`; that of space at one time is `condition_time(t)`'s."""
+        """Cov x of space and time jointly, as `moments`; for space at one time use `condition_time(t)`."""
         return self.moments()[1]
 
     @property
     def mode(self) -> Float[Array, "*batch d"]:
-        """The highest point of the density, (loc, time_loc), where it is the only one: `power (d-1) < 2`.
+        """The maximum of the density, (loc, time_loc), if it is unique: `power (d-1) < 2`.
 
-        On the ridge s = loc + f(u) the density goes as exp(tau^2 (power (d-1) - 2) / 4).
+        On the ridge s = loc + f(u) the density is proportional to exp(tau^2 (power (d-1) - 2) / 4).
 
-        **Source:** eq:foldgauss at s = loc + f(u). **Raises:** ValueError that says whether there is a ridge of
-        modes, two of them (a floor), or none (unbounded); NaN under tracing.
+        **Source:** eq:foldgauss at s = loc + f(u). **Raises:** ValueError if the density has a ridge of modes, two
+        modes (a floor) or none (unbounded); under tracing the result is NaN instead.
         """
         return moments.mode(self)
 
@@ -332,25 +332,25 @@ class FoldedGaussian(eqx.Module):
 
             H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2
 
-        Exact without a floor, where E[log a] = -power / 2; else that is a fixed quadrature. **Units:** nats.
+        Exact without a floor, where E[log a] = -power / 2; otherwise E[log a] is a fixed quadrature. **Units:** nats.
 
-        **Source:** the chain rule of eq:foldgauss. **Example:** `dist.entropy()`. **Raises:** nothing.
+        **Source:** the chain rule of eq:foldgauss. **Example:** `dist.entropy()`.
         """
         return moments.entropy(self)
 
-    # --- parts ----------------------------------------------------------------------------------------------
+    # --- marginal and conditional distributions -----------------------------------------------------------------
 
     def marginal(self, indices) -> "FoldedGaussian | Gaussian | TimeMixture":
-        """The distribution of some coordinates; the indices are kept.
+        """The marginal distribution of the coordinates `indices`.
 
-        With time among them it is exact, a FoldedGaussian (time alone: a Gaussian); without time it is outside the
-        family, a `TimeMixture`, integrated numerically.
+        If time is among them it is exact, a FoldedGaussian (time alone: a Gaussian); otherwise it is outside the
+        family: a `TimeMixture`, integrated numerically.
 
-        **Shapes:** `indices`: whole numbers, in the order wanted, time last; -1 is time.
+        **Shapes:** `indices`: integers in the order of the result, time last; -1 is time.
 
         **Example:** `dist.marginal([0, -1])  # first space coordinate, and time`
 
-        **Source:** eq:integral_proof. **Raises:** ValueError on indices that are none.
+        **Source:** eq:integral_proof. **Raises:** ValueError on invalid indices.
         """
         check_not_forked()
         indices = normalize_indices(indices, self.event_shape[0])
@@ -372,17 +372,17 @@ class FoldedGaussian(eqx.Module):
         )
 
     def condition(self, indices, values: ArrayLike) -> "Gaussian | TimeMixture":
-        """The other coordinates, given these.
+        """The conditional distribution of the other coordinates, given these.
 
-        With time among the given it is exact, a Gaussian; without, it is outside the family: a `TimeMixture` of the
-        other coordinates and time (last), integrated numerically.
+        If time is given it is exact, a Gaussian; otherwise it is outside the family: a `TimeMixture` of the other
+        coordinates and time (last), integrated numerically.
 
-        **Shapes:** `indices`: n whole numbers, -1 is time; `values` (*batch, n) in their order; the result has the
-        other coordinates, in ascending order.
+        **Shapes:** `indices`: n integers, -1 is time; `values` (*batch, n) in the same order; the result has the
+        other coordinates in ascending order.
 
         **Example:** `dist.condition([0], [0.3]).sample(key)  # the other space coordinates, and time`
 
-        **Source:** eq:cond_dens. **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
+        **Source:** eq:cond_dens. **Raises:** ValueError on invalid indices, all indices, or a wrong shape of values.
         """
         indices = normalize_indices(indices, self.event_shape[0])
         values = as_value(values, self.loc.dtype)
@@ -399,7 +399,7 @@ class FoldedGaussian(eqx.Module):
         return conditional_gaussian(ordered, others, values[..., where])
 
     def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> TimeDensity:
-        """The density of time where space is known, by quadrature: its modes, samples, quantiles, moments.
+        """The density of time given space, by quadrature: its modes, samples, quantiles and moments.
 
         **Shapes:** s (*batch, d-1); the result has `event_shape == ()`.
 
@@ -415,30 +415,30 @@ class FoldedGaussian(eqx.Module):
     def _time_index(self) -> int:
         return self.event_shape[0] - 1
 
-    # --- fits, bridges, pictures: imported when asked for -----------------------------------------------------
+    # --- interoperability and display ---------------------------------------------------------------------------
 
     def to_numpyro(self):
-        """This distribution for numpyro models: see `foldgauss.analysis.interop.to_numpyro`."""
+        """This distribution as a numpyro distribution: see `foldgauss.analysis.interop.to_numpyro`."""
         return interop.to_numpyro(self)
 
     def to_scipy(self):
-        """This distribution, frozen, with scipy's methods: see `foldgauss.analysis.interop.to_scipy`."""
+        """This distribution as a frozen scipy distribution: see `foldgauss.analysis.interop.to_scipy`."""
         return interop.to_scipy(self)
 
     def _repr_png_(self) -> bytes | None:
-        """What a notebook shows: the density over time and space, or of many coordinates some views of it."""
+        """Notebook display: the density over time and space, by coordinates if there are several."""
         return notebook_hooks.show("distribution", self)
 
 
-def _whitened(at: Gaussian, s: Array) -> tuple[Array, Array]:
+def _whiten(at: Gaussian, s: Array) -> tuple[Array, Array]:
     """Standard normal coordinates of s, and log |dz/ds|."""
     y = join_columns(solve_lower(at.base_tril, split_columns(s - at.loc)))
     half = jnp.exp(-0.5 * at.log_scale)[..., None]  # twice: the product may fit where exp(-log_scale) does not
     return y * half * half, -_log_det(at)
 
 
-def _coloured(at: Gaussian, z: Array) -> tuple[Array, Array]:
-    """The inverse: s, and log |ds/dz|."""
+def _unwhiten(at: Gaussian, z: Array) -> tuple[Array, Array]:
+    """The inverse of `_whiten`: s, and log |ds/dz|."""
     half = jnp.exp(0.5 * at.log_scale)[..., None]
     return at.loc + join_columns(multiply_lower(at.base_tril, split_columns(z))) * half * half, _log_det(at)
 
@@ -448,16 +448,16 @@ def _log_det(at: Gaussian) -> Array:
     return jnp.broadcast_to(log_diagonal + at.loc.shape[-1] * at.log_scale, at.batch_shape)
 
 
-def _checked_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
+def _check_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
     shape = jax.eval_shape(fold, jax.ShapeDtypeStruct((), loc.dtype)).shape
     if shape[-1:] != loc.shape[-1:]:
         expected = f"shifts of shape (*batch, {loc.shape[-1]})"
-        raise invalid("fold", expected=expected, got=f"shape {shape}", cure="It takes u to d-1 space coordinates.")
+        raise invalid("fold", expected=expected, got=f"shape {shape}", cure="It maps u to d-1 space coordinates.")
     return fold
 
 
-def _checked_envelope(envelope) -> AbstractEnvelope:
+def _as_checked_envelope(envelope) -> AbstractEnvelope:
     if not (isinstance(envelope, AbstractEnvelope) or callable(envelope)):
-        cure = "Constant(), TimeLikelihood(power=...), a callable that gives log a, or plain_envelope(a)."
+        cure = "Constant(), TimeLikelihood(power=...), a callable that returns log a, or plain_envelope(a)."
         raise invalid("envelope", expected="an envelope or a callable", got=repr(envelope), cure=cure)
     return as_envelope(envelope)

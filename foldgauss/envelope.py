@@ -1,7 +1,6 @@
-"""The envelope a: how a Folded-Gaussian's space covariance shrinks away from its own time (eq:cond_dens).
+"""The envelope a(t), by which the space covariance of a Folded-Gaussian shrinks away from `time_loc` (eq:cond_dens).
 
-Envelopes live in log space: far from its time a component's `a` is below every floating-point number, `log a`
-is not.
+Envelopes are computed in log space: far from `time_loc` `a` underflows, `log a` does not.
 """
 
 from abc import abstractmethod
@@ -20,12 +19,12 @@ __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood",
 
 
 class AbstractEnvelope(eqx.Module):
-    """An envelope with batch dimensions, known by its logarithm.
+    """An envelope with batch dimensions, given by its logarithm.
 
     **Shapes:** t, time_loc, time_scale (*batch,) -> (*batch,). **Units:** the three share theirs; a has none.
 
     To extend: return `log a <= 0`, let leading dimensions of the leaves broadcast against those of `t`, and
-    say in `leaf_ranks` where they begin.
+    return the ranks of the leaves without them in `leaf_ranks`.
     """
 
     @property
@@ -35,7 +34,7 @@ class AbstractEnvelope(eqx.Module):
 
     @property
     def is_closed(self) -> bool:
-        """Whether it depends on its leaves only; a user's function may close over tracers too."""
+        """Whether it depends on its leaves only; a user's function may also close over tracers."""
         return False
 
     @abstractmethod
@@ -73,13 +72,13 @@ class Constant(AbstractEnvelope):
 
 
 class TimeLikelihood(AbstractEnvelope):
-    """The paper's envelope, the time likelihood scaled to 1 at its peak, with a power and a floor.
+    """The paper's envelope: the time likelihood, scaled to 1 at its peak, with a power and a floor.
 
         log a = logaddexp(log floor, log(1 - floor) - power tau^2 / 2),   tau = (t - time_loc) / time_scale
 
-    The paper's text is `power=1` (the default); its published code scales *standard deviations* by
-    `exp(-tau^2/2)`, which is `power=2`. A floor > 0 keeps the density bounded: without one the ridge
-    `s = loc + f` has an unbounded density where `power (d-1) > 2`, and its maximum likelihood is degenerate.
+    The paper's text has `power=1` (the default); its published code scales *standard deviations* by
+    `exp(-tau^2/2)`, which is `power=2`. A floor > 0 bounds the density: without a floor it is unbounded on the ridge
+    `s = loc + f` if `power (d-1) > 2`, and maximum likelihood is degenerate.
 
     **Shapes:** `power`, `floor` (*batch,); t, time_loc, time_scale (*batch,) -> (*batch,); all broadcast.
 
@@ -96,7 +95,7 @@ class TimeLikelihood(AbstractEnvelope):
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
         if _any(self.power, lambda x: x < 0):
-            raise invalid("power", expected="a number >= 0", got=power, cure="The paper's text is 1, its code 2.")
+            raise invalid("power", expected="a number >= 0", got=power, cure="The paper's text has 1, its code 2.")
         if _any(self.floor, lambda x: (x < 0) | (x >= 1)):
             raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
 
@@ -115,11 +114,11 @@ class TimeLikelihood(AbstractEnvelope):
 
 
 class CallableEnvelope(AbstractEnvelope):
-    """Any function that gives log a, with or without parameters, as an envelope.
+    """Any function that returns log a, with or without parameters, as an envelope.
 
         log a(t) = log_a(t, time_loc, time_scale)
 
-    **Shapes:** `log_a` takes three scalars to a scalar <= 0; this class vmaps it over batches. Arrays inside it (a
+    **Shapes:** `log_a` maps three scalars to a scalar <= 0; this class vmaps it over batches. Arrays inside it (a
     pytree) are leaves of the envelope and are trained with it.
 
     **Example:** `CallableEnvelope(lambda t, m, scale: -jnp.abs((t - m) / scale))  # a = exp(-|tau|)`
@@ -129,7 +128,7 @@ class CallableEnvelope(AbstractEnvelope):
 
     parameters: PyTree
     static: PyTree = eqx.field(static=True)
-    parameter_ranks: tuple[int, ...] = eqx.field(static=True)  # taken where there is one envelope, as in CallableFold
+    parameter_ranks: tuple[int, ...] = eqx.field(static=True)  # set at construction, as in CallableFold
 
     def __init__(self, log_a: Callable[[Array, Array, Array], Array]):
         if not callable(log_a):
@@ -147,13 +146,13 @@ class CallableEnvelope(AbstractEnvelope):
 
 
 def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelope:
-    """An envelope from a function that gives `a` itself, at a loss of range.
+    """An envelope from a function that returns `a` itself, with a smaller range.
 
-    Where `a` underflows, its logarithm is lost: log a is held at that of the smallest normal number (-87.3 in
-    float32, -708.4 in float64), with slope 0. `exp(-tau^2/2)` gets there at |tau| = 13.2 and 37.6; beyond, densities
-    are those of a wider Gaussian. Give log a to `CallableEnvelope` where that matters.
+    Where `a` underflows, log a is clipped to that of the smallest normal number (-87.3 in float32, -708.4 in float64),
+    with slope 0. `exp(-tau^2/2)` reaches it at |tau| = 13.2 and 37.6; beyond, densities are those of a wider Gaussian.
+    Pass log a to `CallableEnvelope` where that matters.
 
-    **Shapes:** `a` takes three scalars (t, time_loc, time_scale) to a scalar in (0, 1].
+    **Shapes:** `a` maps three scalars (t, time_loc, time_scale) to a scalar in (0, 1].
 
     **Example:** `plain_envelope(lambda t, m, scale: 1 / (1 + ((t - m) / scale) ** 2))`
 
@@ -165,9 +164,9 @@ def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelop
 
 
 def as_envelope(envelope: AbstractEnvelope | Callable) -> AbstractEnvelope:
-    """`envelope` itself if it is one, else the callable, which must give log a, in a `CallableEnvelope`.
+    """`envelope` itself if it is one, else a `CallableEnvelope` of the callable, which must return log a.
 
-    **Shapes:** a callable takes three scalars (t, time_loc, time_scale) to a scalar <= 0. **Raises:** ValueError if it
+    **Shapes:** a callable maps three scalars (t, time_loc, time_scale) to a scalar <= 0. **Raises:** ValueError if it
     is not callable.
 
     **Example:** `as_envelope(lambda t, m, scale: -jnp.abs((t - m) / scale))`
@@ -181,14 +180,14 @@ class _Logarithm(eqx.Module):
     def __call__(self, *scalars):
         a = jnp.asarray(self.function(*scalars))
         smallest = float(jnp.finfo(a.dtype).tiny)
-        return jnp.log(jnp.where(a < smallest, smallest, a))  # a NaN is not smaller, and propagates
+        return jnp.log(jnp.where(a < smallest, smallest, a))  # a NaN compares false, and propagates
 
 
 def _bounded_tau(offset: Float[Array, "*batch"], time_scale: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """offset / time_scale, held where its square is representable (no density is, out there)."""
+    """offset / time_scale, clipped so that its square is representable; densities out there underflow anyway."""
     bound = float(np.sqrt(jnp.finfo(offset.dtype).max)) * 1e-2
     far = jnp.abs(offset) > bound * time_scale
-    # Double where: a quotient that overflows would give 0 * inf in the gradient of the branch not taken.
+    # Double where: an overflowing quotient would give 0 * inf in the gradient of the branch not taken.
     near = jnp.where(far, 0, offset) / jnp.where(far, 1, time_scale)
     return jnp.where(far, jnp.copysign(bound, offset).astype(offset.dtype), near)
 
@@ -196,19 +195,19 @@ def _bounded_tau(offset: Float[Array, "*batch"], time_scale: Float[Array, "*batc
 @jax.custom_jvp
 def _log_floored(q: Float[Array, "*batch"], floor: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """log(floor + (1 - floor) e^-q)."""
-    near = jnp.log1p((1 - floor) * jnp.expm1(-q))  # exactly 0 at the peak, and never above
+    near = jnp.log1p((1 - floor) * jnp.expm1(-q))  # exactly 0 at the peak, never above
     far = jnp.logaddexp(jnp.log(floor), jnp.log1p(-floor) - q)
     return jnp.where(q < 0.5, near, far)
 
 
 @_log_floored.defjvp
 def _log_floored_jvp(primals, tangents):
-    # By hand, because autodiff takes 0 * inf through log(floor) at floor = 0, where the derivative is
-    # expm1(q).
+    # By hand, because autodiff computes 0 * inf through log(floor) at floor = 0, where the derivative is expm1(q).
     (q, floor), (q_dot, floor_dot) = primals, tangents
     log_a = _log_floored(q, floor)
     by_q = -jnp.exp(jnp.log1p(-floor) - q - log_a)
-    # In two factors: the product reaches further than the dtype, which a density's derivatives can use (`_far`).
+    # In two factors: the product may exceed the range of the dtype where the density's derivative does not
+    # (see `foldgauss._numerics.safe_grad`).
     half = jnp.exp(jnp.minimum(-0.5 * log_a, 0.85 * float(np.log(jnp.finfo(q.dtype).max))))
     return log_a, by_q * q_dot - jnp.expm1(-q) * half * (half * floor_dot)
 
@@ -220,5 +219,5 @@ def _float_array(x: ArrayLike) -> Float[Array, "..."]:
 
 
 def _any(x: Array, wrong) -> bool:
-    """Whether a value is wrong; under tracing there are no values to look at."""
+    """Whether a value is wrong; False under tracing, where values are not known."""
     return not isinstance(x, jax.core.Tracer) and bool(np.any(wrong(np.asarray(x))))

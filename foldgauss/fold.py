@@ -1,6 +1,6 @@
-"""The fold f: where a Folded-Gaussian's centre goes as time moves away from its own time (eq:cond_dens).
+"""The fold f, by which the center of a Folded-Gaussian moves away from `time_loc` (eq:cond_dens).
 
-A fold is a function of `u = time_loc - t` (note the sign), from a scalar to R^(d-1).
+A fold maps the scalar `u = time_loc - t` (note the sign) to R^(d-1).
 """
 
 from abc import abstractmethod
@@ -33,22 +33,22 @@ __all__ = [
 
 
 class AbstractFold(eqx.Module):
-    """A fold with batch dimensions: `fold(u)` takes u of shape (*batch,) to shifts (*batch, d-1).
+    """A fold with batch dimensions: `fold(u)` maps u of shape (*batch,) to shifts (*batch, d-1).
 
     **Units:** u is time, f(u) is space.
 
-    To extend: let further leading dimensions of the leaves broadcast against those of `u`, and say in
-    `leaf_ranks` where they begin. A function of one scalar needs no class: `as_fold` wraps it.
+    To extend: let leading dimensions of the leaves broadcast against those of `u`, and return the ranks of the leaves
+    without them in `leaf_ranks`. A function of one scalar needs no class: `as_fold` wraps it.
     """
 
     @property
     @abstractmethod
     def leaf_ranks(self) -> tuple[int, ...]:
-        """Rank of each leaf (in the order of `jax.tree.leaves`) for one fold; what is in front is batch."""
+        """Rank of each leaf (in the order of `jax.tree.leaves`) for one fold; the rest is batch."""
 
     @property
     def is_closed(self) -> bool:
-        """Whether it depends on its leaves only; a user's function may close over tracers too."""
+        """Whether it depends on its leaves only; a user's function may also close over tracers."""
         return False
 
     @abstractmethod
@@ -57,20 +57,20 @@ class AbstractFold(eqx.Module):
 
 
 class ZeroFold(AbstractFold):
-    """No fold: `f(u) = 0`, the centre stands still.
+    """No fold: `f(u) = 0`, a static center.
 
     **Shapes:** u (*batch,) -> (*batch, dim), with `dim = d - 1`.
 
     **Example:** `ZeroFold(2)(0.3)  # [0., 0.]`
 
-    **Source:** the plain Gaussian of eq:gauss_2d. **Raises:** ValueError if `dim` is no whole number >= 1.
+    **Source:** the plain Gaussian of eq:gauss_2d. **Raises:** ValueError if `dim` is not an integer >= 1.
     """
 
     dim: int = eqx.field(static=True)
 
     def __init__(self, dim: int):
         if not isinstance(dim, int) or dim < 1:
-            raise invalid("dim", expected="a whole number >= 1", got=repr(dim), cure="It is d - 1.")
+            raise invalid("dim", expected="an integer >= 1", got=repr(dim), cure="It is d - 1.")
         self.dim = dim
 
     @property
@@ -105,7 +105,7 @@ class PolynomialFold(AbstractFold):
     coefficients: Float[Array, "*batch degree d-1"]
 
     def __init__(self, coefficients: ArrayLike):
-        self.coefficients = _rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
+        self.coefficients = _coefficient_rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
@@ -123,23 +123,23 @@ class PolynomialFold(AbstractFold):
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         check_not_forked()
         u = jnp.asarray(u)
-        u, coefficients = _aligned(u, self.coefficients)
+        u, coefficients = _align(u, self.coefficients)
         batch = jnp.broadcast_shapes(u.shape[:-1], coefficients.shape[:-2])
         shift = jnp.zeros((*batch, coefficients.shape[-1]), jnp.result_type(u, coefficients))
-        for k in reversed(range(self.degree)):  # Horner: no power of u is ever formed
+        for k in reversed(range(self.degree)):  # Horner's scheme
             shift = u * (shift + coefficients[..., k, :])
         return shift
 
 
 class SplineFold(AbstractFold):
-    """A B-spline with given knots: a fold that bends locally, and stays bounded far from its time.
+    """A B-spline with fixed knots: its coefficients act locally, and it stays bounded far from `time_loc`.
 
-        f(u) = sum_i c_i B_i(v),   v = u held within [knots[degree], knots[n]]
+        f(u) = sum_i c_i B_i(v),   v = clip(u, knots[degree], knots[n])
 
-    Outside its domain the fold is held at the end value (a polynomial continued out there would overflow where the
-    time likelihood is still alive). **f(0) is not forced to 0:** the B_i sum to 1, so a shift of all c_i is a shift
-    of `loc`, and when both are fitted only their sum is determined. `centered()` takes the constant out, and leaves
-    `loc` the centre at `time_loc`, as with the other folds.
+    Outside its domain the fold keeps its value at the end (a continued polynomial would overflow where the time
+    likelihood is not yet negligible). **f(0) is not constrained to 0:** the B_i sum to 1, so shifting all c_i equals
+    shifting `loc`, and if both are fitted only their sum is determined. `centered()` subtracts the constant, so that
+    `loc` is the center at `time_loc`, as with the other folds.
 
     **Shapes:** `knots` (n + degree + 1,), fixed, not trained; `coefficients` (*batch, n, d-1); u (*batch,) ->
     (*batch, d-1), leading dimensions broadcast.
@@ -149,19 +149,19 @@ class SplineFold(AbstractFold):
     **Example:** `SplineFold([-1, -1, 0, 1, 1], [[2.0], [0.0], [1.0]], degree=1)(0.5)  # halfway: [0.5]`
 
     **Source:** the "suitably chosen" f of eq:transform_s; the recursion is that of Cox and de Boor. **Raises:**
-    ValueError if `degree` is no whole number >= 0, knots decrease, are not finite, or leave no domain, or their
-    number does not fit.
+    ValueError if `degree` is not an integer >= 0, or the knots decrease, are not finite, leave no domain, or are not
+    n + degree + 1.
     """
 
     coefficients: Float[Array, "*batch n d-1"]
-    knots: tuple[float, ...] = eqx.field(static=True)  # given, not trained: an optimiser of all leaves leaves them be
+    knots: tuple[float, ...] = eqx.field(static=True)  # static: not trained
     degree: int = eqx.field(static=True)
 
     def __init__(self, knots: ArrayLike, coefficients: ArrayLike, *, degree: int = 3):
-        self.coefficients = _rows("coefficients", coefficients, "n", "Row i holds c_i")
+        self.coefficients = _coefficient_rows("coefficients", coefficients, "n", "Row i holds c_i")
         if not isinstance(degree, int) or degree < 0:
-            raise invalid("degree", expected="a whole number >= 0", got=repr(degree), cure="3 is a cubic spline.")
-        self.knots, self.degree = _checked_knots(knots, self.coefficients.shape[-2], degree), degree
+            raise invalid("degree", expected="an integer >= 0", got=repr(degree), cure="3 is a cubic spline.")
+        self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), degree
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
@@ -173,24 +173,24 @@ class SplineFold(AbstractFold):
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         check_not_forked()
-        u, coefficients = _aligned(jnp.asarray(u), self.coefficients)
+        u, coefficients = _align(jnp.asarray(u), self.coefficients)
         n, k = coefficients.shape[-2], self.degree
         v = jnp.clip(u, self.knots[k], self.knots[n])
         terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
-        return sum(terms, 0 * v)  # and a NaN propagates through degree 0 too
+        return sum(terms, 0 * v)  # 0 * v: a NaN propagates through degree 0, too
 
     def centered(self) -> "SplineFold":
-        """The same fold less its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution."""
+        """The fold minus its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution unchanged."""
         here = self(jnp.zeros((), self.coefficients.dtype))
         return eqx.tree_at(lambda fold: fold.coefficients, self, self.coefficients - here[..., None, :])
 
 
 class FourierFold(AbstractFold):
-    """A periodic fold: sines and cosines without a constant, so that f(0) = 0.
+    """A periodic fold: a Fourier series without constant, so that f(0) = 0.
 
         f(u) = sum_{k=1..order} s_k sin(2 pi k u / period) + c_k (cos(2 pi k u / period) - 1)
 
-    More periods away than the float type can tell apart (1 / eps of them) the phase has no meaning and f is 0.
+    Beyond 1 / eps periods, where the phase is below floating-point resolution, f is 0.
 
     **Shapes:** `sine`, `cosine` (*batch, order, d-1), row `k - 1` is s_k, c_k; `period` (*batch,); u (*batch,) ->
     (*batch, d-1), leading dimensions broadcast.
@@ -208,14 +208,16 @@ class FourierFold(AbstractFold):
     period: Float[Array, "*batch"]
 
     def __init__(self, sine: ArrayLike, cosine: ArrayLike, *, period: ArrayLike):
-        self.sine = _rows("sine", sine, "order", "Row k-1 holds s_k")
-        self.cosine = _rows("cosine", cosine, "order", "Row k-1 holds c_k").astype(self.sine.dtype)
+        self.sine = _coefficient_rows("sine", sine, "order", "Row k-1 holds s_k")
+        self.cosine = _coefficient_rows("cosine", cosine, "order", "Row k-1 holds c_k").astype(self.sine.dtype)
         self.period = jnp.asarray(period, self.sine.dtype)
         if self.sine.shape != self.cosine.shape:
             got = f"shapes {self.sine.shape} and {self.cosine.shape}"
-            raise invalid("cosine", expected="the shape of sine", got=got, cure="Zeros are free.")
+            raise invalid(
+                "cosine", expected="the shape of sine", got=got, cure="Pass zeros for the one that is not used."
+            )
         if not isinstance(self.period, jax.core.Tracer) and (np.asarray(self.period) <= 0).any():
-            raise invalid("period", expected="positive numbers", got=period, cure="It is a time.")
+            raise invalid("period", expected="positive values", got=period, cure="It is a duration.")
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
@@ -250,9 +252,9 @@ class FourierFold(AbstractFold):
 class CallableFold(AbstractFold):
     """Any function of one scalar, with or without parameters, as a fold: `f(u) = function(u)`.
 
-    **Shapes:** `function` takes one scalar u to (d-1,); this class vmaps it, u (*batch,) -> (*batch, d-1).
-    Arrays inside `function` (a pytree, say an `equinox.nn.MLP`) are leaves of the fold and are trained with
-    it. They are the parameters of *one* fold; a batch of parameters comes from `vmap` over the constructor.
+    **Shapes:** `function` maps one scalar u to (d-1,); this class vmaps it, u (*batch,) -> (*batch, d-1).
+    Arrays inside `function` (a pytree, say an `equinox.nn.MLP`) are leaves of the fold and are trained with it. They
+    are the parameters of *one* fold; for a batch of parameters use `vmap` over the constructor.
 
     **Example:** `CallableFold(lambda u: jnp.stack([jnp.sin(u), u**2]))(jnp.zeros(5))  # shape (5, 2)`
 
@@ -262,7 +264,7 @@ class CallableFold(AbstractFold):
 
     parameters: PyTree
     static: PyTree = eqx.field(static=True)
-    # Taken at construction, where there is one fold, so that a later vmap cannot blur where its axes begin.
+    # Set at construction, from the leaves of a single fold, so that the axes of a later vmap are known to be batch.
     parameter_ranks: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
@@ -279,9 +281,9 @@ class CallableFold(AbstractFold):
 
 
 def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
-    """`fold` itself if it is one, else the callable wrapped (and so vmapped) by `CallableFold`.
+    """`fold` itself if it is one, else a `CallableFold` of the callable, which vmaps it.
 
-    **Shapes:** a callable takes one scalar u to (d-1,). **Raises:** ValueError if it is not callable.
+    **Shapes:** a callable maps one scalar u to (d-1,). **Raises:** ValueError if it is not callable.
 
     **Example:** `as_fold(lambda u: jnp.stack([u, u**2]))`
     """
@@ -289,12 +291,12 @@ def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
 
 
 def evaluate_shift(fold: AbstractFold, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-    """`fold(u)`, with a derivative by u that is made for large batches.
+    """`fold(u)`, with a derivative in u that is efficient for large batches.
 
-    A fold is pointwise in u, so that its slope is one forward derivative. Backwards, autodiff would sum over the d-1
-    coordinates at each step of the recursion instead of once, in loops of so few that nothing is vectorised.
+    A fold is elementwise in u, so its slope is one forward derivative. Reverse-mode autodiff would sum over the d-1
+    coordinates at each step of the recursion instead of once, in loops too short to be vectorized.
     """
-    if not fold.is_closed:  # then it may close over tracers, which a custom derivative would lose
+    if not fold.is_closed:  # it may close over tracers, which a custom derivative would lose
         return fold(u)
     leaves, structure = jax.tree.flatten(fold)
     return _shift(structure, u, *leaves)
@@ -323,18 +325,18 @@ def _shift_jvp(structure, primals, tangents):
 
 
 def _with_rank(x: Array, rank: int) -> Array:
-    """`x` with ones in front up to `rank` dimensions: broadcasting said aloud, and free under jit."""
+    """`x` with leading axes of size 1, up to `rank` dimensions."""
     return lax.expand_dims(x, range(rank - x.ndim))
 
 
-def _aligned(u: Array, rows: Array) -> tuple[Array, Array]:
+def _align(u: Array, rows: Array) -> tuple[Array, Array]:
     """u (*batch, 1) and rows (*batch, n, d-1), of equal batch rank."""
     check_not_forked()
     rank = max(u.ndim, rows.ndim - 2)
     return _with_rank(u, rank)[..., None], _with_rank(rows, rank + 2)
 
 
-def _rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[Array, "*batch n d-1"]:
+def _coefficient_rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[Array, "*batch n d-1"]:
     x = jnp.asarray(x)
     if x.ndim < 2 or x.shape[-1] < 1:
         cure = f"{rows}; a single space coordinate still needs its own axis."
@@ -342,21 +344,21 @@ def _rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[Array, "*batc
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 
-def _checked_knots(knots: ArrayLike, n: int, degree: int) -> tuple[float, ...]:
+def _check_knots(knots: ArrayLike, n: int, degree: int) -> tuple[float, ...]:
     knots = np.asarray(knots, np.float64)
     if knots.shape != (n + degree + 1,) or n <= degree:
-        cure = "There are n coefficients, n > degree; end knots repeat degree + 1 times to clamp the ends."
+        cure = "There are n coefficients, n > degree; repeat the end knots degree + 1 times to clamp the ends."
         raise invalid(
             "knots", expected=f"shape (n + degree + 1,) = ({n + degree + 1},)", got=f"{knots.shape}", cure=cure
         )
     if not (np.isfinite(knots).all() and (np.diff(knots) >= 0).all() and knots[degree] < knots[n]):
-        cure = "Sort them, and leave knots[degree] < knots[n]."
-        raise invalid("knots", expected="finite numbers that do not decrease", got=knots.tolist(), cure=cure)
+        cure = "Sort them, with knots[degree] < knots[n]."
+        raise invalid("knots", expected="finite, non-decreasing values", got=knots.tolist(), cure=cure)
     return tuple(knots.tolist())
 
 
 def _spline_basis(v: Array, knots: tuple[float, ...], degree: int) -> list[Array]:
-    """B_i(v) for all i, by the recursion of Cox and de Boor; empty intervals drop out while tracing."""
+    """B_i(v) for all i, by the Cox-de Boor recursion; empty intervals are skipped while tracing."""
     last = max(i for i in range(len(knots) - 1) if knots[i] < knots[i + 1] and knots[i + 1] <= knots[-degree - 1])
     inside = [(v >= a) & ((v <= b) if i == last else (v < b)) for i, (a, b) in enumerate(pairwise(knots))]
     basis = [jnp.where(here & (i <= last), 1, 0).astype(v.dtype) for i, here in enumerate(inside)]
@@ -371,7 +373,7 @@ def _ramp(v: Array, start: float, end: float) -> Array:
 
 
 class RestrictedFold(AbstractFold):
-    """Some coordinates of a fold of any class, `f(u)[indices]`."""
+    """Some coordinates of any fold, `f(u)[indices]`."""
 
     fold: AbstractFold
     indices: tuple[int, ...] = eqx.field(static=True)

@@ -1,7 +1,8 @@
-"""The Gaussians that a Folded-Gaussian is made of: of time alone, and of space at one time (eq:cond_dens).
+"""The Gaussians that a Folded-Gaussian consists of: of time, and of space at one time (eq:cond_dens).
 
-Numerics: `a` is never formed, only `log a`. A log-density is finite or -inf for every finite input. Its
-gradient is 0 where it is -inf, and else true, or held at the largest finite number (`_far`).
+Numerics: `a` is never computed, only `log a`. A log-density is finite or -inf for every finite input. Its gradient is 0
+where the log-density is -inf, and otherwise accurate, saturating at the largest finite number
+(`foldgauss._numerics.safe_grad`).
 """
 
 import functools
@@ -44,7 +45,7 @@ _LOG_2PI = float(np.log(2 * np.pi))
 
 
 class Normal(eqx.Module):
-    """A normal distribution on the line: what a Folded-Gaussian says about time alone.
+    """A normal distribution on the real line: the time marginal of a Folded-Gaussian.
 
         N(loc, scale^2)(t) = exp(-((t - loc) / scale)^2 / 2) / (sqrt(2 pi) scale)
 
@@ -90,24 +91,24 @@ class Normal(eqx.Module):
         return jnp.exp(self.log_prob(value))
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws of shape (*sample_shape, *batch), differentiable in the parameters."""
+        """Random samples (*sample_shape, *batch), differentiable in the parameters."""
         return _as_gaussian(self).sample(key, sample_shape)[..., 0]
 
 
 class Gaussian(eqx.Module):
-    """A Gaussian in any dimension, by its factor and a scale kept in log space.
+    """A Gaussian in any dimension, given by a triangular factor and a scale in log space.
 
         N(loc, exp(2 log_scale) L L^T),   L = base_tril
 
-    `log_scale` is there for Folded-Gaussians seen far from their time, where the product `exp(log_scale) L`
-    (given by `scale_tril`) is 0 in floating point and the density is not.
+    `log_scale` serves Folded-Gaussians far from `time_loc`, where the product `exp(log_scale) L` (`scale_tril`)
+    underflows and the log-density does not.
 
     **Shapes:** `loc` (*batch, dim), `scale_tril` (*batch, dim, dim) lower-triangular with a positive
     diagonal, `log_scale` (*batch,), all broadcast; `event_shape == (dim,)`.
 
     **Example:** `Gaussian(jnp.zeros(2), jnp.eye(2)).log_prob(jnp.zeros(2))  # -1.8379`
 
-    **Source:** eq:cond_dens. **Raises:** ValueError on a wrong shape or a factor that is none.
+    **Source:** eq:cond_dens. **Raises:** ValueError on a wrong shape or an invalid factor.
     """
 
     loc: Float[Array, "*#batch dim"]
@@ -129,7 +130,7 @@ class Gaussian(eqx.Module):
             check_tril(tril)
         parts = [(loc, 1), (tril, 2), (log_scale, 0)]
         check_batch(parts)
-        # Ones in front instead of copies: one factor may serve a million times.
+        # Axes of size 1 instead of copies: one factor may serve a million points.
         self.loc, self.base_tril, self.log_scale = align(parts)
 
     @property
@@ -146,12 +147,12 @@ class Gaussian(eqx.Module):
 
     @property
     def scale_tril(self) -> Float[Array, "*#batch dim dim"]:
-        """Factor of the covariance, exp(log_scale) L: it may underflow to 0."""
+        """Factor of the covariance, exp(log_scale) L, which may underflow to 0."""
         return jnp.exp(self.log_scale)[..., None, None] * self.base_tril
 
     @property
     def covariance_matrix(self) -> Float[Array, "*#batch dim dim"]:
-        """exp(2 log_scale) L L^T: it may underflow to 0."""
+        """exp(2 log_scale) L L^T, which may underflow to 0."""
         factor = self.scale_tril
         if factor.shape[-1] > UNROLLED_SIZE:
             return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
@@ -159,12 +160,12 @@ class Gaussian(eqx.Module):
 
     @property
     def mean(self) -> Float[Array, "*batch dim"]:
-        """`loc`, for the whole batch."""
+        """`loc`, broadcast to the batch shape."""
         return jnp.broadcast_to(self.loc, (*self.batch_shape, *self.event_shape))
 
     @property
     def variance(self) -> Float[Array, "*batch dim"]:
-        """Of each coordinate: the diagonal of `covariance_matrix`."""
+        """The diagonal of `covariance_matrix`."""
         return jnp.diagonal(self.covariance_matrix, axis1=-2, axis2=-1)
 
     def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
@@ -175,7 +176,7 @@ class Gaussian(eqx.Module):
         return evaluate_with_safe_grad(_scaled_log_prob, *align(parts))
 
     def scaled_log_prob(self, root: Array | None, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
-        """root^2 log N(loc, Sigma)(value), the factor put in where it keeps derivatives in range (see `_far`)."""
+        """root^2 log N(loc, Sigma)(value), with derivatives that stay in range (`_numerics.safe_grad`)."""
         return _scaled_log_prob(root, *align([(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]))
 
     def pdf(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
@@ -183,7 +184,7 @@ class Gaussian(eqx.Module):
         return jnp.exp(self.log_prob(value))
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws of shape (*sample_shape, *batch, dim), differentiable in the parameters."""
+        """Random samples (*sample_shape, *batch, dim), differentiable in the parameters."""
         shape = (*sample_shape, *self.batch_shape, *self.event_shape)
         noise = jax.random.normal(key, shape, self.loc.dtype)
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
@@ -191,9 +192,9 @@ class Gaussian(eqx.Module):
         return loc + join_columns([scale * y for y in multiply_lower(tril, split_columns(noise))])
 
     def marginal(self, indices) -> "Gaussian":
-        """The distribution of some coordinates, in the order wanted; the indices are kept.
+        """The marginal distribution of the coordinates `indices`, in this order.
 
-        **Raises:** ValueError on indices that are none.
+        **Raises:** ValueError on invalid indices.
         """
         indices = normalize_indices(indices, self.event_shape[0])
         tril = marginal_tril(self.base_tril, indices)
@@ -204,7 +205,7 @@ class Gaussian(eqx.Module):
 
         **Shapes:** values (*batch, n), in the indices' order.
 
-        **Raises:** ValueError on indices that are none, or all, or a wrong shape of values.
+        **Raises:** ValueError on invalid indices, all indices, or a wrong shape of values.
         """
         indices = normalize_indices(indices, self.event_shape[0])
         rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
@@ -220,7 +221,7 @@ def condition_on_first(dist: Gaussian, values: Float[Array, "*#batch given"]) ->
     given = values.shape[-1]
     values, loc, tril, log_scale = align([(values, 1), (dist.loc, 1), (dist.base_tril, 2), (dist.log_scale, 0)])
     z = join_columns(solve_lower(tril[..., :given, :given], split_columns(values - loc[..., :given])))
-    # One sum per coordinate, not a product of matrices: there are many, and they are small.
+    # One sum per coordinate instead of a matrix product: the matrices are many and small.
     mean = loc[..., given:] + (tril[..., given:, :given] * z[..., None, :]).sum(-1)
     return Gaussian(mean, tril[..., given:, given:], log_scale=log_scale, validate_args=False)
 
@@ -246,10 +247,10 @@ def _scaled_log_prob(root: Array | None, value: Array, loc: Array, tril: Array, 
 
 @jax.custom_jvp
 def _half_mahalanobis(value, loc, tril, log_scale, root):
-    """root^2 |L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; it is inf where it would be for root = 1."""
+    """root^2 |L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; inf wherever it is inf for root = 1."""
     residual = split_columns(value - loc)
     z = [_times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
-    # A residual that is infinite in one coordinate meets zeros of L as 0 * inf; it is simply far away.
+    # A residual that is infinite in one coordinate would give 0 * inf with zeros of L.
     beyond = _any([jnp.isinf(r) for r in residual])
     half = _sum([0.5 * y * y for y in z])
     scaled = half if root is None else jnp.where(jnp.isinf(half), half, _times_square(half, root))
@@ -258,9 +259,9 @@ def _half_mahalanobis(value, loc, tril, log_scale, root):
 
 @_half_mahalanobis.defjvp
 def _half_mahalanobis_jvp(primals, tangents):
-    # d(|y|^2/2 e^2c) = g.(dr - dL y) + |y|^2 e^2c dc with y = L^-1 r, c = -log_scale, g = L^-T y e^2c. By
-    # hand, since e^2c alone overflows long before g does, and because g must be 0, not inf * 0, where the
-    # result is inf. Where g overflows, g dL y need not: it is taken as (L^-T z) dL z with z = y e^c.
+    # d(|y|^2/2 e^2c) = g.(dr - dL y) + |y|^2 e^2c dc with y = L^-1 r, c = -log_scale, g = L^-T y e^2c. By hand, since
+    # e^2c overflows long before g does, and because g must be 0, not inf * 0, where the result is inf. Where g
+    # overflows, g dL y need not: it is computed as (L^-T z) dL z with z = y e^c.
     value, loc, tril, log_scale, root = primals
     value_dot, loc_dot, tril_dot, log_scale_dot, _ = tangents
     half = _half_mahalanobis(value, loc, tril, log_scale, root)
@@ -269,8 +270,8 @@ def _half_mahalanobis_jvp(primals, tangents):
     z = [_times_exp(jnp.where(unreachable, 0, y), c, root) for y in solve_lower(tril, residual)]
     w = solve_upper(tril, z)
     by_residual = [_times_exp(y, c, root) for y in w]
-    # The barrier: gradients are made one coordinate at a time, before they are put side by side. XLA on the CPU would
-    # fuse the two, and then ask for every number of every coordinate which of them it is: many times slower.
+    # The barrier separates the gradients of single coordinates from their concatenation. XLA on the CPU would fuse the
+    # two and then select the coordinate again for every element: many times slower.
     residual_dot = lax.optimization_barrier(split_columns(value_dot - loc_dot))
     return half, (
         _sum([g * dr for g, dr in zip(by_residual, residual_dot, strict=True)])
@@ -289,7 +290,7 @@ def _any(flags: Columns) -> Bool[Array, "*#batch"]:
 
 @jax.custom_jvp
 def _times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"], root: Array | None = None):
-    """root y exp(c): infinite only where that product is, not where exp(c) alone is."""
+    """root y exp(c), infinite only where the product is, not where exp(c) is."""
     largest = _log_largest(y.dtype)
     half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))
     return y * (half if root is None else half * root) * half
@@ -307,4 +308,4 @@ def _times_square(x: Array, root: Array | None) -> Array:
 
 
 def _log_largest(dtype) -> float:
-    return float(np.log(jnp.finfo(dtype).max)) * 0.999  # a little less: exp of it must not round to inf
+    return float(np.log(jnp.finfo(dtype).max)) * 0.999  # slightly less: its exp must not round to inf

@@ -1,7 +1,7 @@
-"""Mixtures of Folded-Gaussians, and what becomes of them: at one time, given or without some coordinates.
+"""Mixtures of Folded-Gaussians, and their conditional and marginal distributions.
 
-At a time t a mixture of Folded-Gaussians is a mixture of Gaussians, whose weights follow t; without time, or with space
-known and time not, it is a mixture of integrals over time. All have one set of methods, `AbstractMixture`'s:
+At a time t a mixture of Folded-Gaussians is a mixture of Gaussians whose weights depend on t. Without time, or given
+space but not time, it is a mixture of integrals over time. All classes share the methods of `AbstractMixture`:
 
 | | `FoldedMixture` | `GaussianMixture` | `IntegratedMixture` |
 |---|---|---|---|
@@ -24,12 +24,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key
 from foldgauss._numerics.batch import (
     align,
     as_value,
-    broadcast,
     broadcast_leaves,
-    check_batch,
     check_event,
-    concrete_value,
-    ranked_leaves,
 )
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
@@ -37,6 +33,15 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture
 from foldgauss.analysis.interop import to_numpyro, to_scipy
+from foldgauss.analysis.mixture_weights import (
+    broadcast_weights,
+    choose_components,
+    log_joint,
+    log_sum_exp,
+    mixture_moments,
+    posterior_logits,
+    weighted_sum,
+)
 from foldgauss.analysis.pair_densities import map_in_chunks, move_components_first, pair_log_prob
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import CallableFold
@@ -44,14 +49,14 @@ from foldgauss.gaussian import Gaussian
 
 __all__ = ["AbstractMixture", "FoldedMixture", "GaussianMixture", "IntegratedMixture", "TimePosterior"]
 
-#: Pairs of a point and a component that are looked at together: as many as a core's own cache holds.
+#: Pairs of a point and a component that are evaluated together: as many as a core's cache holds.
 _CHUNK = 1 << 19
 
 
 class AbstractMixture(eqx.Module):
-    """Components with weights: `p(x) = sum_k w_k p_k(x)`. What every mixture here can do.
+    """A mixture `p(x) = sum_k w_k p_k(x)`: the methods that all mixture classes share.
 
-    The components' last batch dimension counts them.
+    The last batch dimension of the components is k.
 
     **Shapes:** `components` with batch (*batch, k), `logits` (*batch, k); points are (..., d), time last where there is
     time.
@@ -75,7 +80,7 @@ class AbstractMixture(eqx.Module):
 
     @property
     def log_weights(self) -> Float[Array, "*batch k"]:
-        """Normalised log w_k; -inf where a component has no weight."""
+        """Normalized log w_k, -inf where a weight is 0."""
         check_not_forked()
         return jax.nn.log_softmax(self.logits, axis=-1)
 
@@ -87,7 +92,7 @@ class AbstractMixture(eqx.Module):
     # --- densities ------------------------------------------------------------------------------------------
 
     def log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
-        """log p(x) = log sum_k w_k p_k(x), finite or -inf. Many points are taken in chunks.
+        """log p(x) = log sum_k w_k p_k(x), finite or -inf. Many points are evaluated in chunks.
 
         **Shapes:** x (*sample, *batch, d), time (if any) last -> (*sample, *batch).
 
@@ -111,7 +116,7 @@ class AbstractMixture(eqx.Module):
     def responsibilities(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
         """P(component k | x) = w_k p_k(x) / p(x): they sum to 1.
 
-        So far away that no component's density is in range of its dtype, they are the weights.
+        Where every component's density underflows, they equal the weights.
 
         **Shapes:** x (*sample, *batch, d) -> (*sample, *batch, k).
 
@@ -124,14 +129,12 @@ class AbstractMixture(eqx.Module):
     def sample(
         self, key: Key[Array, ""], sample_shape: tuple[int, ...] = (), return_component: bool = False
     ) -> Float[Array, "..."] | tuple[Float[Array, "..."], Int[Array, "..."]]:
-        """Draws: first a component, then x from it; differentiable in the components' parameters.
+        """Random samples: first a component, then x from it; differentiable in the components' parameters.
 
-        **Shapes:** -> (*sample_shape, *batch, d), and with `return_component` the components' numbers
+        **Shapes:** -> (*sample_shape, *batch, d), and with `return_component` the component indices
         (*sample_shape, *batch).
 
         **Example:** `x, component = mixture.sample(jax.random.key(0), (1000,), return_component=True)`
-
-        **Raises:** nothing.
         """
         x, component = _sample(self, key, tuple(sample_shape))
         return (x, component) if return_component else x
@@ -161,14 +164,14 @@ class AbstractMixture(eqx.Module):
             check_event("x", x, self.event_shape)
         return x
 
-    # --- bridges --------------------------------------------------------------------------------------------
+    # --- interoperability -------------------------------------------------------------------------------------
 
     def to_numpyro(self):
-        """This mixture for numpyro models: see `foldgauss.analysis.interop.to_numpyro`."""
+        """This mixture as a numpyro distribution: see `foldgauss.analysis.interop.to_numpyro`."""
         return to_numpyro(self)
 
     def to_scipy(self):
-        """This mixture, frozen, with scipy's methods: see `foldgauss.analysis.interop.to_scipy`."""
+        """This mixture as a frozen scipy distribution: see `foldgauss.analysis.interop.to_scipy`."""
         return to_scipy(self)
 
 
@@ -176,18 +179,18 @@ class FoldedMixture(AbstractMixture):
     """A mixture of Folded-Gaussians: `p(x) = sum_k w_k FN_k(x)`, x = (s, t), time last.
 
     **Shapes:** `components` a `FoldedGaussian` with batch shape (*batch, k); exactly one of `logits` and `weights`
-    (*batch, k), normalised by `log_weights`: any positive multiple of the weights, or any constant added to logits,
-    says the same. A weight of 0 is a logit of -inf: that component counts for nothing, exactly, and gets no gradient.
+    (*batch, k), normalized by `log_weights`: scaling the weights, or adding a constant to the logits, changes nothing.
+    A weight of 0 is a logit of -inf: that component contributes exactly nothing and receives no gradient.
 
     **Example:**
 
-        tracks = FoldedGaussian(jnp.zeros((2, 1)), scale=[[0.1], [0.2]], time_loc=[0.3, 0.7], time_scale=[0.2, 0.1])
-        mixture = FoldedMixture(tracks, weights=[0.4, 0.6])
+        components = FoldedGaussian(jnp.zeros((2, 1)), scale=[[0.1], [0.2]], time_loc=[0.3, 0.7], time_scale=[0.2, 0.1])
+        mixture = FoldedMixture(components, weights=[0.4, 0.6])
         x = mixture.sample(jax.random.key(0), (1000,))  # (1000, 2)
         mixture.condition_time(0.5).weights             # [0.83, 0.17]
 
-    **Source:** a weighted sum of eq:foldgauss. **Raises:** ValueError naming
-    the parameter: both or none of logits and weights, shapes that do not fit, no weight at all, NaN.
+    **Source:** a weighted sum of eq:foldgauss. **Raises:** ValueError that names the
+    parameter: both or neither of logits and weights, wrong shapes, all weights 0, NaN.
     """
 
     components: FoldedGaussian
@@ -202,26 +205,26 @@ class FoldedMixture(AbstractMixture):
         validate_args: bool = True,
     ):
         _check_components(components, FoldedGaussian)
-        self.components, self.logits = _weighted(components, logits, weights, validate_args)
+        self.components, self.logits = broadcast_weights(components, logits, weights, validate_args)
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
-        return _ranks_of(self)
+        return _leaf_ranks(self)
 
     def _repr_png_(self) -> bytes | None:
-        """What a notebook shows: the density over time and space, or of many coordinates some views of it."""
+        """Notebook display: the density over time and space, by coordinates if there are several."""
         return notebook_hooks.show("mixture", self)
 
     def condition_time(self, t: Float[Array, "*#batch"]) -> "GaussianMixture":
-        """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalised.
+        """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalized.
 
-        So far from all m_k that none of these is in range of its dtype, they keep their own weights.
+        So far from all m_k that all of these underflow, the components keep their own weights.
 
         **Shapes:** t (*batch,), broadcast; the result has `event_shape == (d-1,)`.
 
         **Example:** `mixture.condition_time(0.25).pdf(jnp.zeros(2))`
 
-        **Source:** eq:cond_dens and Bayes' rule. **Raises:** nothing.
+        **Source:** eq:cond_dens and Bayes' rule.
         """
         return _at_time(self, as_value(t, self.logits.dtype))
 
@@ -234,52 +237,52 @@ class FoldedMixture(AbstractMixture):
 
         **Example:** `mixture.expected_space(jnp.linspace(0.0, 1.0, 100))`
 
-        **Source:** eq:cond_dens, by total expectation. **Raises:** nothing.
+        **Source:** eq:cond_dens, by total expectation.
         """
         return self.condition_time(t).mean
 
     def space_covariance(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1 d-1"]:
-        """Cov[s | t]: that of the components at t, and that of their centres.
+        """Cov[s | t]: the mean covariance of the components at t, plus the covariance of their centers.
 
         **Shapes:** t (*sample, *batch) -> (*sample, *batch, d-1, d-1).
 
         **Example:** `mixture.space_covariance(0.25)`
 
-        **Source:** eq:cond_dens, by total covariance. **Raises:** nothing.
+        **Source:** eq:cond_dens, by total covariance.
         """
         return self.condition_time(t).covariance_matrix
 
     def marginal(self, indices) -> "FoldedMixture | GaussianMixture | IntegratedMixture":
-        """The mixture of some coordinates; the indices are kept.
+        """The marginal mixture of the coordinates `indices`.
 
-        With time among them it is exact, a FoldedMixture (time alone: a GaussianMixture); without, integrated
+        If time is among them it is exact, a FoldedMixture (time alone: a GaussianMixture); otherwise it is integrated
         numerically.
 
-        **Shapes:** `indices`: whole numbers, in the order wanted, time last; -1 is time.
+        **Shapes:** `indices`: integers in the order of the result, time last; -1 is time.
 
         **Example:** `mixture.marginal([0, -1])  # first space coordinate, and time`
 
-        **Source:** eq:integral_proof. **Raises:** ValueError on indices that are none.
+        **Source:** eq:integral_proof. **Raises:** ValueError on invalid indices.
         """
         return _mixture_of(self.components.marginal(indices), self.logits)
 
     def condition(self, indices, values: ArrayLike) -> "GaussianMixture | IntegratedMixture":
-        """The other coordinates, given these: the components given them, with weights `w_k p_k(values)`, normalised.
+        """The other coordinates given these: the conditional components, with weights `w_k p_k(values)`, normalized.
 
-        With time among the given it is exact, a GaussianMixture; without, integrated numerically.
+        If time is given it is exact, a GaussianMixture; otherwise it is integrated numerically.
 
-        **Shapes:** `indices`: n whole numbers, -1 is time; `values` (*batch, n) in their order; the result has the
-        other coordinates, in ascending order.
+        **Shapes:** `indices`: n integers, -1 is time; `values` (*batch, n) in the same order; the result has the
+        other coordinates in ascending order.
 
         **Example:** `mixture.condition([0], [0.3]).sample(key)  # the other space coordinates, and time`
 
-        **Source:** eq:cond_dens and Bayes' rule. **Raises:** ValueError on indices that are none, or all, or a wrong
+        **Source:** eq:cond_dens and Bayes' rule. **Raises:** ValueError on invalid indices, all indices, or a wrong
         shape of values.
         """
         return _conditioned(self, indices, values)
 
     def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> "TimePosterior":
-        """When, if it is known where: p(t | s), by quadrature.
+        """The density of time given space, p(t | s), by quadrature.
 
         **Shapes:** s (*batch, d-1); the result has `event_shape == ()`.
 
@@ -290,11 +293,11 @@ class FoldedMixture(AbstractMixture):
         s = as_value(s, self.logits.dtype)
         check_event("s", s, (self.event_shape[0] - 1,))
         components = self.components.time_given_space(s[..., None, :])
-        return TimePosterior(components, _posterior_logits(self.log_weights, components.log_normalizer))
+        return TimePosterior(components, posterior_logits(self.log_weights, components.log_normalizer))
 
 
 class GaussianMixture(AbstractMixture):
-    """A mixture of Gaussians: what a `FoldedMixture` is at one time.
+    """A mixture of Gaussians: a `FoldedMixture` at one time.
 
     **Shapes:** `components` a `Gaussian` with batch shape (*batch, k); exactly one of `logits` and `weights`
     (*batch, k), as in `FoldedMixture`.
@@ -316,21 +319,18 @@ class GaussianMixture(AbstractMixture):
         validate_args: bool = True,
     ):
         _check_components(components, Gaussian)
-        self.components, self.logits = _weighted(components, logits, weights, validate_args)
+        self.components, self.logits = broadcast_weights(components, logits, weights, validate_args)
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
-        return _ranks_of(self)
+        return _leaf_ranks(self)
 
     def marginal(self, indices) -> "GaussianMixture":
-        """The mixture of some coordinates, in the order wanted; the indices are kept.
-
-        **Raises:** ValueError on indices that are none.
-        """
+        """The marginal mixture of the coordinates `indices`, as `FoldedMixture.marginal`; exact."""
         return _mixture_of(self.components.marginal(indices), self.logits)
 
     def condition(self, indices, values: ArrayLike) -> "GaussianMixture":
-        """The other coordinates, in ascending order, given these, as `FoldedMixture.condition`: exact."""
+        """The other coordinates, in ascending order, given these; exact. As `FoldedMixture.condition`."""
         return _conditioned(self, indices, values)
 
 
@@ -351,28 +351,28 @@ class IntegratedMixture(AbstractMixture):
     logits: Float[Array, "*batch k"]
 
     def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
-        """P(coordinate <= x | given), where there is only one coordinate."""
-        return _mixed(self.weights, self.components.cdf(_beside_components(self, self._checked(x))))
+        """P(coordinate <= x | given), for a single coordinate."""
+        return weighted_sum(self.weights, self.components.cdf(_add_component_axis(self, self._checked(x))))
 
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
-        """Estimated relative error of `pdf(x)`: those of the components, by their shares in it."""
+        """Estimated relative error of `pdf(x)`: those of the components, weighted by responsibility."""
         x = self._checked(x)
-        return _mixed(self.responsibilities(x), self.components.error_estimate(_beside_components(self, x)))
+        return weighted_sum(self.responsibilities(x), self.components.error_estimate(_add_component_axis(self, x)))
 
     def marginal(self, indices) -> "IntegratedMixture":
-        """The mixture of some coordinates; the indices are kept. **Raises:** ValueError on indices that are none."""
+        """The marginal mixture of the coordinates `indices`. **Raises:** ValueError on invalid indices."""
         return _mixture_of(self.components.marginal(indices), self.logits)
 
     def condition(self, indices, values: ArrayLike) -> "IntegratedMixture | GaussianMixture":
-        """The other coordinates, given these, as `FoldedMixture.condition`: exact if time is among the given."""
+        """The other coordinates given these, as `FoldedMixture.condition`; exact if time is given."""
         return _conditioned(self, indices, values)
 
 
 class TimePosterior(AbstractMixture):
-    """The density of t given space under a mixture, `p(t | s) = sum_k P(k | s) p_k(t | s)`: of `TimeDensity`.
+    """The density of t given space, `p(t | s) = sum_k P(k | s) p_k(t | s)`: a mixture of `TimeDensity`.
 
-    Made by `FoldedMixture.time_given_space`; `weights` are P(k | s). Components whose p_k(s) diverges, if any, have
-    all the weight, in equal parts.
+    Made by `FoldedMixture.time_given_space`; `weights` are P(k | s). If p_k(s) diverges for some components, these
+    share all the weight equally.
 
     **Shapes:** `components` with batch shape (*batch, k), `logits` (*batch, k); `event_shape == ()`: values have shape
     (*sample, *batch); mean and variance (*batch,), `covariance_matrix` is (*batch, 1, 1).
@@ -387,20 +387,20 @@ class TimePosterior(AbstractMixture):
 
     @property
     def error_estimate(self) -> Float[Array, "*batch"]:
-        """Estimated relative error of p(s), and so of every density and probability."""
-        return _mixed(self.weights, self.components.error_estimate)
+        """Estimated relative error of p(s), and hence of every density and probability."""
+        return weighted_sum(self.weights, self.components.error_estimate)
 
     def cdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(time <= t | s)."""
         return _cdf(self, self._checked(t))
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """The quantile, the inverse of `cdf`, by bisection; -inf at 0 and +inf at 1. It passes no gradient."""
+        """The quantile, the inverse of `cdf`, by bisection; -inf at 0 and +inf at 1. It has no gradient."""
         return _icdf(self, self._checked(q))
 
 
 def _mixture_of(components, logits: Array) -> AbstractMixture:
-    """The mixture of such components."""
+    """The mixture class that fits the components."""
     if isinstance(components, FoldedGaussian | Gaussian):
         kind = FoldedMixture if isinstance(components, FoldedGaussian) else GaussianMixture
         return kind(components, logits=logits, validate_args=False)
@@ -412,55 +412,16 @@ def _mixture_of(components, logits: Array) -> AbstractMixture:
 
 def _check_components(components, kind: type) -> None:
     if not isinstance(components, kind):
-        expected, cure = (
-            f"one {kind.__name__} of batch shape (*batch, k)",
-            "Its last batch dimension is the components.",
-        )
+        expected = f"one {kind.__name__} of batch shape (*batch, k)"
+        cure = "Its last batch dimension is the components."
         raise invalid("components", expected=expected, got=type(components).__name__, cure=cure)
     if components.batch_shape[-1:] in ((), (0,)):
         cure = "Give its parameters a leading dimension of k: jax.tree.map(lambda *x: jnp.stack(x), *components)."
         raise invalid("components", expected="batch shape (*batch, k)", got=components.batch_shape, cure=cure)
 
 
-def _ranks_of(mixture) -> tuple[int, ...]:
+def _leaf_ranks(mixture) -> tuple[int, ...]:
     return (*(rank + 1 for rank in mixture.components.leaf_ranks), 1)
-
-
-def _weighted(components, logits, weights, validate: bool):
-    """Components and logits, both with the whole batch."""
-    if (logits is None) == (weights is None):
-        got = "none" if logits is None else "both"
-        raise invalid("logits, weights", expected="exactly one of them", got=got, cure="logits are log weights.")
-    name, given = ("weights", weights) if logits is None else ("logits", logits)
-    given = jnp.asarray(given, components.loc.dtype)
-    if given.shape[-1:] != components.batch_shape[-1:]:
-        expected = f"shape (*batch, {components.batch_shape[-1]})"
-        raise invalid(name, expected=expected, got=f"shape {given.shape}", cure="One number for each component.")
-    if validate:
-        _check_weights(name, given)
-    batch = check_batch([*ranked_leaves(components), (given, 0)])
-    if batch != components.batch_shape:
-        components = broadcast_leaves(components, batch)
-    (given,) = broadcast([(given, 0)], batch)
-    return components, given if name == "logits" else _log(given)
-
-
-def _check_weights(name: str, given: Array) -> None:
-    given = concrete_value(given)
-    if given is None:
-        return
-    least = 0 if name == "weights" else -np.inf
-    if not ((given >= least) & (given < np.inf)).all():
-        expected = "finite numbers >= 0" if name == "weights" else "numbers below infinity"
-        raise invalid(name, expected=expected, got=given.tolist(), cure="No NaN; for no weight, 0 or a logit of -inf.")
-    if not (given > least).any(-1).all():
-        raise invalid(name, expected="a component with weight", got="none", cure="They are relative: all equal is 1/k.")
-
-
-def _log(weights: Array) -> Array:
-    """log w, -inf at 0 with no gradient there."""
-    present = weights > 0
-    return jnp.where(present, jnp.log(jnp.where(present, weights, 1)), -jnp.inf)
 
 
 # --- densities -----------------------------------------------------------------------------------------------
@@ -468,83 +429,57 @@ def _log(weights: Array) -> Array:
 
 @eqx.filter_jit
 def _component_log_prob(mixture: AbstractMixture, x: Array) -> Array:
-    return _of_pairs(mixture, x, lambda log_weights, log_components: jnp.moveaxis(log_components, 0, -1))
+    return _map_pairs(mixture, x, lambda log_weights, log_components: jnp.moveaxis(log_components, 0, -1))
 
 
 @eqx.filter_jit
 def _log_prob(mixture: AbstractMixture, x: Array) -> Array:
-    return _of_pairs(mixture, x, lambda *logs: _log_sum(_log_joint(*logs), 0))
+    return _map_pairs(mixture, x, lambda *logs: log_sum_exp(log_joint(*logs), 0))
 
 
 @eqx.filter_jit
 def _responsibilities(mixture: AbstractMixture, x: Array) -> Array:
-    def shares(*logs):
-        return jnp.moveaxis(jax.nn.softmax(_posterior_logits(*logs, axis=0), axis=0), 0, -1)
+    def normalized(*logs):
+        return jnp.moveaxis(jax.nn.softmax(posterior_logits(*logs, axis=0), axis=0), 0, -1)
 
-    return _of_pairs(mixture, x, shares)
+    return _map_pairs(mixture, x, normalized)
 
 
-def _of_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
-    """`function` of log weights (k, 1, *batch) and log p_k(x) (k, n, *batch), with the points (n, *batch) in front."""
+def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
+    """`function` of log weights (k, 1, *batch) and log p_k(x) (k, n, *batch); its results start with (n, *batch)."""
     rank, components = len(mixture.batch_shape), mixture.components
-    rows, shape = _as_rows(mixture, x)
+    rows, shape = _flatten_points(mixture, x)
     if isinstance(components, FoldedGaussian | Gaussian):
         components = move_components_first(components, rank)
         pairs = lambda rows: pair_log_prob(components, rows)  # noqa: E731
     else:
-        pairs = lambda rows: jnp.moveaxis(components.log_prob(_beside_components(mixture, rows)), -1, 0)  # noqa: E731
+        pairs = lambda rows: jnp.moveaxis(components.log_prob(_add_component_axis(mixture, rows)), -1, 0)  # noqa: E731
     log_weights = jnp.expand_dims(jnp.moveaxis(mixture.log_weights, rank, 0), 1)
     size = max(1, _CHUNK // (math.prod(mixture.batch_shape) * mixture.num_components))
     result = map_in_chunks(pairs, lambda log_p: function(log_weights, log_p), rows, size)
     return result.reshape(*shape, *result.shape[1 + rank :])
 
 
-def _as_rows(mixture: AbstractMixture, x: Array) -> tuple[Array, tuple[int, ...]]:
-    """Points as (n, *batch, d), and their own shape (*sample, *batch)."""
+def _flatten_points(mixture: AbstractMixture, x: Array) -> tuple[Array, tuple[int, ...]]:
+    """Points as (n, *batch, d), and their shape (*sample, *batch)."""
     event, batch = len(mixture.event_shape), mixture.batch_shape
     shape = jnp.broadcast_shapes(x.shape[: x.ndim - event], batch)
     points = math.prod(shape[: len(shape) - len(batch)])
     return jnp.broadcast_to(x, (*shape, *mixture.event_shape)).reshape(points, *batch, *mixture.event_shape), shape
 
 
-def _beside_components(mixture: AbstractMixture, x: Array) -> Array:
+def _add_component_axis(mixture: AbstractMixture, x: Array) -> Array:
     return jnp.expand_dims(x, x.ndim - len(mixture.event_shape))
 
 
-def _log_joint(log_weights: Array, log_components: Array) -> Array:
-    """log w_k p_k; a component without weight has none, whatever its density."""
-    (log_weights,) = align([(log_weights, 0)], log_components.ndim)
-    absent = jnp.isneginf(log_weights)
-    # Double where: no gradient passes where there is no weight.
-    return jnp.where(absent, -jnp.inf, jnp.where(absent, 0, log_weights) + jnp.where(absent, 0, log_components))
-
-
-def _posterior_logits(log_weights: Array, log_evidence: Array, axis: int = -1) -> Array:
-    """log w_k p_k; where all p_k are 0, log w_k. Where some are infinite (densities may be), these alone count."""
-    joint = _log_joint(log_weights, log_evidence)
-    infinite = jnp.isposinf(joint)
-    joint = jnp.where(infinite.any(axis, keepdims=True), jnp.where(infinite, 0, -jnp.inf), joint)
-    nowhere = jnp.isneginf(joint).all(axis, keepdims=True)
-    (log_weights,) = align([(log_weights, 0)], joint.ndim)
-    return jnp.where(nowhere, log_weights, joint)
-
-
-def _log_sum(joint: Array, axis: int) -> Array:
-    """logsumexp; its gradient is 0 where all is -inf, and +inf stays what it is."""
-    largest = lax.stop_gradient(joint.max(axis, keepdims=True))
-    usable = jnp.isfinite(largest)
-    shifted = jnp.where(usable, joint - jnp.where(usable, largest, 0), 0)
-    return jnp.where(usable, jnp.log(jnp.exp(shifted).sum(axis, keepdims=True)) + largest, largest).squeeze(axis)
-
-
-# --- parts ---------------------------------------------------------------------------------------------------
+# --- conditional distributions -------------------------------------------------------------------------------
 
 
 @eqx.filter_jit
 def _at_time(mixture: FoldedMixture, t: Array) -> GaussianMixture:
     t = t[..., None]
     log_time = mixture.components.time_marginal.log_prob(t)
-    logits = _posterior_logits(mixture.log_weights, log_time)
+    logits = posterior_logits(mixture.log_weights, log_time)
     return GaussianMixture(mixture.components.condition_time(t), logits=logits, validate_args=False)
 
 
@@ -555,12 +490,12 @@ def _conditioned(mixture: AbstractMixture, indices, values: ArrayLike):
     values = values[..., None, :]
     rest = mixture.components.condition(indices, values)
     log_evidence = _log_evidence(mixture.components, rest, indices, values)
-    return _mixture_of(rest, _posterior_logits(mixture.log_weights, log_evidence))
+    return _mixture_of(rest, posterior_logits(mixture.log_weights, log_evidence))
 
 
 def _log_evidence(components, rest, indices: tuple[int, ...], values: Array) -> Array:
-    """log p_k(values); `rest` is the components given them."""
-    if isinstance(rest, TimeMixture):  # which has the integral already, of these values and what was given before
+    """log p_k(values); `rest` is the components given the values."""
+    if isinstance(rest, TimeMixture):  # holds the integral already, over these values and those given before
         log_given = rest.time.log_normalizer
         if not isinstance(components, TimeMixture) or components.time is None:
             return log_given
@@ -570,20 +505,14 @@ def _log_evidence(components, rest, indices: tuple[int, ...], values: Array) -> 
     return components.marginal(tuple(indices[i] for i in order)).log_prob(values[..., order])
 
 
-def _mixed(weights: Array, values: Array) -> Array:
-    """sum_k w_k values_k over the last dimension; what has no weight may be anything, a weight of NaN gives NaN."""
-    (weights,) = align([(weights, 0)], values.ndim)
-    return jnp.where(weights == 0, 0, weights * values).sum(-1)
-
-
 @eqx.filter_jit
 def _cdf(posterior: TimePosterior, t: Array) -> Array:
-    return jnp.clip(_mixed(posterior.weights, posterior.components.cdf(t[..., None])), 0, 1)
+    return jnp.clip(weighted_sum(posterior.weights, posterior.components.cdf(t[..., None])), 0, 1)
 
 
 @eqx.filter_jit
 def _icdf(posterior: TimePosterior, q: Array) -> Array:
-    """Between the least and the greatest of the components' quantiles."""
+    """Bisection between the least and the greatest of the components' quantiles."""
     quantiles, _ = lax.stop_gradient((posterior.components.icdf(q[..., None]), q))
     (weights,) = align([(posterior.weights, 0)], quantiles.ndim)
     low = jnp.where(weights > 0, quantiles, jnp.inf).min(-1)
@@ -602,29 +531,22 @@ def _icdf(posterior: TimePosterior, q: Array) -> Array:
     return lax.stop_gradient(jnp.where(jnp.isnan(weights).any(-1), jnp.nan, jnp.where(inner, found, low)))
 
 
-# --- draws ---------------------------------------------------------------------------------------------------
+# --- sampling ------------------------------------------------------------------------------------------------
 
 
 @eqx.filter_jit
 def _sample(mixture: AbstractMixture, key, sample_shape: tuple[int, ...]):
     choice_key, key = jax.random.split(key)
-    component = _chosen(choice_key, mixture.weights, (*sample_shape, *mixture.batch_shape))
-    return _drawn(mixture, key, sample_shape, component), component
+    component = choose_components(choice_key, mixture.weights, (*sample_shape, *mixture.batch_shape))
+    return _sample_from(mixture, key, sample_shape, component), component
 
 
-def _chosen(key, weights: Array, shape: tuple[int, ...]) -> Array:
-    """Numbers k with probabilities w_k: never one without weight."""
-    upto = jnp.cumsum(weights, axis=-1)
-    (upto,) = align([(upto, 0)], len(shape) + 1)
-    level = jax.random.uniform(key, shape, weights.dtype) * upto[..., -1]
-    return (level[..., None] >= upto).sum(-1)
-
-
-def _drawn(mixture: AbstractMixture, key, sample_shape, component: Array) -> Array:
-    """A draw from the component of each number."""
+def _sample_from(mixture: AbstractMixture, key, sample_shape, component: Array) -> Array:
+    """One sample from each of the chosen components."""
     components, batch = mixture.components, mixture.batch_shape
     if isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
-        return _picked(broadcast_leaves(components, (*batch, mixture.num_components)), component, batch).sample(key)
+        components = broadcast_leaves(components, (*batch, mixture.num_components))
+        return _take_components(components, component, batch).sample(key)
     every = components.sample(key, sample_shape)
     event = every.ndim - component.ndim - 1
     index = jnp.expand_dims(component, range(component.ndim, every.ndim))
@@ -632,12 +554,12 @@ def _drawn(mixture: AbstractMixture, key, sample_shape, component: Array) -> Arr
 
 
 def _shares_parameters(components) -> bool:
-    """Whether picking one component's parameters for each draw would copy a network each time."""
+    """Whether gathering one component's parameters per sample would copy a network each time."""
     return isinstance(getattr(components, "fold", None), CallableFold)
 
 
-def _picked(components, component: Array, batch: tuple[int, ...]):
-    """The components by number, as one distribution of batch shape `component.shape`."""
+def _take_components(components, component: Array, batch: tuple[int, ...]):
+    """The components at the indices `component`, as one distribution of batch shape `component.shape`."""
     size, rank = math.prod(batch), len(batch)
     flat = component.reshape(-1, size)
     place = jnp.arange(size)[None]
@@ -654,20 +576,7 @@ def _picked(components, component: Array, batch: tuple[int, ...]):
 
 @eqx.filter_jit
 def _moments(mixture: AbstractMixture) -> tuple[Array, Array]:
-    """By the laws of total mean and covariance."""
-    means, covariances = _component_moments(mixture.components)
-    mean = _averaged(mixture.weights, means)
-    # Once more, centred: the rounding of the weights would count times the offset.
-    mean = mean + _averaged(mixture.weights, means - mean[..., None, :])
-    centred = means - mean[..., None, :]
-    return mean, _averaged(mixture.weights, covariances + centred[..., :, None] * centred[..., None, :])
-
-
-def _averaged(weights: Array, x: Array) -> Array:
-    """sum_k w_k x_k over x (*batch, k, ...); what has no weight may be anything, a weight of NaN gives NaN."""
-    rank = weights.ndim
-    weights = lax.expand_dims(weights, range(rank, x.ndim))
-    return jnp.where(weights == 0, 0, weights * x).sum(rank - 1)
+    return mixture_moments(mixture.weights, *_component_moments(mixture.components))
 
 
 def _component_moments(components) -> tuple[Array, Array]:

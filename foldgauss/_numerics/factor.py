@@ -22,7 +22,7 @@ def resolve_scale_tril(given: dict[str, ArrayLike | None], *, dim: int, dtype, v
         return matrix
     if name == "covariance_matrix":
         return check_and_factorize(name, matrix, validate)
-    # P = U^T U with U lower is a Cholesky factorisation from the last coordinate on; then L = U^-1.
+    # P = U^T U with U lower is a Cholesky factorization from the last coordinate on; then L = U^-1.
     upper = check_and_factorize(name, matrix[..., ::-1, ::-1], validate)[..., ::-1, ::-1]
     identity = jnp.broadcast_to(jnp.eye(dim, dtype=dtype), matrix.shape)
     return jnp.tril(lax.linalg.triangular_solve(jnp.swapaxes(upper, -1, -2), identity, left_side=True, lower=True))

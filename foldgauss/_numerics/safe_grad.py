@@ -36,7 +36,7 @@ __all__ = ["evaluate_with_safe_grad"]
 _Scaled = Callable[..., list[Array]]
 
 #: log2 of the roots, in units of the dtype's largest exponent: in float32 the factors are 2^-24, 2^-48, .. 2^-240.
-#: Neighbours are close, so that of a derivative that needs the one nothing is lost to underflow there.
+#: Neighbors are close, so that of a derivative that needs the one nothing is lost to underflow there.
 _LADDER = -0.0945 * np.arange(1, 11)
 
 

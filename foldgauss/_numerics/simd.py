@@ -331,7 +331,7 @@ def transpose_cells(typing_context, a, b, c, d):
 
 @intrinsic(prefer_literal=True)
 def add_lanes(typing_context, a, b, width):
-    """Halfway to the sums of many vectors at once: neighbouring groups of `width` lanes (1, 2, 4, 8) added.
+    """Halfway to the sums of many vectors at once: neighboring groups of `width` lanes (1, 2, 4, 8) added.
 
     Of each pair of groups, the sum for `a` takes the first one's place, that for `b` the second one's. After widths
     1, 2, 4, 8 over a tree of 16 vectors, lane k of the last holds the sum of vector k.

@@ -15,7 +15,7 @@ from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["kl_divergence"]
 
-# Centres closer than this many roundings of their own size are one curve, written in two ways.
+# Centers closer than this many roundings of their own size are one curve, written in two ways.
 _SAME_CURVE = 64
 _PEAKS = 8
 
@@ -25,10 +25,10 @@ def kl_divergence(p, q, *, order: int = 64) -> Float[Array, "*batch"]:
 
         KL = KL(t) + E[KL(p(s | t), q(s | t))],
         2 E[KL(s | t)] = |L_q^-1 L_p|^2 E[a_p / a_q] - (d-1) + log det Sigma_q / Sigma_p + (d-1) E[log a_q / a_p]
-                         + E[|L_q^-1 (centre_p - centre_q)|^2 / a_q]
+                         + E[|L_q^-1 (center_p - center_q)|^2 / a_q]
 
     Exact for constant and time-likelihood envelopes where that of q has no floor: 1 / a_q only tilts the Gaussian of
-    t. Then E[a_p / a_q] is finite iff `(1 + power_p) scale_q^2 > power_q scale_p^2` and, if the centres differ, the
+    t. Then E[a_p / a_q] is finite iff `(1 + power_p) scale_q^2 > power_q scale_p^2` and, if the centers differ, the
     last term iff `scale_q^2 > power_q scale_p^2` (time scales). `order` is that of Gauss-Hermite for the last term:
     exact for polynomial folds up to degree order - 1. Else (a floor in q, other envelopes) by adaptive quadrature
     over t, to about 1e-10 in float64.
@@ -98,7 +98,7 @@ def _solve(tril, b):
 
 
 def _expectations(p, q, order: int):
-    """E[a_p / a_q], E[|centre difference|^2 / a_q], E[log a_q / a_p] under t of p."""
+    """E[a_p / a_q], E[|center difference|^2 / a_q], E[log a_q / a_p] under t of p."""
     own, other = _time_likelihood(p), _time_likelihood(q)
     if own is None or other is None:
         return map_over_batch(_integrals, p, q)
@@ -128,7 +128,7 @@ def _exact(p, q, own, power_q, order: int):
     mass, mean, scale = plain
     z, weights = (jnp.asarray(x, mean.dtype).reshape(-1, *(1,) * mean.ndim) for x in gauss_hermite(order))
     finite = jnp.isfinite(mass)
-    log_square, same = _centre_distance(p, q, mean[None] + scale[None] * z)
+    log_square, same = _center_distance(p, q, mean[None] + scale[None] * z)
     mahalanobis = jnp.where(finite, mass, 1) * (weights * jnp.exp(log_square)).sum(0)
     mahalanobis = jnp.where(same.all(0), 0, jnp.where(finite, mahalanobis, jnp.inf))
     offset = (p.time_loc - q.time_loc) / q.time_scale
@@ -148,8 +148,8 @@ def _tilted(p, q, sharpness, power_q):
     return jnp.where(finite, mass, jnp.inf), mean, p.time_scale / jnp.sqrt(rest)
 
 
-def _centre_distance(p, q, t):
-    """log |L_q^-1 (centre_p - centre_q)|^2 at t (one axis in front of the batch), and whether it is only rounding."""
+def _center_distance(p, q, t):
+    """log |L_q^-1 (center_p - center_q)|^2 at t (one axis in front of the batch), and whether it is only rounding."""
     here, there = (expand_leaves(x, t.ndim).condition_time(t).loc for x in (p, q))
     difference = here - there
     size = jnp.abs(here) + jnp.abs(there) + jnp.abs(p.loc)[None] + jnp.abs(q.loc)[None]
@@ -175,7 +175,7 @@ def _integrals(p, q):
 
         def log_mahalanobis(tau):
             t = time(tau)
-            log_square, _ = _centre_distance(p, q, t.ravel())
+            log_square, _ = _center_distance(p, q, t.ravel())
             return log_square.reshape(t.shape) - 0.5 * tau**2 - 0.5 * float(np.log(2 * np.pi)) - log_a(q, t)
 
         return log_ratio, log_mahalanobis

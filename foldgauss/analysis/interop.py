@@ -1,6 +1,6 @@
 """Folded-Gaussians as numpyro and as scipy objects. This is not the |X| folded normal of scipy and numpyro.
 
-Their `foldnorm` and `FoldedDistribution` reflect a variable at 0. Here a Gaussian's *centre* is bent along a curve
+Their `foldnorm` and `FoldedDistribution` reflect a variable at 0. Here a Gaussian's *center* is bent along a curve
 in time, and nothing is reflected. Neither library is imported before it is asked for.
 """
 

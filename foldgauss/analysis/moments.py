@@ -30,7 +30,7 @@ def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*
 
     **Example:** `moments(dist, 64)[0]  # as dist.mean`
 
-    **Source:** the laws of total mean and covariance given t. **Raises:** nothing of its own.
+    **Source:** the laws of total mean and covariance given t.
     """
     dist = broadcast_leaves(dist, dist.batch_shape)
     mean_f, cov_f, cross = _fold_moments(dist, order)
@@ -122,8 +122,8 @@ def _fold_moments(dist, order: int):
     z = z.reshape(-1, *(1,) * dist.time_scale.ndim)
     values = expand_leaves(dist.fold, dist.time_scale.ndim + 1)(z * dist.time_scale[None])
     mean = jnp.tensordot(weights, values, axes=1)
-    centred = values - mean[None]
-    covariance = jnp.tensordot(weights, centred[..., :, None] * centred[..., None, :], axes=1)
+    centerd = values - mean[None]
+    covariance = jnp.tensordot(weights, centerd[..., :, None] * centerd[..., None, :], axes=1)
     cross = jnp.tensordot(weights, values * z[..., None], axes=1) * dist.time_scale[..., None]
     return mean, covariance, cross
 

@@ -30,7 +30,7 @@ class _Bells(NamedTuple):
     time_loc: np.ndarray
     time_scale: np.ndarray
     t: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     scale: np.ndarray
 
 
@@ -109,7 +109,7 @@ def _part(dist, batch: tuple[int, ...], chosen: np.ndarray):
 
 def _drawn(dist, weights: np.ndarray, title: str) -> "Figure":
     bells = _bells(dist, weights)
-    spaces = bells.centre.shape[-1]
+    spaces = bells.center.shape[-1]
     panels = min(spaces, _SPACES) + (spaces > 1)
     figure = _figure(panels)
     axes = np.atleast_1d(figure.subplots(1, panels))
@@ -131,7 +131,7 @@ def _bells(dist, weights: np.ndarray) -> _Bells:
 
 @jax.jit
 def _given(dist, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Centres and deviations of all space coordinates at times t."""
+    """Centers and deviations of all space coordinates at times t."""
     gaussian = dist.condition_time(t)
     tril = gaussian.scale_tril
     return gaussian.loc, jnp.sqrt(jnp.sum(tril**2, axis=-1))
@@ -143,7 +143,7 @@ def _alive(bells: _Bells, reach: float) -> np.ndarray:
 
 def _limits(bells: _Bells, j: int) -> tuple[float, float]:
     alive = _alive(bells, 2.0)
-    low, high = (bells.centre[..., j] + side * _WIDE * bells.scale[..., j] for side in (-1, 1))
+    low, high = (bells.center[..., j] + side * _WIDE * bells.scale[..., j] for side in (-1, 1))
     return low[alive].min(), high[alive].max()
 
 
@@ -153,26 +153,26 @@ def _draw_time(bells: _Bells, j: int, ax: Any) -> None:
     s, density = np.linspace(low, high, _GRID), np.zeros((_GRID, _GRID))
     for k, weight in enumerate(bells.weight):
         of_time = _normal(bells.t, bells.time_loc[k], bells.time_scale[k])
-        density += weight * of_time * _normal(s[:, None], bells.centre[:, k, j], bells.scale[:, k, j])
+        density += weight * of_time * _normal(s[:, None], bells.center[:, k, j], bells.scale[:, k, j])
     shade = np.sqrt(density / max(density.max(), 1e-300))
     ax.pcolormesh(bells.t, s, shade, cmap="Blues", vmin=0, vmax=1.3, shading="gouraud", rasterized=True)
-    path = np.where(_alive(bells, _BOLD), bells.centre[..., j], np.nan)
+    path = np.where(_alive(bells, _BOLD), bells.center[..., j], np.nan)
     ax.plot(bells.t, path, color=_RED, linewidth=0.9, alpha=0.7)
-    name = "space s" if bells.centre.shape[-1] == 1 else f"space s[{j}]"
+    name = "space s" if bells.center.shape[-1] == 1 else f"space s[{j}]"
     ax.set(xlabel="time t", ylabel=name, ylim=(low, high), xlim=(bells.t[0], bells.t[-1]))
 
 
 def _draw_paths(bells: _Bells, ax: Any) -> None:
-    """Centres in the plane of the first two space coordinates, darker as time goes by; crosses: one deviation."""
+    """Centers in the plane of the first two space coordinates, darker as time goes by; crosses: one deviation."""
     for k in range(len(bells.weight)):
         alive = _alive(bells, _BOLD)[:, k]
-        x, y = bells.centre[alive, k, 0], bells.centre[alive, k, 1]
+        x, y = bells.center[alive, k, 0], bells.center[alive, k, 1]
         if not len(x):  # shorter than the grid is fine
             continue
         ax.scatter(x, y, c=bells.t[alive], cmap="Reds", vmin=2 * bells.t[0] - bells.t[-1], vmax=bells.t[-1], s=3)
         now = np.argmin(np.abs(bells.t - bells.time_loc[k]))
-        centre, scale = bells.centre[now, k], bells.scale[now, k]
-        ax.errorbar(centre[0], centre[1], yerr=scale[1], xerr=scale[0], color="#1f4e79", linewidth=0.8)
+        center, scale = bells.center[now, k], bells.scale[now, k]
+        ax.errorbar(center[0], center[1], yerr=scale[1], xerr=scale[0], color="#1f4e79", linewidth=0.8)
     ax.set(xlabel="space s[0]", ylabel="space s[1]", title="paths, darker later")
     ax.title.set_fontsize(8)
     ax.margins(0.08)

@@ -21,7 +21,7 @@ _DENSITY = "Blues"
 _MASS = (0.3, 0.6, 0.9)  # probability inside the contour lines
 _GRID = 240
 _REACH = 3.2  # time shown, in time_scales on either side
-_MARKERS = "osD^vPX"  # of axes, colours being ten
+_MARKERS = "osD^vPX"  # of axes, colors being ten
 _SIDES = ((-1, 1), (0, 1), (-1, 0), (1, -1), (1, 0), (0, -1), (1, 1), (-1, -1))  # of a name, the best first
 _STEPS_DRAWN = 5000  # of a history: more than a picture has columns
 _LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
@@ -39,7 +39,7 @@ def plot_density(
 
     Time runs to the right, space upwards; contour lines hold 30, 60 and 90% of the probability shown. A red bell
     stands on each chosen time: `N(s | t)` drawn sideways, all to the same height (a narrow one would be tall), its
-    foot at that time, a dot at its centre `loc + f(time_loc - t)`.
+    foot at that time, a dot at its center `loc + f(time_loc - t)`.
 
     **Shapes:** `dist` has `event_shape == (2,)` and no batch; `slices` is their number, or the times themselves.
 
@@ -122,7 +122,7 @@ def plot_tradeoff(
     names: Sequence[tuple[str, str]],
     axes: "np.ndarray | None" = None,
 ) -> np.ndarray:
-    """Quality against what it costs, a panel for each cost: a colour for each axis, the front drawn, its knee ringed.
+    """Quality against what it costs, a panel for each cost: a color for each axis, the front drawn, its knee ringed.
 
     Points of a front are named where there is room for it, the knee always. A point of the axis "base" is a star.
 
@@ -246,13 +246,13 @@ def _mass_levels(density: np.ndarray) -> np.ndarray:
 
 def _draw_slices(dist, ax, times, s_limits, width: float) -> None:
     for t in times:
-        centre, scale = _conditional(dist, np.array([t]))
-        s = np.linspace(centre[0] - 3.5 * scale[0], centre[0] + 3.5 * scale[0], 201)
-        bell = t + width * np.exp(-0.5 * ((s - centre[0]) / scale[0]) ** 2)
+        center, scale = _conditional(dist, np.array([t]))
+        s = np.linspace(center[0] - 3.5 * scale[0], center[0] + 3.5 * scale[0], 201)
+        bell = t + width * np.exp(-0.5 * ((s - center[0]) / scale[0]) ** 2)
         ax.fill_betweenx(s, t, bell, color=_RED, alpha=0.25, linewidth=0, zorder=3)
         ax.plot(bell, s, color=_RED, linewidth=1.4, zorder=4)
         ax.plot([t, t], s_limits, color=_RED, linewidth=0.7, alpha=0.55, zorder=2)
-        ax.plot([t], centre, "o", color=_RED, markersize=3, zorder=5)
+        ax.plot([t], center, "o", color=_RED, markersize=3, zorder=5)
 
 
 def _bell_width(times, t_limits) -> float:
@@ -262,7 +262,7 @@ def _bell_width(times, t_limits) -> float:
 
 
 def _conditional(dist, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and standard deviation of s | t."""
+    """Center and standard deviation of s | t."""
     gaussian = dist.condition_time(jnp.asarray(t, dist.loc.dtype))
     return np.asarray(gaussian.loc, float)[..., 0], np.asarray(gaussian.scale_tril, float)[..., 0, 0]
 
@@ -271,8 +271,8 @@ def _space_limits(dist, t_limits) -> tuple[float, float]:
     """Where s is with a probability of about 99%: the curve's far ends carry no mass and need no room."""
     loc, scale = float(dist.time_loc), float(dist.time_scale)
     t = np.linspace(max(t_limits[0], loc - 2.2 * scale), min(t_limits[1], loc + 2.2 * scale), 101)
-    centre, spread = _conditional(dist, t)
-    low, high = (centre - 3.2 * spread).min(), (centre + 3.2 * spread).max()
+    center, spread = _conditional(dist, t)
+    low, high = (center - 3.2 * spread).min(), (center + 3.2 * spread).max()
     return float(low), float(high)
 
 

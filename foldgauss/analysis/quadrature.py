@@ -83,9 +83,9 @@ def gauss_hermite(order: int) -> tuple[np.ndarray, np.ndarray]:
 def normal_rule() -> tuple[np.ndarray, np.ndarray]:
     """The like of `gauss_hermite` for functions that are no polynomials: Gauss-Legendre on panels of width 1/4."""
     y, weights = np.polynomial.legendre.leggauss(12)
-    centres = np.arange(-12, 12, 0.25)[:, None] + 0.125
-    z = (centres + 0.125 * y).ravel()
-    weights = np.tile(0.125 * weights, len(centres)) * np.exp(-0.5 * z * z)
+    centers = np.arange(-12, 12, 0.25)[:, None] + 0.125
+    z = (centers + 0.125 * y).ravel()
+    weights = np.tile(0.125 * weights, len(centers)) * np.exp(-0.5 * z * z)
     return z, weights / weights.sum()
 
 
@@ -147,7 +147,7 @@ class Panels(eqx.Module):
         return self.weights.sum(-1)
 
     def expectation(self, function: Float[Array, "panels 15 *event"]) -> Float[Array, "*event"]:
-        """Mean of values given at `nodes` under the normalised density; one integral, not a batch."""
+        """Mean of values given at `nodes` under the normalized density; one integral, not a batch."""
         weights = self.weights
         # Far out, where no mass is, a function may overflow: 0 * inf is 0 here.
         weighs = lax.expand_dims(weights > 0, range(2, function.ndim))

@@ -1,0 +1,112 @@
+"""Weights of mixture components: checks, posterior weights, weighted sums and random choice.
+
+A component is absent if its weight is 0 (a logit of -inf). Whatever its density or its moments are, it contributes
+nothing, and it receives no gradient.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from foldgauss._numerics.batch import align, broadcast, broadcast_leaves, check_batch, concrete_value, ranked_leaves
+from foldgauss._runtime.checks import invalid
+
+__all__ = [
+    "broadcast_weights",
+    "choose_components",
+    "log_joint",
+    "log_sum_exp",
+    "mixture_moments",
+    "posterior_logits",
+    "weighted_sum",
+]
+
+
+def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike | None, validate: bool):
+    """Components and logits, both broadcast to the common batch shape."""
+    if (logits is None) == (weights is None):
+        got = "none" if logits is None else "both"
+        raise invalid("logits, weights", expected="exactly one of them", got=got, cure="logits are log weights.")
+    name, given = ("weights", weights) if logits is None else ("logits", logits)
+    given = jnp.asarray(given, components.loc.dtype)
+    if given.shape[-1:] != components.batch_shape[-1:]:
+        expected = f"shape (*batch, {components.batch_shape[-1]})"
+        raise invalid(name, expected=expected, got=f"shape {given.shape}", cure="One value for each component.")
+    if validate:
+        _check_weights(name, given)
+    batch = check_batch([*ranked_leaves(components), (given, 0)])
+    if batch != components.batch_shape:
+        components = broadcast_leaves(components, batch)
+    (given,) = broadcast([(given, 0)], batch)
+    return components, given if name == "logits" else _log_weights(given)
+
+
+def _check_weights(name: str, given: Array) -> None:
+    given = concrete_value(given)
+    if given is None:
+        return
+    least = 0 if name == "weights" else -np.inf
+    if not ((given >= least) & (given < np.inf)).all():
+        expected = "finite values >= 0" if name == "weights" else "values below infinity"
+        cure = "A component without weight has weight 0, or a logit of -inf."
+        raise invalid(name, expected=expected, got=given.tolist(), cure=cure)
+    if not (given > least).any(-1).all():
+        raise invalid(name, expected="a positive weight", got="none", cure="Weights are relative: all equal means 1/k.")
+
+
+def _log_weights(weights: Array) -> Array:
+    """log w, -inf at 0 with no gradient there."""
+    present = weights > 0
+    return jnp.where(present, jnp.log(jnp.where(present, weights, 1)), -jnp.inf)
+
+
+def log_joint(log_weights: Array, log_components: Array) -> Array:
+    """log w_k p_k, -inf where the component is absent, whatever its density."""
+    (log_weights,) = align([(log_weights, 0)], log_components.ndim)
+    absent = jnp.isneginf(log_weights)
+    # Double where: an absent component passes no gradient.
+    return jnp.where(absent, -jnp.inf, jnp.where(absent, 0, log_weights) + jnp.where(absent, 0, log_components))
+
+
+def posterior_logits(log_weights: Array, log_evidence: Array, axis: int = -1) -> Array:
+    """log w_k p_k; log w_k where all p_k are 0. Where some p_k are infinite, they share all the weight equally."""
+    joint = log_joint(log_weights, log_evidence)
+    infinite = jnp.isposinf(joint)
+    joint = jnp.where(infinite.any(axis, keepdims=True), jnp.where(infinite, 0, -jnp.inf), joint)
+    all_zero = jnp.isneginf(joint).all(axis, keepdims=True)
+    (log_weights,) = align([(log_weights, 0)], joint.ndim)
+    return jnp.where(all_zero, log_weights, joint)
+
+
+def log_sum_exp(joint: Array, axis: int) -> Array:
+    """logsumexp whose gradient is 0 where all terms are -inf; +inf stays +inf."""
+    largest = lax.stop_gradient(joint.max(axis, keepdims=True))
+    usable = jnp.isfinite(largest)
+    shifted = jnp.where(usable, joint - jnp.where(usable, largest, 0), 0)
+    return jnp.where(usable, jnp.log(jnp.exp(shifted).sum(axis, keepdims=True)) + largest, largest).squeeze(axis)
+
+
+def weighted_sum(weights: Array, values: Array, event_rank: int = 0) -> Array:
+    """sum_k w_k x_k over values (*batch, k, *event). Absent components are ignored; a weight of NaN gives NaN."""
+    weights = lax.expand_dims(weights, range(weights.ndim, weights.ndim + event_rank))
+    (weights,) = align([(weights, 0)], values.ndim)
+    return jnp.where(weights == 0, 0, weights * values).sum(-1 - event_rank)
+
+
+def mixture_moments(weights: Array, means: Array, covariances: Array) -> tuple[Array, Array]:
+    """Mean and covariance by the laws of total mean and covariance, from those of the components."""
+    mean = weighted_sum(weights, means, 1)
+    # A second pass on centered means: otherwise the rounding error of the weights is multiplied by the offset.
+    mean = mean + weighted_sum(weights, means - mean[..., None, :], 1)
+    centered = means - mean[..., None, :]
+    return mean, weighted_sum(weights, covariances + centered[..., :, None] * centered[..., None, :], 2)
+
+
+def choose_components(key, weights: Array, shape: tuple[int, ...]) -> Array:
+    """Random component indices k with probabilities w_k; an absent component is never chosen."""
+    cumulative = jnp.cumsum(weights, axis=-1)
+    (cumulative,) = align([(cumulative, 0)], len(shape) + 1)
+    level = jax.random.uniform(key, shape, weights.dtype) * cumulative[..., -1]
+    return (level[..., None] >= cumulative).sum(-1)
