@@ -80,7 +80,7 @@ def feature_tracks(seed: int = 0) -> Split:
     grey = cv2.cvtColor(frames[home], cv2.COLOR_RGB2GRAY)
     corners = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, DISTANCE).reshape(-1, 2) + np.float32(0.5)
     reach = min(home, len(frames) - 1 - home)
-    tracks = Motion.of(frames).follow(np.full(len(corners), home), corners, longest=reach)
+    tracks = Motion.from_frames(frames).follow(np.full(len(corners), home), corners, longest=reach)
     rng = np.random.default_rng(seed)
     points, groups = [], []
     for k in np.flatnonzero(tracks.known.sum(1) >= LONG):

@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from foldgauss._runtime.machine import describe_machine as describe_machine
 from foldgauss.io._atomic import atomic_path, check_writable
 
 console = Console(width=140)

@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks._dying import HIDDEN
+from foldgauss.io import write_video
 from foldgauss.io.datasets import bunny
-from foldgauss.io.media.video_file import write_video
 from foldgauss.io.models.model_file import ModelFileError, load_model, read_header
 from foldgauss.io.models.video_model import load_video_model, read_metadata, save_video_model
 
-#: Frames and size of the clip that is fitted.
 FRAMES, SIZE = (0, 12), (80, 160)
 #: Fits by name: what is kept of them differs. Frame times are learned in all. Checkpoints are of 2 to 4 MB.
 FITS = {

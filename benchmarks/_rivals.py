@@ -21,7 +21,7 @@ from foldgauss.render._cpu_kernels import _f, _i, _u
 
 SOURCE = Path(__file__).with_name("rasterizer_kernel.cpp")
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-mprefer-vector-width=512", "-std=c++17", "-shared", "-fPIC")
-_TILE, _PIXELS, _aligned = _cpu_kernels.TILE, _cpu_kernels.PIXELS, _cpu_kernels._aligned
+_TILE, _PIXELS, _aligned = _cpu_kernels.TILE, _cpu_kernels.PIXELS, _cpu_kernels._aligned_empty
 
 
 class Lists(NamedTuple):
@@ -141,7 +141,7 @@ def _boxes(geometry, span, across, first, last):
             first[i], last[i] = 0, 0
             continue
         own = geometry[i]
-        radius = _cpu_kernels._edge(own[2], own[3], own[4], _cpu_kernels._level(own[5], own[6]), own[7])
+        radius = _cpu_kernels._right_edge(own[2], own[3], own[4], _cpu_kernels._level(own[5], own[6]), own[7])
         left, right = own[0] - radius, own[0] + radius
         first[i, 0] = min(max(left, _f(0.0)) / _f(_TILE), _f(across))
         last[i, 0] = min(max(right, _f(0.0)) / _f(_TILE) + _f(1.0), _f(across))
@@ -150,7 +150,7 @@ def _boxes(geometry, span, across, first, last):
 
 def plain_image(scene: Scene, trace: cpu.Trace) -> Planes:
     """A whole image the textbook way: projection, lists by bounding box, every pixel of every listed pair."""
-    draft = cpu._Draft(scene.leaves, scene.size, "over", RenderOptions(), False)
+    draft = cpu._ForwardPass(scene.leaves, scene.size, "over", RenderOptions(), False)
     run_tasks(draft.project, draft.chunks)
     across, down = -(-scene.size[1] // _TILE), -(-scene.size[0] // _TILE)
     first, last = np.empty((len(draft.span), 2), np.int32), np.empty((len(draft.span), 2), np.int32)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks._common import console, machine
+from foldgauss.io import Clip
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.media.video_file import Clip
 from foldgauss.video import FitConfig, VideoModel, fit, fit_steps, psnr, ssim
 
 Run = dict[str, Any]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from foldgauss.io import Clip, write_video
 from foldgauss.io.datasets import bunny
-from foldgauss.io.media.video_file import Clip, write_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video import FitConfig, evaluate

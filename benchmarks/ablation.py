@@ -23,8 +23,8 @@ from pathlib import Path
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, kept_setting, scaled, seconds_per_step
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig
 
 SIZE, MINUTES = (160, 320), 60.0
@@ -220,7 +220,9 @@ def main(arguments: list[str] | None = None) -> None:
     show_starts(made, clip.size, steps)
     words = trend(made)
     console.print("What the paper finds:", *words, sep="\n- ", soft_wrap=True)
-    console.print("machine: " + ", ".join(f"{name} {value}" for name, value in _common.machine().items()), style="dim")
+    console.print(
+        "machine: " + ", ".join(f"{name} {value}" for name, value in _common.describe_machine().items()), style="dim"
+    )
     figures = {f"psnr, {cell.name}": run["psnr"] for cell, run in made.items()}
     runs.write(figures=figures, trend=words)
 

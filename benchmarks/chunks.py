@@ -10,6 +10,7 @@ the rows are there before, their bytes are added. Parameters are compared after 
 largest number of each kind.
 """
 
+import dataclasses
 import json
 import os
 import resource
@@ -41,6 +42,17 @@ def _rows(first: int, last: int) -> np.ndarray:
     return np.concatenate(parts)
 
 
+@dataclasses.dataclass
+class _Chunks:
+    """Chunks that are generated anew in each pass."""
+
+    num: int
+    size: int
+
+    def __iter__(self):
+        return (_rows(first, min(first + self.size, self.num)) for first in range(0, self.num, self.size))
+
+
 def _data(way: str, num: int, chunk: int):
     if way == "in memory":
         return _rows(0, num)
@@ -54,7 +66,7 @@ def _data(way: str, num: int, chunk: int):
         return dask.array.concatenate(
             [dask.array.from_delayed(one, size, np.float32) for one, size in zip(made, sizes, strict=True)]
         )
-    return lambda: (_rows(first, min(first + chunk, num)) for first in starts)
+    return _Chunks(num, chunk)
 
 
 def _peak() -> float:
@@ -80,9 +92,9 @@ def _one(way: str, num: int, chunk: int, components: int, passes: int) -> dict:
             seconds[-1] = time.perf_counter() - begun
     peak = _peak() - before + (data.nbytes / 2**20 if way == "in memory" else 0)
     making = 0.0
-    if callable(data):
+    if isinstance(data, _Chunks):
         begun = time.perf_counter()
-        for _ in data():
+        for _ in data:
             pass
         making = time.perf_counter() - begun
     found = {name: np.asarray(getattr(model, name), np.float64).tolist() for name in PARAMETERS}
@@ -117,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     ways = [("in memory", num)]
     for rows in options.chunk_rows:
         size = -(-rows // SEED_ROWS) * SEED_ROWS
-        ways += [("function", size), ("dask array", size)]
+        ways += [("iterable", size), ("dask array", size)]
     title = f"{num:,} rows ({12 * num / 2**20:.0f} MiB), {options.components} components of degree 3"
     columns = ("rows", "of a chunk", "pass (s)", "making the chunks (s)", "peak (MiB)", "parameters apart")
     shown, figures, whole = _common.table(title, *columns), {}, None
@@ -130,7 +142,7 @@ def main(arguments: list[str] | None = None) -> None:
         name = way if way == "in memory" else f"{way} of {size}"
         figures |= {f"{name}: pass": found["pass"], f"{name}: peak": found["peak"], f"{name}: apart": apart}
     _common.console.print(shown)
-    _common.finish(options.json, figures, _common.machine(), rows=num, components=options.components)
+    _common.finish(options.json, figures, _common.describe_machine(), rows=num, components=options.components)
 
 
 if __name__ == "__main__":

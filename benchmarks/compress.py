@@ -21,12 +21,11 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.io import read_video, save_compact, save_video_model
+from foldgauss.io import Clip, read_video, save_compact, save_video_model
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit, psnr
-from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
 SIZE, CLIPS, PRUNED_DB = (160, 320), ("bunny", "bikes"), 0.01
@@ -41,7 +40,7 @@ def pruned(model: VideoModel, clip: Clip) -> VideoModel:
     """Without as many of the Gaussians that add least as `PRUNED_DB` allows."""
     lit = Contributions(model)
     everywhere = np.ones(model.size, np.float32)
-    order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
+    order = np.argsort(sum_contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     before, least, most = evaluate(model, clip.frames).mean_psnr, 0, model.num_gaussians - 1
     while most - least > model.num_gaussians // 200:
         middle = (least + most) // 2
@@ -130,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(parser, arguments)
     if options.model is not None and options.clip is None:
         parser.error("--model needs --clip")
-    facts, figures = _common.machine(), {}
+    facts, figures = _common.describe_machine(), {}
     for name in CLIPS if options.clip is None else (options.clip,):
         clip = read_video(sample_clip(name), size=options.size)
         if options.model is not None:

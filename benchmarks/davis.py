@@ -212,7 +212,7 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(f"Frames {options.frames} only: the paper's figures are of whole sequences.")
     if not figures:
         parser.error(f"--root: expected any of {', '.join(sorted(wanted))} in {options.root / 'JPEGImages'}, got none")
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
 
 

@@ -21,7 +21,7 @@ from benchmarks.compress import kept
 from foldgauss.io import read_video, save_video_model
 from foldgauss.io.datasets import sample_clip
 from foldgauss.video import Economy, FitConfig, VideoModel, evaluate, fit
-from foldgauss.video.selection.contributions import Contributions, contributions
+from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
 SIZE, PSNR, STEPS, DEGREES = (160, 320), 33.0, 6000, (1, 3, 7, 0)
@@ -32,7 +32,7 @@ FIRST, RATIO = 12_000, 2**0.125
 def pruned(model: VideoModel, frames: np.ndarray, psnr: float) -> VideoModel:
     """Without as many of the Gaussians that add least as leave the mean PSNR at `psnr`."""
     lit, everywhere = Contributions(model), np.ones(model.size, np.float32)
-    order = np.argsort(contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
+    order = np.argsort(sum_contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     least, most = 0, model.num_gaussians - 1
     while most - least > max(model.num_gaussians // 200, 1):
         middle = (least + most) // 2
@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--degrees", default=",".join(map(str, DEGREES)), help="[1,3,7,0]")
     parser.add_argument("--model", type=Path, help="write the economical model here")
     options = _common.parse(parser, arguments)
-    facts, figures, rows = _common.machine(), {}, []
+    facts, figures, rows = _common.describe_machine(), {}, []
     clip = read_video(sample_clip(options.clip), size=options.size)
     begun = time.perf_counter()
     result = fit(clip.frames, FitConfig(steps=options.steps, economy=Economy(psnr=options.psnr)), fps=clip.fps)
@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
         "fit",
         "degree",
         "Gaussians",
-        "numbers stored",
+        "parameters stored",
         "PSNR",
         "seconds",
     )
@@ -116,7 +116,9 @@ def main(arguments: list[str] | None = None) -> None:
         table.add_row(what + mark, str(degree), f"{num:,}", f"{floats:,}", f"{reached:.2f}", f"{seconds:.0f}")
     console.print(table)
     ratio = off[3] / rows[0][3]
-    console.print(f"* the smallest of the sweep that reaches it: {ratio:.2f} times the numbers of the economical one")
+    console.print(
+        f"* the smallest of the sweep that reaches it: {ratio:.2f} times the parameters of the economical one"
+    )
     figures |= {"economy: numbers": rows[0][3], "off: numbers": off[3], "off / economy": ratio}
     figures["rows"] = json.dumps(rows)
     _common.finish(options.json, figures, facts, setting={"clip": options.clip, "size": options.size})

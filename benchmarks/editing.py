@@ -331,7 +331,7 @@ def main(arguments: list[str] | None = None) -> None:
             write_sheet(options.sheets / f"editing-{name}.png", sheet(rows))
     show(found)
     figures = {f"{clip}_{name}": value for clip, own in found.items() for name, value in own.items()}
-    _common.finish(options.json, figures, _common.machine(), gaussians=options.gaussians, steps=options.steps)
+    _common.finish(options.json, figures, _common.describe_machine(), gaussians=options.gaussians, steps=options.steps)
 
 
 def show(found: dict[str, dict[str, float]]) -> None:

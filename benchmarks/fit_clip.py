@@ -24,8 +24,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video.fitting.config import PRESETS, FitConfig
 from foldgauss.video.fitting.loop import FitInfo, fit
 from foldgauss.video.models.metrics import Evaluation, evaluate
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     figures, setting, course = measure(options)
     if options.plot is not None:
         plot({str(options.clip): course}, options.plot)
-    _common.finish(options.json, figures, _common.machine(), setting=setting, course=course)
+    _common.finish(options.json, figures, _common.describe_machine(), setting=setting, course=course)
 
 
 def measure(options: argparse.Namespace) -> tuple[dict, dict, list[dict]]:

@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> None:
         figures |= {f"{name}_{clip}": value for name, value in found.items()}
     if options.plot is not None:
         fit_clip.plot(courses, options.plot)
-    _common.finish(options.json, figures, _common.machine(), settings=settings, courses=courses)
+    _common.finish(options.json, figures, _common.describe_machine(), settings=settings, courses=courses)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What folds bring: a folded video against every frame its own Gaussians (eq:miragevideo), at equal numbers stored.
+"""What folds bring: a folded video against every frame its own Gaussians (eq:miragevideo), at equal parameters stored.
 
     python -m benchmarks.folding_gain [--json FILE] [--clip bunny|bikes|carphone|PATH ...] [--size HxW] [--frames A:B]
                                       [--minutes M | --steps N] [--longer F] [--gaussians N] [--seed S]
@@ -19,8 +19,8 @@ from pathlib import Path
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scores
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig, independent_frames
 
 SIZES = {"bunny": (160, 320), "bikes": None, "carphone": None}
@@ -51,7 +51,7 @@ def measure(name: str, clip: Clip, config: FitConfig, runs: Runs, longer: float 
 
 
 def show(title: str, made: dict[str, Run]) -> None:
-    columns = "PSNR, dB", "worst", "SSIM", "Gaussians", "numbers stored", "frames seen", "minutes"
+    columns = "PSNR, dB", "worst", "SSIM", "Gaussians", "parameters stored", "frames seen", "minutes"
     table = _common.table(title, "fit", *columns)
     for name, run in made.items():
         quality = f"{run['psnr']:.2f}", f"{run['worst_psnr']:.2f}", f"{run['ssim']:.4f}"
@@ -82,7 +82,7 @@ def main(arguments: list[str] | None = None) -> None:
         for title, run in list(made.items())[1:]:
             end = "" if title == ALONE else f"_over_{options.longer:g}_times_as_long"
             figures[f"gain_{Path(name).stem}{end}"] = made[FOLDED]["psnr"] - run["psnr"]
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
 
 

@@ -28,9 +28,9 @@ import numpy as np
 from benchmarks import _common, fit_clip, presets
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.figures import write_figure
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig, LearningRates
 
 MINUTES, SHARE = 2.0, 0.15
@@ -141,7 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
         plot(options.plot, times, shown)
     gain = made[LEARNED]["psnr"] - made[FIXED]["psnr"]
     figures = {"psnr_fixed": made[FIXED]["psnr"], "psnr_learned": made[LEARNED]["psnr"], "gain": gain, **found}
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures, shown=shown.tolist())
 
 

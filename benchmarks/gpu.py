@@ -28,8 +28,8 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import Scene, Task, console, interleaved, random_scene
 from benchmarks.rasterizer import num_boxes
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions, Splats2D, cpu, pallas, render, tiles, xla
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit_steps, mean_psnr, to_model
@@ -77,7 +77,7 @@ def engine_tasks(scene: Scene) -> dict[str, Task]:
     tasks = {}
     for engine, tile in ENGINES.items():
         num_tiles = -(-scene.size[0] // tile) * -(-scene.size[1] // tile)
-        capacity = max(min(num_boxes(scene, tile), tiles.MOST_SLOTS), num_tiles)
+        capacity = max(min(num_boxes(scene, tile), tiles.MAX_SLOTS), num_tiles)
         how = {"engine": engine, "options": RenderOptions(list_capacity=capacity)}
 
         def drawn(leaves, how=how):
@@ -207,7 +207,11 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
 
 def facts() -> dict[str, object]:
     devices = jax.local_devices()
-    return _common.machine() | {"device": devices[0].device_kind, "devices": len(devices), "jax": jax.__version__}
+    return _common.describe_machine() | {
+        "device": devices[0].device_kind,
+        "devices": len(devices),
+        "jax": jax.__version__,
+    }
 
 
 if __name__ == "__main__":

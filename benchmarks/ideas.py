@@ -15,8 +15,8 @@ import statistics
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, evaluate, fit
 
@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
             text = f"{name}, seed {seed}, {what}: {psnr[what][-1]:.2f} dB, {result.history[-1].step:,} steps"
             console.print(text, style="dim", soft_wrap=True)
         figures |= show(name, psnr, options)
-    _common.finish(options.json, figures, _common.machine(), **budget, seeds=options.seeds)
+    _common.finish(options.json, figures, _common.describe_machine(), **budget, seeds=options.seeds)
 
 
 def show(clip: str, psnr: dict[str, list[float]], options) -> dict[str, float]:

@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     kept = all(figures[name]["processor_ratio"] <= LIMIT for name in HELD)
     _common.console.print(f"{' and '.join(HELD)}: at most {LIMIT} of import jax: {'yes' if kept else 'NO'}")
     flat = {f"{name}: {key}": value for name, of in figures.items() for key, value in of.items()}
-    _common.finish(options.json, flat, _common.machine(), rounds=options.rounds, limit=LIMIT, kept=kept)
+    _common.finish(options.json, flat, _common.describe_machine(), rounds=options.rounds, limit=LIMIT, kept=kept)
 
 
 if __name__ == "__main__":

@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
+from foldgauss.io import Clip, read_video, write_image
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.pictures import comparison
-from foldgauss.io.media.video_file import Clip, read_video, write_image
+from foldgauss.io.media.contact_sheet import make_comparison_sheet
 from foldgauss.video import interpolated_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit
@@ -103,7 +103,9 @@ def _draw(path: Path, held_out, pictures, scores, whole) -> None:
     shown = [*order[: SHOWN // 2], *order[-(SHOWN // 2) :]]
     for way, where in ((ours, path), (rival, path.with_stem(f"{path.stem}-warped"))):
         captions = [f"frame {2 * k + 1}, {scores[way][k]:.1f} dB" for k in shown]
-        write_image(where, comparison([held_out[k] for k in shown], [pictures[way][k] for k in shown], captions))
+        write_image(
+            where, make_comparison_sheet([held_out[k] for k in shown], [pictures[way][k] for k in shown], captions)
+        )
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -116,7 +118,9 @@ def main(arguments: list[str] | None = None) -> None:
         clip = read_video(path, frames=options.frames, size=options.size)
         figures |= measure(clip, config, Path(name).stem, options.sheet)
     setting = {"size": options.size, "gaussians": options.gaussians, "seed": options.seed} | budget
-    _common.finish(options.json, figures, _common.machine(), setting=setting | {"set": dict(options.set or ())})
+    _common.finish(
+        options.json, figures, _common.describe_machine(), setting=setting | {"set": dict(options.set or ())}
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -21,8 +21,8 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import Task, console
 from foldgauss._runtime.threads import set_num_threads
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import RenderOptions, cpu
 from foldgauss.video.fitting.loop import FitConfig, fit
@@ -59,7 +59,7 @@ def settings(fitted: RenderOptions) -> dict[tuple[str, str], RenderOptions]:
 
 def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(_parser(), arguments)
-    facts, clip = _common.machine(), read_video(sample_clip("bunny"), size=options.size)
+    facts, clip = _common.describe_machine(), read_video(sample_clip("bunny"), size=options.size)
     if options.model is not None:
         model = load_video_model(options.model)
     else:

@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 
 FRAMES, SIZE, LIMIT = (125, 250, 500, 1000, 2000), (320, 640), 2 * 1024**3
 
@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
         slope, base = np.polyfit(list(peaks), list(peaks.values()), 1)
         figures |= {"bytes_per_frame_over_its_own": slope / each, "base_mib": base / 2**20}
     figures["within_2_gib"] = float(max(peaks.values()) <= LIMIT)
-    _common.finish(options.json, figures, _common.machine(), gaussians=options.gaussians, size=options.size)
+    _common.finish(options.json, figures, _common.describe_machine(), gaussians=options.gaussians, size=options.size)
 
 
 if __name__ == "__main__":

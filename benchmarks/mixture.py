@@ -20,10 +20,10 @@ from sklearn.mixture import GaussianMixture
 
 from benchmarks import _bending, _common
 from foldgauss.envelope import Constant
-from foldgauss.estimator.em.loop import State, _steps, used_degrees
+from foldgauss.estimator.em.initialization import params_from_gaussians
+from foldgauss.estimator.em.loop import State, _step_restarts, broadcast_degrees
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
-from foldgauss.estimator.em.starts import from_joint
-from foldgauss.estimator.em.statistics import points_of
+from foldgauss.estimator.em.statistics import make_points
 from foldgauss.estimator.em.updates import Model
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
@@ -65,7 +65,7 @@ def _ours(problem: Problem, dtype) -> dict:
     num, x = len(problem.weights), problem.x.astype(dtype)
     scaling = Scaling(problem.x.mean(0), problem.x.std(0))
     scale = scaling.scale
-    params = from_joint(
+    params = params_from_gaussians(
         problem.weights,
         (problem.means - scaling.shift) / scale,
         problem.covariances / (scale[:, None] * scale),
@@ -79,18 +79,18 @@ def _ours(problem: Problem, dtype) -> dict:
         Constant(),
     )
     fitted.n_features_in_, fitted.weights_ = DIM, problem.weights
-    points = points_of(scaling.apply(x), np.ones(len(x), dtype), num)
+    points = make_points(scaling.apply(x), np.ones(len(x), dtype), num)
     state = jax.tree.map(lambda z: z[None], State(params, jnp.ones_like(params.time_loc)))
-    model = Model(used_degrees(1, num), jnp.asarray(REG / scale**2, dtype), "full")
+    model = Model(broadcast_degrees(1, num), jnp.asarray(REG / scale**2, dtype), "full")
     frozen = jnp.zeros(1, bool)
 
     def em():
-        new = jax.block_until_ready(_steps(state, frozen, points, Constant(), model, None))[0].params
+        new = jax.block_until_ready(_step_restarts(state, frozen, points, Constant(), model, None))[0].params
         mixture = to_mixture(jax.tree.map(lambda z: z[0], new), scaling, Constant())
         return tuple(map(np.asarray, mixture.components.moments()))
 
     def em_alone():
-        return jax.block_until_ready(_steps(state, frozen, points, Constant(), model, None))
+        return jax.block_until_ready(_step_restarts(state, frozen, points, Constant(), model, None))
 
     return {"score": lambda: fitted.score_samples(x), "em": em_alone, "em result": em}
 
@@ -207,7 +207,9 @@ def main(arguments: list[str] | None = None) -> None:
             figures[name.rpartition(" ")[0]] = figures[name]
     if not options.skip_bending:
         figures |= _bends()
-    _common.finish(options.json, figures, _common.machine(), points=options.points, components=options.components)
+    _common.finish(
+        options.json, figures, _common.describe_machine(), points=options.points, components=options.components
+    )
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks import _common
 from benchmarks._common import console
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.render import cpu
 from foldgauss.video.fitting.loop import FitConfig, fit
@@ -64,7 +64,7 @@ def stages(playback: VideoRenderer, times: np.ndarray) -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(_parser(), arguments)
-    facts, model = _common.machine(), fitted(options)
+    facts, model = _common.describe_machine(), fitted(options)
     playback, times = VideoRenderer(model, options.size), np.asarray(model.frame_times.times())
     list(playback.frames(times[:3]))  # compiled
     rates, slowest = [], 0.0

@@ -23,8 +23,8 @@ from pathlib import Path
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scaled, seconds_per_step, told
+from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import Clip, read_video
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.config import PRESETS
 
@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> None:
         made = measure(clip, runs, options.minutes, options.seed)
         show(f"{setting['clip']}, {clip.num_frames} frames of {size[0]}x{size[1]}, seed {options.seed}", made)
         figures |= {f"{name}_{size[0]}x{size[1]}": gain for name, gain in gains(made).items()}
-    _common.finish(None, figures, _common.machine())
+    _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
 
 

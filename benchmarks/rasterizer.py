@@ -214,14 +214,14 @@ def _use_threads(threads: int) -> None:
 def rival_tasks(case: Case, compiled: _rivals.Compiled | None) -> dict[str, Task]:
     """The engine's rows by themselves, the plain loop, and both in C++; one thread."""
     scene, prepare = case.scene, functools.partial(_use_threads, 1)
-    draft = cpu._Draft(scene.leaves, scene.size, "over", RenderOptions(), False)
+    draft = cpu._ForwardPass(scene.leaves, scene.size, "over", RenderOptions(), False)
     for start in draft.chunks if len(draft.chunks) > 1 else ():
         draft.project(start)
     draft.bucket()
-    parts = draft.cut(whole=draft.work < cpu.SMALL)
+    parts = draft.split(whole=draft.work < cpu.SINGLE_TASK_NS)
     by_box, planes = _rivals.box_lists(*boxes(scene), scene.size), _rivals.Planes.of_size(scene.size)
     tasks = {
-        "cpu rows forward 1": Task(lambda: [draft.blend(part) for part in parts], prepare),
+        "cpu rows forward 1": Task(lambda: [draft.composite(part) for part in parts], prepare),
         "plain forward 1": Task(lambda: _rivals.plain_numba(by_box, case.trace, planes), prepare),
         "plain image forward 1": Task(lambda: _rivals.plain_image(scene, case.trace), prepare),
     }
@@ -458,7 +458,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--plot", type=Path, metavar="FILE", help="PNG of the lines [with --all: rasterizer.png]")
     options = _common.parse(parser, arguments)
     names = options.scene or (SCENES if options.all else DEFAULT_SCENES)
-    facts, figures, lines = _common.machine(), {}, {}
+    facts, figures, lines = _common.describe_machine(), {}, {}
     with contextlib.ExitStack() as stack:
         compiled = None
         if _rivals.has_compiler():

@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
         ways = (figures[f"{place}, {way}, s"] for way in ("by seeking", "from the start"))
         table.add_row(place, *(f"{value:.2f}" for value in ways))
     console.print(table)
-    _common.finish(options.json, figures, _common.machine(), cuts=index.cuts)
+    _common.finish(options.json, figures, _common.describe_machine(), cuts=index.cuts)
 
 
 if __name__ == "__main__":

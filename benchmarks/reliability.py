@@ -61,7 +61,7 @@ def kills(options) -> None:
     figures = {"kills": len(rows), "in_write": sum(bool(row["in_write"]) for row in rows)}
     figures |= {f"from_{where.split()[-1]}": sum(row["goes_on_from"] == where for row in rows) for where in PLACES}
     figures |= {"fits_ended_bit_identical": found["ended"], "damaged_files": 0}  # or `Wrong` would have been raised
-    _common.finish(options.json, figures, _common.machine(), kills=rows)
+    _common.finish(options.json, figures, _common.describe_machine(), kills=rows)
 
 
 #: Where a fit may go on from after a kill.
@@ -76,7 +76,7 @@ def outputs(options) -> None:
         table.add_row(row["output"], f"{row['moment']} {row['ending']}", row["found"], str(len(row["left"])))
     console.print(table)
     figures = {"kills": len(rows), "damaged_files": 0}  # or `Wrong` would have been raised
-    _common.finish(options.json, figures, _common.machine(), kills=rows)
+    _common.finish(options.json, figures, _common.describe_machine(), kills=rows)
 
 
 def long(options) -> None:
@@ -95,7 +95,9 @@ def long(options) -> None:
     console.print(table)
     figures |= _long.progress(ran["fit"].lines)
     told = [{"at": at} | line for at, line in ran["fit"].lines]
-    _common.finish(options.json, figures, _common.machine(), lines=told, size=options.size, frames=options.frames)
+    _common.finish(
+        options.json, figures, _common.describe_machine(), lines=told, size=options.size, frames=options.frames
+    )
 
 
 def soak(options) -> None:
@@ -111,7 +113,7 @@ def soak(options) -> None:
         line = _soak.trend(own)
         figures |= {f"{field}_mib": line.level, f"{field}_mib_per_hour": line.slope}
         figures |= {f"{field}_mib_per_hour_low": line.low, f"{field}_mib_per_hour_high": line.high}
-    _common.finish(options.json, figures, _common.machine(), series=[sample._asdict() for sample in samples])
+    _common.finish(options.json, figures, _common.describe_machine(), series=[sample._asdict() for sample in samples])
 
 
 KINDS = {"kills": kills, "outputs": outputs, "long": long, "soak": soak}

@@ -29,14 +29,14 @@ import optax
 from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import cpu
 from foldgauss.video.fitting.loop import FitConfig, FitState, fit_steps
 from foldgauss.video.models.row_layout import unpack
 
 #: The module, which the function `fit` of the package hides.
-fit_module = importlib.import_module("foldgauss.video.fitting.loop")
+stepper_module = importlib.import_module("foldgauss.video.fitting.steppers.cpu_stepper")
 WARMUP = 5  # steps: the first compiles, and the optimiser's pages are touched for the first time
 #: What is timed, in the order of a step.
 PARTS = {
@@ -82,18 +82,18 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
     )
     parts = {
         "frame_times": "frame times",
-        "_update_times": "frame times",
+        "update_frame_times": "frame times",
         "condition": "condition",
         "image_loss": "loss",
         "backpropagate": "backpropagate",
-        "sparse_adam": "adam",
+        "update_rows": "adam",
         "update_windows": "adam",
     }
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.object(fit_module, "cpu", kernels))
+        stack.enter_context(mock.patch.object(stepper_module, "cpu", kernels))
         for name, part in parts.items():
-            timed = clock.timed(part, getattr(fit_module, name))
-            stack.enter_context(mock.patch.object(fit_module, name, timed))
+            timed = clock.timed(part, getattr(stepper_module, name))
+            stack.enter_context(mock.patch.object(stepper_module, name, timed))
         yield
 
 
@@ -182,7 +182,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=_common.size, default=(160, 320), metavar="HxW", help="frames [160x320]")
     parser.add_argument("--steps", type=_common.whole, default=24, help="steps that are timed [24]")
     options = _common.parse(parser, arguments)
-    facts = _common.machine()
+    facts = _common.describe_machine()
     frames = read_video(sample_clip("bunny"), size=options.size).frames
     config = FitConfig(num_gaussians=options.gaussians, degree=3, steps=3000, quarter_fraction=0.0, half_fraction=0.0)
     records, state, num_alive = measure(frames, config, options.steps)

@@ -25,7 +25,7 @@ from benchmarks import _common
 from benchmarks._common import Task
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.estimator.em.components import Parameters, log_likelihoods, pairs_of
+from foldgauss.estimator.em.components import Parameters, evaluate_densities, log_likelihoods
 from foldgauss.fold import FourierFold, PolynomialFold
 
 ORDERS = (4, 8, 16, 32, 64, 128)
@@ -147,7 +147,7 @@ def coefficients_of(params: Parameters) -> np.ndarray:
 @jax.jit
 def by_whitening(params: Parameters, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Log-likelihood of every point, and responsibilities."""
-    log_density = pairs_of(params, Constant(), x).log_density
+    log_density = evaluate_densities(params, Constant(), x).log_density
     total = log_likelihoods(log_density)
     return total, jnp.exp(log_density - total[:, None])
 
@@ -202,7 +202,7 @@ def main(arguments: list[str] | None = None) -> None:
     made.add_argument("--components", type=_common.whole, default=64, help="[64]")
     made.add_argument("--rounds", type=_common.whole, default=7, help="[7]")
     options = _common.parse(made, arguments)
-    facts, figures = _common.machine(), {}
+    facts, figures = _common.describe_machine(), {}
     quadrature(options.rounds, figures)
     precision(options.points, options.rounds, figures)
     e_step(options.points, options.components, options.rounds, figures)

@@ -10,7 +10,7 @@
   is each frame found where the whole clip has it? Its pictures and its splats are the same, so this tells only that
   frames are found wherever they are.
 - unseen: every second frame of the clip is fitted, and the frames between are looked for: are they half way between
-  the times of their neighbours, as far as a clip's pace is even?
+  the times of their neighbours, if the clip's playback speed is regular?
 - calibration: ranks of true times in simulated videos of a small synthetic scene, with right noise, noise assumed 1.5
   times too great and too small, and smoothed noise; coverage of 50% and 90% intervals; `--plot` draws the ranks.
 - retimed: that scene drawn at a smooth warp of times, with noise: are the warp's times in the intervals, given the
@@ -28,22 +28,21 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import load_video_model
+from foldgauss.io import load_video_model, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import read_video
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
     Increments,
     SimulatedRanks,
     ecdf_band,
-    evidence,
-    exact_times,
+    exact_posterior,
     frame_time_log_prob,
     frame_time_posterior,
+    likelihood_profiles,
     simulated_ranks,
 )
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, fit
 
 PARTS = "clip", "unseen", "calibration", "retimed"
@@ -80,14 +79,14 @@ def scene(seed: int = 0) -> VideoModel:
 
 def drawn(model: VideoModel, times: np.ndarray, scale: float, rng: np.random.Generator) -> np.ndarray:
     """Frames of 8 bits at `times`, with white noise."""
-    screen = Screen(model, np.zeros((3, *model.size, 3), np.uint8))
-    pictures = np.moveaxis(np.stack(list(screen.pictures(times))), 1, -1)
+    residuals = Residuals(model, np.zeros((3, *model.size, 3), np.uint8))
+    pictures = np.moveaxis(np.stack(list(residuals.render_at(times))), 1, -1)
     noisy = pictures + scale * rng.standard_normal(pictures.shape)
     return np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
 
 
 def warp(u: np.ndarray) -> np.ndarray:
-    """From [0, 1] to [0, 1], rising, at paces from 0.5 to 1.5."""
+    """An increasing map of [0, 1] onto itself, at speeds from 0.5 to 1.5."""
     return u + 0.5 * np.sin(2 * np.pi * u) / (2 * np.pi)
 
 
@@ -101,13 +100,13 @@ def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: di
     """Level (a) of a whole clip: how long it takes, and how far emcee is from the exact passes."""
     with warnings.catch_warnings():  # what is compiled once is not timed
         warnings.simplefilter("ignore")
-        evidence(model, frames[: max(3, len(frames) // 40)], noise="score", reach=1)
+        likelihood_profiles(model, frames[: max(3, len(frames) // 40)], noise="score", reach=1)
     begun = time.perf_counter()
-    seen = evidence(model, frames, noise="score")
+    profiles = likelihood_profiles(model, frames, noise="score")
     pictures = time.perf_counter() - begun
-    log_prob = frame_time_log_prob(model, seen=seen)
+    log_prob = frame_time_log_prob(model, profiles=profiles)
     begun = time.perf_counter()
-    exact_times(seen.profiles, log_prob.increments)
+    exact_posterior(profiles.curves, log_prob.increments)
     passes = time.perf_counter() - begun
     begun = time.perf_counter()
     found = frame_time_posterior(log_prob=log_prob, seed=seed, progress=False)
@@ -121,8 +120,8 @@ def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: di
         "clip.seconds.pictures": pictures,
         "clip.seconds.passes": passes,
         "clip.seconds.sampling": sampling,
-        "clip.pictures": seen.num_drawn,
-        "clip.share": float(np.median(seen.noise.share)),
+        "clip.pictures": profiles.num_rendered,
+        "clip.share": float(np.median(profiles.noise.fraction)),
         "clip.converged": found.converged,
         "clip.steps": found.times.shape[1],
         "clip.r_hat": found.r_hat.max(),
@@ -145,8 +144,8 @@ def subset_of_clip(model: VideoModel, frames: np.ndarray, whole, figures: dict[s
     """Every first to third frame, by a smooth warp, whose times and numbers nobody says."""
     last = len(frames) - 1
     numbers = np.unique(np.rint(warp(np.linspace(0, 1, last // 2 + 1)) * last).astype(int))
-    seen = evidence(model, frames[numbers], noise="score")
-    found = exact_times(seen.profiles, frame_time_log_prob(model, seen=seen).increments)
+    profiles = likelihood_profiles(model, frames[numbers], noise="score")
+    found = exact_posterior(profiles.curves, frame_time_log_prob(model, profiles=profiles).increments)
     truth, spread = whole.exact.mean()[numbers], whole.exact.std()[numbers]
     miss = np.abs(found.mean() - truth)[1:-1] * last
     both = np.hypot(found.std(), spread)[1:-1] * last
@@ -215,7 +214,7 @@ def draw(found: dict[str, SimulatedRanks], path: Path) -> None:
             known = label if k == len(ranks.names) - 1 else ("times of frames" if k == 0 else None)
             axis.step(uniform, shares - uniform, where="post", label=known, **style)
         axis.set(title=f"{name} ({ranks.inside(0.99).sum()} of {len(ranks.names)} inside)", xlabel="rank / ranks")
-    axes[0].set_ylabel("share of ranks below, less uniform")
+    axes[0].set_ylabel("fraction of ranks below, less uniform")
     axes[0].legend(fontsize=8, loc="lower right")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
@@ -260,8 +259,8 @@ def put(figures: dict[str, float], name: str, values) -> None:
 
 
 def posterior_of(model: VideoModel, frames: np.ndarray, noise: FrameNoise | str):
-    seen = evidence(model, frames, noise=noise)
-    return exact_times(seen.profiles, Increments.among(np.linspace(0, 1, len(frames))))
+    profiles = likelihood_profiles(model, frames, noise=noise)
+    return exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, len(frames))))
 
 
 def measured(model: VideoModel, frames: np.ndarray, truth: np.ndarray) -> list[float]:
@@ -300,7 +299,7 @@ def main(arguments: list[str] | None = None) -> None:
         calibration(options.replicates, options.seed, options.plot, figures)
     if "retimed" in options.parts:
         retimed(options.seed, figures)
-    _common.finish(options.json, figures, _common.machine(), parts=options.parts)
+    _common.finish(options.json, figures, _common.describe_machine(), parts=options.parts)
 
 
 def clip_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
@@ -328,8 +327,8 @@ def unseen_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
     learned = np.asarray(model.frame_times.times(), np.float64)
     truth = np.concatenate([[0.0], (learned[1:] + learned[:-1]) / 2, [1.0]])
     numbers = [0, *range(1, len(frames), 2), len(frames) - 1]
-    seen = evidence(model, frames[numbers], noise="score")
-    found = exact_times(seen.profiles, Increments.among(np.linspace(0, 1, len(numbers))))
+    profiles = likelihood_profiles(model, frames[numbers], noise="score")
+    found = exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, len(numbers))))
     miss, median_std, z = errors(found, truth)
     last = (len(frames) - 1) / (len(numbers) - 1)  # `errors` counts in steps of this video, two frames each
     figures |= {

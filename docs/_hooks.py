@@ -1,5 +1,6 @@
 """What the site needs beyond Markdown: pages that stand elsewhere in the repository; mathematics without scripts."""
 
+import importlib
 import re
 from pathlib import Path
 
@@ -7,11 +8,15 @@ import latex2mathml.converter
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 
+from foldgauss._runtime.settings import markdown_table
+
 ROOT = Path(__file__).parents[1]
 #: Files of the repository that are pages of the site, too.
 ROOT_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 #: A picture that a notebook shows is named `output_CELL_N.png`: it goes to a folder of the notebook's name.
 _IMAGE = re.compile(r"\]\((output_[\w.]+)\)")
+#: Where an API page shows the table of a dataclass of settings.
+_SETTINGS = re.compile(r"<!-- settings of ([\w.]+)\.(\w+) -->")
 _MATHS = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.S)
 
 
@@ -29,7 +34,10 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, config, files) -> str:
-    """Links to files of the repository become links to their pages."""
+    """Links to files of the repository become links to their pages, and marks of settings become tables of them."""
+    markdown = _SETTINGS.sub(
+        lambda found: markdown_table(getattr(importlib.import_module(found[1]), found[2])), markdown
+    )
     up = "../" * page.file.src_uri.count("/")
     markdown = re.sub(r"\]\(\.\./notebooks/(\w+)\.ipynb", rf"]({up}notebooks/\1.md", markdown)
     for name, root_page in ROOT_PAGES.items():
@@ -42,6 +50,10 @@ def on_page_markdown(markdown: str, page, config, files) -> str:
 def on_page_content(html: str, page, config, files) -> str:
     """TeX becomes MathML."""
     return _MATHS.sub(_mathml, html)
+
+
+def _settings_table(found: re.Match) -> str:
+    return markdown_table(getattr(importlib.import_module(found[1]), found[2]))
 
 
 def _mathml(found: re.Match) -> str:

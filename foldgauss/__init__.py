@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from foldgauss.analysis.divergence import kl_divergence
     from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
     from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood, plain_envelope
-    from foldgauss.estimator import FoldedGaussianMixture
+    from foldgauss.estimator import FoldedGaussianMixture as FoldedGaussianMixture
     from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
     from foldgauss.mixture import FoldedMixture, GaussianMixture
 
@@ -21,18 +21,18 @@ for _kind, _location in {
     "distribution": "foldgauss.analysis.notebook:distribution_png",
     "mixture": "foldgauss.analysis.notebook:mixture_png",
     "history": "foldgauss.analysis.notebook:history_png",
-    "video": "foldgauss.io.page.html:notebook_frame",
+    "video": "foldgauss.io.page.player_page:make_notebook_iframe",
 }.items():
     notebook_hooks.register(_kind, _location)
 
 __version__ = "0.1.0"
 
+# Without `FoldedGaussianMixture`, which needs scikit-learn: `from foldgauss import *` works without the extra.
 __all__ = [
     "CallableEnvelope",
     "CallableFold",
     "Constant",
     "FoldedGaussian",
-    "FoldedGaussianMixture",
     "FoldedMixture",
     "FourierFold",
     "Gaussian",
@@ -58,7 +58,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
-    """A public name, or a module (PEP 562); each is asked for here once."""
+    """Import a public name or a module when it is first accessed (PEP 562)."""
     for home, names in _HOMES.items():
         if name in names:
             globals()[name] = found = getattr(importlib.import_module(f"{__name__}.{home}"), name)

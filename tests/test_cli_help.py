@@ -107,7 +107,7 @@ def completions(words: str, folder: Path, monkeypatch, capsys) -> list[str]:
         ("fit --preset ", ["standard", "draft", "paper"]),
         ("fit --preset dr", ["draft"]),
         ("fit --compositing ", ["over", "sum"]),
-        ("fit --between", ["--between-share"]),
+        ("fit --interp", ["--interpolation-fraction"]),
         ("export m.safetensors --format ply", ["ply", "ply3dgs"]),
         ("render m.safetensors --format ", ["png", "webp"]),
         ("uncertainty m c --noise s", ["score"]),

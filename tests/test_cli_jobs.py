@@ -317,12 +317,12 @@ def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, opt
 
 def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys, monkeypatch):
     def full(*given):
-        raise OutputError("path: expected room for 'summary.json', got none.")
+        raise OutputError("path: expected free space for 'summary.json', got none.")
 
     monkeypatch.setattr(many, "write_json", full)
     assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK) == 1
     assert "3 models in" in (told := capsys.readouterr()).out
-    assert "warning: path: expected room" in told.err
+    assert "warning: path: expected free space" in told.err
     assert len(list((tmp_path / "models").glob("*.safetensors"))) == 3
 
 

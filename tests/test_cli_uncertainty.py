@@ -16,8 +16,8 @@ from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 from foldgauss.cli import uncertainty as command
 from foldgauss.cli._profiles_file import keep_evidence
 from foldgauss.io import load_video_model, read_video, save_video_model
-from foldgauss.uncertainty import evidence
-from foldgauss.uncertainty.posterior.sampling import only_run
+from foldgauss.uncertainty import likelihood_profiles
+from foldgauss.uncertainty.posterior.draws_file import lock_draws
 from foldgauss.video import edit
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
@@ -86,9 +86,9 @@ def test_everything_is_there(done):
 
 
 def test_arviz_reads_the_draws(done):
-    from foldgauss.uncertainty.posterior.sampling import needed
+    from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
-    data = needed("arviz").from_netcdf(str(done / "posterior.nc"))
+    data = import_optional("arviz").from_netcdf(str(done / "posterior.nc"))
     t = data.posterior["t"]
     assert t.sizes["chain"] == 2
     assert t.sizes["frame"] == NUM_FRAMES
@@ -119,12 +119,12 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no
     target = tmp_path / "killed"
     code = (
         "import os, signal, sys\n"
-        "from foldgauss.uncertainty import posterior\n"
-        "whole = posterior._Kept.keep\n"
+        "from foldgauss.uncertainty.posterior import draws_file\n"
+        "whole = draws_file.DrawsFile.save\n"
         "def keep(self):\n"
         "    whole(self)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
-        "posterior._Kept.keep = keep\n"
+        "draws_file.DrawsFile.save = keep\n"
         "from foldgauss import cli\n"
         "cli.main(sys.argv[1:])\n"
     )
@@ -146,7 +146,7 @@ def test_without_colours_less_is_known(work, done, tmp_path, no_pictures):
     target = tmp_path / "results"
     assert run(*arguments(work, target, *SHORT, "--level", "colors")) == 0
     told = (target / "summary.md").read_text()
-    assert "their colours are integrated out" in told
+    assert "their colors are integrated out" in told
     assert "their colours" not in (done / "summary.md").read_text()
     wider = [float(one["exact_std"]) / float(other["exact_std"]) for one, other in zip(
         table_of(target)[5:9], table_of(done)[5:9], strict=True)]  # fmt: skip
@@ -176,7 +176,7 @@ def test_draws_that_python_is_writing_are_left_alone(work, tmp_path, capsys, mon
     """Known before pictures are drawn."""
     monkeypatch.setattr(command, "_evidence", None)
     for more in ([], ["--overwrite"]):
-        with only_run(tmp_path / "chains.h5"):
+        with lock_draws(tmp_path / "chains.h5"):
             assert run(*arguments(work, tmp_path, *SHORT, *more)) == 1
         message = capsys.readouterr().err
         assert "error: --out: expected a file that no other run is writing" in message
@@ -196,7 +196,7 @@ def test_evidence_that_is_none_is_left_alone(work, tmp_path, capsys, monkeypatch
         assert os.listdir(tmp_path) == ["evidence.npz"]
         assert run(*arguments(work, tmp_path, *SHORT, "--overwrite")) == 1
         assert "NoneType" in capsys.readouterr().err
-    keep_evidence(mine, "another's", evidence(model_of_12(), read_video(work / "clip").frames))
+    keep_evidence(mine, "another's", likelihood_profiles(model_of_12(), read_video(work / "clip").frames))
     assert run(*arguments(work, tmp_path, *SHORT)) == 1
     assert "NoneType" in capsys.readouterr().err
 

@@ -143,7 +143,7 @@ def test_davis_refuses_masks_that_do_not_fit(root):
     colours = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     colours[0, 0] = 1, 2, 3
     write_image(place / "00002.png", colours)
-    _fails(ValueError, "masks with a number per pixel.*'RGB'.*00002.png", root, "bear")
+    _fails(ValueError, "masks with a label per pixel.*'RGB'.*00002.png", root, "bear")
     (place / "00002.png").write_text("cut off")
     _fails(ValueError, "masks that decode, got .*00002.png", root, "bear")
     write_mask(place / "00002.png", labels(2)[1:])

@@ -8,15 +8,38 @@ import pytest
 
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components
-from foldgauss.estimator.em.loop import EMStatus, best, expectation_maximisation, used_degrees
-from foldgauss.estimator.em.online import seen_from
-from foldgauss.estimator.em.scaling import Scaling, from_mixture, to_mixture
-from foldgauss.estimator.em.statistics import Times, accumulate, points_of, time_steps
-from foldgauss.estimator.em.updates import Model, newton_step, profile, updated
+from foldgauss.estimator.em.loop import EMStatus, broadcast_degrees, run_em, select_best
+from foldgauss.estimator.em.online import change_reference
+from foldgauss.estimator.em.scaling import Scaling, to_mixture
+from foldgauss.estimator.em.statistics import Times, accumulate, make_points, step_times
+from foldgauss.estimator.em.updates import Model, newton_step, profile_log_likelihood, update_components
 
 K, N, DEGREE = 3, 200, 2
 NO_SCALING = Scaling(np.zeros(3), np.ones(3))
 ENVELOPES = {"0": Constant(), "1": TimeLikelihood(1.0, 1e-3), "2": TimeLikelihood(2.0, 1e-2)}
+
+
+def _from_mixture(mixture, scaling, degree, dtype):
+    """The components of a mixture with polynomial folds of at most this degree."""
+    parts = mixture.components
+    space, time = scaling.scale[:-1], scaling.scale[-1]
+    loc, tril, time_loc, time_scale = (
+        np.asarray(z, np.float64) for z in (parts.loc, parts.scale_tril, parts.time_loc, parts.time_scale)
+    )
+    curve = np.zeros((len(loc), degree + 1, loc.shape[1]))
+    curve[:, 0] = (loc - scaling.shift[:-1]) / space
+    if hasattr(parts.fold, "coefficients"):
+        rows = np.asarray(parts.fold.coefficients, np.float64)
+        used = rows.shape[1]
+        curve[:, 1 : used + 1] = rows * time_scale[:, None, None] ** np.arange(1, used + 1)[None, :, None] / space
+    arrays = (
+        np.asarray(mixture.log_weights, np.float64),
+        (time_loc - scaling.shift[-1]) / time,
+        time_scale / time,
+        curve,
+        tril / space[:, None],
+    )
+    return components.Parameters(*(jnp.asarray(z, dtype) for z in arrays))
 
 
 @pytest.fixture
@@ -43,24 +66,26 @@ def _data(seed=1):
 
 
 def _model(covariance="full", floor=0.0, degree=DEGREE, dtype=np.float64):
-    return Model(used_degrees(degree, K), jnp.full(3, floor, dtype), covariance)
+    return Model(broadcast_degrees(degree, K), jnp.full(3, floor, dtype), covariance)
 
 
 def _run(points, params, envelope, model, total=N, **options):
     starts = jax.tree.map(lambda z: z[None], params)
-    return expectation_maximisation(starts, points, envelope, model, total=total, **options)[0]
+    return run_em(starts, points, envelope, model, total=total, **options)[0]
 
 
 # --- oracles ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("power", ENVELOPES)
-def test_density_is_the_mixtures(x64, power):
+def test_density_matches_mixture(x64, power):
     params, x = _params(), _data()
     mixture = to_mixture(params, NO_SCALING, ENVELOPES[power])
-    density = components.log_likelihoods(components.pairs_of(params, ENVELOPES[power], jnp.asarray(x)).log_density)
+    density = components.log_likelihoods(
+        components.evaluate_densities(params, ENVELOPES[power], jnp.asarray(x)).log_density
+    )
     np.testing.assert_allclose(density, mixture.log_prob(jnp.asarray(x)), rtol=1e-12)
-    again = from_mixture(mixture, NO_SCALING, DEGREE, np.float64)
+    again = _from_mixture(mixture, NO_SCALING, DEGREE, np.float64)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), again, params)
 
 
@@ -70,7 +95,7 @@ def test_density_in_many_space_dimensions(x64):
     parts = (np.log([0.4, 0.6]), np.zeros(2), np.ones(2), rng.normal(size=(2, 3, 9)), tril)
     params, x = components.Parameters(*map(jnp.asarray, parts)), jnp.asarray(rng.normal(size=(5, 10)))
     mixture = to_mixture(params, Scaling(np.zeros(10), np.ones(10)), Constant())
-    density = components.log_likelihoods(components.pairs_of(params, Constant(), x).log_density)
+    density = components.log_likelihoods(components.evaluate_densities(params, Constant(), x).log_density)
     np.testing.assert_allclose(density, mixture.log_prob(x), rtol=1e-12)
 
 
@@ -78,8 +103,8 @@ def test_gram_is_the_sum_over_pairs(x64):
     """Chunks, padding, weights: against the sum written out in NumPy."""
     params, x, weights = _params(), _data(), np.random.default_rng(2).uniform(0, 2, N)
     summed = eqx.filter_jit(lambda points: accumulate(params, ENVELOPES["1"], points))
-    sums = summed(points_of(x, weights, K))
-    pairs = components.pairs_of(params, ENVELOPES["1"], jnp.asarray(x))
+    sums = summed(make_points(x, weights, K))
+    pairs = components.evaluate_densities(params, ENVELOPES["1"], jnp.asarray(x))
     log_density = np.asarray(pairs.log_density)
     shares = weights[:, None] * np.exp(log_density - np.logaddexp.reduce(log_density, axis=1)[:, None])
     v = np.asarray(pairs.v)
@@ -87,39 +112,39 @@ def test_gram_is_the_sum_over_pairs(x64):
     np.testing.assert_allclose(sums.mass, shares.sum(0), rtol=1e-12)
     gram = np.einsum("nk,nka,nkb->kab", shares * np.exp(-np.asarray(pairs.log_a)), z, z)
     np.testing.assert_allclose(sums.gram[0], gram, rtol=1e-10, atol=1e-9)
-    split = summed(points_of(x, weights, 2**13))  # 16 rows a chunk
+    split = summed(make_points(x, weights, 2**13))  # 16 rows a chunk
     np.testing.assert_allclose(split.gram, sums.gram, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize(
     "covariance", ["full", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("diag", "spherical", "tied"))]
 )
-def test_promises_of_time_are_slopes_of_the_profile(x64, covariance):
-    """The Newton step's promise, g . step, against differences of the profile itself."""
+def test_newton_gain_matches_profile_derivatives(x64, covariance):
+    """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)
     if covariance != "full":
         params = params._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
-    points, envelope = points_of(_data(), np.ones(N), K), ENVELOPES["1"]
+    points, envelope = make_points(_data(), np.ones(N), K), ENVELOPES["1"]
     here = eqx.filter_jit(lambda: accumulate(params, envelope, points, order=2))()
     steps, promise = newton_step(here, model, DEGREE)
 
     @jax.jit
     def value(share):
         moved = share * steps
-        times = time_steps(Times(params.time_loc, params.time_scale), moved)
+        times = step_times(Times(params.time_loc, params.time_scale), moved)
         there = accumulate(params, envelope, points, times=times)
-        return profile(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
+        return profile_log_likelihood(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
 
     np.testing.assert_allclose((value(1e-5) - value(-1e-5)) / 2e-5, promise, rtol=1e-5)
     assert (np.asarray(promise) > 0).all()
 
 
-def test_sums_seen_from_elsewhere(x64):
+def test_changing_the_reference_equals_recomputing(x64):
     """A linear map of the sums equals sums made there, with the same shares."""
-    here, there, points = _params(), _params(seed=5), points_of(_data(), np.ones(N), K)
+    here, there, points = _params(), _params(seed=5), make_points(_data(), np.ones(N), K)
     shares = jnp.asarray(np.random.default_rng(3).dirichlet(np.ones(K), points.x.shape[:3]))
     made = eqx.filter_jit(lambda params: accumulate(params, Constant(), points, responsibilities=shares))
-    mapped = seen_from(made(here), here, there)._replace(log_likelihood=made(there).log_likelihood)
+    mapped = change_reference(made(here), here, there)._replace(log_likelihood=made(there).log_likelihood)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), mapped, made(there))
 
 
@@ -139,59 +164,57 @@ def test_sums_seen_from_elsewhere(x64):
         ),
     ],
 )
-def test_likelihood_never_falls(x64, power, covariance):
+def test_likelihood_never_decreases(x64, power, covariance):
     params = _params()._replace(tril=jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
-    run = _run(points_of(_data(), np.ones(N), K), params, ENVELOPES[power], _model(covariance), tol=0, max_steps=60)
+    run = _run(make_points(_data(), np.ones(N), K), params, ENVELOPES[power], _model(covariance), tol=0, max_steps=60)
     history = np.array(run.history)
     assert len(history) == 60
     assert history[-1] > history[0] + 0.1  # it did work
     assert (np.diff(history) >= -1e-10 * np.abs(history[1:])).all()
 
 
-def test_moments_of_time_would_let_the_likelihood_fall(x64):
+def test_moment_updates_of_time_can_decrease_the_likelihood(x64):
     """Power check of the test above: from its end, plain moments of time go down."""
-    envelope, model, points = ENVELOPES["1"], _model(), points_of(_data(), np.ones(N), K)
+    envelope, model, points = ENVELOPES["1"], _model(), make_points(_data(), np.ones(N), K)
     params = _run(points, _params(), envelope, model, tol=1e-8, max_steps=60).params
 
     @jax.jit
     def by_moments(params):
         sums = accumulate(params, envelope, points)
-        return updated(params, sums, model)[0], sums.log_likelihood
+        return update_components(params, sums, model)[0], sums.log_likelihood
 
     params, before = by_moments(params)
     assert by_moments(params)[1] < before - 1e-3
 
 
-def test_lower_degrees_stay_lower(x64):
+def test_coefficients_above_the_degree_stay_zero(x64):
     degrees = np.array([0, 1, 2])
     params = _params()._replace(
         curve=_params().curve * jnp.asarray(1.0 * (np.arange(3)[None, :, None] <= degrees[:, None, None]))
     )
-    run = _run(points_of(_data(), np.ones(N), K), params, ENVELOPES["1"], _model(degree=degrees), tol=0, max_steps=10)
+    run = _run(make_points(_data(), np.ones(N), K), params, ENVELOPES["1"], _model(degree=degrees), tol=0, max_steps=10)
     curve = np.asarray(run.params.curve)
     assert (curve[0, 1:] == 0).all()
     assert (curve[1, 2:] == 0).all()
     assert (curve[2] != 0).all()
 
 
-def test_restarts_in_one_program_are_the_single_runs(x64):
-    points, options = points_of(_data(), np.ones(N), K), {"total": N, "tol": 1e-6, "max_steps": 60}
+def test_vectorized_restarts_equal_single_runs(x64):
+    points, options = make_points(_data(), np.ones(N), K), {"total": N, "tol": 1e-6, "max_steps": 60}
     starts = [_params(seed=s) for s in (0, 1)]
-    both = expectation_maximisation(
-        jax.tree.map(lambda *z: jnp.stack(z), *starts), points, Constant(), _model(), **options
-    )
+    both = run_em(jax.tree.map(lambda *z: jnp.stack(z), *starts), points, Constant(), _model(), **options)
     for run, start in zip(both, starts, strict=True):
         alone = _run(points, start, Constant(), _model(), tol=1e-6, max_steps=60)
         assert run.num_steps == alone.num_steps
         np.testing.assert_allclose(run.history, alone.history, rtol=1e-9)
         np.testing.assert_allclose(run.params.curve, alone.params.curve, rtol=1e-6, atol=1e-9)
-    assert best(both).log_likelihood == max(run.log_likelihood for run in both)
+    assert select_best(both).log_likelihood == max(run.log_likelihood for run in both)
 
 
-def test_any_envelope_can_be_fitted_with(x64):
+def test_custom_envelope_can_be_fitted(x64):
     """A user's own envelope, equal to the built-in: the same run."""
     own = plain_envelope(lambda t, m, s: 1e-3 + (1 - 1e-3) * jnp.exp(-0.5 * ((t - m) / s) ** 2))
-    points = points_of(_data(), np.ones(N), K)
+    points = make_points(_data(), np.ones(N), K)
     runs = [_run(points, _params(), envelope, _model(), tol=0, max_steps=10) for envelope in (own, ENVELOPES["1"])]
     np.testing.assert_allclose(runs[0].history, runs[1].history, rtol=1e-9)
 
@@ -199,11 +222,11 @@ def test_any_envelope_can_be_fitted_with(x64):
 # --- data that determine nothing ----------------------------------------------------------------------------
 
 
-def test_dead_component_is_reset_and_told():
+def test_empty_component_is_reset():
     params = _params(np.float32)
     params = params._replace(time_loc=params.time_loc.at[0].set(1e3))  # out of reach: no mass
     points, model = (
-        points_of(_data().astype(np.float32), np.ones(N, np.float32), K),
+        make_points(_data().astype(np.float32), np.ones(N, np.float32), K),
         _model(dtype=np.float32, floor=1e-6),
     )
     left = _run(points, params, Constant(), model, tol=1e-4, max_steps=30)
@@ -216,17 +239,17 @@ def test_dead_component_is_reset_and_told():
 
 
 def test_nan_is_never_convergence():
-    points = points_of(_data().astype(np.float32), np.ones(N, np.float32), K)
+    points = make_points(_data().astype(np.float32), np.ones(N, np.float32), K)
     params = _params(np.float32)
     broken = params._replace(curve=params.curve.at[0].set(jnp.nan))
     run = _run(points, broken, Constant(), _model(dtype=np.float32), tol=1e6, max_steps=30)
     assert run.status == EMStatus.NOT_FINITE
-    assert best([run, run._replace(status=EMStatus.NOT_CONVERGED, log_likelihood=-1e9)]).log_likelihood == -1e9
+    assert select_best([run, run._replace(status=EMStatus.NOT_CONVERGED, log_likelihood=-1e9)]).log_likelihood == -1e9
 
 
-def test_singular_component_is_told():
+def test_singular_component_sets_status():
     x = np.repeat(_data()[:K], 20, axis=0).astype(np.float32)  # three points, many times
-    points = points_of(x, np.ones(len(x), np.float32), K)
+    points = make_points(x, np.ones(len(x), np.float32), K)
     params = _params(np.float32)
     apart = params._replace(
         curve=params.curve * 0, time_scale=params.time_scale * 0 + 0.5, time_loc=jnp.asarray(x[::20, 2])

@@ -13,9 +13,9 @@ pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning
 
 from foldgauss.estimator import chunks as _chunks
-from foldgauss.estimator.chunks import chunks_of, is_chunked, survey, variances_of
-from foldgauss.estimator.em import loop, prune, starts, statistics
-from foldgauss.estimator.em.scaling import Prepare
+from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows, weighted_moments
+from foldgauss.estimator.em import initialization, loop, prune, statistics
+from foldgauss.estimator.em.scaling import RowTransform
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.model_selection import select_mixture
 
@@ -51,7 +51,7 @@ def _small(monkeypatch):
     """Pieces, parts and blocks so small that the tests' data make several."""
     monkeypatch.setattr(_chunks, "_PIECE_ROWS", 100)
     monkeypatch.setattr(statistics, "PAIRS_PER_CHUNK", 512)
-    monkeypatch.setattr(statistics, "_ROUNDS_PER_BLOCK", 2)
+    monkeypatch.setattr(statistics, "_CHUNKS_PER_BLOCK", 2)
 
 
 def _tracks(num=N, dtype=np.float64, offset=0.0):
@@ -90,6 +90,16 @@ class _Files:
         return (part.copy() for part in self.parts)
 
 
+class _Changing:
+    """Other rows in each pass."""
+
+    def __init__(self, passes):
+        self.passes = passes
+
+    def __iter__(self):
+        return iter(next(self.passes))
+
+
 # --- the same result ------------------------------------------------------------------------------------------
 
 
@@ -113,7 +123,7 @@ class _Files:
         pytest.param({"init_params": "random", "annealing": 0.1, "time_column": 0}, marks=pytest.mark.slow),
     ],
 )
-def test_chunks_are_fitted_as_one_array(options):
+def test_chunks_equal_one_array(options):
     """Weights of zero among them, and 1e6 away from zero."""
     x, weights = _tracks(offset=1e6), _weights()
     whole = _fit(x, weights, **options)
@@ -124,7 +134,7 @@ def test_chunks_are_fitted_as_one_array(options):
         assert (np.diff(parted.lower_bounds_) > -1e-9).all()
 
 
-def test_any_kind_of_chunks_will_do(tmp_path):
+def test_all_kinds_of_chunks_are_equivalent(tmp_path):
     x, weights = _tracks(), _weights()
     parts, masses = np.split(x, CUTS), np.split(weights, CUTS)
     x.tofile(tmp_path / "rows")
@@ -132,7 +142,6 @@ def test_any_kind_of_chunks_will_do(tmp_path):
     whole = _fit(x, weights)
     kinds = {
         "an object": (_Files(parts), _Files(masses)),
-        "a function": (lambda: iter(parts), lambda: iter(masses)),
         "one chunk from a file": ([mapped], weights),
         "slices of a file, and a list": ([mapped[:7], mapped[7:]], list(weights)),
         "rows one by one": ([row[None] for row in x], weights),
@@ -143,7 +152,7 @@ def test_any_kind_of_chunks_will_do(tmp_path):
     _assert_same(_fit(x), _fit(parts, 1.0), 1e-9)
 
 
-def test_columns_are_scaled_each_by_its_own_spread():
+def test_columns_are_scaled_by_their_standard_deviation():
     x = _tracks() * [100.0, 1.0] + [7.0, 0.0]
     whole, parted = _fit(x, time_column=0), _fit(np.split(x, CUTS), time_column=0)
     np.testing.assert_allclose(parted._scaling.scale, whole._scaling.scale, rtol=1e-12)
@@ -162,18 +171,18 @@ def test_float32_chunks_are_fitted_in_float32():
 
 
 @pytest.mark.parametrize("ordered", [2**20, 300])
-def test_starts_look_at_the_same_rows(monkeypatch, ordered):
+def test_initialization_draws_the_same_rows(monkeypatch, ordered):
     """Where a start looks at some rows only; by either way of drawing them."""
-    monkeypatch.setattr(starts, "_MOST_POINTS", 100)
-    monkeypatch.setattr(starts, "_MOST_ORDERED", ordered)
+    monkeypatch.setattr(initialization, "_MAX_POINTS", 100)
+    monkeypatch.setattr(initialization, "_MAX_PERMUTED", ordered)
     x, weights = _tracks(), _weights()
     seen = []
 
-    def start(kind, y, weights, *rest):
+    def record(kind, y, weights, *rest):
         seen.append((y, weights))
-        return starts.start(kind, y, weights, *rest)
+        return initialization.initialize(kind, y, weights, *rest)
 
-    monkeypatch.setattr("foldgauss.estimator.folded_gaussian_mixture.start", start)
+    monkeypatch.setattr("foldgauss.estimator.folded_gaussian_mixture.initialize", record)
     _assert_same(_fit(x, weights), _fit(np.split(x, CUTS), np.split(weights, CUTS)))
     for (y, w), (again, mass) in zip(seen[:2], seen[2:], strict=True):
         assert len(y) == len(again) == 100
@@ -182,7 +191,7 @@ def test_starts_look_at_the_same_rows(monkeypatch, ordered):
     assert not np.allclose(np.sort(seen[2][0], axis=0), np.sort(seen[3][0], axis=0))
 
 
-def test_of_equal_ends_the_first_is_kept():
+def test_first_of_equal_runs_is_selected():
     """Up to rounding, which hangs on how points are chunked."""
     params = _fit(X, max_iter=1)._params
     run = loop.Run(params, 2.0, [2.0], 1, loop.EMStatus.CONVERGED, 0)
@@ -190,21 +199,21 @@ def test_of_equal_ends_the_first_is_kept():
     lost = broken._replace(log_likelihood=-np.inf)
     for ends, expected in [((2, 2 + 1e-14), 0), ((2, 2 + 1e-12), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
         runs = [run._replace(log_likelihood=end) for end in ends]
-        assert loop.best([broken, *runs]) is runs[expected]
-    assert loop.best([lost, broken]) is broken
-    assert loop.best([lost, lost]).log_likelihood == -np.inf
+        assert loop.select_best([broken, *runs]) is runs[expected]
+    assert loop.select_best([lost, broken]) is broken
+    assert loop.select_best([lost, lost]).log_likelihood == -np.inf
 
 
-def test_a_draw_of_many_is_fair_and_without_repetition():
+def test_large_draws_are_uniform_without_duplicates():
     rng = np.random.RandomState(0)
     num = 2**21  # without care some 95 would be drawn twice
-    numbers = starts.drawn(num, rng)
-    assert len(np.unique(numbers)) == starts._MOST_POINTS
+    numbers = initialization.draw_subset(num, rng)
+    assert len(np.unique(numbers)) == initialization._MAX_POINTS
     # Uniform: the mean of 20,000 is within 5 standard errors of the middle (false alarm 6e-7).
-    assert abs(numbers.mean() / num - 0.5) < 5 / np.sqrt(12 * starts._MOST_POINTS)
+    assert abs(numbers.mean() / num - 0.5) < 5 / np.sqrt(12 * initialization._MAX_POINTS)
 
 
-def test_a_warm_start_goes_on_with_chunks():
+def test_warm_start_continues_with_chunks():
     x = _tracks()
     begun = _fit(x, max_iter=2, warm_start=True)
     reached = begun.lower_bound_
@@ -213,27 +222,29 @@ def test_a_warm_start_goes_on_with_chunks():
     assert begun.lower_bounds_[0] > reached
 
 
-def test_what_pruning_asks_of_points_is_the_same_of_blocks():
+def test_pruning_statistics_of_blocks_equal_those_of_points():
     x, weights = _tracks(), _weights()
     fitted, there = _fit(x, weights, max_iter=1), weights > 0
-    chunks = chunks_of(np.split(x, CUTS), np.split(weights, CUTS))
-    prepare = Prepare(np.arange(2), fitted._scaling, 1.0, np.dtype(np.float64))
-    with statistics.precision(np.float64):
-        points = statistics.points_of(fitted._scaling.apply(x[there]), weights[there], 3)
+    chunks = open_chunks(np.split(x, CUTS), np.split(weights, CUTS))
+    prepare = RowTransform(np.arange(2), fitted._scaling, 1.0, np.dtype(np.float64))
+    with statistics.enable_dtype(np.float64):
+        points = statistics.make_points(fitted._scaling.apply(x[there]), weights[there], 3)
         blocks = statistics.Blocks(chunks, prepare, np.dtype(np.float64), 3, [there.sum()])
-        for function in (prune._without, prune._sums):
-            pairs = [statistics.summed(function, z, fitted._params, fitted._envelope) for z in (points, blocks)]
+        for function in (prune._log_likelihoods_without, prune._accumulate):
+            pairs = [
+                statistics.sum_over_points(function, z, fitted._params, fitted._envelope) for z in (points, blocks)
+            ]
             for one, other in zip(*map(jax.tree.leaves, pairs), strict=True):
                 np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * np.abs(one).max())
         value = prune.log_likelihood(fitted._params, blocks, fitted._envelope)
         np.testing.assert_allclose(value, prune.log_likelihood(fitted._params, points, fitted._envelope), rtol=1e-12)
 
 
-def test_variances_are_of_centred_numbers():
+def test_variances_are_accurate_far_from_zero():
     x = 1e8 + np.random.default_rng(0).normal(size=(1000, 2)) * [1.0, 1e-3]
     weights = _weights(1000)
-    found, sizes = survey(chunks_of(np.array_split(x, 77), weights))
-    mean, variance = variances_of(x[weights > 0], weights[weights > 0])
+    found, sizes = summarize_rows(open_chunks(np.array_split(x, 77), weights))
+    mean, variance = weighted_moments(x[weights > 0], weights[weights > 0])
     np.testing.assert_allclose(found.mean, mean, rtol=1e-15)
     np.testing.assert_allclose(found.scatter / found.total, variance, rtol=1e-5)
     assert (found.num_rows, found.size, sizes) == (1000, (weights > 0).sum(), [(weights > 0).sum()])
@@ -243,7 +254,7 @@ def test_variances_are_of_centred_numbers():
 # --- what is known of chunks ----------------------------------------------------------------------------------
 
 
-def test_scores_and_labels_of_chunks():
+def test_predictions_of_chunks_equal_those_of_rows():
     x = _tracks()
     fitted, parts = _fit(x), np.split(x, CUTS)
     for name in ("score", "bic", "aic"):
@@ -258,7 +269,7 @@ def test_scores_and_labels_of_chunks():
     np.testing.assert_array_equal(np.concatenate(list(labels)), fitted.predict(x))
 
 
-def test_chunks_are_chosen_among_by_information():
+def test_select_mixture_takes_chunks():
     x = _tracks()
     options = {"n_components": [3], "degrees": [2]}
     estimator = FoldedGaussianMixture(**OPTIONS)
@@ -275,12 +286,12 @@ def _dask():
     return pytest.importorskip("dask.array", reason="dask is not installed")
 
 
-def test_a_dask_array_is_fitted_as_one_array():
+def test_dask_array_equals_one_array():
     array = _dask()
     x, weights = _tracks(offset=1e6), _weights()
     rows = array.from_array(x, chunks=((70, 10, 0, 160, 1, 259, 100), 2))
     whole = _fit(x, weights)
-    assert chunks_of(rows).num_parts == 3  # small chunks are taken together
+    assert open_chunks(rows).num_parts == 3  # small chunks are taken together
     for mass in (weights, array.from_array(weights, chunks=77)):
         _assert_same(whole, _fit(rows, mass))
     for name in ("score", "bic"):
@@ -322,15 +333,15 @@ def _same_with(client, rows, alone):
     submit = client.compute
     client.compute = lambda *args, **more: tasks.append(1) or submit(*args, **more)
     parted = _fit(rows, _weights())
-    num_parts = chunks_of(rows).num_parts
-    # A survey, the starts' rows, and a pass for each step, of which the other start may have taken more.
+    num_parts = open_chunks(rows).num_parts
+    # A summary, the rows of the starts, and a pass for each step, of which the other start may have taken more.
     assert len(tasks) % num_parts == 0
     assert len(tasks) >= num_parts * (2 + parted.n_iter_)
     for name in FITTED:
         np.testing.assert_array_equal(getattr(parted, name), getattr(alone, name))
 
 
-def test_workers_sum_to_the_same_bits():
+def test_workers_give_equal_bits():
     rows = _dask().from_array(_tracks(), chunks=(101, 2))
     alone = _fit(rows, _weights())
     with _workers(processes=False) as client:
@@ -339,7 +350,7 @@ def test_workers_sum_to_the_same_bits():
 
 
 @pytest.mark.slow
-def test_workers_in_processes_sum_to_the_same_bits(monkeypatch):
+def test_worker_processes_give_equal_bits(monkeypatch):
     monkeypatch.undo()  # processes have their own constants
     rows = _dask().from_array(_tracks(200_000, np.float32), chunks=(66_000, 2))
     options = {"max_iter": 5}
@@ -362,7 +373,6 @@ _NAN = np.where(np.arange(20)[:, None] == 17, np.nan, X[:20])
 @pytest.mark.parametrize(
     ("data", "weights", "match"),
     [
-        (lambda: iter([X]).__iter__(), None, None),
         ("once", None, "X: expected chunks that can be read again in each pass, got generator"),
         ([X, X[:, :1]], None, "X, chunk 1: expected 2 columns, got 1"),
         ([X, X[0]], None, r"X, chunk 1: expected an array \(n, d\), got ndarray of shape \(2,\)"),
@@ -373,8 +383,6 @@ _NAN = np.where(np.arange(20)[:, None] == 17, np.nan, X[:20])
         ([X[:0]], None, "X: expected at least one chunk with rows, got none"),
         ([X[:1]], None, "X: expected at least 2 rows, got 1"),
         ([X[:2]], None, "n_components: expected at most the number of points"),
-        (lambda: X, None, "X: expected an iterable of chunks, got ndarray"),
-        (lambda: 3, None, "X: expected an iterable of chunks, got int"),
         ([X, X], [np.ones(50), np.ones(49)], r"sample_weight, chunk 1: expected shape \(50,\), got shape \(49,\)"),
         ([X, X], [np.ones(50)], "sample_weight: expected as many chunks as X, at least 2, got 1"),
         ([X], [np.ones(50), np.ones(50)], "sample_weight: expected as many chunks as X, got more"),
@@ -385,22 +393,19 @@ _NAN = np.where(np.arange(20)[:, None] == 17, np.nan, X[:20])
         ([X], "heavy", "sample_weight, chunk 0: expected"),
     ],
 )
-def test_chunks_that_cannot_be_fitted_are_named(data, weights, match):
-    if match is None:
-        assert _fit(data, max_iter=1).n_iter_ == 1
-        return
+def test_invalid_chunks_raise(data, weights, match):
     data = (part for part in [X]) if data == "once" else data
     with pytest.raises(ValueError, match=match):
         _fit(data, weights)
 
 
-def test_rows_that_change_from_pass_to_pass_are_told():
-    left = iter([[X, X], [X]])
+def test_rows_that_change_between_passes_raise():
+    left = iter([[X, X], [X, X], [X]])  # the first is taken by the check that there are several passes
     with pytest.raises(ValueError, match="X: expected the same rows in each pass, got 100 at first and 50 now"):
-        _fit(lambda: next(left))
+        _fit(_Changing(left))
 
 
-def test_dask_arrays_that_cannot_be_fitted_are_told():
+def test_invalid_dask_arrays_raise():
     array = _dask()
     rows = array.from_array(X, chunks=(20, 1))
     for data, weights, match in [
@@ -425,24 +430,24 @@ def test_dask_arrays_that_cannot_be_fitted_are_told():
             _fit(data, weights)
 
 
-def test_chunks_unlike_those_fitted_are_told():
+def test_prediction_checks_chunks():
     fitted = _fit(X, max_iter=1)
     with pytest.raises(ValueError, match="X, chunk 1: expected 2 columns, got 1"):
         fitted.score([X, X[:, :1]])
     with pytest.raises(ValueError, match="X, chunk 0: expected finite numbers"):
         next(fitted.predict([_NAN]))
     with pytest.raises(ValueError, match="X: expected at least one chunk with rows"):
-        fitted.bic(list)
+        fitted.bic(_Files([]))
     with pytest.raises(ValueError, match="X: expected 2 columns, got 1"):
         fitted.predict(_dask().from_array(X[:, :1]))
     with pytest.raises(ValueError, match=r"X: expected one batch of rows, got chunks. fit takes chunks"):
         fitted.partial_fit([X])
 
 
-def test_rows_are_not_taken_for_chunks():
-    for rows in (X, X.tolist(), list(X), [], "text", {"a": X}, None, [[1, 2], [3, 4]], X[None]):
+def test_rows_and_chunks_are_told_apart():
+    for rows in (X, X.tolist(), list(X), lambda: [X], [], "text", {"a": X}, None, [[1, 2], [3, 4]], X[None]):
         assert not is_chunked(rows)
-    for chunks in ([X], (X, X), _Files([X]), lambda: [X], (part for part in [X])):
+    for chunks in ([X], (X, X), _Files([X]), (part for part in [X])):
         assert is_chunked(chunks)
 
 
@@ -465,18 +470,20 @@ from foldgauss.estimator import FoldedGaussianMixture
 
 warnings.simplefilter("ignore")
 
-def chunks(num):
-    def begin():
-        for seed in range(num):
+class Chunks:
+    def __init__(self, num):
+        self.num = num
+
+    def __iter__(self):
+        for seed in range(self.num):
             t = np.random.default_rng(seed).normal(size=50_000)
             yield np.stack([t**2 + 0.1 * np.cos(99 * t), np.sin(t), t], 1)
-    return begin
 
 peaks = []
 for num in (4, 80):
     fitted = FoldedGaussianMixture(2, degree=1, init_params="random_from_data", max_iter=2, random_state=0)
-    fitted.fit(chunks(num))
-    fitted.score(chunks(num))
+    fitted.fit(Chunks(num))
+    fitted.score(Chunks(num))
     peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 assert "dask" not in sys.modules
 print(peaks[1] - peaks[0])

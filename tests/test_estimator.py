@@ -82,7 +82,7 @@ def test_passes_quick_checks(check):
 
 
 @pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0)])
-def test_linear_folds_are_scikit_learns_mixture(kind, degree):
+def test_linear_folds_match_scikit_learn(kind, degree):
     """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""
     x = _blobs() + np.array([100.0, -5.0, 3.0])
     precisions = {"full": np.tile(np.eye(3) * 0.1, (K, 1, 1)), "diag": np.full((K, 3), 0.1)}[kind]
@@ -132,7 +132,7 @@ def test_to_mixture_samples_conditions_in_the_users_columns():
 # --- weights ------------------------------------------------------------------------------------------------
 
 
-def test_weights_count_repetitions():
+def test_weights_equal_repetitions():
     x, rng = _blobs(), np.random.default_rng(1)
     weights = rng.integers(0, 3, N)
     options = {"degree": 1, "random_state": 0, "max_iter": 20, "tol": 0}
@@ -145,7 +145,7 @@ def test_weights_count_repetitions():
 
 
 @pytest.mark.slow
-def test_batches_lead_where_all_points_do():
+def test_partial_fit_approaches_fit():
     x = _blobs(n=6000)[np.random.default_rng(1).permutation(6000)]
     options = {"degree": 1, "random_state": 0, "n_init": 5, "tol": 1e-5, "max_iter": 300}
     whole, online = FoldedGaussianMixture(K, **options).fit(x), FoldedGaussianMixture(K, **options)
@@ -177,7 +177,7 @@ def test_crossing_tracks_are_found():
 
 
 @pytest.mark.parametrize("start", ["kmeans", pytest.param("random_from_data", marks=pytest.mark.slow)])
-def test_annealing_finds_what_hard_starts_miss(start):
+def test_annealing_finds_the_best_optimum(start):
     """Groups of neighbours, where tracks cross: from heat on, every start ends at the same best."""
     x, labels = _tracks()
     plain, heated = (
@@ -195,7 +195,7 @@ def test_annealing_finds_what_hard_starts_miss(start):
     assert min(_same_partition(fitted.predict(x), labels) for fitted in heated) > truth - 0.02
 
 
-def test_heat_alone_is_not_kept():
+def test_annealing_ends_at_temperature_one():
     """No run ends before it is cold; plain EM from its end hardly moves."""
     x, _ = _tracks()
     options = {"degree": 3, "random_state": 0}
@@ -261,7 +261,7 @@ def test_float32_far_from_zero():
 # --- hard data, wrong words ---------------------------------------------------------------------------------
 
 
-def test_hard_data_end_in_numbers():
+def test_degenerate_data_give_finite_parameters():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(N, 3))
     constant = np.concatenate([x[:, :1], np.full((N, 1), 7.0), x[:, 2:]], 1)
@@ -297,18 +297,18 @@ def test_hard_data_end_in_numbers():
         ("means_init", np.zeros((5, 3)), {"n_components": 1, "means_init": np.zeros((2, 3))}),
     ],
 )
-def test_wrong_words_are_named(match, data, options):
+def test_invalid_arguments_raise(match, data, options):
     with pytest.raises(ValueError, match=match):
         FoldedGaussianMixture(**({"n_components": 1, "degree": 1} | options)).fit(data)
 
 
-def test_unfitted_says_so():
+def test_unfitted_estimator_raises():
     for call in ("to_mixture", "sample"):
         with pytest.raises(NotFittedError):
             getattr(FoldedGaussianMixture(), call)()
 
 
-def test_no_convergence_is_told():
+def test_no_convergence_warns():
     with pytest.warns(ConvergenceWarning, match="NOT_CONVERGED"):
         fitted = FoldedGaussianMixture(K, degree=1, max_iter=2, tol=0, random_state=0).fit(_blobs())
     assert not fitted.converged_
@@ -341,7 +341,7 @@ def test_same_on_one_and_on_four_devices():
 
 
 @pytest.mark.parametrize("kind", ["tied", "spherical"])
-def test_starts_are_of_the_kind_that_is_fitted(kind):
+def test_initial_covariances_are_of_the_fitted_kind(kind):
     """Given means make a covariance for each component; those of a fit are tied, or round, all the same."""
     x, labels = _tracks()
     means = np.stack([x[labels == k].mean(0) for k in range(3)])
@@ -352,7 +352,7 @@ def test_starts_are_of_the_kind_that_is_fitted(kind):
     np.testing.assert_allclose(given, given * np.eye(given.shape[-1]), atol=1e-12)
 
 
-def test_auto_begins_with_every_component_at_work(monkeypatch):
+def test_auto_starts_without_empty_components(monkeypatch):
     """More curves than tracks: none is taken twice, none is left without points."""
     begun = []
 
@@ -360,7 +360,7 @@ def test_auto_begins_with_every_component_at_work(monkeypatch):
         begun.append(params)
         return params, model
 
-    monkeypatch.setattr(estimator, "pruned", nothing_goes)
+    monkeypatch.setattr(estimator, "prune_mixture", nothing_goes)
     x, _ = _tracks()
     _quiet(FoldedGaussianMixture(degree=1, max_components=12, init_params="trajectories", random_state=0), x)
     assert begun[0].log_weights.shape == (12,)
@@ -368,7 +368,7 @@ def test_auto_begins_with_every_component_at_work(monkeypatch):
 
 
 @pytest.mark.slow
-def test_weights_that_are_shares_prune_as_well():
+def test_normalized_weights_prune_alike():
     rng = np.random.default_rng(0)
     t = rng.normal(size=300)
     x = np.stack([2 * t + 0.1 * rng.normal(size=300), t], 1)
@@ -387,7 +387,7 @@ def test_degrees_of_a_constant_column_and_of_exact_data():
         assert _quiet(FoldedGaussianMixture(1, random_state=0), x).degrees_.tolist() == [1]
 
 
-def test_a_row_without_weight_may_hold_any_number():
+def test_rows_of_weight_zero_are_ignored():
     x, _ = _tracks()
     whole = _quiet(FoldedGaussianMixture(3, degree=1, random_state=0), x)
     more = np.concatenate([x, [[1e200, -1e200]]])
@@ -396,7 +396,7 @@ def test_a_row_without_weight_may_hold_any_number():
 
 
 @pytest.mark.slow
-def test_unequal_batches_lead_where_all_points_do():
+def test_unequal_batches_approach_fit():
     x = _blobs(n=4000)
     groups = [x[k::K] for k in range(K)]
     start = {
@@ -418,7 +418,7 @@ def test_unequal_batches_lead_where_all_points_do():
     assert best - online.score(x) < 0.3 * (best - first)
 
 
-def test_a_warm_start_goes_on():
+def test_warm_start_continues():
     x = _blobs()
     options = {"degree": 1, "random_state": 0, "tol": 1e-4}
     whole = _quiet(FoldedGaussianMixture(K, max_iter=200, **options), x)
@@ -434,7 +434,7 @@ def test_a_warm_start_goes_on():
     assert _quiet(cold, x).lower_bounds_ == pytest.approx(whole.lower_bounds_[:5], rel=1e-9)
 
 
-def test_verbose_says_each_iteration(capsys):
+def test_verbose_prints_each_iteration(capsys):
     _quiet(FoldedGaussianMixture(K, degree=1, max_iter=3, tol=0, random_state=0), _blobs())
     assert capsys.readouterr().out == ""
     fitted = _quiet(FoldedGaussianMixture(K, degree=1, max_iter=3, tol=0, random_state=0, verbose=1), _blobs())
@@ -444,7 +444,7 @@ def test_verbose_says_each_iteration(capsys):
     np.testing.assert_allclose(np.diff(told), np.diff(fitted.lower_bounds_), atol=1e-5)
 
 
-def test_sums_of_many_points_are_taken_in_float64():
+def test_sums_of_many_points_are_in_float64():
     x = _blobs(n=4000).astype(np.float32)
     fitted = _quiet(FoldedGaussianMixture(K, degree=1, max_iter=2, random_state=0), x)
     each = fitted.score_samples(x)
@@ -478,7 +478,7 @@ def test_float32_fits_high_degrees(degree):
         assert online.score(x) == pytest.approx(double.score(x), abs=0.01)
 
 
-def test_a_small_batch_counts_for_little():
+def test_small_batches_have_small_effect():
     x = _blobs()
     online = FoldedGaussianMixture(1, degree=1).partial_fit(x)
     before = online.means_.copy()
@@ -486,7 +486,7 @@ def test_a_small_batch_counts_for_little():
     assert 0 < moved < 0.5
 
 
-def test_conditions_far_from_zero_are_taken_in_the_precision_of_the_fit():
+def test_conditions_far_from_zero_use_the_fits_dtype():
     rng = np.random.default_rng(0)
     t = rng.uniform(-1000, 1000, 400)
     x = np.stack([np.sin(t / 400) + 0.01 * rng.normal(size=400), 1.7e9 + t], 1)
@@ -498,7 +498,7 @@ def test_conditions_far_from_zero_are_taken_in_the_precision_of_the_fit():
         fitted.condition(-1, np.nan)
 
 
-def test_times_too_coarse_for_float32_are_told():
+def test_times_too_coarse_for_float32_warn():
     rng = np.random.default_rng(0)
     t = rng.normal(size=300)
     x = np.stack([2 * t + 0.1 * rng.normal(size=300), t], 1)
@@ -513,7 +513,7 @@ def test_times_too_coarse_for_float32_are_told():
 
 
 @pytest.mark.slow
-def test_a_warm_start_from_other_sizes_is_cold():
+def test_warm_start_ignores_fits_of_other_sizes():
     x = _blobs()
     fitted = _quiet(FoldedGaussianMixture(2, degree=1, warm_start=True, random_state=0), x)
     again = _quiet(fitted.set_params(n_components=3, degree=2), x)
@@ -525,6 +525,6 @@ def test_a_warm_start_from_other_sizes_is_cold():
     "options",
     [{"means_init": np.full((3, 3), np.nan)}, {"precisions_init": np.full((3, 3, 3), np.nan)}, {"time_column": True}],
 )
-def test_starts_and_columns_that_cannot_be(options):
+def test_invalid_initial_values_and_columns_raise(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         FoldedGaussianMixture(3, degree=1, **options).fit(_blobs())

@@ -10,7 +10,7 @@ from scipy import stats
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.estimator.likelihood import FitStatus, _cv_parts, _student_quantile, bootstrap, fit, select_degree
+from foldgauss.estimator.likelihood import FitStatus, _assign_folds, _student_quantile, bootstrap, fit, select_degree
 from foldgauss.estimator.time_profile import Ascent, Profile, _step
 from foldgauss.fold import PolynomialFold
 
@@ -67,7 +67,7 @@ def test_hermite_polynomials_convert_to_powers():
 @pytest.mark.parametrize("covariance", ["full", "diagonal"])
 def test_closed_form_is_generalised_least_squares(x64, covariance):
     x, weights = _points(), jnp.linspace(0.5, 2.0, 60)
-    result = fit(x, degree=3, weights=weights, time_loc=0.35, time_scale=0.28, covariance=covariance).checked()
+    result = fit(x, degree=3, weights=weights, time_loc=0.35, time_scale=0.28, covariance=covariance).check()
     beta, sigma, errors = _numpy_fit(x, weights, 3, 0.35, 0.28, 1.0, 1e-3)
     sigma = np.diag(np.diag(sigma)) if covariance == "diagonal" else sigma
     dist, close = result.distribution, lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
@@ -81,34 +81,34 @@ def test_closed_form_is_generalised_least_squares(x64, covariance):
 
 def test_own_estimates_of_time_are_mean_and_standard_deviation(x64):
     x, weights = _points(), jnp.linspace(0.5, 2.0, 60)
-    dist = fit(x, degree=2, weights=weights).checked().distribution
+    dist = fit(x, degree=2, weights=weights).check().distribution
     mean = np.average(x[:, -1], weights=weights)
     np.testing.assert_allclose(dist.time_loc, mean, rtol=1e-14)
     scale = np.sqrt(np.average((x[:, -1] - mean) ** 2, weights=weights))
     np.testing.assert_allclose(dist.time_scale, scale, rtol=1e-14)
 
 
-def test_the_truth_is_found_in_float32():
-    dist = fit(_points(20_000), degree=2).checked().distribution
+def test_true_parameters_are_recovered_in_float32():
+    dist = fit(_points(20_000), degree=2).check().distribution
     np.testing.assert_allclose(dist.loc, LOC, atol=0.02)
     np.testing.assert_allclose(dist.fold.coefficients, BEND, atol=0.03)
     np.testing.assert_allclose(dist.scale_tril, TRIL, atol=0.01)
 
 
-def test_weights_are_repetitions_and_absent_rows_may_be_nan(x64):
+def test_weights_equal_repetitions_and_rows_of_weight_zero_may_be_nan(x64):
     x = _points(12)
     weights = jnp.array([1, 2, 3, 1, 2, 1, 1, 1, 4, 1, 0, 0])
-    repeated = fit(jnp.asarray(np.repeat(x, weights, axis=0)), degree=1).checked()
-    weighted = fit(x.at[10:].set(jnp.nan), degree=1, weights=weights).checked()
+    repeated = fit(jnp.asarray(np.repeat(x, weights, axis=0)), degree=1).check()
+    weighted = fit(x.at[10:].set(jnp.nan), degree=1, weights=weights).check()
     for a, b in zip(jax.tree.leaves(weighted), jax.tree.leaves(repeated), strict=True):
         np.testing.assert_allclose(np.abs(a), np.abs(b), rtol=1e-10, atol=1e-12)  # a QR is unique up to signs
 
 
-def test_fit_moves_with_the_units_of_space_and_time():
+def test_fit_is_equivariant_to_units():
     x = _points(20_000)
     dist = fit(x, degree=2).distribution
     stretch, shift = jnp.array([1e18, 1e-12, 1e4]), jnp.array([1e18, 1e-12, 1e7])
-    moved = fit(x * stretch[None] + shift[None], degree=2).checked()
+    moved = fit(x * stretch[None] + shift[None], degree=2).check()
     # Offsets of 1e3 time scales cost 10 bits of t, no more.
     np.testing.assert_allclose((moved.distribution.loc - shift[:2]) / stretch[:2], dist.loc, atol=2e-3)
     bend = moved.distribution.fold.coefficients / stretch[None, :2] * stretch[2] ** jnp.array([[1.0], [2.0]])
@@ -135,14 +135,14 @@ def _covered(keys, power, floor):
         loc = jnp.asarray(LOC)[None]
         right = inside(low, jnp.concatenate([loc, bend]), high)
         mirrored = inside(low, jnp.concatenate([loc, bend * jnp.array([[-1.0], [1.0]])]), high)
-        low, high = result.centre_interval(t)
+        low, high = result.center_interval(t)
         return right, mirrored, inside(low, truth.condition_time(t).loc, high), result.status
 
     return jax.vmap(one)(keys)
 
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 1e-3), (2.0, 0.0)])
-def test_intervals_cover_as_stated(x64, power, floor):
+def test_intervals_have_stated_coverage(x64, power, floor):
     # 16,000 replicates: sd of a rate 0.17%. Ten rates of a correct method leave 4.5 sd with p < 1e-4, and 1.96 instead
     # of Student's 2.11 (a rate of 93.3%) is 9 sd off.
     n = 16_000
@@ -156,7 +156,7 @@ def test_intervals_cover_as_stated(x64, power, floor):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-8), (jnp.float32, 2e-4)])
-def test_half_widths_are_students(x64, dtype, tolerance):
+def test_half_widths_match_student_t(x64, dtype, tolerance):
     # 17 degrees of freedom matter: 1.96 instead of 2.11 would cover 93.3%.
     freedom = jnp.array([1, 2, 17, 400, 1e6, 0], dtype)
     for level in (0.5, 0.95, 0.999):
@@ -177,7 +177,7 @@ def _profile(x, degree=2):
     )
 
 
-def test_gradient_of_the_profile_is_its_slope(x64):
+def test_profile_gradient_matches_finite_differences(x64):
     profile = _profile(_points())
     value = jax.jit(lambda z: profile.space(z[0], z[1]).value)
     z, step = jnp.array([0.3, 0.35]), 1e-5
@@ -185,9 +185,9 @@ def test_gradient_of_the_profile_is_its_slope(x64):
     np.testing.assert_allclose(jax.jit(jax.grad(value))(z), slope, rtol=1e-7)
 
 
-def test_joint_fit_is_the_highest_point_around(x64):
+def test_joint_fit_is_a_local_maximum(x64):
     x = _points(60)
-    joint = fit(x, degree=2, time="joint").checked()
+    joint = fit(x, degree=2, time="joint").check()
     near = jnp.linspace(-0.3, 0.3, 13)
     loc, log_scale = (z.ravel() for z in jnp.meshgrid(near, near))
     dist = joint.distribution
@@ -198,7 +198,7 @@ def test_joint_fit_is_the_highest_point_around(x64):
     np.testing.assert_allclose(values[6 * 13 + 6], joint.log_likelihood, rtol=1e-12)
 
 
-def test_search_for_time_never_goes_down(x64):
+def test_time_search_never_decreases(x64):
     profile = _profile(_points(40, seed=4))
     evaluate = jax.value_and_grad(lambda z: profile.space(z[0], jnp.exp(z[1])).value)
 
@@ -214,7 +214,7 @@ def test_search_for_time_never_goes_down(x64):
     assert converged
 
 
-def test_joint_fit_without_a_floor_is_refused_where_it_is_unbounded():
+def test_unbounded_joint_fit_raises():
     with pytest.raises(ValueError, match=r"floor: expected a positive number where power \(d-1\) > 2"):
         fit(_points(), time="joint", power=2.0, floor=0.0)
 
@@ -231,9 +231,9 @@ def test_a_floor_bounds_the_ridge(x64):
 # --- bootstrap ----------------------------------------------------------------------------------------------
 
 
-def test_bootstrap_knows_the_errors_of_a_plain_normal(x64):
+def test_bootstrap_matches_known_standard_errors(x64):
     n = 50
-    result = fit(_points(n, power=0.0), degree=1, power=0.0).checked()  # own is joint where a = 1
+    result = fit(_points(n, power=0.0), degree=1, power=0.0).check()  # own is joint where a = 1
     replicates = bootstrap(result, jax.random.key(0), 300)
     scale = float(result.distribution.time_scale)
     errors = replicates.standard_errors
@@ -252,14 +252,14 @@ def test_bootstrap_knows_the_errors_of_a_plain_normal(x64):
 def test_bootstrap_agrees_with_fresh_data(x64):
     fits = jax.jit(jax.vmap(lambda key: fit(_dist().sample(key, (80,)), degree=2, time="joint")))
     fresh = fits(jax.random.split(jax.random.key(1), 1000)).distribution
-    truth = fit(_points(5000), degree=2, time="joint").checked()
+    truth = fit(_points(5000), degree=2, time="joint").check()
     again = eqx.tree_at(lambda r: r.num_points, truth, jnp.asarray(80.0))
     errors = bootstrap(again, jax.random.key(2), 1000, batch_size=200).standard_errors
     for name in ("time_loc", "time_scale", "loc"):
         np.testing.assert_allclose(errors[name], getattr(fresh, name).std(0), rtol=0.15)
 
 
-def test_bootstrap_of_a_failed_fit_is_refused():
+def test_bootstrap_of_a_failed_fit_raises():
     failed = fit(jnp.zeros((12, 3)), degree=1)
     with pytest.raises(ValueError, match="SINGULAR_TIME"):
         bootstrap(failed, jax.random.key(0))
@@ -295,9 +295,9 @@ def test_degenerate_data_have_a_status_and_nan(x64):
         assert jnp.isnan(leaf[1:]).all()
 
 
-def test_checked_says_what_to_try():
+def test_check_names_the_remedy():
     with pytest.raises(ValueError, match=r"TOO_FEW_POINTS.*Lower degree"):
-        fit(jnp.zeros((1, 3)), degree=2).checked()
+        fit(jnp.zeros((1, 3)), degree=2).check()
     assert int(fit(jnp.zeros((0, 3)), degree=2).status) == FitStatus.TOO_FEW_POINTS
 
 
@@ -316,7 +316,7 @@ def test_checked_says_what_to_try():
         ({"floor": 1.0}, "floor: expected"),
     ],
 )
-def test_wrong_arguments_are_named(options, message):
+def test_invalid_arguments_raise(options, message):
     with pytest.raises(ValueError, match=message):
         fit(**({"x": np.zeros((5, 3))} | options))
 
@@ -325,7 +325,7 @@ def test_wrong_arguments_are_named(options, message):
 
 
 @pytest.mark.slow  # it compiles for long
-def test_select_degree_tells_its_scores_and_its_fit(x64):
+def test_select_degree_returns_scores_and_fit(x64):
     for criterion in ("bic", "aic", "cv"):
         choice = select_degree(_points(300), 3, criterion)
         assert choice.fit.degree == choice.degree == choice.scores.argmin()
@@ -362,17 +362,17 @@ def test_select_degree_finds_the_true_degree_as_often_as_it_should(x64):
     assert 0.08 < share["cv"] < 0.25
 
 
-def test_held_out_score_is_what_a_loop_over_the_parts_gives(x64):
+def test_cross_validation_matches_a_loop_over_folds(x64):
     x = _points(60)
     scores = select_degree(x, 1, "cv").scores
-    parts, total = _cv_parts(x, jax.random.key(0)), 0.0
+    parts, total = _assign_folds(x, jax.random.key(0)), 0.0
     for part in range(5):
         trained = fit(x, degree=1, weights=jnp.where(parts == part, 0.0, 1.0)).distribution
         total -= 2 * trained.log_prob(x[parts == part]).sum()
     np.testing.assert_allclose(scores[1], total, rtol=1e-10)
 
 
-def test_a_degree_that_cannot_be_fitted_is_never_chosen():
+def test_degree_that_cannot_be_fitted_is_not_selected():
     choice = select_degree(_points(5), 3)
     assert np.isinf(choice.scores[3])
     assert choice.degree < 3
@@ -380,7 +380,7 @@ def test_a_degree_that_cannot_be_fitted_is_never_chosen():
         select_degree(jnp.zeros((5, 3)), 3)
 
 
-def test_select_degree_names_what_is_wrong():
+def test_select_degree_checks_arguments():
     with pytest.raises(ValueError, match="criterion: expected one of"):
         select_degree(_points(), 1, "dic")
     with pytest.raises(ValueError, match="degree: expected no such option"):

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import ablation, davis, folding_gain, frame_times, presets
 from benchmarks._runs import Runs, kept_setting, scaled, scores, seconds_per_step
-from foldgauss.io.media.video_file import Clip, write_video
+from foldgauss.io import Clip, write_video
 from foldgauss.video import FitConfig, psnr, ssim
 
 SIZE, NUM_FRAMES = (24, 32), 6

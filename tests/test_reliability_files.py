@@ -23,7 +23,7 @@ from foldgauss.cli import uncertainty
 from foldgauss.cli.app import shared as _shared
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.io import load_video_model, save_video_model, write_video
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.io.models.model_file import load_model, read_header
 
 resource = pytest.importorskip("resource", reason="limits to the size of files are POSIX's; CI runs it on Linux")
@@ -191,7 +191,7 @@ def test_a_checkpoint_without_room_is_told_and_the_fit_goes_on(work, disk, monke
     assert seen == [1, 2, 3, 4, 5, 5, 5, 5, *range(9, 31)]  # whole at any time
     told = capsys.readouterr().err
     assert told.count("warning: the fit could not be kept at step ") == 3
-    assert f"expected room for {str(kept)!r}" in told
+    assert f"expected free space for {str(kept)!r}" in told
     assert load_model(target).num_frames == 6
     assert set(os.listdir(disk.folder)) <= {"m.safetensors", "ballast"}
 
@@ -202,7 +202,7 @@ def test_a_model_without_room_is_written_by_resuming_to_the_bit(work, disk, monk
     filling(monkeypatch, disk, 27)
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told.startswith(f"error: path: expected room for {str(target)!r}")
+    assert told.startswith(f"error: path: expected free space for {str(target)!r}")
     assert f"The fit is kept in {kept}: --resume goes on" in told
     assert read_header(kept)["header"]["step"] == 26
     assert set(os.listdir(disk.folder)) <= {kept.name, "ballast"}
@@ -258,7 +258,7 @@ def test_draws_without_room(size, what, work, small_disk, capsys):
     out = folder / "draws"
     assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told.startswith(f"error: path: expected room for {str(out / what)!r}, got none")
+    assert told.startswith(f"error: path: expected free space for {str(out / what)!r}, got none")
     there = sorted(path.name for path in folder.rglob("*"))
     assert there == ([] if what == "evidence.npz" else ["draws", "evidence.npz"])
 
@@ -300,10 +300,10 @@ def test_places_that_cannot_be_written_are_found_before_the_fit(work, tmp_path, 
     told = {
         tmp_path / "none" / "m.safetensors": "expected an existing folder",
         tmp_path / "file" / "m.safetensors": "expected a folder, got the file",
-        tmp_path / "folder.safetensors": "not a plain file",
+        tmp_path / "folder.safetensors": "not a regular file",
         tmp_path / f"{'m' * 250}.safetensors": "File name too long",
         tmp_path / f"{'m' * 240}.safetensors": ".checkpoint' (File name too long)",
-        tmp_path / "m.safetensors": "m.safetensors.checkpoint', which is not a plain file",
+        tmp_path / "m.safetensors": "m.safetensors.checkpoint', which is not a regular file",
     }
     for target, what in told.items():
         before = sorted(os.listdir(tmp_path))
@@ -317,13 +317,13 @@ def test_places_that_cannot_be_written_are_found_before_the_fit(work, tmp_path, 
 
 def test_a_read_only_folder_is_found_before_the_fit(work, read_only, capsys, before_any_work):
     found = refused(work, read_only / "m.safetensors", capsys)
-    assert f"expected a writable place, got {str(read_only / 'm.safetensors')!r}" in found
+    assert f"expected a writable path, got {str(read_only / 'm.safetensors')!r}" in found
     assert "Choose another output path" in found
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the folder of processes is Linux's")
 def test_a_folder_of_the_system_is_found_before_the_fit(work, capsys, before_any_work):
-    assert "expected a writable place" in refused(work, "/proc/self/m.safetensors", capsys)
+    assert "expected a writable path" in refused(work, "/proc/self/m.safetensors", capsys)
 
 
 def test_read_only_for_every_command(work, read_only, capsys):
@@ -366,7 +366,7 @@ def test_one_output_by_any_name_has_one_fit(work, tmp_path, monkeypatch, capsys,
     monkeypatch.chdir(folder)
     names = [folder / "m.safetensors", "m.safetensors", "../models/m.safetensors", tmp_path / "link" / "m.safetensors"]
     for held in names:
-        with only_writer(fitting.Path(held)):
+        with lock_output(fitting.Path(held)):
             for other in names:
                 assert "which another fit is" in refused(work, other, capsys)
     assert os.listdir(folder) == []
@@ -377,9 +377,9 @@ def test_a_folder_of_results_has_one_run(work, tmp_path, capsys, command, name):
     if command == "uncertainty":
         pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
     words = [work / "model.safetensors"] if command == "uncertainty" else []
-    with only_writer(tmp_path / name):
+    with lock_output(tmp_path / name):
         assert run(command, *words, work / "clip.mp4", "--out", tmp_path) == 1
-        assert f"{command} is. Wait for that one" in capsys.readouterr().err
+        assert f"{command} is writing. Wait for it" in capsys.readouterr().err
     assert os.listdir(tmp_path) == []
 
 
@@ -389,7 +389,7 @@ def test_a_link_is_an_output_of_its_own(work, tmp_path):
     real, link = tmp_path / "other" / "m.safetensors", tmp_path / "m.safetensors"
     real.write_bytes(OLDER)
     link.symlink_to(real)
-    with only_writer(real):
+    with lock_output(real):
         assert run("fit", work / "clip.mp4", "--out", link, *SMALL, "--overwrite") == 0
     assert real.read_bytes() == OLDER
     assert not link.is_symlink()
@@ -491,15 +491,15 @@ def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
 def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsys):
     pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
-    from foldgauss.uncertainty.posterior import sampling as posterior
+    from foldgauss.uncertainty.posterior import draws_file
 
-    keep = posterior._Kept.keep
+    keep = draws_file.DrawsFile.save
 
     def kept(self):
         keep(self)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(posterior._Kept, "keep", kept)
+    monkeypatch.setattr(draws_file.DrawsFile, "save", kept)
     words = ["uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", tmp_path, "--steps", "600"]
     assert run(*words) == 143
     assert "goes on when called again" in " ".join(capsys.readouterr().err.split())

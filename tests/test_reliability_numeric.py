@@ -1,4 +1,4 @@
-"""Numbers that are none, rates far too high, models at the ends of float32: named, taken back, drawn all the same."""
+"""NaN and infinities, far too high learning rates, and models at the limits of float32."""
 
 import dataclasses
 import math
@@ -56,12 +56,12 @@ def too_high(leaf, factor):
 #: what it can do: angles turn round, opacities are 0 or 1, and the
 #: falling rates find a poorer end. With log_time_scale go the rates that are in its units.
 NAMED = {
-    "loc": [None, "loc having moved most"],
-    "coefficients": [None, "coefficients having moved most"],
+    "loc": [None, "loc moved most"],
+    "coefficients": [None, "coefficients moved most"],
     "log_scale": ["no finite log_scale", "no finite log_scale"],
     "angle_logit": [None, None],
     "opacity_logit": [None, None],
-    "color_dc": ["color_dc having moved most", "color_dc having moved most"],
+    "color_dc": ["color_dc moved most", "color_dc moved most"],
     "time_loc_logit": [None, None],
     "log_time_scale": ["no finite time_loc_logit", None],
     "frame_times": ["frame times moved", "frame times moved"],
@@ -70,7 +70,7 @@ NAMED = {
 
 @pytest.mark.parametrize("power", [3, 6])
 @pytest.mark.parametrize("leaf", NAMED)
-def test_a_rate_far_too_high_is_named_and_no_model_is_worse_than_its_start(at_start, leaf, power):
+def test_too_high_rate_is_named_and_the_model_not_worse_than_its_start(at_start, leaf, power):
     config, named = too_high(leaf, 10.0**power), NAMED[leaf][power // 6]
     if (leaf, power) == ("log_time_scale", 6):
         with pytest.warns(DivergenceWarning), pytest.raises(FitDiverged, match=r"step \d+: no finite time_loc_logit"):
@@ -81,10 +81,10 @@ def test_a_rate_far_too_high_is_named_and_no_model_is_worse_than_its_start(at_st
     assert bool(told) == (named is not None)
     if told:
         assert named in told[0]
-        assert "came apart at step " in told[0]
+        assert "diverged at step " in told[0]
 
 
-def test_frame_times_that_fly_apart_are_brought_back(at_start):
+def test_diverging_frame_times_are_restored(at_start):
     """Pictures alone do not tell: they come to a poor end, and never get worse than before."""
     psnr, told = fitted_with(too_high("frame_times", 1e3))
     assert len(told) == 1
@@ -92,15 +92,15 @@ def test_frame_times_that_fly_apart_are_brought_back(at_start):
     assert psnr > at_start + 8
 
 
-def test_a_fit_that_cannot_be_saved_gives_back_what_was_sound(at_start):
+def test_exhausted_backoffs_restore_the_last_finite_state(at_start):
     psnr, told = fitted_with(too_high("color_dc", 1e8))
     assert "the fit ended at step 240" in told[-1]
-    assert "lower these rates" in told[-1]
+    assert "lower these learning rates" in told[-1]
     assert psnr == pytest.approx(at_start, abs=0.3)
 
 
 @pytest.mark.parametrize(("leaf", "power"), [("loc", 6), ("color_dc", 6), ("log_scale", 3)])
-def test_a_fit_that_comes_apart_is_the_same_when_it_was_stopped(tmp_path, leaf, power):
+def test_resuming_keeps_divergence_and_recovery(tmp_path, leaf, power):
     """While it is taken back, and before it is seen to come apart: what was sound is kept with it."""
     config, path = too_high(leaf, 10.0**power), tmp_path / "kept.safetensors"
 
@@ -122,7 +122,7 @@ def test_a_fit_that_comes_apart_is_the_same_when_it_was_stopped(tmp_path, leaf, 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
 @pytest.mark.parametrize("leaf", NAMED)
-def test_rates_that_are_none_are_refused(leaf, value):
+def test_nonfinite_rates_are_refused(leaf, value):
     with pytest.raises(ValueError, match=f"rates.{leaf}"):
         LearningRates(**{leaf: value})
 
@@ -131,11 +131,11 @@ def test_rates_that_are_none_are_refused(leaf, value):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_frames_that_hold_none_say_where(value):
+def test_nonfinite_frames_are_located(value):
     frames = CLIP.astype(np.float32) / 255
     frames[2, 3, 5, 1] = frames[4, 0, 0, 0] = value
     with pytest.raises(
-        ValueError, match=r"float32.* 2 of its numbers are NaN or infinite, the first at frames\[2, 3, 5, 1\]"
+        ValueError, match=r"float32.* 2 of its values are NaN or infinite, the first at frames\[2, 3, 5, 1\]"
     ):
         fit(frames, CONFIG)
 
@@ -160,15 +160,15 @@ def with_leaf(model, name, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["loc", "coefficients", "opacity_logit"])
-def test_models_that_hold_none_are_not_gone_on_with(name, value):
+def test_nonfinite_models_are_refused(name, value):
     model = with_leaf(soft_model(size=CLIP.shape[1:3], num_frames=len(CLIP)), name, value)
     config = FitConfig(power=2.0, options=model.options)
-    with pytest.raises(FitDiverged, match=f"state: expected finite numbers, got no finite {name} in 1 Gaussians"):
+    with pytest.raises(FitDiverged, match=f"state: expected finite parameters, got no finite {name} in 1 Gaussians"):
         next(steps_of(CLIP, config, start_from(model, config, 10)))
 
 
 @pytest.mark.parametrize("huge", [1e6, 1e18, 1e38])
-def test_folds_of_degree_7_that_explode_stay_finite(huge):
+def test_exploding_folds_of_degree_7_stay_finite(huge):
     """Gaussians are thrown out of the picture; those that are left learn on."""
     model = soft_model(size=CLIP.shape[1:3], num_frames=len(CLIP), degree=7)
     coefficients = np.array(model.splats.coefficients)
@@ -212,7 +212,7 @@ def _extreme():
 
 
 @pytest.mark.parametrize("name", _extreme())
-def test_models_far_from_usual_are_drawn_alike_by_all(name):
+def test_engines_agree_on_extreme_models(name):
     """Degree 7; a Gaussian in three is far from usual. Colours of the others stay below white."""
     model = soft_model(degree=7)
     changed = {}
@@ -237,7 +237,7 @@ def test_models_far_from_usual_are_drawn_alike_by_all(name):
 
 
 @pytest.mark.parametrize("logits", [[1e30, 0, 0, 0, 0, 0], [-1e30] * 6, [3e38, -3e38, 0, 0, 0, 0]])
-def test_frame_times_far_from_usual_stay_in_order(logits):
+def test_extreme_frame_times_stay_in_order(logits):
     times = np.asarray(FrameTimes(jnp.asarray(logits, jnp.float32)).times())
     assert np.isfinite(times).all()
     assert (np.diff(times) >= 0).all()

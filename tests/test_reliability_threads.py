@@ -301,7 +301,7 @@ FORKED = """
     from foldgauss.estimator.gradient_fit import fit_gradient
     from foldgauss.io import load_video_model, save_video_model
     from foldgauss.render import render
-    from foldgauss.uncertainty import evidence
+    from foldgauss.uncertainty import likelihood_profiles
     from foldgauss.video import FitConfig, compress, edit, evaluate, fit, layers
     from foldgauss.video.models.renderer import Playback
     from soft_models import soft_model
@@ -328,7 +328,7 @@ FORKED = """
         "compress": lambda: compress(model, clip),
         "edit": lambda: next(edit(model).move((0.1, 0)).video().frames()),
         "layers": lambda: next(layers(model, model).frames()),
-        "evidence": lambda: evidence(model, clip),
+        "likelihood_profiles": lambda: likelihood_profiles(model, clip),
         "load": lambda: load_video_model(path),
         "gaussians": model.splats.gaussians,
         "to_mixture": model.splats.to_mixture,

@@ -32,12 +32,12 @@ from foldgauss.video.tradeoff import (
     LEAST_STEPS,
     Throughput,
     check_axes,
-    front,
-    halved,
+    estimate_seconds,
+    estimate_steps,
     knee,
-    points,
-    seconds_of,
-    steps_within,
+    pareto_front,
+    plan_points,
+    to_half_precision,
 )
 
 SIZE, FRAMES = (24, 32), 6
@@ -94,15 +94,15 @@ def name_of(row):
         ([], [], []),
     ],
 )
-def test_front(cost, quality, expected):
-    assert front(cost, quality) == expected
+def test_pareto_front(cost, quality, expected):
+    assert pareto_front(cost, quality) == expected
 
 
-def test_front_is_what_nothing_beats():
+def test_pareto_front_is_not_dominated():
     rng = np.random.default_rng(0)
     for _ in range(50):
         cost, quality = rng.integers(1, 9, 30), rng.integers(20, 40, 30)
-        chosen = front(cost, quality)
+        chosen = pareto_front(cost, quality)
         for k in range(30):
             beaten = ((cost <= cost[k]) & (quality >= quality[k]) & ((cost < cost[k]) | (quality > quality[k]))).any()
             equal = [(cost[j], quality[j]) for j in chosen]
@@ -127,8 +127,8 @@ def test_knee(cost, quality, expected):
     assert knee([c**2 for c in cost], [2 * q for q in quality]) == expected
 
 
-def test_each_turn_changes_one_thing_and_has_a_command():
-    made, left = points(BASE, tuple(AXES), 132, (320, 640))
+def test_each_variant_changes_one_setting_and_has_a_command():
+    made, left = plan_points(BASE, tuple(AXES), 132, (320, 640))
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
     words = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
@@ -141,7 +141,7 @@ def test_each_turn_changes_one_thing_and_has_a_command():
         assert "my clip.mp4" in shlex.split(line)
     assert made[0].config == BASE
     shown = dict(zip((point.name for point in made), lines, strict=True))
-    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-share 0.0")
+    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-fraction 0.0")
     assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
     assert shown["economy on"].endswith("--steps 1000 --economy")  # a flag
     assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
@@ -159,9 +159,9 @@ def test_each_turn_changes_one_thing_and_has_a_command():
         ({"num_frames": 3}, "batch", "3 frames"),
     ],
 )
-def test_turns_that_a_clip_cannot_have_are_left_out(where, axis, why):
+def test_variants_that_do_not_apply_are_skipped(where, axis, why):
     where = {"num_frames": FRAMES, "has_alpha": False} | where
-    made, left = points(BASE, (axis,), where["num_frames"], SIZE, has_alpha=where["has_alpha"])
+    made, left = plan_points(BASE, (axis,), where["num_frames"], SIZE, has_alpha=where["has_alpha"])
     assert {one.name.split()[0] for one in left} == {axis}
     assert all(why in one.why for one in left)
     assert len(made) + len(left) == 1 + len(AXES[axis])
@@ -169,14 +169,14 @@ def test_turns_that_a_clip_cannot_have_are_left_out(where, axis, why):
 
 @pytest.mark.parametrize("seconds", [50.0, 200.0, 3600.0])
 def test_steps_fill_the_time(seconds):
-    made, _ = points(BASE, tuple(AXES), 132, (320, 640))
-    pace = Throughput(start=0.5, step=0.03, look=0.1)
-    steps = steps_within(seconds, made, pace, 132)
-    assert seconds_of(made, steps, pace, 132) <= seconds < seconds_of(made, steps + 1, pace, 132)
+    made, _ = plan_points(BASE, tuple(AXES), 132, (320, 640))
+    pace = Throughput(start=0.5, step=0.03, evaluation=0.1)
+    steps = estimate_steps(seconds, made, pace, 132)
+    assert estimate_seconds(made, steps, pace, 132) <= seconds < estimate_seconds(made, steps + 1, pace, 132)
     # Points of the base's model cost no fit.
     played = [point for point in made if point.played is None]
-    saved = seconds_of(made, steps, pace, 132) - seconds_of(played, steps, pace, 132)
-    assert saved == pytest.approx((len(made) - len(played)) * pace.look)
+    saved = estimate_seconds(made, steps, pace, 132) - estimate_seconds(played, steps, pace, 132)
+    assert saved == pytest.approx((len(made) - len(played)) * pace.evaluation)
 
 
 def test_axes_by_name():
@@ -192,7 +192,7 @@ def test_half_precision_is_kept_and_widened(tmp_path):
     state.rows += 0.01 * rng.standard_normal(state.rows.shape).astype(np.float32)
     model = to_model(state, config, (16, 16), 25.0)
     save_video_model(tmp_path / "whole.safetensors", model)
-    save_video_model(tmp_path / "half.safetensors", halved(model))
+    save_video_model(tmp_path / "half.safetensors", to_half_precision(model))
     again = load_video_model(tmp_path / "half.safetensors")
     for name in ("loc", "coefficients", "color_dc"):
         leaf = np.asarray(getattr(again.splats, name))
@@ -208,7 +208,7 @@ def test_half_precision_is_kept_and_widened(tmp_path):
     leaves["coefficients"][:, 1:] = 0
     leaves["log_time_scale"][:5], leaves["time_loc_logit"][:5] = STATIC_LOG_TIME_SCALE, 0
     lean = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
-    save_video_model(tmp_path / "lean.safetensors", halved(lean))
+    save_video_model(tmp_path / "lean.safetensors", to_half_precision(lean))
     again = load_video_model(tmp_path / "lean.safetensors")
     assert (again.splats.degrees == 1).all()
     np.testing.assert_array_equal(again.splats.static, lean.splats.static)
@@ -216,7 +216,7 @@ def test_half_precision_is_kept_and_widened(tmp_path):
     # A leaf with a number beyond 16 bits keeps its 32.
     leaves["coefficients"][3, 0, 0] = 1e5
     steep = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
-    save_video_model(tmp_path / "steep.safetensors", halved(steep))
+    save_video_model(tmp_path / "steep.safetensors", to_half_precision(steep))
     again = load_video_model(tmp_path / "steep.safetensors")
     np.testing.assert_array_equal(again.splats.coefficients, leaves["coefficients"])
     np.testing.assert_array_equal(again.splats.loc, np.asarray(model.splats.loc).astype(np.float16))
@@ -293,7 +293,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
         assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
 
 
-def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
+def test_killed_run_resumes(clip, tmp_path, capsys, monkeypatch):
     target, axes = tmp_path / "results", "time"
     arguments = ["tradeoff", str(clip), "--out", str(target), "--axes", axes, *QUICK]
     process = subprocess.Popen([sys.executable, "-m", "foldgauss", *arguments], stderr=subprocess.DEVNULL)
@@ -333,7 +333,7 @@ def test_a_killed_run_goes_on(clip, tmp_path, capsys, monkeypatch):
 
 def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypatch):
     """`fit` finds it anew each time; so it is in each fit's seconds, though it was found once."""
-    found, given, steps, of = [], [], command.fit_steps, Motion.of
+    found, given, steps, of = [], [], command.fit_steps, Motion.from_frames
 
     def slow(frames):
         found.append(len(frames))
@@ -344,7 +344,7 @@ def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypat
         given.extend([known.get("motion")] if config.follow_motion else [])
         return steps(frames, config, **known)
 
-    monkeypatch.setattr(Motion, "of", slow)
+    monkeypatch.setattr(Motion, "from_frames", slow)
     monkeypatch.setattr(command, "fit_steps", watched)
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing", *QUICK) == 0
     assert found == [FRAMES]
@@ -384,7 +384,7 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
     assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
     record = record_of(tmp_path / "r")
     assert [name_of(row) for row in record["points"]] == ["base", "precision float16"]
-    assert set(record["left_out"]) == {"precision compact", "precision compact, mended"}
+    assert set(record["left_out"]) == {"precision compact", "precision compact, finetuned"}
     quick = command.compress
     monkeypatch.setattr(command, "compress", lambda *given, **more: quick(*given, **more | {"passes": 0}))
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
@@ -403,7 +403,7 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
 def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
     """At a pace with which all fits take a minute if the base has 1,000 steps."""
     work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
-    pace = Throughput(start=0.0, step=60 / command.SLOWER / (work * 1000.001), look=0.0)
+    pace = Throughput(start=0.0, step=60 / command.SLOWER / (work * 1000.001), evaluation=0.0)
     monkeypatch.setattr(command._Run, "_pace", lambda self, config: pace)
     monkeypatch.setattr(command._Run, "measure", lambda self, made, base: (_ for _ in ()).throw(KeyboardInterrupt))
     arguments = ["--axes", "time,compositing", "--minutes", minutes]
@@ -525,7 +525,7 @@ def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(
         fitting, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config)
     )
-    options = ["--ssim-share", 0.3, "--quarter-share", 0.1, "--half-share", 0.2]
+    options = ["--ssim-fraction", 0.3, "--quarter-fraction", 0.1, "--half-fraction", 0.2]
     options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
     target = tmp_path / "m.safetensors"
     assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0

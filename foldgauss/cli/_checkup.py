@@ -23,7 +23,9 @@ from foldgauss._runtime import threads
 from foldgauss._runtime.machine import cpu_model
 from foldgauss._runtime.threads import available_cores, num_threads
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_file import memory_limit, read_video, write_video
+from foldgauss.io.media.resizing import memory_limit
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.video_writing import write_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.render import ENGINES, Splats2D, render
 from foldgauss.video.fitting.config import FitConfig

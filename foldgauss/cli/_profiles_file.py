@@ -7,19 +7,30 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss.io._atomic import atomic_path
-from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, Profiles
+from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, ProfileCurves
 
 _PROFILES = ("nodes", "values", "slopes", "count")
 #: Bytes of a member beside its numbers: the header of a NumPy array, which has 64 to 128.
 _HEADER = 1024
 
 
-def keep_evidence(path: Path, key: str, seen: LikelihoodProfiles) -> None:
+def keep_evidence(path: Path, key: str, profiles: LikelihoodProfiles) -> None:
     """Write it; `key` is of all that it depends on."""
-    arrays = {name: getattr(seen.profiles, name) for name in _PROFILES}
-    arrays |= {"scale": seen.noise.scale, "share": seen.noise.share, "correlation": seen.residual_correlation}
+    arrays = {name: getattr(profiles.curves, name) for name in _PROFILES}
+    arrays |= {
+        "scale": profiles.noise.scale,
+        "share": profiles.noise.fraction,
+        "correlation": profiles.residual_correlation,
+    }
     with atomic_path(path) as temporary:
-        np.savez(temporary, key=key, num_drawn=seen.num_drawn, level=seen.level, notes=list(seen.notes), **arrays)
+        np.savez(
+            temporary,
+            key=key,
+            num_drawn=profiles.num_rendered,
+            level=profiles.level,
+            notes=list(profiles.notes),
+            **arrays,
+        )
 
 
 def kept_evidence(path: Path, key: str, num_frames: int) -> LikelihoodProfiles | None:
@@ -35,11 +46,11 @@ def kept_evidence(path: Path, key: str, num_frames: int) -> LikelihoodProfiles |
                 return None
             names = (*_PROFILES, "scale", "share", "correlation", "num_drawn", "level", "notes")
             kept |= {name: _array(archive, f"{name}.npy") for name in names}
-        profiles = _checked_profiles(*(kept[name] for name in _PROFILES), num_frames)
+        curves = _checked_profiles(*(kept[name] for name in _PROFILES), num_frames)
         noise = FrameNoise(_floats(kept["scale"], (num_frames,)), _floats(kept["share"], (num_frames,)))
         correlation = _floats(kept["correlation"], np.shape(kept["correlation"])[:1])
         told = str(kept["level"]), tuple(map(str, np.atleast_1d(kept["notes"])))
-        return LikelihoodProfiles(profiles, noise, correlation, int(kept["num_drawn"]), *told)
+        return LikelihoodProfiles(curves, noise, correlation, int(kept["num_drawn"]), *told)
     except Exception:  # of what kind depends on where it is damaged; it is drawn anew
         return None
 
@@ -80,7 +91,7 @@ def _floats(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _checked_profiles(
     nodes: np.ndarray, values: np.ndarray, slopes: np.ndarray, count: np.ndarray, num_frames: int
-) -> Profiles:
+) -> ProfileCurves:
     shape = nodes.shape
     if len(shape) != 2 or count.shape != (num_frames,) or count.dtype.kind != "i":
         raise ValueError("tables of another shape")
@@ -93,4 +104,4 @@ def _checked_profiles(
         raise ValueError("numbers that are not finite")
     if not (np.diff(nodes, axis=1)[used[:, 1:]] > 0).all():
         raise ValueError("times that do not rise")
-    return Profiles(nodes, values, slopes, count)
+    return ProfileCurves(nodes, values, slopes, count)

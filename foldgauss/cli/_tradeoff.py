@@ -21,7 +21,7 @@ from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.render import RenderOptions
 from foldgauss.video.fitting.config import FitConfig, default_num_gaussians
-from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, front, knee
+from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
@@ -220,7 +220,7 @@ def report(record: Record, made: list[Point], left: list[Skipped], clock: str) -
         amounts = [row[columns[cost]] for row in rows]
         costs = [1 / amount if more_is_better else amount for amount in amounts]
         quality = [row["psnr"] for row in rows]
-        chosen = front(costs, quality)
+        chosen = pareto_front(costs, quality)
         bend = knee([costs[k] for k in chosen], [quality[k] for k in chosen])
         at = None if bend is None else chosen[bend]
         told = label.replace("(s)", "(CPU seconds)") if columns[cost] == "cpu_seconds" else label

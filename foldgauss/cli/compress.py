@@ -26,7 +26,7 @@ from foldgauss.cli.app.shared import (
     scores_of,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_file import Clip
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
@@ -38,7 +38,7 @@ from foldgauss.io.models.video_model import (
 from foldgauss.video.compression.search import Compressed, compress
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.tradeoff import halved
+from foldgauss.video.tradeoff import to_half_precision
 
 Score = Callable[[VideoModel], Evaluation]
 #: dB by which a compact file may be better than its model without a word.
@@ -123,7 +123,7 @@ def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, kn
 def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
     """Write a model with 16-bit numbers, and the scores, if asked for, of what its reader will get."""
     about = {name: value for name, value in about.items() if not name.startswith("mean_")}
-    small = halved(model)
+    small = to_half_precision(model)
     save_video_model(target, small, metadata=about)
     if score is None:
         return None

@@ -31,9 +31,9 @@ from foldgauss.cli.app.shared import (
 )
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
-from foldgauss.io.exchange.convert import FORMATS, export, import_model
-from foldgauss.io.exchange.mesh import read_pseudomesh
-from foldgauss.io.media.video_file import VIDEO_SUFFIXES, write_video
+from foldgauss.io.exchange.export_import import FORMATS, export, import_model
+from foldgauss.io.exchange.pseudomesh import read_pseudomesh
+from foldgauss.io.media.video_writing import VIDEO_SUFFIXES, write_video
 from foldgauss.io.models.segmented import is_segmented
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
@@ -42,7 +42,7 @@ from foldgauss.io.models.video_model import (
     read_origin,
     save_video_model,
 )
-from foldgauss.io.page.html import HTML_SUFFIX, QUALITY, write_html
+from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, write_html
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo

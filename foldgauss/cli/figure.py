@@ -25,8 +25,8 @@ from foldgauss.cli.app.shared import (
     refuse_huge,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.pictures import comparison, sheet
-from foldgauss.io.media.video_file import write_image
+from foldgauss.io.media.contact_sheet import make_comparison_sheet, make_contact_sheet
+from foldgauss.io.media.video_writing import write_image
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.frame_times import times_at
 from foldgauss.video.models.metrics import psnr
@@ -76,7 +76,7 @@ def interpolation(
     rows = [list(model.frames(times_at(times, k + shares), size)) for k in chosen]
     inner = [f"t + {part}/{parts}" for part in range(1, parts)]
     titles = [[f"t: frame {k}", *inner, f"t + 1: frame {k + 1}"] for k in chosen]
-    _write(out_path, sheet(rows, titles), ", ".join(f"from frame {k} to {k + 1}" for k in chosen))
+    _write(out_path, make_contact_sheet(rows, titles), ", ".join(f"from frame {k} to {k + 1}" for k in chosen))
 
 
 @figure.command()
@@ -114,7 +114,7 @@ def reconstruction(
     small = (
         [cv2.resize(one, size[::-1], interpolation=cv2.INTER_AREA) for one in every] for every in (originals, pictures)
     )
-    _write(out_path, comparison(*small, captions), "; ".join(captions))
+    _write(out_path, make_comparison_sheet(*small, captions), "; ".join(captions))
 
 
 def _checked_out(path: Path | None, model_path: Path, kind: str, overwrite: bool) -> Path:

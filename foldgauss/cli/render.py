@@ -44,7 +44,8 @@ from foldgauss.cli.app.shared import (
     write_json,
 )
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_file import IMAGE_FORMATS, MAX_FPS, VIDEO_SUFFIXES
+from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.video_model import load_video_model, read_metadata, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
@@ -53,7 +54,7 @@ from foldgauss.video.models.metrics import Evaluation
 from foldgauss.video.models.sparse_storage import stored_counts, to_stored
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
-from foldgauss.video.tradeoff import frames_per_second
+from foldgauss.video.tradeoff import measure_frame_rate
 
 MAX_UPSAMPLE, MAX_PICTURES = MAX_SHOWN, 10 * MAX_SHOWN
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
@@ -237,7 +238,7 @@ def evaluate_command(
         on_white = evaluate_with_progress(model, clip.frames, background=(1.0, 1.0, 1.0))
         figures["mean_psnr_on_white"] = round(on_white.mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
-    figures["frames_per_second"] = round(frames_per_second(model), 1)
+    figures["frames_per_second"] = round(measure_frame_rate(model), 1)
     if json_path is not None:
         write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
     _print_segments(model, scores) if isinstance(model, SegmentedVideo) else print_frames(scores)
@@ -271,7 +272,7 @@ def info(model_path: ModelFile) -> None:
         **_economies(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": _about_times(np.asarray(model.frame_times.times())),
-        "numbers stored": f"{model.num_parameters:,}",
+        "parameters stored": f"{model.num_parameters:,}",
         "file": _size_of(model_path, model),
     }
     if isinstance(model, EditedVideo):
@@ -299,7 +300,7 @@ def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> N
         "segments": f"{len(model.segments):,}{joints}",
         "Gaussians": f"{model.num_gaussians:,} in all",
         "fold": f"polynomial of degree {model.degree}",
-        "numbers stored": f"{model.num_parameters:,}",
+        "parameters stored": f"{model.num_parameters:,}",
         "file": _size_of(model_path, model),
     }
     _print_facts(model_path, figures, about)
@@ -329,10 +330,10 @@ def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
     if any((splats.degrees < splats.degree).any() for splats in parts):
         counts = zip(*np.unique(degrees, return_counts=True), strict=True)
         told["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
-    if lasting := sum(int(splats.static.sum()) for splats in parts):
-        told["lasting"] = f"{lasting:,} of {len(degrees):,} Gaussians, throughout the clip"
-    if solid := sum(int(splats.opaque.sum()) for splats in parts):
-        told["solid"] = f"{solid:,} of {len(degrees):,} Gaussians, no light comes through"
+    if static := sum(int(splats.static.sum()) for splats in parts):
+        told["static"] = f"{static:,} of {len(degrees):,} Gaussians, throughout the clip"
+    if opaque := sum(int(splats.opaque.sum()) for splats in parts):
+        told["opaque"] = f"{opaque:,} of {len(degrees):,} Gaussians, without transmittance"
     counted = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
     for what, name in (("colors", "colours"), ("shapes", "shapes")):
         # Where most have their own, what is alike is so by chance, as of rounded numbers.

@@ -41,8 +41,9 @@ from foldgauss.cli.app.shared import (
 from foldgauss.cli.compress import save_compressed, save_halved
 from foldgauss.cli.fitting.fit import make_folder, noted
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io._lock import only_writer
-from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
@@ -60,11 +61,11 @@ from foldgauss.video.tradeoff import (
     Skipped,
     Throughput,
     check_axes,
-    frames_per_second,
-    points,
-    seconds_of,
-    seconds_per_frame,
-    steps_within,
+    estimate_seconds,
+    estimate_steps,
+    measure_frame_rate,
+    measure_frame_seconds,
+    plan_points,
 )
 
 DEFAULT_MINUTES = 10.0
@@ -129,11 +130,11 @@ def tradeoff_command(
     tell_of(clip)
     make_folder(out_dir)
     own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))
-    context.with_resource(only_writer(out_dir / RECORD, own=own, what="tradeoff"))
+    context.with_resource(lock_output(out_dir / RECORD, own=own, what="tradeoff"))
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
     run = _Run(clip, record, Commands(video, size, frames, out_dir), noted(clip, seed, frames))
     base = run.planned(wanted, chosen, minutes, steps)
-    made, left = points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
+    made, left = plan_points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
     for one in left:
         err.print(f"note: {one.name} is left out: {one.why}.", soft_wrap=True)
     try:
@@ -163,11 +164,11 @@ class _Run:
             with err.status("Measuring the pace"):
                 pace = self._pace(dataclasses.replace(wanted, num_gaussians=num, steps=PILOT_STEPS))
             base = dataclasses.replace(wanted, num_gaussians=num, steps=full)
-            made, _ = points(base, axes, self.clip.num_frames, self.clip.size, has_alpha=self.clip.has_alpha)
-            allowed = steps_within(60 * minutes / SLOWER, made, pace, self.clip.num_frames)
+            made, _ = plan_points(base, axes, self.clip.num_frames, self.clip.size, has_alpha=self.clip.has_alpha)
+            allowed = estimate_steps(60 * minutes / SLOWER, made, pace, self.clip.num_frames)
             least = max(LEAST_STEPS, self.clip.num_frames)  # so that the base sees every frame
             chosen = min(max(allowed, least), full) if steps is None else steps
-            expected = SLOWER * seconds_of(made, chosen, pace, self.clip.num_frames) / 60
+            expected = SLOWER * estimate_seconds(made, chosen, pace, self.clip.num_frames) / 60
             self.record.plan |= {"steps": chosen, "expected_minutes": round(expected, 2), "pace": pace._asdict()}
             self._say(len(made), chosen, expected)
             if steps is None:
@@ -201,7 +202,7 @@ class _Run:
         model = to_model(state, config, self.clip.size, self.clip.fps)
         begun = time.perf_counter()
         evaluate(model, self.clip.frames)
-        frames_per_second(model)
+        measure_frame_rate(model)
         look = time.perf_counter() - begun
         step = (last.seconds - first.seconds) / max(last.step - first.step, 1)
         return Throughput(max(first.seconds - step, 0.0), step, look)
@@ -215,7 +216,7 @@ class _Run:
         """The clip's, found once; what that took is kept with the plan: `fit` spends it anew on every model."""
         if self._motion is None:
             begun = _Spent.now()
-            self._motion = Motion.of(np.ascontiguousarray(self.clip.frames[..., :3]))
+            self._motion = Motion.from_frames(np.ascontiguousarray(self.clip.frames[..., :3]))
             self.record.plan.setdefault("motion", _Spent.since(begun)._asdict())
         return self._motion
 
@@ -250,7 +251,7 @@ class _Run:
 
     def _measured(self, point: Point, base: FitConfig, tell: Tell) -> dict[str, Any]:
         with atomic_path(self.folder / BASE) if point.axis == "base" else _passing(self.folder, point) as path:
-            if point.of_base:
+            if point.reuses_base:
                 shown, scores, spent = self._again(self._base(base, tell), point, path, tell)
             else:
                 shown, spent = self._fitted(point.config, tell)
@@ -259,9 +260,9 @@ class _Run:
             num_bytes = (self.folder / BASE if point.played is not None else path).stat().st_size
         tell("playing")
         if point.axis == "base":
-            rate = frames_per_second(shown)
+            rate = measure_frame_rate(shown)
         else:  # beside the base, which others of this machine slow down as much
-            own, others = seconds_per_frame(shown, self._base(base, tell))
+            own, others = measure_frame_seconds(shown, self._base(base, tell))
             rate = self.record.rows["base"]["frames_per_second"] * others / own
         return {
             "axis": point.axis,

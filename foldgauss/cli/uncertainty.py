@@ -32,18 +32,21 @@ from foldgauss.cli.app.shared import (
     out,
     refuse_segments,
 )
-from foldgauss.io._atomic import OutputError, atomic_path, check_writable, not_writable
-from foldgauss.io._lock import only_writer
-from foldgauss.io.media.video_file import Clip
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.uncertainty import LikelihoodProfiles, evidence, frame_time_log_prob, frame_time_posterior
+from foldgauss.uncertainty import LikelihoodProfiles, frame_time_log_prob, frame_time_posterior, likelihood_profiles
 from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
 from foldgauss.uncertainty.likelihood.noise import NOISES
+from foldgauss.uncertainty.posterior.draws_file import is_sealed, lock_draws
 from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.log_prob import LEVELS, at_level
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior, check_settings, is_sealed, needed, only_run
+from foldgauss.uncertainty.posterior.log_prob import LEVELS, condition_on_level
+from foldgauss.uncertainty.posterior.optional_imports import import_optional
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
+from foldgauss.uncertainty.posterior.settings import check_settings
 from foldgauss.video.models.video_model import VideoModel
 
 CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
@@ -109,7 +112,7 @@ def uncertainty_command(
     stopped goes on when called again with the same arguments; more --steps go on from fewer.
     """
     for name in ("matplotlib", "emcee", "h5py", "h5netcdf", "arviz"):
-        needed(name)
+        import_optional(name)
     if noise not in NOISES:
         raise WrongUse(str(invalid("--noise", expected="one of " + ", ".join(NOISES), got=noise)))
     if level not in LEVELS:
@@ -131,23 +134,23 @@ def uncertainty_command(
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
     context.with_resource(_made_folder(out_dir))
     own = tuple(out_dir / name for name in (*FILES, EVIDENCE))
-    context.with_resource(only_writer(out_dir / CHAINS, own=own, what="run of uncertainty"))
-    with _no_other_run(), only_run(out_dir / CHAINS):
+    context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
+    with _no_other_run(), lock_draws(out_dir / CHAINS):
         pass  # known now, not when pictures are drawn
-    seen = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
-    if seen is None and (out_dir / CHAINS).exists() and not overwrite:
+    profiles = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
+    if profiles is None and (out_dir / CHAINS).exists() and not overwrite:
         kept = out_dir / CHAINS
         raise _of_another(kept) if is_sealed(kept) else _damaged(kept)
     with _bars() as bars:
-        if seen is not None:
-            for note in seen.notes:
+        if profiles is not None:
+            for note in profiles.notes:
                 err.print(f"warning: {note}", soft_wrap=True)
         else:
-            seen = _evidence(model, clip, noise, level, wanted, bars)
-            keep_evidence(out_dir / EVIDENCE, key, seen)
-        log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, seen=seen)
+            profiles = _evidence(model, clip, noise, level, wanted, bars)
+            keep_evidence(out_dir / EVIDENCE, key, profiles)
+        log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, profiles=profiles)
         settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
-        posterior = _drawn(out_dir / CHAINS, overwrite, bars, seen=seen, log_prob=log_prob, **settings)
+        posterior = _drawn(out_dir / CHAINS, overwrite, bars, profiles=profiles, log_prob=log_prob, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     _write(out_dir, posterior, fitted, f"{model_path.name}, by {Path(clip.source).name}", level)
     _tell(out_dir, posterior)
@@ -210,7 +213,7 @@ def _made_folder(path: Path) -> Iterator[None]:
 def _check_settings(num_frames: int, only, concentration: float, walkers, ensembles: int, steps: int) -> None:
     """All that can be known to be wrong before pictures are drawn."""
     try:
-        found = Increments.among(np.linspace(0.0, 1.0, num_frames), only, concentration)
+        found = Increments.with_free(np.linspace(0.0, 1.0, num_frames), only, concentration)
     except ValueError as error:
         if str(error).startswith("concentration"):
             raise
@@ -233,8 +236,12 @@ def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] |
 def _evidence(
     model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars
 ) -> LikelihoodProfiles:
-    seen = evidence(model, clip.frames, noise=noise, on_picture=lambda done, total: bars("pictures", done, total))
-    return at_level(level, model, clip.frames, seen, only, lambda done, total: bars("frames", done, total))
+    profiles = likelihood_profiles(
+        model, clip.frames, noise=noise, on_render=lambda done, total: bars("pictures", done, total)
+    )
+    return condition_on_level(
+        level, model, clip.frames, profiles, only, lambda done, total: bars("frames", done, total)
+    )
 
 
 @contextmanager
@@ -304,7 +311,7 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
         if error.filename is None or Path(error.filename) != path:
             raise
         again = f" What {path} holds goes on when called again." if path.exists() else ""
-        raise OutputError(f"{not_writable(path, error)}{again}") from error
+        raise OutputError(f"{output_error(path, error)}{again}") from error
     if existed:
         text = "had finished: nothing was drawn anew" if not course else "went on from where it was stopped"
         out.print(f"{path}: {text}", soft_wrap=True)
@@ -323,8 +330,8 @@ def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | Non
     _draw(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
     _draw(folder / "corner.png", plots.plot_pairs, posterior)
     _draw(folder / "trace.png", plots.plot_trace, posterior)
-    if posterior.seen is not None:
-        _draw(folder / "correlation.png", plots.plot_correlation, posterior.seen)
+    if posterior.profiles is not None:
+        _draw(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
 
 
 def _draw(path: Path, plot: Callable, *arguments: Any, **options: Any) -> None:

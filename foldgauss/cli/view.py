@@ -11,7 +11,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.cli.app.shared import ModelFile, WrongUse, app, clip_of_model, err, out
 from foldgauss.cli.edit import Original, OriginalQuality
 from foldgauss.io.models.video_model import load_video_model
-from foldgauss.io.page.html import QUALITY, html_page, warn_of_size
+from foldgauss.io.page.player_page import QUALITY, html_page, warn_of_size
 
 _HOST = "127.0.0.1"
 

@@ -1,8 +1,9 @@
-"""Estimation from points: mixtures by EM as a scikit-learn estimator, one Folded-Gaussian by maximum likelihood.
+"""Estimation of Folded-Gaussians and their mixtures from points.
 
-`FoldedGaussianMixture` is the estimator; `likelihood.fit` fits a single Folded-Gaussian, `gradient_fit` a mixture with
-any fold and envelope by gradient ascent, `model_selection` chooses the number of components. `em` has the algorithm on
-arrays. Names are imported when first used: `likelihood` works without scikit-learn.
+`FoldedGaussianMixture` fits mixtures by EM as a scikit-learn estimator, and `model_selection.select_mixture` chooses
+their size; `likelihood.fit` fits a single Folded-Gaussian by maximum likelihood, and `gradient_fit.fit_gradient` a
+mixture with any fold and envelope by gradient ascent. `em` is the algorithm on arrays. Names are imported when first
+used: `likelihood` does not need scikit-learn.
 """
 
 from typing import TYPE_CHECKING

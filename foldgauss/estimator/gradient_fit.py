@@ -1,4 +1,4 @@
-"""Maximum likelihood of a mixture by gradients: for folds and envelopes that EM has no closed form for."""
+"""Maximum likelihood of a mixture by gradient ascent, for folds and envelopes without closed-form EM updates."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ _LEARNING_RATE = 1e-2
 
 
 class GradientFit(NamedTuple):
-    """The mixture of the last step whose loss was a number; the mean log-likelihood before each step; how it ended:
+    """The mixture of the last step with a finite loss; the mean log-likelihood before each step; and the status:
     NOT_CONVERGED means that all steps were taken."""
 
     mixture: FoldedMixture
@@ -30,12 +30,12 @@ class GradientFit(NamedTuple):
 
 
 class _Raw(NamedTuple):
-    """What is optimised: free of constraints, and in units of each component's own scale at the start."""
+    """The optimized parameters: unconstrained, and in units of each component's initial scales."""
 
     logits: Float[Array, " k"]
     loc: Float[Array, "k d-1"]
     log_diagonal: Float[Array, "k d-1"]
-    below: Float[Array, "k d-1 d-1"]
+    lower: Float[Array, "k d-1 d-1"]
     time_loc: Float[Array, " k"]
     log_time_scale: Float[Array, " k"]
     fold: PyTree
@@ -48,25 +48,24 @@ def fit_gradient(
     *,
     sample_weight: Float[ArrayLike, " n"] | None = None,
     steps: int = 500,
-    optimiser: optax.GradientTransformation | None = None,
+    optimizer: optax.GradientTransformation | None = None,
     batch_size: int | None = None,
     key: Key[Array, ""] | None = None,
 ) -> GradientFit:
-    """Climb the (weighted) mean log-likelihood of points x from a mixture, all its parameters together.
+    """Maximize the (weighted) mean log-likelihood of points x over all parameters of a mixture, starting from it.
 
-    Weights, centres, covariances, times and the fold's leaves are trained; of the envelope, those that a
-    `CallableEnvelope` carries (a built-in envelope's power and floor are a choice, not parameters). A component of
-    weight 0 stays without.
+    Trained are weights, centers, covariances, times and the fold's leaves; of the envelope, those of a
+    `CallableEnvelope` (a built-in envelope's power and floor are fixed). A component of weight 0 keeps it.
 
-    **Shapes:** x (n, d), time last; the mixture has no batch but its components. `batch_size` points are drawn anew
-    for each step with `key` (default: all points, every time). `optimiser` is optax's, default Adam at 0.01.
+    **Shapes:** x (n, d), time last; the mixture has no batch axes. `batch_size` points are drawn for each step with
+    `key` (default: all points in every step). `optimizer` is optax's, by default Adam with learning rate 0.01.
 
     **Example:**
 
         start = FoldedMixture(FoldedGaussian(loc, scale=scale, time_loc=t, time_scale=s, fold=network), weights=w)
         result = fit_gradient(start, x, steps=2000)
 
-    **Source:** eq:foldgauss; Kingma and Ba 2015. **Raises:** ValueError naming the parameter; a loss that is no number
+    **Source:** eq:foldgauss; Kingma and Ba 2015. **Raises:** ValueError naming the parameter. A loss that is not finite
     ends the fit with `status` NOT_FINITE.
     """
     if not isinstance(mixture, FoldedMixture) or mixture.logits.ndim != 1:
@@ -87,48 +86,48 @@ def fit_gradient(
         raise invalid("sample_weight", expected=f"{len(x)} numbers >= 0, not all 0", got=f"shape {weights.shape}")
     if batch_size is not None and not is_integer(batch_size, 1):
         raise invalid("batch_size", expected="a whole number >= 1 or None", got=repr(batch_size))
-    optimiser = optax.adam(_LEARNING_RATE) if optimiser is None else optimiser
+    optimizer = optax.adam(_LEARNING_RATE) if optimizer is None else optimizer
     key = jax.random.key(0) if key is None else key
     start = jax.tree.map(lambda z: z, mixture)
-    raw = _raw_of(start)
-    state, values, good = optimiser.init(raw), [], start
-    for number in range(steps + 1):  # once more, since a step tells of the parameters it begins with
+    raw = _init_raw(start)
+    state, values, last = optimizer.init(raw), [], start
+    for number in range(steps + 1):  # once more, since a step evaluates the parameters before it
         step_key = jax.random.fold_in(key, number)
-        new, state, value, here, finite = _step(raw, state, start, x, weights, step_key, optimiser, batch_size)
+        new, state, value, current, finite = _step(raw, state, start, x, weights, step_key, optimizer, batch_size)
         if not finite:
-            return GradientFit(good, np.array(values), EMStatus.NOT_FINITE)
-        raw, good = new, here
+            return GradientFit(last, np.array(values), EMStatus.NOT_FINITE)
+        raw, last = new, current
         if number < steps:
             values.append(float(value))
-    return GradientFit(good, np.array(values), EMStatus.NOT_CONVERGED)
+    return GradientFit(last, np.array(values), EMStatus.NOT_CONVERGED)
 
 
 def _is_finite(mixture: FoldedMixture) -> Bool[Array, ""]:
-    """Whether all numbers are, but for logits of -inf."""
+    """Whether all parameters are finite, except for logits of -inf."""
     leaves = jax.tree.leaves(eqx.filter(mixture.components, eqx.is_inexact_array))
     return jnp.stack([jnp.isfinite(z).all() for z in leaves]).all() & ~jnp.isnan(mixture.logits).any()
 
 
 @eqx.filter_jit
-def _step(raw, state, start, x, weights, key, optimiser, batch_size):
+def _step(raw, state, start, x, weights, key, optimizer, batch_size):
     if batch_size is not None:
         rows = jax.random.choice(key, x.shape[0], (batch_size,), p=weights / weights.sum())
         x, weights = x[rows], jnp.ones(batch_size, x.dtype)
 
     def loss(raw):
         present = weights > 0
-        log_p = _mixture_of(raw, start).log_prob(jnp.where(present[:, None], x, 0))
+        log_p = _build_mixture(raw, start).log_prob(jnp.where(present[:, None], x, 0))
         return -jnp.where(present, weights * log_p, 0).sum() / weights.sum()
 
     value, gradient = jax.value_and_grad(loss)(raw)
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # the optimiser is not ours
-        updates, state = optimiser.update(gradient, state, raw)
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # third-party code
+        updates, state = optimizer.update(gradient, state, raw)
         new = optax.apply_updates(raw, updates)
-    here = _mixture_of(raw, start)
-    return new, state, -value, here, jnp.isfinite(value) & _is_finite(here)
+    current = _build_mixture(raw, start)
+    return new, state, -value, current, jnp.isfinite(value) & _is_finite(current)
 
 
-def _raw_of(mixture: FoldedMixture) -> _Raw:
+def _init_raw(mixture: FoldedMixture) -> _Raw:
     components = mixture.components
     zero = jnp.zeros_like(components.loc)
     fold = eqx.filter(components.fold, eqx.is_inexact_array)
@@ -145,21 +144,21 @@ def _raw_of(mixture: FoldedMixture) -> _Raw:
     )
 
 
-def _mixture_of(raw: _Raw, start: FoldedMixture) -> FoldedMixture:
-    """The start, moved: centres by the factors of Sigma, times by sigma_t, scales by factors."""
-    was = start.components
-    diagonal = jnp.diagonal(was.scale_tril, axis1=1, axis2=2)
+def _build_mixture(raw: _Raw, start: FoldedMixture) -> FoldedMixture:
+    """Apply `raw` to the start: it shifts centers in units of Sigma's factor, times in units of sigma_t."""
+    initial = start.components
+    diagonal = jnp.diagonal(initial.scale_tril, axis1=1, axis2=2)
     eye = jnp.eye(diagonal.shape[-1], dtype=diagonal.dtype)[None]
-    below = jnp.tril(was.scale_tril + diagonal[:, :, None] * raw.below, -1)
+    lower = jnp.tril(initial.scale_tril + diagonal[:, :, None] * raw.lower, -1)
     leaves = (
-        was.loc + diagonal * raw.loc,
-        below + (diagonal * jnp.exp(raw.log_diagonal))[:, :, None] * eye,
-        was.time_loc + was.time_scale * raw.time_loc,
-        was.time_scale * jnp.exp(raw.log_time_scale),
-        eqx.combine(raw.fold, was.fold),
-        was.envelope if raw.envelope is None else eqx.combine(raw.envelope, was.envelope),
+        initial.loc + diagonal * raw.loc,
+        lower + (diagonal * jnp.exp(raw.log_diagonal))[:, :, None] * eye,
+        initial.time_loc + initial.time_scale * raw.time_loc,
+        initial.time_scale * jnp.exp(raw.log_time_scale),
+        eqx.combine(raw.fold, initial.fold),
+        initial.envelope if raw.envelope is None else eqx.combine(raw.envelope, initial.envelope),
     )
-    places = lambda m: (  # noqa: E731
+    where = lambda m: (  # noqa: E731
         m.components.loc,
         m.components.scale_tril,
         m.components.time_loc,
@@ -168,4 +167,4 @@ def _mixture_of(raw: _Raw, start: FoldedMixture) -> FoldedMixture:
         m.components.envelope,
         m.logits,
     )
-    return eqx.tree_at(places, start, (*leaves, start.logits + raw.logits))
+    return eqx.tree_at(where, start, (*leaves, start.logits + raw.logits))

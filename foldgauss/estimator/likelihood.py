@@ -1,6 +1,6 @@
-"""Maximum likelihood for one Folded-Gaussian: fit, standard errors, bootstrap, choice of the fold's degree.
+"""Maximum likelihood for one Folded-Gaussian: fit, standard errors, bootstrap, selection of the fold's degree.
 
-Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *centre* is bent along a curve in time.
+Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *center* follows a curve in time.
 """
 
 import inspect
@@ -21,17 +21,17 @@ from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
-from foldgauss.estimator.time_profile import Profile, Space, maximise
+from foldgauss.estimator.time_profile import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
-__all__ = ["CentreParameters", "DegreeChoice", "Fit", "FitStatus", "Replicates", "bootstrap", "fit", "select_degree"]
+__all__ = ["CenterParameters", "DegreeChoice", "Fit", "FitStatus", "Replicates", "bootstrap", "fit", "select_degree"]
 
-_MAX_STEPS = 200  # trials of the search for time; it takes 5 to 20
-_CV_PARTS = 5
+_MAX_STEPS = 200  # trial steps of the maximization over time; it takes 5 to 20
+_CV_FOLDS = 5
 
 
 class FitStatus(IntEnum):
-    """How a fit ended. All but OK and NOT_CONVERGED leave NaN in every parameter: nothing fails in silence."""
+    """How a fit ended. With any status but OK and NOT_CONVERGED all parameters are NaN."""
 
     OK = 0
     NOT_FINITE = 1
@@ -45,11 +45,11 @@ class FitStatus(IntEnum):
 _CURES = {
     FitStatus.NOT_FINITE: "x or weights hold NaN or infinity. Drop those rows, or give them weight 0.",
     FitStatus.TOO_FEW_POINTS: "degree + d points of positive weight are needed (degree + 2 if diagonal). Lower degree.",
-    FitStatus.SINGULAR_TIME: "all times are equal, or time_scale is not positive: nothing can be folded.",
+    FitStatus.SINGULAR_TIME: "all times are equal, or time_scale is not positive: the fold is undetermined.",
     FitStatus.SINGULAR_DESIGN: "the times do not determine the polynomial (too few distinct ones). Lower degree.",
     FitStatus.SINGULAR_COVARIANCE: "the points lie on the curve, or a space coordinate is determined by the others. "
     "Drop it, use covariance='diagonal', or lower degree.",
-    FitStatus.NOT_CONVERGED: "the search for time_loc and time_scale stopped early. Scale x, or raise floor.",
+    FitStatus.NOT_CONVERGED: "the maximization over time_loc and time_scale stopped early. Scale x, or raise floor.",
 }
 
 
@@ -59,25 +59,25 @@ _CRITERIA = {
 }
 
 
-class CentreParameters(NamedTuple):
-    """Something for every parameter of the centre's curve: `loc` (d-1,), `coefficients` (degree, d-1)."""
+class CenterParameters(NamedTuple):
+    """A value for every parameter of the center's curve: `loc` (d-1,), `coefficients` (degree, d-1)."""
 
     loc: Float[Array, " d-1"]
     coefficients: Float[Array, "degree d-1"]
 
 
 class Fit(eqx.Module):
-    """A maximum-likelihood fit: the distribution, and how well its centre is known.
+    """A maximum-likelihood fit: the distribution, and the uncertainty of its center.
 
     **Standard errors** are those of weighted least squares *given the observed times and (time_loc, time_scale)*:
 
         Cov(beta_j | t) = Sigma_jj (B' W B)^-1,   W = diag(w / a(t)),   Sigma unbiased on `degrees_of_freedom`
 
-    so `interval` (Student's t) covers exactly as stated, for any n. The *expected* Fisher information of loc and f
-    is no way to them: it is infinite for a time likelihood without a floor, as `E[1/a] = inf`, although t is
-    ancillary and the information given t finite. Nor does anything of this sort cover jointly fitted (or own)
-    `time_loc` and `time_scale`: `1/a` weighs the tails so much that their curvature is ruled by the few outermost
-    points. For those, and for loc and f with the uncertainty of time included, use `bootstrap`.
+    so `interval` (Student's t) has exact coverage for any n. The *expected* Fisher information of loc and f cannot be
+    used: it is infinite for a time likelihood without a floor, as `E[1/a] = inf`, although t is ancillary and the
+    information given t finite. No such formula holds for estimated `time_loc` and `time_scale` either: `1/a` weights
+    the tails so heavily that a few outermost points dominate the curvature. For those, and for loc and f with the
+    uncertainty of time included, use `bootstrap`.
 
     **Shapes:** `status`, `log_likelihood`, `num_points` (the sum of weights) are scalars, `residual_scale` (d-1,).
 
@@ -98,7 +98,7 @@ class Fit(eqx.Module):
     covariance: str = eqx.field(static=True)
 
     def _repr_png_(self) -> bytes | None:
-        """What a notebook shows: the distribution's picture."""
+        """The distribution's image, which notebooks show."""
         return self.distribution._repr_png_()
 
     @property
@@ -107,7 +107,7 @@ class Fit(eqx.Module):
 
     @property
     def degrees_of_freedom(self) -> Float[Array, ""]:
-        """Sum of weights less the coefficients per coordinate, `n - degree - 1`; errors are NaN unless positive."""
+        """Sum of weights less the coefficients per coordinate, `n - degree - 1`; errors need it positive."""
         return self.num_points - (self.degree + 1)
 
     @property
@@ -126,32 +126,32 @@ class Fit(eqx.Module):
         return _CRITERIA["aic"](self.log_likelihood, self.num_parameters, self.num_points)
 
     @property
-    def standard_errors(self) -> CentreParameters:
+    def standard_errors(self) -> CenterParameters:
         """Of loc and the fold's coefficients, given the times and (time_loc, time_scale)."""
         to_powers = jnp.asarray(hermite_to_powers(self.degree), self.triangle_inverse.dtype)
         length = _norm(jnp.matmul(to_powers, self.triangle_inverse))
         errors = length[:, None] * self.residual_scale[None]
-        return CentreParameters(errors[0], errors[1:] / _powers(self.distribution.time_scale, self.degree))
+        return CenterParameters(errors[0], errors[1:] / _powers(self.distribution.time_scale, self.degree))
 
-    def interval(self, level: float = 0.95) -> tuple[CentreParameters, CentreParameters]:
-        """(lower, upper) ends of the exact Student-t intervals for loc and the coefficients, one at a time."""
-        quantile, errors = _student_quantile(_level(level), self.degrees_of_freedom), self.standard_errors
-        centre = CentreParameters(self.distribution.loc, self.distribution.fold.coefficients)
-        lower = jax.tree.map(lambda c, e: c - quantile * e, centre, errors)
-        return lower, jax.tree.map(lambda c, e: c + quantile * e, centre, errors)
+    def interval(self, level: float = 0.95) -> tuple[CenterParameters, CenterParameters]:
+        """(lower, upper) ends of exact Student-t intervals for loc and the coefficients, each by itself."""
+        quantile, errors = _student_quantile(_check_level(level), self.degrees_of_freedom), self.standard_errors
+        center = CenterParameters(self.distribution.loc, self.distribution.fold.coefficients)
+        lower = jax.tree.map(lambda c, e: c - quantile * e, center, errors)
+        return lower, jax.tree.map(lambda c, e: c + quantile * e, center, errors)
 
-    def centre_interval(self, t: Float[Array, "*m"], level: float = 0.95) -> tuple[Array, Array]:
+    def center_interval(self, t: Float[Array, "*m"], level: float = 0.95) -> tuple[Array, Array]:
         """(lower, upper) for the curve loc + f(time_loc - t), exact at each t: shapes (*m, d-1)."""
         dist, t = self.distribution, jnp.asarray(t, self.residual_scale.dtype)
         rows = hermite((dist.time_loc - t) / dist.time_scale, self.degree)
         error = _norm(jnp.matmul(rows, self.triangle_inverse))[..., None]
-        half = _student_quantile(_level(level), self.degrees_of_freedom) * error
+        half = _student_quantile(_check_level(level), self.degrees_of_freedom) * error
         half = half * lax.expand_dims(self.residual_scale, range(t.ndim))
-        centre = dist.condition_time(t).loc
-        return centre - half, centre + half
+        center = dist.condition_time(t).loc
+        return center - half, center + half
 
-    def checked(self) -> "Fit":
-        """This fit if it ended OK. **Raises:** ValueError saying what was wrong and what to try."""
+    def check(self) -> "Fit":
+        """Return this fit if its status is OK. **Raises:** ValueError with the status and a remedy."""
         status = FitStatus(int(self.status))
         if status is not FitStatus.OK:
             raise invalid("x", expected="points that determine the fit", got=status.name, cure=_CURES[status])
@@ -171,35 +171,34 @@ def fit(
     weights: Float[ArrayLike, " n"] | None = None,
     covariance: str = "full",
 ) -> Fit:
-    """Maximum (weighted) likelihood of a Folded-Gaussian with a polynomial fold.
+    """Fit a Folded-Gaussian with a polynomial fold by maximum (weighted) likelihood.
 
-        maximise sum_i w_i [ log N(s_i | loc + f(u_i), a(t_i) Sigma) + log N(t_i | time_loc, time_scale^2) ]
+        maximize sum_i w_i [ log N(s_i | loc + f(u_i), a(t_i) Sigma) + log N(t_i | time_loc, time_scale^2) ]
 
     Given time, `loc`, `f` and `Sigma` are weighted least squares (weights `w / a`) in closed form, by QR in
-    Hermite polynomials of `u / time_scale`. What is done about time:
+    Hermite polynomials of `u / time_scale`. The parameters of time are
 
-    * `time_loc` and `time_scale` passed: they are taken as given;
-    * `time="own"`: their own estimates, weighted mean and standard deviation of t;
-    * `time="joint"`: the maximum of the whole likelihood, searched from there uphill, step by step (BFGS): a local
-      maximum, as likelihoods of this kind may have several.
+    * fixed, if `time_loc` and `time_scale` are passed;
+    * for `time="own"` their marginal estimates, weighted mean and standard deviation of t;
+    * for `time="joint"` a local maximum of the joint likelihood, by BFGS from those estimates; there may be several.
 
-    The envelope is `TimeLikelihood(power, floor)`; `power=0` is a constant one, and `envelope` replaces it whole.
-    The floor is a *modelling* choice, and kept in the fitted distribution: without one the ridge is unbounded
+    The envelope is `TimeLikelihood(power, floor)`; `power=0` is a constant one, and `envelope` replaces it. The floor
+    is a *modeling* choice, and kept in the fitted distribution: without one the density on the ridge is unbounded
     where `power (d-1) > 2`, and outlying times make a joint likelihood degenerate.
 
-    **Shapes:** x (n, d), time last; `weights` (n,), counting repetitions: 2 is the point twice, 0 is not there (and
-    such a row may hold NaN). One fit; use `jax.vmap` for many. `covariance` is "full" or "diagonal" (the paper's).
+    **Shapes:** x (n, d), time last; `weights` (n,), frequency weights: 2 repeats a point, 0 leaves it out (such a row
+    may hold NaN). A single fit; use `jax.vmap` for many. `covariance` is "full" or "diagonal" (the paper's).
 
     **dtype:** that of x. **Units:** those of x.
 
-    **Example:** `fit(x, degree=2).checked().distribution`
+    **Example:** `fit(x, degree=2).check().distribution`
 
-    **Source:** eq:foldgauss. **Raises:** ValueError on unknown options, wrong shapes, negative weights, and on a
-    joint fit with floor 0 where it is unbounded. Troubles of the *data* are told by `Fit.status`, never raised: it
-    works under `jit` and `vmap`; see `Fit.checked`.
+    **Source:** eq:foldgauss. **Raises:** ValueError on unknown options, wrong shapes, negative weights, and a joint fit
+    with floor 0 where it is unbounded. Problems of the *data* do not raise but set `Fit.status`, also under `jit` and
+    `vmap`; see `Fit.check`.
     """
-    degree = _whole("degree", degree)
-    plan = _plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance)
+    degree = _check_degree("degree", degree)
+    plan = _make_plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance)
     return _fit(plan, plan.weights, jnp.int32(degree))
 
 
@@ -207,7 +206,7 @@ def fit(
 
 
 class _Data(NamedTuple):
-    """Points centred and scaled: `s = shift + scale * y`; weights of sum 1; absent rows at the centre."""
+    """Points centered and scaled: `s = shift + scale * y`; weights of sum 1; rows of weight 0 moved to the center."""
 
     t: Float[Array, " n"]
     y: Float[Array, "n d-1"]
@@ -220,7 +219,7 @@ class _Data(NamedTuple):
 
 
 class _Plan(eqx.Module):
-    """What `fit` was asked, checked and in the type of x."""
+    """The check arguments of `fit`, in the dtype of x."""
 
     x: Float[Array, "n d"]
     weights: Float[Array, " n"]
@@ -231,13 +230,13 @@ class _Plan(eqx.Module):
     covariance: str = eqx.field(static=True)
 
 
-def _plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance) -> _Plan:
+def _make_plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance) -> _Plan:
     check_one_of("time", time, ("own", "joint"))
     check_one_of("covariance", covariance, ("full", "diagonal"))
-    x = _points(x)
-    weights = _weights(weights, x)
+    x = _check_points(x)
+    weights = _check_weights(weights, x)
     envelope = TimeLikelihood(power, floor) if envelope is None else envelope
-    given = _given_time(time_loc, time_scale, x.dtype)
+    given = _check_time(time_loc, time_scale, x.dtype)
     if given is None and time == "joint":
         _check_bounded(envelope, x.shape[1])
     envelope = jax.tree.map(lambda leaf: leaf.astype(x.dtype) if eqx.is_inexact_array(leaf) else leaf, envelope)
@@ -246,25 +245,25 @@ def _plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights
 
 @eqx.filter_jit
 def _fit(plan: _Plan, weights: Float[Array, " n"], used: Int[Array, ""]) -> Fit:
-    """The plan carried out with these weights and a polynomial of degree `used` <= plan.degree."""
-    data = _prepared(plan.x, weights, plan.degree)
-    time_loc, time_scale = _own_time(data) if plan.given is None else plan.given
+    """Fit with these weights and a polynomial of degree `used` <= plan.degree."""
+    data = _prepare_data(plan.x, weights, plan.degree)
+    time_loc, time_scale = _estimate_time(data) if plan.given is None else plan.given
     singular_time = ~(time_scale > 0)
     time_scale = jnp.where(singular_time, 1, time_scale)
     diagonal = plan.covariance == "diagonal"
     profile = Profile(data.t, data.y, data.weights, plan.envelope, used, plan.degree, diagonal)
     converged, steps = jnp.array(True), jnp.zeros((), jnp.int32)
     if plan.time == "joint":
-        time_loc, time_scale, ascent = maximise(profile, time_loc, time_scale, _MAX_STEPS)
+        time_loc, time_scale, ascent = maximize(profile, time_loc, time_scale, _MAX_STEPS)
         converged, steps = ascent.converged(slack=4.0), ascent.steps
     space = profile.space(time_loc, time_scale)
     status = _status(data, space, used + (2 if diagonal else plan.x.shape[1]), singular_time, converged)
-    result = _assembled(plan, data, space, (time_loc, time_scale), status, steps, used)
+    result = _assemble_fit(plan, data, space, (time_loc, time_scale), status, steps, used)
     failed = (status != FitStatus.OK) & (status != FitStatus.NOT_CONVERGED)
     return jax.tree.map(lambda leaf: _nan_where(failed, leaf), result)
 
 
-def _prepared(x, weights, degree: int) -> _Data:
+def _prepare_data(x, weights, degree: int) -> _Data:
     missing = max(degree + 1 - x.shape[0], 0)  # a QR needs as many rows as columns; padding has no weight
     x, weights = jnp.pad(x, ((0, missing), (0, 0))), jnp.pad(weights, (0, missing))
     present = weights > 0
@@ -274,32 +273,32 @@ def _prepared(x, weights, degree: int) -> _Data:
     count = present.sum(dtype=jnp.int32)
     weights = jnp.where(finite & (total > 0), weights / jnp.where(total > 0, total, 1), 0)
     shift = _mean(x, weights)
-    centred = jnp.where(present[:, None], x - shift[None], 0)  # centre before squaring, always
-    scale = jnp.abs(centred).max(0)
+    centered = jnp.where(present[:, None], x - shift[None], 0)
+    scale = jnp.abs(centered).max(0)
     scale = jnp.where(scale > 0, scale, 1)
     t = jnp.where(present, x[:, -1], shift[-1])
-    return _Data(t, (centred / scale[None])[:, :-1], shift[:-1], scale[:-1], weights, total, count, finite)
+    return _Data(t, (centered / scale[None])[:, :-1], shift[:-1], scale[:-1], weights, total, count, finite)
 
 
 def _mean(x, weights):
     first = (weights[:, None] * x).sum(0)
-    return first + (weights[:, None] * (x - first[None])).sum(0)  # the second pass removes the offset's rounding
+    return first + (weights[:, None] * (x - first[None])).sum(0)  # corrects the rounding of large offsets
 
 
-def _own_time(data: _Data):
+def _estimate_time(data: _Data):
     loc = _mean(data.t[:, None], data.weights)[0]
-    centred = jnp.where(data.weights > 0, data.t - loc, 0)
-    largest = jnp.abs(centred).max()
+    centered = jnp.where(data.weights > 0, data.t - loc, 0)
+    largest = jnp.abs(centered).max()
     unit = jnp.where(largest > 0, largest, 1)
-    # All times equal: what is left is the rounding of their mean.
+    # All times are equal if they differ by no more than the rounding of their mean.
     flat = largest <= 4 * jnp.finfo(data.t.dtype).eps * jnp.abs(data.t).max()
-    scale = unit * jnp.sqrt((data.weights * (centred / unit) ** 2).sum())
+    scale = unit * jnp.sqrt((data.weights * (centered / unit) ** 2).sum())
     return loc, jnp.where(flat, 0, scale)
 
 
 def _status(data: _Data, space: Space, needed: int, singular_time, converged) -> Int[Array, ""]:
-    """The first thing that went wrong; the later ones would only follow from it."""
-    troubles = [
+    """The first problem found; later ones follow from it."""
+    problems = [
         (~data.finite, FitStatus.NOT_FINITE),
         (data.count < needed, FitStatus.TOO_FEW_POINTS),
         (singular_time, FitStatus.SINGULAR_TIME),
@@ -308,11 +307,11 @@ def _status(data: _Data, space: Space, needed: int, singular_time, converged) ->
         (~jnp.isfinite(space.value), FitStatus.NOT_FINITE),
         (~converged, FitStatus.NOT_CONVERGED),
     ]
-    conditions, codes = zip(*troubles, strict=True)
+    conditions, codes = zip(*problems, strict=True)
     return jnp.select(conditions, [jnp.int32(code) for code in codes], jnp.int32(FitStatus.OK))
 
 
-def _assembled(plan: _Plan, data: _Data, space: Space, when, status, steps, used) -> Fit:
+def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, used) -> Fit:
     """The fit in the units of the points."""
     time_loc, time_scale = when
     to_powers = jnp.asarray(hermite_to_powers(plan.degree), data.t.dtype)
@@ -361,10 +360,10 @@ def _num_parameters(degree: int, dim: int, time: str, covariance: str) -> int:
 
 
 def _student_quantile(level: float, freedom):
-    """Half-width of the central interval of Student's t, in standard errors; nan unless freedom > 0."""
+    """Half-width of the central interval of Student's t, in standard errors; NaN unless freedom > 0."""
     many = freedom > 300  # where the incomplete beta function loses digits, and the series has 9
     n = jnp.where((freedom > 0) & ~many, freedom, 1)
-    # P(|T| > q) = I_x(n/2, 1/2) with x = n / (n + q^2): halve an interval of log q.
+    # P(|T| > q) = I_x(n/2, 1/2) with x = n / (n + q^2): bisection over log q.
     tail = lambda z: jax.scipy.special.betainc(0.5 * n, 0.5 * jnp.ones_like(n), n / (n + jnp.exp(2 * z)))  # noqa: E731
 
     def halve(_, ends):
@@ -389,9 +388,9 @@ def _student_series(level: float, n):
 
 
 class Replicates(eqx.Module):
-    """Parameters refitted to samples of a fitted distribution; the leading axis counts replicates.
+    """Parameters refitted to samples of a fitted distribution; the leading axis is that of replicates.
 
-    Failed replicates hold NaN (see `status`) and are left out of the summaries.
+    Failed replicates hold NaN (see `status`) and are excluded from the summaries.
     """
 
     distribution: FoldedGaussian
@@ -411,18 +410,17 @@ class Replicates(eqx.Module):
 
     def interval(self, level: float = 0.95) -> tuple[dict[str, Array], dict[str, Array]]:
         """(lower, upper) percentiles over the replicates, by parameter name."""
-        ends = ((1 - _level(level)) / 2, (1 + level) / 2)
+        ends = ((1 - _check_level(level)) / 2, (1 + level) / 2)
         lower, upper = ({k: jnp.nanquantile(v, p, axis=0) for k, v in self.parameters.items()} for p in ends)
         return lower, upper
 
 
 def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, batch_size: int = 25) -> Replicates:
-    """Parametric bootstrap: sample as many points from the fit, fit them in the same way, again and again.
+    """Parametric bootstrap: repeatedly sample as many points from the fit and fit them in the same way.
 
-    For time_loc and time_scale fitted jointly (or by their own estimates), and for loc and f with that uncertainty
-    included. There is no formula for it to rest on: without a floor the expected Fisher information is infinite
-    (`E[1/a] = inf`), and with one it is ruled by the rare outermost times; sampling makes no such assumption. It
-    does assume the model, and its percentile intervals cover approximately, not exactly.
+    For estimated time_loc and time_scale, and for loc and f with their uncertainty included. There the Fisher
+    information is of no use: without a floor its expectation is infinite (`E[1/a] = inf`), and with one the rare
+    outermost times dominate it. The bootstrap assumes the model; its percentile intervals have approximate coverage.
 
     **Shapes:** `num_replicates` fits of `round(sum of weights)` points, `batch_size` of them at a time in memory.
 
@@ -431,10 +429,10 @@ def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, ba
     **Source:** Efron and Tibshirani, An Introduction to the Bootstrap, section 6.5.
     **Raises:** ValueError if the fit failed, or `num_replicates` is below 2.
     """
-    if _whole("num_replicates", num_replicates) < 2:
+    if _check_degree("num_replicates", num_replicates) < 2:
         raise invalid("num_replicates", expected="a whole number >= 2", got=num_replicates, cure="200 is usual.")
     if int(result.status) not in (FitStatus.OK, FitStatus.NOT_CONVERGED):
-        result.checked()
+        result.check()
     keys, num_points = jax.random.split(key, num_replicates), max(round(float(result.num_points)), 1)
     return _bootstrap(result, keys, num_points, min(batch_size, num_replicates))
 
@@ -448,8 +446,8 @@ def _bootstrap(result: Fit, keys, num_points: int, batch_size: int) -> Replicate
     def replicate(key):
         x = dist.sample(key, (num_points,))
         plan = _Plan(x, weights, given, dist.envelope, degree, result.time, result.covariance)
-        again = _fit(plan, weights, jnp.int32(degree))
-        return Replicates(again.distribution, again.status)
+        refit = _fit(plan, weights, jnp.int32(degree))
+        return Replicates(refit.distribution, refit.status)
 
     return lax.map(replicate, keys, batch_size=batch_size)
 
@@ -468,10 +466,10 @@ class DegreeChoice(NamedTuple):
 def select_degree(
     x: Float[ArrayLike, "n d"], max_degree: int, criterion: str = "bic", *, key: Key[Array, ""] | None = None, **options
 ) -> DegreeChoice:
-    """The fold's degree, 0 to `max_degree`, of the smallest criterion.
+    """Select the fold's degree, 0 to `max_degree`, that minimizes a criterion.
 
-    * "bic": finds the true degree as n grows; "aic": predicts well, and chooses too high a degree now and then;
-    * "cv": -2 times the log-likelihood of points held out, in 5 parts; `key` shuffles them (default: key 0).
+    * "bic": finds the true degree as n grows; "aic": predicts well, but sometimes selects too high a degree;
+    * "cv": -2 times the log-likelihood of held-out points, in 5 folds; `key` shuffles them (default: key 0).
 
     **Shapes:** x (n, d); `options` are those of `fit`, the same for every degree.
 
@@ -482,24 +480,24 @@ def select_degree(
     """
     check_one_of("criterion", criterion, (*_CRITERIA, "cv"))
     if "degree" in options:
-        raise invalid("degree", expected="no such option", got=options["degree"], cure="It is what is selected.")
+        raise invalid("degree", expected="no such option", got=options["degree"], cure="It is selected.")
     defaults = {name: p.default for name, p in inspect.signature(fit).parameters.items() if name != "x"}
     unknown = set(options) - set(defaults)
     if unknown:
         raise invalid("options", expected="options of fit", got=", ".join(sorted(unknown)), cure="See fit.")
-    plan = _plan(x, **(defaults | options | {"degree": _whole("max_degree", max_degree)}))
+    plan = _make_plan(x, **(defaults | options | {"degree": _check_degree("max_degree", max_degree)}))
     if criterion == "cv":
-        scores = _held_out(plan, _cv_parts(plan.x, jax.random.key(0) if key is None else key))
+        scores = _cross_validate(plan, _assign_folds(plan.x, jax.random.key(0) if key is None else key))
     else:
-        scores = _penalised(plan, criterion)
+        scores = _penalize(plan, criterion)
     scores = np.where(np.isfinite(scores), scores, np.inf)
     best = int(np.argmin(scores))
     chosen = fit(x, degree=best, **options)
-    return DegreeChoice(best, scores, chosen if np.isfinite(scores[best]) else chosen.checked())
+    return DegreeChoice(best, scores, chosen if np.isfinite(scores[best]) else chosen.check())
 
 
 @eqx.filter_jit
-def _penalised(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
+def _penalize(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
     degrees = range(plan.degree + 1)
     fits = jax.vmap(lambda used: _fit(plan, plan.weights, used))(jnp.arange(len(degrees), dtype=jnp.int32))
     dim = plan.x.shape[1] - 1
@@ -507,14 +505,14 @@ def _penalised(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
     return _CRITERIA[criterion](fits.log_likelihood, free, fits.num_points)
 
 
-def _cv_parts(x, key) -> Int[Array, " n"]:
-    """The part of each point, parts of equal size in random order."""
-    return jax.random.permutation(key, jnp.arange(x.shape[0]) % _CV_PARTS)
+def _assign_folds(x, key) -> Int[Array, " n"]:
+    """The cross-validation fold of each point, at random and of equal sizes."""
+    return jax.random.permutation(key, jnp.arange(x.shape[0]) % _CV_FOLDS)
 
 
 @eqx.filter_jit
-def _held_out(plan: _Plan, parts) -> Float[Array, " degrees"]:
-    """-2 times the log-likelihood of each part under the fit to the others; nan if one of those fails."""
+def _cross_validate(plan: _Plan, parts) -> Float[Array, " degrees"]:
+    """-2 times the log-likelihood of each fold under the fit to the others; NaN if one of those fails."""
 
     def score(used, part):
         trained = _fit(plan, jnp.where(parts == part, 0, plan.weights), used)
@@ -523,13 +521,13 @@ def _held_out(plan: _Plan, parts) -> Float[Array, " degrees"]:
         return -2 * jnp.where(held, plan.weights * log_prob, 0).sum() + 0 * trained.log_likelihood
 
     degrees = jnp.arange(plan.degree + 1, dtype=jnp.int32)
-    return jax.vmap(lambda used: jax.vmap(lambda part: score(used, part))(jnp.arange(_CV_PARTS)).sum())(degrees)
+    return jax.vmap(lambda used: jax.vmap(lambda part: score(used, part))(jnp.arange(_CV_FOLDS)).sum())(degrees)
 
 
 # --- checks -------------------------------------------------------------------------------------------------
 
 
-def _points(x) -> Float[Array, "n d"]:
+def _check_points(x) -> Float[Array, "n d"]:
     check_not_forked()
     x = jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
@@ -539,7 +537,7 @@ def _points(x) -> Float[Array, "n d"]:
     return x
 
 
-def _weights(weights, x) -> Float[Array, " n"]:
+def _check_weights(weights, x) -> Float[Array, " n"]:
     if weights is None:
         return jnp.ones(x.shape[0], x.dtype)
     weights = jnp.asarray(weights).astype(x.dtype)
@@ -552,7 +550,7 @@ def _weights(weights, x) -> Float[Array, " n"]:
     return weights
 
 
-def _given_time(time_loc, time_scale, dtype):
+def _check_time(time_loc, time_scale, dtype):
     if (time_loc is None) != (time_scale is None):
         got = "time_loc alone" if time_scale is None else "time_scale alone"
         cure = "Pass both, or none and time='own' or 'joint'."
@@ -568,13 +566,13 @@ def _check_bounded(envelope: AbstractEnvelope, dim: int) -> None:
         raise invalid("floor", expected="a positive number where power (d-1) > 2", got=0, cure=cure)
 
 
-def _whole(name: str, value) -> int:
+def _check_degree(name: str, value) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise invalid(name, expected="a whole number >= 0", got=repr(value))
     return int(value)
 
 
-def _level(level: float) -> float:
+def _check_level(level: float) -> float:
     if not 0 < level < 1:
         raise invalid("level", expected="a number between 0 and 1", got=level, cure="0.95 is usual.")
     return level

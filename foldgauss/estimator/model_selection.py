@@ -1,4 +1,4 @@
-"""How many components, of which degree: information criteria and cross-validation over a grid."""
+"""Selection of the number of components and the degree, by information criteria or cross-validation over a grid."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ __all__ = ["MixtureChoice", "select_mixture"]
 
 
 class MixtureChoice(NamedTuple):
-    """The estimator of the smallest criterion, fitted to all points; the criterion, (components, degrees), inf where a
-    fit failed; and what the axes are."""
+    """The estimator with the smallest criterion, fitted to all points; the criterion, (components, degrees), inf for a
+    failed fit; and the values along these axes."""
 
     estimator: FoldedGaussianMixture
     scores: Float[np.ndarray, "components degrees"]
@@ -36,34 +36,34 @@ def select_mixture(
     folds: int = 5,
     groups: np.ndarray | None = None,
 ) -> MixtureChoice:
-    """The number of components and the degree with the smallest criterion.
+    """Select the number of components and the degree that minimize a criterion.
 
     * "bic": -2 log-likelihood + parameters log n; "aic": + 2 parameters;
-    * "cv": -2 times the log-likelihood of points held out, in `folds` parts; with `groups` (n,) no group is torn
-      apart (the points of one track, say).
+    * "cv": -2 times the log-likelihood of held-out points, in `folds` folds; with `groups` (n,) each group stays in one
+      fold (the points of one track, for example).
 
-    A degree of "auto" takes away, in each component by itself, the powers that do not pay (from `max_degree`).
+    A degree of "auto" is chosen for each component by itself, up to `max_degree`.
 
     **Shapes:** X (n, d), as in `fit`, or chunks of rows for "bic" and "aic"; all other settings are the estimator's.
 
     **Example:** `select_mixture(FoldedGaussianMixture(n_init=3), x, n_components=range(1, 6), degrees=[0, 1, 3])`
 
-    **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on empty or wrong choices, or if no
-    fit is finite.
+    **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on empty or invalid choices, or if no fit
+    is finite.
     """
     check_one_of("criterion", criterion, ("bic", "aic", "cv"))
     sizes, degrees = tuple(n_components), tuple(degrees)
     if not sizes or not all(is_integer(k, 1) for k in sizes):
-        raise invalid("n_components", expected="whole numbers >= 1", got=sizes, cure="range(1, 6), say.")
+        raise invalid("n_components", expected="whole numbers >= 1", got=sizes, cure="For example range(1, 6).")
     if not degrees or not all(q == "auto" or is_integer(q, 0) for q in degrees):
         raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
     parts, least = None, np.inf
     if not is_chunked(X):
         X = np.asarray(X)
-        parts = _parts(len(X), folds, groups) if criterion == "cv" else None
+        parts = _assign_folds(len(X), folds, groups) if criterion == "cv" else None
         least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
     elif criterion == "cv":
-        raise invalid("criterion", expected='"bic" or "aic" for chunks of rows', got='"cv"', cure="Or give one array.")
+        raise invalid("criterion", expected='"bic" or "aic" for chunks of rows', got='"cv"', cure="Or pass one array.")
     if max(sizes) > least:
         got, cure = max(sizes), "Fewer components."
         raise invalid("n_components", expected=f"at most {least}, the points of a fit", got=got, cure=cure)
@@ -71,39 +71,39 @@ def select_mixture(
     for i, size in enumerate(sizes):
         for j, degree in enumerate(degrees):
             one = clone(estimator).set_params(n_components=int(size), degree=degree)
-            scores[i, j] = _held_out(one, X, parts) if criterion == "cv" else _penalised(one, X, criterion)
+            scores[i, j] = _cross_validate(one, X, parts) if criterion == "cv" else _penalize(one, X, criterion)
             if scores[i, j] < np.inf and scores[i, j] == scores.min():
                 chosen = one
     if not np.isfinite(scores).any():
         raise invalid("X", expected="points that some mixture fits", got="none", cure="Raise reg_covar.")
-    # By "bic" and "aic" it is fitted already, and another fit might end elsewhere.
+    # For "bic" and "aic" it is fitted already; fitting again could find another optimum.
     return MixtureChoice(chosen.fit(X) if criterion == "cv" else chosen, scores, sizes, degrees)
 
 
-def _penalised(estimator, X, criterion: str) -> float:
-    fitted = _fitted(estimator, X)
+def _penalize(estimator, X, criterion: str) -> float:
+    fitted = _fit_or_none(estimator, X)
     return np.inf if fitted is None else getattr(fitted, criterion)(X)
 
 
-def _held_out(estimator, X, parts) -> float:
+def _cross_validate(estimator, X, parts) -> float:
     total = 0.0
     for part in range(parts.max() + 1):
-        fitted = _fitted(clone(estimator), X[parts != part])
+        fitted = _fit_or_none(clone(estimator), X[parts != part])
         if fitted is None:
             return np.inf
         total += -2 * float(fitted.score_samples(X[parts == part]).sum(dtype=np.float64))
     return total if np.isfinite(total) else np.inf
 
 
-def _fitted(estimator, X) -> FoldedGaussianMixture | None:
+def _fit_or_none(estimator, X) -> FoldedGaussianMixture | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         fitted = estimator.fit(X)
     return None if fitted.status_ == EMStatus.NOT_FINITE else fitted
 
 
-def _parts(num: int, folds: int, groups: np.ndarray | None) -> np.ndarray:
-    """The part of each point: parts of equal size, in random order but the same every time."""
+def _assign_folds(num: int, folds: int, groups: np.ndarray | None) -> np.ndarray:
+    """The cross-validation fold of each point: folds of equal size, random but reproducible."""
     names, which = np.unique(np.arange(num) if groups is None else groups, return_inverse=True)
     if which.shape != (num,):
         raise invalid("groups", expected=f"shape ({num},)", got=f"shape {np.shape(groups)}", cure="One per row of X.")

@@ -1,4 +1,4 @@
-"""The profiled log-likelihood of time: what is left of (time_loc, time_scale) once space is fitted in closed form."""
+"""The profile log-likelihood of (time_loc, time_scale), with space maximized in closed form, and its maximization."""
 
 from typing import NamedTuple
 
@@ -11,16 +11,16 @@ from jaxtyping import Array, Bool, Float, Int
 from foldgauss._numerics.regression import Regression, weighted_regression
 from foldgauss.envelope import AbstractEnvelope
 
-__all__ = ["Ascent", "Profile", "Space", "maximise"]
+__all__ = ["Ascent", "Profile", "Space", "maximize"]
 
 _LOG_2PI = 1.8378770664093453
-_ARMIJO = 1e-4  # the usual sufficient share of the promised increase
-_SHORTEST = 2.0**-20  # below this share of a step the value no longer changes
-_LONGEST = 0.5  # a step moves time_loc by half a time_scale at most, or time_scale by exp(0.5)
+_ARMIJO = 1e-4  # sufficient increase, as a fraction of the predicted one
+_MIN_FRACTION = 2.0**-20  # below this fraction of a step the value no longer changes
+_MAX_STEP = 0.5  # a step changes time_loc by at most half a time_scale, and time_scale by a factor exp(0.5)
 
 
 class Space(NamedTuple):
-    """The closed form given time; `exp(2 log_unit) tril tril'` is the covariance."""
+    """The maximum over space given time; `exp(2 log_unit) tril tril'` is the covariance."""
 
     regression: Regression
     tril: Float[Array, "d-1 d-1"]
@@ -29,7 +29,7 @@ class Space(NamedTuple):
 
 
 class Profile(eqx.Module):
-    """Points ready to be fitted: space centred and scaled, weights of sum 1."""
+    """The points of a fit: space centered and scaled, weights of sum 1."""
 
     t: Float[Array, " n"]
     y: Float[Array, "n d-1"]
@@ -71,7 +71,7 @@ class Profile(eqx.Module):
         z = jnp.sqrt(self.weights)[:, None] * residual / scale[None]
         correlation = jnp.matmul(z.T, z)
         pivots = jnp.diagonal(jnp.linalg.cholesky(lax.stop_gradient(correlation)))
-        singular = singular | ~(pivots**2 > 64 * eps).all()  # so written, a NaN pivot is singular too
+        singular = singular | ~(pivots**2 > 64 * eps).all()  # true for NaN pivots
         tril = jnp.linalg.cholesky(jnp.where(singular, jnp.eye(scale.size, dtype=scale.dtype), correlation))
         return scale[:, None] * tril, singular
 
@@ -83,17 +83,17 @@ class Ascent(NamedTuple):
     value: Float[Array, ""]
     gradient: Float[Array, "2"]
     inverse_hessian: Float[Array, "2 2"]  # of minus the value
-    share: Float[Array, ""]  # of the quasi-Newton step, halved until the value increases
+    fraction: Float[Array, ""]  # of the quasi-Newton step, halved until the value increases
     steps: Int[Array, ""]
 
     def converged(self, slack: float = 1.0) -> Bool[Array, ""]:
-        # Values resolve eps, so gradients resolve its square root: a smaller one cannot be asked for.
+        # Values are accurate to eps, and so the gradient at the maximum to its square root.
         resolution = jnp.finfo(self.value.dtype).eps * jnp.maximum(1, jnp.abs(self.value))
         return jnp.abs(self.gradient).max() <= 4 * slack * jnp.sqrt(resolution)
 
 
-def maximise(profile: Profile, time_loc, time_scale, max_steps: int):
-    """(time_loc, time_scale, Ascent) of a local maximum of the profile: BFGS, every accepted step goes up."""
+def maximize(profile: Profile, time_loc, time_scale, max_steps: int):
+    """(time_loc, time_scale, Ascent) of a local maximum of the profile, by BFGS with increasing values."""
 
     def times(theta):
         return time_loc + time_scale * theta[0], time_scale * jnp.exp(theta[1])
@@ -105,31 +105,31 @@ def maximise(profile: Profile, time_loc, time_scale, max_steps: int):
     one, zero = jnp.ones((), theta.dtype), jnp.zeros((), jnp.int32)
     state = Ascent(theta, *evaluate(theta), start, one, zero)
 
-    def goes_on(state):
-        usable = jnp.isfinite(state.value) & (state.share > _SHORTEST)
+    def unfinished(state):
+        usable = jnp.isfinite(state.value) & (state.fraction > _MIN_FRACTION)
         return usable & ~state.converged() & (state.steps < max_steps)
 
-    state = lax.while_loop(goes_on, lambda state: _step(state, evaluate), state)
+    state = lax.while_loop(unfinished, lambda state: _step(state, evaluate), state)
     return *times(state.theta), state
 
 
 def _step(state: Ascent, evaluate) -> Ascent:
-    """One trial: accepted and learned from if the value rises enough, else a shorter share is left to try."""
+    """One trial step: accepted with a BFGS update if the value increases enough, else the fraction is halved."""
     direction = jnp.matmul(state.inverse_hessian, state.gradient)
-    direction = direction * jnp.minimum(1, _LONGEST / jnp.abs(direction).max())
-    move = state.share * direction
+    direction = direction * jnp.minimum(1, _MAX_STEP / jnp.abs(direction).max())
+    move = state.fraction * direction
     value, gradient = evaluate(state.theta + move)
     rises = value >= state.value + _ARMIJO * (move * state.gradient).sum()
     rises = rises & jnp.isfinite(value) & jnp.isfinite(gradient).all() & (value > state.value)
     accepted = Ascent(
-        state.theta + move, value, gradient, _updated(state, move, gradient), jnp.ones_like(value), state.steps + 1
+        state.theta + move, value, gradient, _update_bfgs(state, move, gradient), jnp.ones_like(value), state.steps + 1
     )
-    refused = state._replace(share=0.5 * state.share, steps=state.steps + 1)
-    return jax.tree.map(lambda a, b: jnp.where(rises, a, b), accepted, refused)
+    rejected = state._replace(fraction=0.5 * state.fraction, steps=state.steps + 1)
+    return jax.tree.map(lambda a, b: jnp.where(rises, a, b), accepted, rejected)
 
 
-def _updated(state: Ascent, move, gradient) -> Float[Array, "2 2"]:
-    """The BFGS update, skipped where the curvature along the move is not safely positive."""
+def _update_bfgs(state: Ascent, move, gradient) -> Float[Array, "2 2"]:
+    """The BFGS update of the inverse Hessian, skipped unless the curvature along the move is clearly positive."""
     change = state.gradient - gradient
     curvature = (move * change).sum()
     safe = curvature > 1e-3 * (move * move).sum()

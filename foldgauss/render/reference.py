@@ -1,13 +1,13 @@
-"""The judge: every splat on every pixel, in plain JAX, in the dtype of its input (float64 included).
+"""The reference engine: every splat on every pixel, in plain JAX, in the dtype of its input (float64 included).
 
-Slow and readable on purpose. Every other engine must agree with it, gradients too.
+Slow and readable on purpose. Tests hold every other engine to it, gradients included.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss.render.footprint import capped, pixel_centres, raw_alpha, squared_distance, whitening
+from foldgauss.render.footprint import cap_alpha, compute_whitener, pixel_centers, raw_alpha, squared_distance
 from foldgauss.render.splats import RenderOptions, Splats2D
 
 
@@ -19,41 +19,40 @@ def render_reference(
     compositing: str,
     options: RenderOptions,
 ) -> Float[Array, "height width channels"]:
-    """Picture of the splats; see `foldgauss.render.render` for the meaning of the arguments."""
-    centres = pixel_centres(size, splats.mean.dtype)
-    step = {"over": _over, "sum": _sum}[compositing]
+    """Render the splats; `foldgauss.render.render` documents the arguments."""
+    centers = pixel_centers(size, splats.mean.dtype)
+    composite = {"over": _composite_over, "sum": _composite_sum}[compositing]
 
     def add(carry, splat):
-        alpha = splat_alpha(splat, centres, options)
-        return step(carry, alpha, splat.color, options), None
+        alpha = splat_alpha(splat, centers, options)
+        return composite(carry, alpha, splat.color, options), None
 
-    light = jnp.ones(size, splats.mean.dtype)
-    blank = jnp.zeros((*size, splats.color.shape[-1]), splats.mean.dtype)
-    (transmittance, image), _ = jax.lax.scan(add, (light, blank), splats)
+    start = jnp.ones(size, splats.mean.dtype), jnp.zeros((*size, splats.color.shape[-1]), splats.mean.dtype)
+    (transmittance, image), _ = jax.lax.scan(add, start, splats)
     return image + transmittance[..., None] * background[None, None, :]
 
 
 def splat_alpha(
-    splat: Splats2D, centres: Float[Array, "height width 2"], options: RenderOptions
+    splat: Splats2D, centers: Float[Array, "height width 2"], options: RenderOptions
 ) -> Float[Array, "height width"]:
-    """Alpha of one splat at every pixel centre: capped, and zero where it is left out."""
-    whitener, drawn = whitening(splat.factor, options.low_pass)
-    offset = centres - splat.mean[None, None, :]
+    """Alpha of one splat at every pixel center: capped, and zero where it is left out."""
+    whitener, valid = compute_whitener(splat.factor, options.low_pass)
+    offset = centers - splat.mean[None, None, :]
     distance = squared_distance(offset[..., 0], offset[..., 1], whitener)
-    alpha = capped(raw_alpha(splat.opacity, distance, options), options)
-    return jnp.where(drawn, alpha, jnp.zeros_like(alpha))
+    alpha = cap_alpha(raw_alpha(splat.opacity, distance, options), options)
+    return jnp.where(valid, alpha, jnp.zeros_like(alpha))
 
 
-def _over(carry, alpha, color, options):
-    """Front to back: a splat takes its share of the light that those before it left."""
+def _composite_over(carry, alpha, color, options):
+    """Alpha compositing, front to back."""
     transmittance, image = carry
     alpha = jnp.where(transmittance > options.transmittance_stop, alpha, jnp.zeros_like(alpha))
     weight = alpha * transmittance
     return transmittance - weight, image + weight[..., None] * color[None, None, :]
 
 
-def _sum(carry, alpha, color, options):
-    """Accumulated blend: every splat adds its light, over a background that stays whole."""
+def _composite_sum(carry, alpha, color, options):
+    """Accumulated blend: every splat is added, over a background that is not attenuated."""
     del options
     transmittance, image = carry
     return transmittance, image + alpha[..., None] * color[None, None, :]

@@ -1,4 +1,4 @@
-"""Two-dimensional splats and the constants that say how they become pixels."""
+"""Two-dimensional splats, their conversion to pixels, and the options of rendering."""
 
 import dataclasses
 import math
@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import invalid
 
-#: Below the first support radius, in standard deviations, a splat is no Gaussian any more; the square of the second
-#: is still far from the end of float32.
+#: Bounds of the support radius in standard deviations: below the first a splat is no longer Gaussian; the square of the
+#: second is still far from float32's maximum.
 SMALLEST_RADIUS, LARGEST_RADIUS = 0.1, 1e6
-#: Engine "xla" counts (tile, splat) pairs up to one more, so that int32 holds the sum of two.
+#: Engine "xla" counts (tile, splat) pairs up to one more than this, so that the sum of two counts fits into int32.
 LARGEST_CAPACITY = 2**30 - 2
 
 
@@ -24,8 +24,8 @@ class Splats2D(eqx.Module):
 
     Shapes: `mean` (num, 2) as (x right, y down); `factor` (num, 2, 2), any F with covariance F F^T (a
     rotation times scales, or a Cholesky factor); `opacity` (num,) in [0, 1]; `color` (num, channels).
-    Units: `render` takes pixels, with pixel centres at +0.5; `to_pixels` brings splats there from model
-    space, where the frame's centre is the origin and its longer side has length 1.
+    Units: `render` takes pixels, with pixel centers at +0.5; `to_pixels` converts from model space, where the
+    frame's center is the origin and its longer side has length 1.
     """
 
     mean: Float[Array, "num 2"]
@@ -37,24 +37,23 @@ class Splats2D(eqx.Module):
         check_shapes(self, mean=(2,), factor=(2, 2))
 
     def to_pixels(self, size: tuple[int, int], *, aspect: float | None = None) -> "Splats2D":
-        """Model space to pixels of a picture of `size` = (height, width).
+        """Convert from model space to pixels of an image of `size` = (height, width).
 
-        `aspect` is the model frame's height / width (default: the picture's own). Where the two differ the
-        frame covers the picture and what sticks out is cut off evenly, as a centre crop does. Raises ValueError as
-        `pixels_per_unit`.
+        `aspect` is the model frame's height / width (default: the image's own). If the two differ, the frame covers
+        the image and is cropped about its center. Raises ValueError as `pixels_per_unit`.
         """
         scale = pixels_per_unit(size, aspect=aspect)
         height, width = size
-        centre = jnp.asarray([[width / 2, height / 2]], self.mean.dtype)
-        return Splats2D(self.mean * scale + centre, self.factor * scale, self.opacity, self.color)
+        center = jnp.asarray([[width / 2, height / 2]], self.mean.dtype)
+        return Splats2D(self.mean * scale + center, self.factor * scale, self.opacity, self.color)
 
 
 def check_shapes(splats: eqx.Module, **geometry: tuple[int, ...]) -> None:
-    """Raise unless the leaves fit: for one splat those named have these shapes, opacity (), color (channels,)."""
+    """Raise unless the shapes match: per splat those given in `geometry`, opacity (), color (channels,)."""
     names = [*geometry, "opacity", "color"]
     shapes = [getattr(getattr(splats, name), "shape", None) for name in names]
     if any(shape is None for shape in shapes):
-        return  # a skeleton, as inside tree transformations
+        return  # placeholders, as inside tree transformations
     *_, num, color = shapes
     own = [(*num, *shape) for shape in geometry.values()]
     if shapes != [*own, num, (*num, *color[-1:])] or len(color) == len(num):
@@ -64,22 +63,22 @@ def check_shapes(splats: eqx.Module, **geometry: tuple[int, ...]) -> None:
 
 
 def check_size(size: tuple[int, int]) -> None:
-    """Raise unless `size` is that of a picture, (height, width)."""
+    """Raise unless `size` is an image's (height, width)."""
     pair = isinstance(size, (tuple, list)) and len(size) == 2
     if not (pair and all(isinstance(n, Integral) and n >= 1 for n in size)):
         raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
 
 
 def check_aspect(aspect: float) -> None:
-    """Raise unless `aspect` is that of a frame."""
+    """Raise unless `aspect` is a positive number."""
     if not (isinstance(aspect, Real) and 0 < aspect < math.inf):
         raise invalid("aspect", expected="a frame's height / width, one positive number", got=aspect)
 
 
 def pixels_per_unit(size: tuple[int, int], *, aspect: float | None = None) -> float:
-    """Pixels along one unit of model space when a frame of height/width `aspect` covers `size` (None: its own).
+    """Pixels per unit of model space if a frame of height / width `aspect` (None: that of `size`) covers `size`.
 
-    Raises ValueError unless `size` is two whole numbers >= 1 and `aspect` one positive number.
+    Raises ValueError unless `size` is two whole numbers >= 1 and `aspect` a positive number.
     """
     check_size(size)
     height, width = size
@@ -91,32 +90,31 @@ def pixels_per_unit(size: tuple[int, int], *, aspect: float | None = None) -> fl
 
 @dataclasses.dataclass(frozen=True)
 class RenderOptions:
-    """What is left out of a picture, and how little it matters; and how the work is cut, which changes no picture.
+    """Cutoffs of rendering; and tiling, which affects speed and memory but not the image.
 
-    The defaults are the constants of the published 3DGS rasteriser and so of VeGaS. For a single splat the cutoff and
-    the stop change a pixel by no more than one step of 8 bits, the ceiling by up to 2.55 of them (where the opacity is
-    above 0.99), the low pass by more. See `exact`, `standard` and `fast`.
+    The defaults are the constants of the published 3DGS rasterizer and so of VeGaS. For a single splat the cutoff and
+    the stop change a pixel by at most one step of 8 bits, the ceiling by up to 2.55 steps (where the opacity is above
+    0.99), the low pass by more. See `exact`, `standard` and `fast`.
 
-    Raises ValueError for a number outside its bounds. Numbers are kept as Python's own.
+    Raises ValueError for a value outside its bounds. Values are stored as Python numbers.
     """
 
-    #: A splat is dropped where its alpha is below this: less than one step of an 8-bit picture.
+    #: A splat is dropped where its alpha is below this: less than one step of an 8-bit image.
     alpha_cutoff: float = 1 / 255
-    #: Alpha never exceeds this, so that some light is left and what lies behind has a gradient. 1: no ceiling.
+    #: Alpha never exceeds this, so that the transmittance stays positive and splats behind have a gradient. 1: none.
     alpha_ceiling: float = 0.99
-    #: Variance in px^2 added to both axes: a splat is never thinner than about a pixel's footprint.
+    #: Variance in px^2 added to both axes: a splat is never thinner than about a pixel.
     low_pass: float = 0.3
-    #: A pixel is finished once the light left is not above this.
+    #: A pixel is finished once its transmittance is not above this.
     transmittance_stop: float = 1e-4
-    #: A splat is dropped beyond this many standard deviations. None: where the cutoff drops it anyway, which loses
-    #: nothing more (3.3 deviations for opacity 1 and 1/255). The published rasteriser cuts its tiles' lists, not its
-    #: pixels, at 3.
+    #: A splat is dropped beyond this many standard deviations. None: where the cutoff drops it anyway (3.3 deviations
+    #: for opacity 1 and 1/255). The published rasterizer applies 3 to its tiles' lists, not to its pixels.
     support_radius: float | None = None
-    #: Side of the square tiles that splats are listed by, in px: speed only. None: what the engine is fastest with.
+    #: Side of the square tiles of the splats' lists, in px: speed only. None: the engine's fastest.
     tile_size: int | None = None
-    #: Room for (tile, splat) pairs in engine "xla": memory and speed only, since splats that do not fit into the lists
-    #: at once are drawn in several rounds. A whole number of at least the number of tiles; None: counted where the
-    #: splats are known, else (inside `jit`, `vmap`) derived from the numbers of splats and tiles.
+    #: Capacity for (tile, splat) pairs in engine "xla": memory and speed only, since splats beyond it are rendered in
+    #: further rounds. At least the number of tiles; None: counted where the splats are concrete, else (inside `jit`,
+    #: `vmap`) derived from the numbers of splats and tiles.
     list_capacity: int | None = None
 
     def __post_init__(self) -> None:
@@ -144,10 +142,10 @@ class RenderOptions:
 
     @classmethod
     def exact(cls) -> "RenderOptions":
-        """The formula to the letter: no low pass, no ceiling, no stop, and the smallest cutoff there is.
+        """The exact equation: no low pass, no ceiling, no stop, and the smallest cutoff.
 
-        Alphas below 1e-8 alone are dropped (6 deviations), as no float32 picture would show them. Splats much
-        smaller than a pixel are then seen only if they meet a pixel's centre.
+        Only alphas below 1e-8 are dropped (6 deviations), which a float32 image does not resolve. Splats much smaller
+        than a pixel are then visible only if they meet a pixel's center.
         """
         return cls(alpha_cutoff=1e-8, alpha_ceiling=1.0, low_pass=0.0, transmittance_stop=0.0)
 
@@ -158,8 +156,8 @@ class RenderOptions:
 
     @classmethod
     def fast(cls) -> "RenderOptions":
-        """Cutoff 1/64 and stop 1e-3, for previews: what these bring on a fitted model is in docs/performance.md.
+        """Cutoff 1/64 and stop 1e-3, for previews; docs/performance.md reports speed and error on a fitted model.
 
-        A later stop costs more picture than it saves time, and so does a smaller support radius.
+        An earlier stop or a smaller support radius would cost more quality than they save time.
         """
         return cls(alpha_cutoff=1 / 64, transmittance_stop=1e-3)

@@ -1,9 +1,9 @@
-"""Pictures cut into square tiles: which splats each tile lists, and what the engines in JAX, `xla` and `pallas`, share.
+"""Tiling for the JAX engines `xla` and `pallas`: bins splats into square tiles, and converts tiles to images and back.
 
-Every splat is listed in the tiles that its cutoff ellipse reaches: prefix sums give each (splat, tile) of a bounding
-box a slot, an exact test drops what the ellipse misses, and one sort by tile * num + splat brings the slots of a tile
-together, front to back. The room for slots is static, as XLA wants it, yet nothing is ever cut: splats that do not fit
-at once are drawn in *rounds*, from front to back, while the light left travels along.
+Every splat is listed in the tiles that its cutoff ellipse reaches: prefix sums assign a slot to each (splat, tile) of a
+bounding box, an exact test drops those that the ellipse misses, and one sort by tile * num + splat groups the slots by
+tile, front to back. The number of slots is static, as XLA requires, but no splat is dropped: those beyond it are
+rendered in further *rounds*, front to back, which continue from the transmittance reached.
 """
 
 import functools
@@ -16,27 +16,27 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.render.footprint import covariance, squared_reach, whitening
+from foldgauss.render.footprint import compute_whitener, covariance, squared_reach
 from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
 
-#: Slots per splat, or if there are few per tile, where the splats' sizes are not known (inside `jit`), and the most
-#: slots of one round.
-SLOTS_PER_SPLAT, SLOTS_PER_TILE, MOST_SLOTS = 16, 16, 1 << 22
-#: Rounds whose start the backward pass keeps, a plane of light each; of more, every n-th.
-KEPT_ROUNDS = 8
-#: Ellipses are listed a little too large, so that the alpha test alone decides about a pixel.
+#: Slots per splat, or per tile if there are few splats, where the splats' sizes are unknown (inside `jit`), and the
+#: maximum of one round.
+SLOTS_PER_SPLAT, SLOTS_PER_TILE, MAX_SLOTS = 16, 16, 1 << 22
+#: Rounds at whose start the backward pass stores the transmittance; of more rounds, every n-th.
+STORED_ROUNDS = 8
+#: Ellipses are enlarged a little for binning, so that the alpha test alone decides about a pixel.
 SLACK = 1e-3
-#: Sums of slots stop here, above any capacity.
-_MANY = LARGEST_CAPACITY + 1
-# Rows of a splat's fields, colours after them.
+#: Sums of slots saturate here, above any capacity.
+_SATURATED = LARGEST_CAPACITY + 1
+# Rows of a splat's fields, followed by its colors.
 X, Y, P, Q, R, OPACITY, COLOR = range(7)
-# Rows of a splat's gradient sums, colours after them: of dL/dalpha * alpha against 1, v, w, v^2, v w, w^2, where
+# Rows of a splat's gradient sums, followed by its colors': of dL/dalpha * alpha times 1, v, w, v^2, v w, w^2, where
 # v = p dx + q dy and w = r dy.
 MOMENTS = 6
 
 
 class Plan(NamedTuple):
-    """How the work is cut; static."""
+    """The tiling, its static capacity, and the compositing rule; static under jit."""
 
     size: tuple[int, int]
     over: bool
@@ -59,15 +59,15 @@ class Plan(NamedTuple):
         return -(-self.num_tiles // self.batch)
 
     @property
-    def finished(self) -> float:
-        """Light up to which a pixel is finished; with compositing "sum" it never is."""
+    def stop(self) -> float:
+        """The transmittance up to which a pixel is finished; with compositing "sum" none is."""
         return self.options.transmittance_stop if self.over else -1.0
 
 
 def make_plan(leaves, size, compositing, options, *, tile: int, batch_pixels: int) -> Plan:
-    """Cut the work: counted where the splats are at hand, from their number where they are traced.
+    """Choose the capacity and batches: by counting slots of concrete splats, from the number of splats if traced.
 
-    `tile`: side of a tile in px; `batch_pixels`: about as many are drawn at a time, in whole tiles.
+    `tile`: side of a tile in px; `batch_pixels`: the approximate number of pixels in a batch of tiles.
     """
     num_tiles = -(-size[0] // tile) * -(-size[1] // tile)
     num_batches = -(-num_tiles * tile * tile // max(batch_pixels, tile * tile))
@@ -79,18 +79,18 @@ def make_plan(leaves, size, compositing, options, *, tile: int, batch_pixels: in
             "options.list_capacity",
             expected=f"at least the number of tiles, {num_tiles}",
             got=capacity,
-            cure="Or None, to have it chosen.",
+            cure="None chooses it.",
         )
     if capacity is None:
         geometry = jax.lax.stop_gradient(leaves[:3])  # concrete even under an eager `grad`
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in geometry)
         num = len(leaves[2])
-        # Of a few wide splats some for every tile: fewer would make rounds of little work, more would be sorted in
-        # vain where splats are small (a million slots double the time of 20k splats on 160x320).
+        # A few wide splats need some slots for every tile: fewer would give rounds of little work, more would be sorted
+        # for nothing if splats are small (a million slots double the time of 20k splats on 160x320).
         guess = min(num * num_tiles, max(SLOTS_PER_SPLAT * num, SLOTS_PER_TILE * num_tiles))
         slots = guess if traced else int(_count_slots(plan, *geometry))
-        # A power of two, so that a scene that moves does not compile anew for each frame.
-        capacity = max(_power_of_two(min(slots, MOST_SLOTS)), _power_of_two(num_tiles))
+        # A power of two, so that a moving scene does not recompile for each frame.
+        capacity = max(_power_of_two(min(slots, MAX_SLOTS)), _power_of_two(num_tiles))
     return plan._replace(capacity=capacity)
 
 
@@ -102,13 +102,13 @@ def _power_of_two(number: int) -> int:
 
 
 class Projected(NamedTuple):
-    """What the tiles need to know of every splat."""
+    """The ellipse of every splat and its bounding box of tiles."""
 
-    white: Float[Array, "3 num"]
-    reach: Float[Array, " num"]  # squared Mahalanobis distance, with slack; not positive: not seen
+    whitener: Float[Array, "3 num"]
+    reach: Float[Array, " num"]  # squared Mahalanobis distance, with slack; not positive: not visible
     radius_x: Float[Array, " num"]
     first: Int[Array, "2 num"]  # (row, column) of tiles of the bounding box
-    shape: Int[Array, "2 num"]  # its rows and columns; 0 where it is not seen
+    shape: Int[Array, "2 num"]  # its rows and columns; 0 where it is not visible
 
     @property
     def slots(self) -> Int[Array, " num"]:
@@ -117,10 +117,10 @@ class Projected(NamedTuple):
 
 def project(plan: Plan, mean, factor, opacity) -> Projected:
     options = plan.options
-    white, drawn = jax.vmap(lambda one: whitening(one, options.low_pass), out_axes=(-1, 0))(factor)
+    whitener, valid = jax.vmap(lambda one: compute_whitener(one, options.low_pass), out_axes=(-1, 0))(factor)
     xx, _, yy, _ = jax.vmap(lambda one: covariance(one, options.low_pass))(factor)
     reach = squared_reach(opacity, options)
-    seen = drawn & (reach >= 0) & jnp.all(jnp.isfinite(mean), axis=1)
+    seen = valid & (reach >= 0) & jnp.all(jnp.isfinite(mean), axis=1)
     reach = jnp.where(seen, reach * (1 + SLACK) + SLACK, jnp.zeros_like(reach))
     radius_x, radius_y = jnp.sqrt(reach * jnp.where(seen, xx, 1)), jnp.sqrt(reach * jnp.where(seen, yy, 1))
     firsts, shapes = [], []
@@ -128,17 +128,17 @@ def project(plan: Plan, mean, factor, opacity) -> Projected:
         first, last = _tiles_between(mean[:, axis] - radius, mean[:, axis] + radius, length, plan.tile)
         firsts.append(first)
         shapes.append(jnp.where(seen, last - first, 0))
-    return Projected(white, reach, radius_x, jnp.stack(firsts), jnp.stack(shapes))
+    return Projected(whitener, reach, radius_x, jnp.stack(firsts), jnp.stack(shapes))
 
 
-def on_screen(mean, factor, opacity, size: tuple[int, int], options: RenderOptions) -> Bool[Array, " num"]:
-    """Which splats may reach a picture: those whose cutoff ellipse has a box around it that meets pixels' centres."""
+def find_visible(mean, factor, opacity, size: tuple[int, int], options: RenderOptions) -> Bool[Array, " num"]:
+    """Which splats may reach an image: those whose cutoff ellipse has a bounding box that contains pixel centers."""
     plan = Plan(size, True, options, max(size), 1, 1)
     return project(plan, mean, factor, opacity).slots > 0
 
 
 def _tiles_between(low, high, length: int, tile: int):
-    """Tiles first <= k < last whose pixel centres lie within [low, high]; clipped before the cast to an integer."""
+    """Tiles first <= k < last whose pixel centers lie within [low, high]; clipped before the cast to an integer."""
     first = jnp.clip(jnp.ceil(low - 0.5), 0, length)
     last = jnp.clip(jnp.floor(high - 0.5), -1, length - 1)
     first_tile, last_tile = first.astype(jnp.int32) // tile, last.astype(jnp.int32) // tile
@@ -150,19 +150,19 @@ def _count_slots(plan: Plan, mean, factor, opacity) -> Int[Array, ""]:
     return _running_sum(project(plan, mean, factor, opacity).slots)[-1]
 
 
-def numbers(count: int) -> Int[Array, " count"]:
+def indices(count: int) -> Int[Array, " count"]:
     """0, 1, ...: 32 bits also where JAX's default is 64."""
     return jnp.arange(count, dtype=jnp.int32)
 
 
 def _running_sum(counts: Int[Array, " num"]) -> Int[Array, " num"]:
-    """Inclusive prefix sum that stays at `_MANY`: the pairs of a million large splats would overflow."""
-    return jax.lax.associative_scan(lambda a, b: jnp.minimum(a + b, _MANY), jnp.minimum(counts, _MANY))
+    """Inclusive prefix sum that saturates: the pairs of a million large splats would overflow."""
+    return jax.lax.associative_scan(lambda a, b: jnp.minimum(a + b, _SATURATED), jnp.minimum(counts, _SATURATED))
 
 
-def fields_of(projected: Projected, mean, opacity, color) -> Float[Array, "num+1 fields"]:
-    """A row for every splat, and one of zeros, which is never seen, for the empty slots."""
-    table = jnp.concatenate([mean, projected.white.T, opacity[:, None], color], axis=1)
+def pack_fields(projected: Projected, mean, opacity, color) -> Float[Array, "num+1 fields"]:
+    """A row of parameters for every splat, and one of zeros, which is invisible, for empty slots."""
+    table = jnp.concatenate([mean, projected.whitener.T, opacity[:, None], color], axis=1)
     return jnp.concatenate([table, jnp.zeros((1, table.shape[1]), table.dtype)])
 
 
@@ -170,7 +170,7 @@ def fields_of(projected: Projected, mean, opacity, color) -> Float[Array, "num+1
 
 
 class Lists(NamedTuple):
-    """Splats of every tile, front to back, at `splat[start[k] : start[k] + length[k]]`; tiles fill whole batches."""
+    """Splats of tile k, front to back: `splat[start[k] : start[k] + length[k]]`; tiles are padded to whole batches."""
 
     splat: Int[Array, " capacity"]
     start: Int[Array, " tiles"]
@@ -179,43 +179,43 @@ class Lists(NamedTuple):
 
 
 def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, Int[Array, ""]]:
-    """Lists of the splats from number `begin` on, as many as have room, and the number of the first that has not."""
+    """Lists of the splats from index `begin` on, as many as fit, and the index of the first that does not."""
     num = len(mean)
-    slots = jnp.where(numbers(num) >= begin, projected.slots, 0)
+    slots = jnp.where(indices(num) >= begin, projected.slots, 0)
     total = _running_sum(slots)
     end = jnp.sum(total <= plan.capacity, dtype=jnp.int32)
-    slots = jnp.where(numbers(num) < end, slots, 0)
-    first = total - slots  # of no meaning for splats from `end` on, which have no slots
-    number = numbers(plan.capacity)
-    # A mark at each splat's first slot; splats without slots share a place, of whom the last counts.
-    marks = jnp.zeros(plan.capacity, jnp.int32).at[jnp.where(numbers(num) < end, first, plan.capacity)]
+    slots = jnp.where(indices(num) < end, slots, 0)
+    first = total - slots  # meaningless for splats from `end` on, which have no slots
+    number = indices(plan.capacity)
+    # A mark at each splat's first slot; splats without slots share a position, which belongs to the last of them.
+    marks = jnp.zeros(plan.capacity, jnp.int32).at[jnp.where(indices(num) < end, first, plan.capacity)]
     owner = jnp.cumsum(marks.add(1, mode="drop")) - 1
-    used = number < jnp.max(jnp.where(numbers(num) < end, total, 0))
+    used = number < jnp.max(jnp.where(indices(num) < end, total, 0))
     owner = jnp.where(used, owner, 0)
-    rows, columns = _place(projected, owner, number - first[owner])
-    used &= _meets(plan, projected, mean, owner, rows, columns)
+    rows, columns = _tile_of_slot(projected, owner, number - first[owner])
+    used &= _reaches_tile(plan, projected, mean, owner, rows, columns)
     tile = jnp.where(used, rows * plan.grid[1] + columns, plan.num_tiles)
     tile, splat = _sort_by_tile(tile, owner, plan.num_tiles, num)
     padded = plan.num_batches * plan.batch
-    bounds = jnp.searchsorted(tile, numbers(padded + 1), side="left").astype(jnp.int32)
-    bounds = jnp.where(numbers(padded + 1) <= plan.num_tiles, bounds, bounds[plan.num_tiles])
+    bounds = jnp.searchsorted(tile, indices(padded + 1), side="left").astype(jnp.int32)
+    bounds = jnp.where(indices(padded + 1) <= plan.num_tiles, bounds, bounds[plan.num_tiles])
     length = bounds[1:] - bounds[:-1]
     order = jnp.argsort(-length).astype(jnp.int32).reshape(plan.num_batches, plan.batch)
     return Lists(splat, bounds[:-1], length, order), end
 
 
-def _place(projected: Projected, owner, local):
-    """Row and column of tiles of slot number `local` of its splat."""
+def _tile_of_slot(projected: Projected, owner, local):
+    """Row and column of the tile of a splat's slot `local`."""
     columns = jnp.maximum(projected.shape[1][owner], 1)
     down = local // columns
     return projected.first[0][owner] + down, projected.first[1][owner] + local - down * columns
 
 
-def _meets(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, " slots"]:
-    """Whether the splat's ellipse meets the pixel centres of a tile: within the tile's rows it is widest at its own
-    turning point, or at the nearest of the rows.
+def _reaches_tile(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, " slots"]:
+    """Whether the splat's ellipse contains pixel centers of a tile: within the tile's rows it is widest at its turning
+    point, or at the row nearest to it.
     """
-    p, q, r = projected.white[:, owner]
+    p, q, r = projected.whitener[:, owner]
     x, y, reach = mean[owner, 0], mean[owner, 1], projected.reach[owner]
     top = (rows * plan.tile).astype(mean.dtype) + 0.5
     bottom = jnp.minimum(top + (plan.tile - 1), plan.size[0] - 0.5)
@@ -231,7 +231,7 @@ def _meets(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool
 
 
 def _sort_by_tile(tile, splat, num_tiles: int, num: int):
-    """Sort by tile, then splat. As one number if it fits into 32 bits: on the CPU five times faster than pairs."""
+    """Sort by tile, then splat. As one key if it fits into 32 bits: on the CPU five times faster than pairs."""
     if (num_tiles + 1) * num >= 2**32:
         return jax.lax.sort((tile, splat), num_keys=2, is_stable=False)
     key = jnp.sort(tile.astype(jnp.uint32) * np.uint32(num) + splat.astype(jnp.uint32))
@@ -243,30 +243,30 @@ def _sort_by_tile(tile, splat, num_tiles: int, num: int):
 
 
 class Canvas(NamedTuple):
-    """Pixels by tile, filled up to whole batches."""
+    """Pixels by tile, padded to whole batches."""
 
-    light: Float[Array, "pixels tiles"]
+    transmittance: Float[Array, "pixels tiles"]
     color: tuple[Float[Array, "pixels tiles"], ...]  # a plane per channel
 
 
-def blank(plan: Plan, channels: int, dtype) -> Canvas:
-    """Where a tile reaches beyond the picture there is no light from the start: nothing waits for it to be taken."""
-    pixel, tile = numbers(plan.tile**2)[:, None], numbers(plan.num_batches * plan.batch)[None, :]
+def make_canvas(plan: Plan, channels: int, dtype) -> Canvas:
+    """An empty canvas. Pixels of tiles beyond the image have transmittance 0, so that they count as finished."""
+    pixel, tile = indices(plan.tile**2)[:, None], indices(plan.num_batches * plan.batch)[None, :]
     y = tile // plan.grid[1] * plan.tile + pixel // plan.tile
     x = tile % plan.grid[1] * plan.tile + pixel % plan.tile
-    light = ((y < plan.size[0]) & (x < plan.size[1])).astype(dtype)
-    return Canvas(light, tuple(jnp.zeros_like(light) for _ in range(channels)))
+    transmittance = ((y < plan.size[0]) & (x < plan.size[1])).astype(dtype)
+    return Canvas(transmittance, tuple(jnp.zeros_like(transmittance) for _ in range(channels)))
 
 
-def picture_of(plan: Plan, planes: Float[Array, "channels pixels tiles"]) -> Float[Array, "height width channels"]:
+def join_tiles(plan: Plan, planes: Float[Array, "channels pixels tiles"]) -> Float[Array, "height width channels"]:
     (rows, columns), tile = plan.grid, plan.tile
     planes = planes[..., : plan.num_tiles].reshape(len(planes), tile, tile, rows, columns)
     image = planes.transpose(3, 1, 4, 2, 0).reshape(rows * tile, columns * tile, len(planes))
     return image[: plan.size[0], : plan.size[1]]
 
 
-def planes_of(plan: Plan, image: Float[Array, "height width channels"]) -> Float[Array, "channels pixels tiles"]:
-    """The reverse of `picture_of`; zeros where there is no pixel."""
+def split_tiles(plan: Plan, image: Float[Array, "height width channels"]) -> Float[Array, "channels pixels tiles"]:
+    """The inverse of `join_tiles`, padded with zeros."""
     (rows, columns), tile, channels = plan.grid, plan.tile, image.shape[-1]
     image = jnp.pad(image, ((0, rows * tile - image.shape[0]), (0, columns * tile - image.shape[1]), (0, 0)))
     planes = image.reshape(rows, tile, columns, tile, channels).transpose(4, 1, 3, 0, 2)
@@ -274,35 +274,36 @@ def planes_of(plan: Plan, image: Float[Array, "height width channels"]) -> Float
     return jnp.pad(planes, ((0, 0), (0, 0), (0, plan.num_batches * plan.batch - plan.num_tiles)))
 
 
-def keep_rounds(plan: Plan, light, num, draw: Callable):
-    """Draw `num` rounds once more but for colours, keeping starts; returns the function that gives, for the number of
-    a round, its first splat and the light there, by drawing on from the start kept before it.
+def checkpoint_rounds(plan: Plan, start, num, attenuate: Callable):
+    """Replay the transmittance of `num` rounds and store checkpoints; returns a function that maps the index of a round
+    to its first splat and the transmittance there, replayed from the last checkpoint before it.
 
-    `light`: at the first round. `draw(begin, light)`: one round, gives the first splat that did not fit, and the light.
+    `start`: transmittance before the first round. `attenuate(begin, transmittance)`: one round; returns the first splat
+    that did not fit, and the transmittance behind it.
     """
-    stride = jnp.maximum(-(-num // KEPT_ROUNDS), 1)
+    stride = jnp.maximum(-(-num // STORED_ROUNDS), 1)
     last = (num - 1) // stride
 
-    def advance(count, begin, light):
-        return jax.lax.fori_loop(0, count, lambda _, state: draw(*state), (begin, light))
+    def advance(count, begin, transmittance):
+        return jax.lax.fori_loop(0, count, lambda _, state: attenuate(*state), (begin, transmittance))
 
-    def keep(k, carry):
-        begins, lights, begin, light = carry
-        begins, lights = begins.at[k].set(begin), lights.at[k].set(light)
-        return begins, lights, *advance(jnp.where(k < last, stride, 0), begin, light)
+    def store(k, carry):
+        begins, stored, begin, transmittance = carry
+        begins, stored = begins.at[k].set(begin), stored.at[k].set(transmittance)
+        return begins, stored, *advance(jnp.where(k < last, stride, 0), begin, transmittance)
 
-    room = jnp.zeros(KEPT_ROUNDS, jnp.int32), jnp.zeros((KEPT_ROUNDS, *light.shape), light.dtype)
-    begins, lights, *_ = jax.lax.fori_loop(0, last + 1, keep, (*room, jnp.int32(0), light))
-    return lambda number: advance(number % stride, begins[number // stride], lights[number // stride])
+    empty = jnp.zeros(STORED_ROUNDS, jnp.int32), jnp.zeros((STORED_ROUNDS, *start.shape), start.dtype)
+    begins, stored, *_ = jax.lax.fori_loop(0, last + 1, store, (*empty, jnp.int32(0), start))
+    return lambda number: advance(number % stride, begins[number // stride], stored[number // stride])
 
 
-def carry_back(projected: Projected, sums, factor, opacity):
-    """Carry a splat's sums back to its mean, factor, opacity and colour.
+def gradients_from_sums(projected: Projected, sums, factor, opacity):
+    """Convert a splat's gradient sums to gradients of its mean, factor, opacity and color.
 
     With W = [[p, q], [0, r]]: Sigma^-1 = W^T W, dL/dmean = W^T (v, w), dL/dF = W^T M W F, M the second moments of
     (v, w). In whitened coordinates the moments of thin splats do not cancel.
     """
-    p, q, r = projected.white
+    p, q, r = projected.whitener
     total, v, w, vv, vw, ww = (sums[:, k] for k in range(MOMENTS))
     mean = jnp.stack([p * v, q * v + r * w], axis=-1)
     seen = projected.reach > 0

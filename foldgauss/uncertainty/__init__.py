@@ -1,56 +1,64 @@
-"""How sure the learned frame times are: likelihood profiles, and what is drawn from them."""
+"""Posterior distribution of the learned frame times.
+
+`likelihood_profiles` renders the model at many times and gives the log-likelihood of each frame as a function of its
+time; `frame_time_posterior` samples the times from their posterior by emcee, beside the exact marginals
+(`exact_posterior`) and Laplace's approximation; `irregularities`, `summary` and `frame_table` report on it;
+`simulated_ranks` checks the calibration and `refit_frame_times` refits splats and times together. Sampling needs the
+extra `uncertainty`.
+"""
 
 from foldgauss.uncertainty.diagnostics.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
 from foldgauss.uncertainty.diagnostics.irregularities import (
-    ComparedTimes,
     IncrementIntervals,
     Irregularity,
+    TimesComparison,
     compare_times,
-    intervals,
+    increment_intervals,
     irregularities,
 )
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
-from foldgauss.uncertainty.likelihood.colors import evidence_without_colors
-from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
+from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_colors
+from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
-from foldgauss.uncertainty.likelihood.profiles import Profiles
-from foldgauss.uncertainty.likelihood.refit import Refit, RefitTimes, refit_frame_times, refits
-from foldgauss.uncertainty.posterior.exact import ExactTimes, exact_times
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
+from foldgauss.uncertainty.likelihood.refit import Refit, RefitTimes, iter_refits, refit_frame_times
+from foldgauss.uncertainty.posterior.exact import ExactPosterior, exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.laplace import LaplaceTimes, laplace_times
-from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, drawn_log_likelihood, frame_time_log_prob
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior, frame_time_posterior
+from foldgauss.uncertainty.posterior.laplace import LaplaceApproximation, laplace_approximation
+from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob, rendered_log_likelihood
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
+from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 
 __all__ = [
-    "ComparedTimes",
-    "ExactTimes",
+    "ExactPosterior",
     "FrameNoise",
     "FrameTimeLogProb",
     "FrameTimePosterior",
     "IncrementIntervals",
     "Increments",
     "Irregularity",
-    "LaplaceTimes",
+    "LaplaceApproximation",
     "LikelihoodProfiles",
-    "Profiles",
+    "ProfileCurves",
     "Refit",
     "RefitTimes",
     "SimulatedRanks",
+    "TimesComparison",
     "compare_times",
     "coverage",
-    "drawn_log_likelihood",
     "ecdf_band",
-    "evidence",
-    "evidence_without_colors",
-    "exact_times",
+    "exact_posterior",
     "frame_table",
     "frame_time_log_prob",
     "frame_time_posterior",
-    "intervals",
+    "increment_intervals",
     "irregularities",
-    "laplace_times",
+    "iter_refits",
+    "laplace_approximation",
+    "likelihood_profiles",
+    "marginalize_colors",
     "refit_frame_times",
-    "refits",
+    "rendered_log_likelihood",
     "simulated_ranks",
     "summary",
 ]

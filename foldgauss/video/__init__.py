@@ -1,4 +1,8 @@
-"""Videos as folded splats: the model, its fit and its quality. Frames are arrays here; files are `foldgauss.io`'s."""
+"""Videos as folded splats: the model, its fit, edits and compression. Frames are arrays; `foldgauss.io` reads files.
+
+In reading order: `models` (the model, and rendering it), `fitting` (`fit`), `selection` (`select`), `editing` (`edit`),
+`segmented` (long videos in segments), `compression` (`compress`) and `tradeoff` (speed against accuracy).
+"""
 
 from foldgauss.video.compression.search import Compressed, compress
 from foldgauss.video.editing.chain import Edit, edit

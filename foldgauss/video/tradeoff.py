@@ -1,4 +1,4 @@
-"""Speed against accuracy: the axes along which a fit is turned, one at a time; the Pareto front, and its knee."""
+"""Speed against accuracy: variants of a fit along named axes, the Pareto front of their costs, and its knee."""
 
 import dataclasses
 import math
@@ -14,38 +14,38 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.economy import Economy
-from foldgauss.video.fitting.schedule import levels
+from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-#: How a model's numbers are kept: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`)
-#: with that many passes over the clip, at a loss of at most `MAX_LOSS_DB`.
+#: How parameters are stored: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`) with
+#: this many passes of fine-tuning and a loss of at most `MAX_LOSS_DB`.
 FLOAT32, FLOAT16 = "float32", "float16"
-PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, mended": 4})
+PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, finetuned": 4})
 MAX_LOSS_DB = 0.2
-#: What compressing takes, in steps of a fit per frame: about what was measured.
-_COMPRESSING = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, mended": 18.0}
-#: Fewer steps show nothing of what a setting is worth.
+#: Cost of compression in steps of a fit per frame, as measured.
+_COMPRESSION_STEPS = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, finetuned": 18.0}
+#: Fewer steps do not show what a setting is worth.
 LEAST_STEPS = 200
-#: A point of the front is better than all cheaper ones by more than this, in dB: what is told of a PSNR.
+#: A point of the front is better than all cheaper ones by more than this, in dB.
 LEAST_GAIN = 0.01
-#: Playing is timed on so many frames at most, and each so many times, of which the fastest counts: others share cores.
-_SHOWN, _ROUNDS = 24, 8
+#: Frames that are timed, at most; and rounds, of which the fastest counts: other processes share the cores.
+_TIMED_FRAMES, _ROUNDS = 24, 8
 #: Segments that are timed.
-_SEGMENTS_SHOWN = 3
-#: Seconds after which it is not drawn again, but for a second time.
+_TIMED_SEGMENTS = 3
+#: Seconds after which no third round starts.
 _LONG = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One setting of an axis, as what it changes of the base.
+    """One setting of an axis, as its differences from the base.
 
-    `fit`: fields of `FitConfig`; `scale`: fields to be multiplied; `options`: constants of `RenderOptions`, fitted with
-    or, if `played`, only drawn with; `stored`: how numbers are kept. `work`: about how many fits of the base this takes
-    on two cores, to plan by. `value` names it, with what is scaled in braces.
+    `fit`: fields of `FitConfig`; `scale`: fields to multiply; `options`: fields of `RenderOptions`, for fit and
+    rendering, or if `played` for rendering only; `stored`: how parameters are stored. `work`: estimated cost in fits of
+    the base on two cores, for planning. `value` is its name, with scaled fields in braces.
     """
 
     value: str
@@ -58,7 +58,7 @@ class Variant:
 
 
 def _cutoffs() -> tuple[Variant, ...]:
-    """Constants drawn with, and those of them fitted with that save the most time."""
+    """Options for rendering only, and for the fit those that save the most time."""
     values = {
         "alpha_cutoff": ("alpha", (("1/1024", 1 / 1024), ("1/64", 1 / 64), ("1/32", 1 / 32))),
         "support_radius": ("radius", (("2.5", 2.5), ("2", 2.0))),
@@ -72,7 +72,7 @@ def _cutoffs() -> tuple[Variant, ...]:
     return (*played, *fitted)
 
 
-#: The axes, in the order they are run in; see docs/tradeoff.md for what each buys and costs.
+#: The axes in the order of their runs; docs/tradeoff.md describes their benefits and costs.
 AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
     {
         "time": (
@@ -90,7 +90,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
             Variant("1", fit={"degree": 1}, work=0.9),
             Variant("7", fit={"degree": 7}, work=1.1),
         ),
-        # As many frames are seen: of a batch's steps there are fewer.
+        # Fewer steps with a larger batch: the number of frames seen is the same.
         "batch": (
             Variant("2", fit={"batch_size": 2}, scale={"steps": 1 / 2}),
             Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
@@ -112,7 +112,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A setting to be measured: `config` is fitted, drawn with `played` where that is given, and kept as `stored`."""
+    """A setting to measure: `config` is fitted, rendered with `played` if given, and stored as `stored`."""
 
     axis: str
     value: str
@@ -126,13 +126,13 @@ class Point:
         return f"{self.axis} {self.value}".rstrip()
 
     @property
-    def of_base(self) -> bool:
-        """Whether it is the base's model, drawn or kept in another way."""
+    def reuses_base(self) -> bool:
+        """Whether this is the base's model, rendered or stored in another way."""
         return self.played is not None or self.stored != FLOAT32
 
 
 class Skipped(NamedTuple):
-    """A turn that is left out, and why."""
+    """A setting that is not measured, and why."""
 
     name: str
     why: str
@@ -147,99 +147,101 @@ def check_axes(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in AXES if name in names)
 
 
-def points(
+def plan_points(
     base: FitConfig, axes: Sequence[str], num_frames: int, size: tuple[int, int], *, has_alpha: bool = False
 ) -> tuple[list[Point], list[Skipped]]:
-    """The base and every turn of `axes` about it, one setting changed at a time; and the turns left out.
+    """The base and every variant of `axes`, one setting changed at a time; and the variants skipped.
 
-    Left out are those that this clip cannot have, or that change nothing for it. `base` has numbers for `steps` and
-    `num_gaussians`. Raises ValueError as `check_axes`.
+    Skipped are variants that do not apply to this clip or change nothing for it. `base` must have numbers for `steps`
+    and `num_gaussians`. Raises ValueError as `check_axes`.
     """
-    made, left = [Point("base", "", base)], []
+    points, skipped = [Point("base", "", base)], []
     for axis in check_axes(axes):
-        for turn in AXES[axis]:
-            point = _turned(base, axis, turn)
-            why = _why_not(point, base, num_frames, size, has_alpha)
+        for variant in AXES[axis]:
+            point = _apply(variant, axis, base)
+            why = _why_skipped(point, base, num_frames, size, has_alpha)
             if why:
-                left.append(Skipped(point.name, why))
+                skipped.append(Skipped(point.name, why))
             else:
-                made.append(point)
-    return made, left
+                points.append(point)
+    return points, skipped
 
 
-def _turned(base: FitConfig, axis: str, turn: Variant) -> Point:
-    scaled = {name: max(round(factor * getattr(base, name)), 1) for name, factor in turn.scale.items()}
-    options = dataclasses.replace(base.options, **turn.options)
-    fitted = base.options if turn.played else options
-    config = dataclasses.replace(base, **turn.fit, **scaled, options=fitted)
-    return Point(axis, turn.value.format(**scaled), config, options if turn.played else None, turn.stored, turn.work)
+def _apply(variant: Variant, axis: str, base: FitConfig) -> Point:
+    scaled = {name: max(round(factor * getattr(base, name)), 1) for name, factor in variant.scale.items()}
+    options = dataclasses.replace(base.options, **variant.options)
+    fitted = base.options if variant.played else options
+    config = dataclasses.replace(base, **variant.fit, **scaled, options=fitted)
+    played = options if variant.played else None
+    return Point(axis, variant.value.format(**scaled), config, played, variant.stored, variant.work)
 
 
-def _why_not(point: Point, base: FitConfig, num_frames: int, size: tuple[int, int], has_alpha: bool) -> str:
+def _why_skipped(point: Point, base: FitConfig, num_frames: int, size: tuple[int, int], has_alpha: bool) -> str:
     if has_alpha and point.config.compositing == "sum":
-        return "sums let all light through, and the frames have alpha"
+        return "sums have no alpha, but the frames do"
     if point.config.batch_size > num_frames:
         return f"there are {num_frames} frames"
-    if point.of_base:
+    if point.reuses_base:
         return ""
-    shares = {"quarter_fraction": base.quarter_fraction, "half_fraction": base.half_fraction}
-    same = dataclasses.replace(point.config, **shares) == base and levels(point.config, size) == levels(base, size)
+    fractions = {"quarter_fraction": base.quarter_fraction, "half_fraction": base.half_fraction}
+    same = dataclasses.replace(point.config, **fractions) == base
+    same = same and plan_levels(point.config, size) == plan_levels(base, size)
     return f"it changes nothing at {size[0]}x{size[1]}" if same else ""
 
 
 class Throughput(NamedTuple):
-    """Seconds: of what comes before a fit's first step, of a step of the base, and of looking at a model."""
+    """Seconds for the start of a fit, for one step of the base, and for evaluating a model."""
 
     start: float
     step: float
-    look: float
+    evaluation: float
 
 
-def seconds_of(made: Sequence[Point], steps: int, pace: Throughput, num_frames: int) -> float:
-    """What measuring the points takes, about, if the base has so many steps."""
-    fixed, each = _costs(made, pace, num_frames)
+def estimate_seconds(points: Sequence[Point], steps: int, throughput: Throughput, num_frames: int) -> float:
+    """Estimated time to measure the points if the base has this many steps."""
+    fixed, each = _costs(points, throughput, num_frames)
     return fixed + each * steps
 
 
-def steps_within(seconds: float, made: Sequence[Point], pace: Throughput, num_frames: int) -> int:
-    """Steps of the base with which measuring the points takes so many seconds; below 1 where none are left for it."""
-    fixed, each = _costs(made, pace, num_frames)
+def estimate_steps(seconds: float, points: Sequence[Point], throughput: Throughput, num_frames: int) -> int:
+    """Steps of the base so that measuring the points takes this many seconds; below 1 if there is no time."""
+    fixed, each = _costs(points, throughput, num_frames)
     return math.floor((seconds - fixed) / each)
 
 
-def _costs(made: Sequence[Point], pace: Throughput, num_frames: int) -> tuple[float, float]:
-    """Seconds that steps do not change, and seconds for each step of the base."""
-    fits = [point for point in made if not point.of_base]
-    compressing = sum(_COMPRESSING[point.stored] for point in made) * num_frames * pace.step
+def _costs(points: Sequence[Point], throughput: Throughput, num_frames: int) -> tuple[float, float]:
+    """Seconds independent of steps, and seconds per step of the base."""
+    fits = [point for point in points if not point.reuses_base]
+    compression = sum(_COMPRESSION_STEPS[point.stored] for point in points) * num_frames * throughput.step
     return (
-        len(fits) * pace.start + len(made) * pace.look + compressing,
-        sum(point.work for point in fits) * pace.step,
+        len(fits) * throughput.start + len(points) * throughput.evaluation + compression,
+        sum(point.work for point in fits) * throughput.step,
     )
 
 
-def front(cost: Sequence[float], quality: Sequence[float], least_gain: float = LEAST_GAIN) -> list[int]:
+def pareto_front(cost: Sequence[float], quality: Sequence[float], least_gain: float = LEAST_GAIN) -> list[int]:
     """Indices of the Pareto front, the cheapest first: each is better by more than `least_gain` than all cheaper ones.
 
-    **Shapes:** one cost and one quality per point. Points with a number that is not finite are left out; of those that
-    cost the same and differ by no more than `least_gain`, the first one stands.
+    **Shapes:** one cost and one quality per point. Points with NaN or infinities are left out; of points with the same
+    cost and qualities within `least_gain`, the first one is taken.
 
-    **Example:** `front([1, 2, 3], [30, 29, 33]) == [0, 2]`.
+    **Example:** `pareto_front([1, 2, 3], [30, 29, 33]) == [0, 2]`.
     """
-    known = [k for k in range(len(cost)) if math.isfinite(cost[k]) and math.isfinite(quality[k])]
+    finite = [k for k in range(len(cost)) if math.isfinite(cost[k]) and math.isfinite(quality[k])]
     chosen, best = [], -math.inf
-    for k in sorted(known, key=lambda k: (cost[k], -quality[k])):
+    for k in sorted(finite, key=lambda k: (cost[k], -quality[k])):
         if quality[k] > best + least_gain:
             least = max(quality[k] - least_gain, best + least_gain)
-            chosen.append(next(j for j in known if cost[j] == cost[k] and quality[j] >= least))
+            chosen.append(next(j for j in finite if cost[j] == cost[k] and quality[j] >= least))
             best = quality[k]
     return chosen
 
 
 def knee(cost: Sequence[float], quality: Sequence[float]) -> int | None:
-    """Index of the knee of a front, costs rising: where it is farthest above the chord between its two ends.
+    """Index of the knee of a Pareto front, costs rising: the point farthest above the chord between its ends.
 
-    Both axes are logarithms, scaled to [0, 1]: of the cost, which must be above 0, and of the squared error, which a
-    quality in dB is. None for fewer than three points, and where none is above the chord.
+    Both axes are logarithmic and scaled to [0, 1]: the cost, which must be positive, and the squared error, as quality
+    in dB is. None for fewer than three points, and if none is above the chord.
 
     **Example:** `knee([1, 2, 16], [30, 36, 38]) == 1`.
 
@@ -253,12 +255,12 @@ def knee(cost: Sequence[float], quality: Sequence[float]) -> int | None:
     return best if above[best] > 1e-9 else None
 
 
-def halved(model: VideoModel) -> VideoModel:
-    """The model to be stored with 16-bit numbers, in about half the bytes.
+def to_half_precision(model: VideoModel) -> VideoModel:
+    """The model with 16-bit parameters, for a file of about half the size.
 
-    Its splats have the form that they are stored in (`to_stored`) and leaves of NumPy's float16, which
-    `foldgauss.io.save_video_model` keeps and a file's reader widens again. Frame times, the envelope and leaves with
-    numbers beyond 65,504, as coefficients of Gaussians that live for a frame have them, stay as they are.
+    Its splats are in stored form (`to_stored`) with NumPy float16 leaves, which `foldgauss.io.save_video_model` writes
+    and its reader converts back to float32. Frame times, the envelope, and leaves with values beyond 65,504 (such as
+    coefficients of Gaussians that live for one frame) stay in float32.
     """
     splats, short = to_stored(model.splats), {}
     for field in dataclasses.fields(splats):
@@ -272,38 +274,38 @@ def halved(model: VideoModel) -> VideoModel:
     return dataclasses.replace(model, splats=dataclasses.replace(splats, **short))
 
 
-def seconds_per_frame(*models: VideoModel | EditedVideo) -> list[float]:
-    """How long each video takes to draw a frame at its own size and times, conditioning included.
+def measure_frame_seconds(*models: VideoModel | EditedVideo) -> list[float]:
+    """Mean time to render a frame of each video at its own size and times, conditioning included.
 
-    They are drawn in turn, frame by frame, and of each frame the fastest of a few rounds counts: so what else the
-    machine does tells on all alike.
+    The videos are rendered in turn, frame by frame, and the fastest of several rounds counts for each frame: other load
+    on the machine then affects all videos alike.
     """
-    playbacks = [VideoRenderer(model) for model in models]
+    renderers = [VideoRenderer(model) for model in models]
     num_frames = min(model.num_frames for model in models)
-    shown = np.unique(np.linspace(0, num_frames - 1, _SHOWN).round().astype(int))
-    times = [np.asarray(model.frame_times.times())[shown] for model in models]
-    for playback, own in zip(playbacks, times, strict=True):
-        playback.frame(own[0])  # kernels are there from here on
-    best, started = np.full((len(models), len(shown)), np.inf), time.perf_counter()
+    chosen = np.unique(np.linspace(0, num_frames - 1, _TIMED_FRAMES).round().astype(int))
+    times = [np.asarray(model.frame_times.times())[chosen] for model in models]
+    for renderer, own in zip(renderers, times, strict=True):
+        renderer.frame(own[0])  # compiles the kernels
+    best, started = np.full((len(models), len(chosen)), np.inf), time.perf_counter()
     for done in range(_ROUNDS):
         if done >= 2 and time.perf_counter() - started > _LONG:
             break
-        for k in range(len(shown)):
-            for number, playback in enumerate(playbacks):
-                begun = time.perf_counter()
-                playback.frame(times[number][k])
-                best[number, k] = min(best[number, k], time.perf_counter() - begun)
+        for k in range(len(chosen)):
+            for number, renderer in enumerate(renderers):
+                start = time.perf_counter()
+                renderer.frame(times[number][k])
+                best[number, k] = min(best[number, k], time.perf_counter() - start)
     return best.mean(1).tolist()
 
 
-def frames_per_second(model: VideoModel | EditedVideo | SegmentedVideo) -> float:
-    """How fast a video is drawn, see `seconds_per_frame`.
+def measure_frame_rate(model: VideoModel | EditedVideo | SegmentedVideo) -> float:
+    """Frames rendered per second, see `measure_frame_seconds`.
 
-    Of one in segments some are drawn, each alone: neither loading nor fades count.
+    Of a video in segments, some segments are timed, each alone: without loading and fades.
     """
     if not isinstance(model, SegmentedVideo):
-        return 1 / seconds_per_frame(model)[0]
-    numbers = np.linspace(0, len(model.segments) - 1, _SEGMENTS_SHOWN).round().astype(int)
+        return 1 / measure_frame_seconds(model)[0]
+    numbers = np.linspace(0, len(model.segments) - 1, _TIMED_SEGMENTS).round().astype(int)
     chosen = [model.segments[number] for number in np.unique(numbers)]
-    seconds = [segment.num_frames * seconds_per_frame(segment.model)[0] for segment in chosen]
+    seconds = [segment.num_frames * measure_frame_seconds(segment.model)[0] for segment in chosen]
     return sum(segment.num_frames for segment in chosen) / sum(seconds)

@@ -16,11 +16,12 @@ from PIL import Image
 
 from foldgauss.cli._profiles_file import keep_evidence, kept_evidence
 from foldgauss.io import VideoError, read_masks, read_video, write_video
-from foldgauss.io.media import containers as _containers
-from foldgauss.io.media.containers import _ASF_SOUND, _CLUSTER, _MATROSKA_SOUND
-from foldgauss.io.media.labels import MOST_PER_BYTE, MOST_PIXELS
-from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, Profiles
-from foldgauss.uncertainty.posterior import sampling as posterior
+from foldgauss.io.media import format_detection
+from foldgauss.io.media.format_detection import _ASF_AUDIO, _CLUSTER, _MATROSKA_AUDIO
+from foldgauss.io.media.masks import MAX_PIXELS, MAX_PIXELS_PER_BYTE
+from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, ProfileCurves
+from foldgauss.uncertainty.posterior import draws_file
+from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 from .branches import ONLY
 from .models import written
@@ -29,7 +30,7 @@ from .target import CONSTANT, Target, chance
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    posterior.needed("arviz")
+    import_optional("arviz")
 
 _NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
 
@@ -55,8 +56,8 @@ def _images() -> list[bytes]:
 
 
 def _picture_memory(size: int) -> int:
-    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.media.labels`."""
-    return 2 * CONSTANT + 12 * max(MOST_PIXELS, MOST_PER_BYTE * size)
+    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.media.masks`."""
+    return 2 * CONSTANT + 12 * max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * size)
 
 
 #: What is asked for besides: a label, a size, the folder that the image is alone in, frames of it.
@@ -88,7 +89,7 @@ MASKS = Target(
     _images,
     _read_mask,
     (ValueError,),
-    {"foldgauss.io.media.labels": (), "foldgauss.io.media.masks": ()},
+    {"foldgauss.io.media.masks": ()},
     lambda data: 8 if data.startswith(b"\x89PNG") else 2,
     _picture_memory,
     (png_resealed, png_sized),
@@ -130,15 +131,25 @@ def _read_picture(path: Path) -> None:
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
 
-#: The part of `foldgauss.io.media.video_file` that reads.
-_READ = (
-    ONLY, "read_video", "readable_path", "reader_of", "_head", "read_file", "pass_through", "told_of_span", "_usable",
-    "_gap_notes", "pace_notes", "read_folder", "_is_image", "_read_image_file", "_read_animation",
-    "_promised_pictures", "read_pictures", "alike_frames", "image_paths", "read_picture", "_undecoded",
-    "_refuse_huge_image", "_refuse_huge", "_premultiplied", "_capture", "open_video", "_refuse_alpha", "_shape_notes",
-    "frames_grabbed", "frames_decoded", "_Stays", "_same_size", "_declared_frames", "fit_to", "aspect_window",
-    "_in_blocks", "stacked", "_check_within",
-)  # fmt: skip
+#: The parts of `foldgauss.io.media` that read clips.
+_READ = {
+    f"foldgauss.io.media.{module}": names
+    for module, names in {
+        "clip": (ONLY, "check_readable", "read_head", "check_range_within"),
+        "resizing": (
+            ONLY, "make_resizer", "aspect_window", "convert_channels", "unify_channels", "copy_to_blocks",
+            "stack_frames",
+        ),
+        "opencv": (
+            ONLY, "open_video", "open_silently", "check_num_pixels", "_check_no_alpha", "grab_frames", "decode_frames",
+        ),
+        "image_files": ("natural_sort_key", "_is_jpeg_sequence", "image_size"),
+        "video_decoding": ("_count_shown", "_can_convert"),
+        "video_reading": (),
+        "format_detection": (),
+        "frame_rate": (),
+    }.items()
+}  # fmt: skip
 
 PICTURES = Target(
     "pictures",
@@ -146,7 +157,7 @@ PICTURES = Target(
     lambda: [*_images(), *_more_images()],
     _read_picture,
     (VideoError,),
-    {"foldgauss.io.media.video_file": _READ, "foldgauss.io.media.containers": (), "foldgauss.io.media.rates": ()},
+    _READ,
     lambda data: 8,
     lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
     (png_resealed, png_sized, _another_picture),
@@ -210,9 +221,9 @@ def _with_edits(data: bytes) -> bytes:
 
 #: What may stand in a header, and what is asked of it.
 _MARKS = (
-    _MATROSKA_SOUND,
+    _MATROSKA_AUDIO,
     _CLUSTER,
-    _ASF_SOUND,
+    _ASF_AUDIO,
     b"soun",
     b"vide",
     b"mvex",
@@ -253,12 +264,7 @@ VIDEO = Target(
     lambda: list(_clips()),
     _read_clip,
     (VideoError,),
-    {
-        "foldgauss.io.media.video_file": _READ,
-        "foldgauss.io.media.masks": (),
-        "foldgauss.io.media.containers": (),
-        "foldgauss.io.media.rates": (),
-    },
+    _READ | {"foldgauss.io.media.masks": ()},
     _clip_body,
     lambda size: 1 << 32,
     (by_chance, by_chance, _marked, _another_kind),
@@ -268,16 +274,16 @@ VIDEO = Target(
 
 def _read_head(path: Path) -> None:
     """All that is asked of a file's first bytes, and of an index, without decoding."""
-    size, head = path.stat().st_size, path.read_bytes()[: _containers.HEAD_BYTES]
-    for ask in ("is_image", "may_move", "has_alpha_beside", "counts_frames"):
-        getattr(_containers, ask)(head)
-    _containers.tells_duration(head, size)
-    claimed = _containers.claimed_size(head)
-    assert claimed is None or _containers.fewest_bytes(head, claimed) >= 0
+    size, head = path.stat().st_size, path.read_bytes()[: format_detection.HEAD_BYTES]
+    for ask in ("is_image_format", "may_be_animation", "has_alpha_plane", "has_frame_count"):
+        getattr(format_detection, ask)(head)
+    format_detection.has_reliable_duration(head, size)
+    claimed = format_detection.parse_image_size(head)
+    assert claimed is None or format_detection.min_file_bytes(head, claimed) >= 0
     with open(path, "rb") as file:
-        shown = _containers.shown_seconds(file)
+        shown = format_detection.read_shown_seconds(file)
     assert shown is None or shown > 0
-    kind = _containers.kind_of(head)
+    kind = format_detection.describe_kind(head)
     if kind is not None:
         raise ValueError(f"expected a video or an image, got {kind}")
 
@@ -301,7 +307,7 @@ HEADERS = Target(
     lambda: [*_clips(), *_images(), *_more_images()],
     _read_head,
     (ValueError,),
-    {"foldgauss.io.media.containers": ()},
+    {"foldgauss.io.media.format_detection": ()},
     lambda data: 8,
     mutations=(_resized_box, png_sized, _marked, _another_kind),
     past_header=2,
@@ -318,7 +324,7 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
 
     def write(path: Path) -> None:
         rng = np.random.default_rng(0)
-        with h5py.File(path, "w", libver=version, userblock_size=posterior._BLOCK) as file:
+        with h5py.File(path, "w", libver=version, userblock_size=draws_file._BLOCK) as file:
             file.attrs["fingerprint"] = _FINGERPRINT
             for n in range(_SHAPE[0]):
                 group = file.create_group(f"ensemble_{n}")
@@ -337,20 +343,20 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
                 group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
                 for k, value in enumerate(np.random.RandomState(0).get_state()):
                     group.attrs[f"random_state_{k}"] = value
-        posterior._seal(path)
+        draws_file._seal(path)
 
     return written(write, ".h5")
 
 
 def _read_chains(path: Path) -> None:
     there = path.exists()
-    kept = posterior._Kept(path, _FINGERPRINT, _SHAPE)
+    kept = draws_file.DrawsFile(path, _FINGERPRINT, _SHAPE)
     if not there:  # a run begins there
         kept.live.unlink()
         raise FileNotFoundError
     try:
         for n in range(_SHAPE[0]):
-            backend = kept.of(n)
+            backend = kept.backend(n)
             assert backend.initialized
             assert backend.shape == _SHAPE[1:]
             if backend.iteration:
@@ -400,12 +406,12 @@ def h5_changed(data: bytes, random: Random) -> bytes:
                     if int(np.prod(shape)) > 10**6:
                         options = {"chunks": (1, *shape[1:])}
                     group.create_dataset(name, shape, kind, **options)
-        posterior._seal(path)
+        draws_file._seal(path)
 
     try:
         return written(write, ".h5")
     except (OSError, KeyError, ValueError, TypeError, IndexError):
-        return by_chance(data, random, posterior._BLOCK)
+        return by_chance(data, random, draws_file._BLOCK)
 
 
 CHAINS = Target(
@@ -415,12 +421,12 @@ CHAINS = Target(
     _read_chains,
     (ValueError,),
     {
-        "foldgauss.uncertainty.posterior.sampling": (
-            ONLY, "_Kept", "-check_space", "-check_room", "-written",
-            "_fingerprint_of", "_damaged", "_is_whole", "_is_random_state", "is_sealed",
+        "foldgauss.uncertainty.posterior.draws_file": (
+            ONLY, "DrawsFile", "-check_space", "-raise_system_error", "-convert_errors",
+            "read_fingerprint", "_damaged", "_is_valid", "_is_random_state", "is_sealed",
         )
     },
-    lambda data: posterior._BLOCK,
+    lambda data: draws_file._BLOCK,
     lambda size: 4 * CONSTANT + 64 * size,
     (h5_changed,),
     past_header=1,
@@ -431,18 +437,18 @@ CHAINS = Target(
 @functools.cache
 def _evidence() -> bytes:
     times, heights = np.linspace(0, 1, 4), np.array([0.0, -1.0, -0.5, -2.0])
-    profiles = Profiles.of([times, times[:3], times], [heights, heights[:3], heights])
-    seen = LikelihoodProfiles(
-        profiles, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
+    curves = ProfileCurves.from_nodes([times, times[:3], times], [heights, heights[:3], heights])
+    profiles = LikelihoodProfiles(
+        curves, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
     )
-    return written(lambda path: keep_evidence(path, "key", seen), ".npz")
+    return written(lambda path: keep_evidence(path, "key", profiles), ".npz")
 
 
 def _read_evidence(path: Path) -> None:
-    seen = kept_evidence(path, "key", 3)
-    if seen is None:
+    profiles = kept_evidence(path, "key", 3)
+    if profiles is None:
         raise ValueError("expected evidence, got none")  # what the command does then: it draws the pictures
-    assert seen.profiles(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
+    assert profiles.curves(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
 
 
 EVIDENCE = Target(

@@ -26,12 +26,12 @@ from foldgauss.io.models.model_file import load_model
 from foldgauss.io.models.video_model import read_origin
 from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
-from foldgauss.video.compression.quantize import Rule, column_names, describe, is_whole, quantize
+from foldgauss.video.compression.quantize import Rule, column_names, compute_columns, is_integral, quantize
 from foldgauss.video.editing.chain import edit
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
-from foldgauss.video.fitting.state import TIME_ADAM, FitState
+from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 from foldgauss.video.selection.selectors import Selection
 
@@ -265,13 +265,12 @@ def _checkpoint_seeds() -> list[bytes]:
 
     counts, width, num = np.arange(3, dtype=np.int32), 14, 3
     shared = Codebook(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
-    plain = Codebook(np.zeros(0, np.int32), floats(0, 2), floats(0, 2), np.zeros(0, np.int32))
     kept, state = [], None
     for statistics in (None, GradientStatistics(floats(num), floats(num), counts)):
-        state = FitState(
-            floats(num, width), floats(num, width), floats(num, width), counts, np.zeros(num, np.uint8),
-            np.zeros(num, bool), shared, plain, floats(3), floats(2), TIME_ADAM.init(floats(2)), statistics,
-            5, 100, 1.5, 0.01, sound=state, start_errors=((0, 0.1),),
+        state = FitState.create(
+            floats(num, width), np.zeros(num, np.uint8), floats(2), counts=counts, first=floats(num, width),
+            second=floats(num, width), colors=shared, frame_errors=floats(3), statistics=statistics,
+            step=5, plan=100, seconds=1.5, error=0.01, last_finite=state, start_errors=((0, 0.1),),
         )  # fmt: skip
         kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))
     return kept
@@ -291,7 +290,7 @@ CHECKPOINT = Target(
             "_from_stored", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited", "_describe_layer",
             "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton",
         ),
-        "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe_checkpoint", "_counts"),
+        "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe"),
     },
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,
@@ -333,10 +332,10 @@ def _quantised() -> tuple:
         (tiny_model(16, 3, plain=False), (1, 1, 1)),
         (tiny_model(4, 0, frames=1), (1, 0, 1)),
     ):
-        described = describe(model)
-        names = column_names(model.degree, described.facts.shared)
-        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_whole(name)}
-        described = dataclasses.replace(described, facts=dataclasses.replace(described.facts, cells=cells))
+        described = compute_columns(model)
+        names = column_names(model.degree, described.info.shared)
+        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_integral(name)}
+        described = dataclasses.replace(described, info=dataclasses.replace(described.info, cells=cells))
         found.append(quantize(described, np.arange(model.num_gaussians, dtype=np.int32) % 4, rules))
     return tuple(found)
 
@@ -387,7 +386,7 @@ def numbers_changed(data: bytes, random: Random) -> bytes:
     changed = dataclasses.replace(quantized, columns=columns, rules=rules, intervals=intervals)
     try:
         with np.errstate(all="ignore"):
-            return compact.packed(changed, {"clip": "a"})
+            return compact.pack_compact(changed, {"clip": "a"})
     except (ValueError, IndexError, KeyError, OverflowError):
         return stream_changed(data, random)
 
@@ -419,8 +418,8 @@ COMPACT = Target(
     _read_compact,
     (ModelFileError,),
     {
-        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "packed", "_steps"),
-        "foldgauss.io.models.columns": (),
+        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact", "_wrapped_differences"),
+        "foldgauss.io.models.column_contexts": (),
         "foldgauss.io.models.video_model": (
             ONLY,
             "load_video_model",

@@ -18,8 +18,9 @@ from foldgauss.io import (
     write_pseudomesh,
     write_vegas_ply,
 )
-from foldgauss.io.exchange.mesh import read_obj
+from foldgauss.io.exchange.pseudomesh import read_obj
 
+from .branches import ONLY
 from .models import tiny_model, written
 from .mutate import by_chance, json_changed, json_text_changed
 from .target import CONSTANT, Target, chance
@@ -152,12 +153,8 @@ def _read_vegas(path: Path) -> None:
 
 
 _PLY = {
-    "foldgauss.io.exchange.ply_format": ("write_ply", "_encoded"),
+    "foldgauss.io.exchange.ply_file": ("write_ply", "_encode"),
 }
-_WRITERS = (
-    "write_vegas_ply", "_check_writable_as_vegas", "frame_gaussians", "_alive", "write_gaussians_ply", "write_3dgs_ply",
-    "write_3dgs_frames", "_check_covers", "checked_times", "_scales_and_quaternion",
-)  # fmt: skip
 _PLY_MUTATIONS = (numbers_changed, note_changed, counted, columns_changed)
 
 VEGAS = Target(
@@ -169,7 +166,7 @@ VEGAS = Target(
     ],
     _read_vegas,
     (FormatError,),
-    _PLY | {"foldgauss.io.exchange.ply": (*_WRITERS, "read_3dgs_ply", "_turned")},
+    _PLY | {"foldgauss.io.exchange.vegas_ply": ("write_vegas_ply", "_check_writable_as_vegas")},
     _ply_body,
     lambda size: 2 * CONSTANT + 200 * size,
     _PLY_MUTATIONS,
@@ -186,13 +183,7 @@ SCENE = Target(
     ],
     lambda path: read_3dgs_ply(path, axes="y-up" if chance(path) % 2 else "y-down"),
     (FormatError,),
-    _PLY
-    | {
-        "foldgauss.io.exchange.ply": (
-            *_WRITERS, "read_vegas_ply", "_with_power", "_vegas_unit", "_check_vegas", "_degree", "_time_logits",
-            "_filled_in", "_note",
-        )
-    },
+    _PLY | {"foldgauss.io.exchange.gaussians_ply": (ONLY, "read_3dgs_ply", "_turn")},
     _ply_body,
     lambda size: 2 * CONSTANT + 200 * size,
     _PLY_MUTATIONS,
@@ -265,7 +256,7 @@ def _read_mesh(path: Path) -> None:
 
 
 _MESH = {
-    "foldgauss.io.exchange.mesh": (
+    "foldgauss.io.exchange.pseudomesh": (
         "Pseudomesh", "_flat_factor", "write_pseudomesh", "_obj_text", "_axes",
     )
 }  # fmt: skip
@@ -276,7 +267,7 @@ OBJ = Target(
     lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"]), _from_the_end(_mesh()["frame_0000.obj"])],
     _read_mesh,
     (FormatError,),
-    {"foldgauss.io.exchange.mesh": (*_MESH["foldgauss.io.exchange.mesh"], "_notes", "_checked_notes")},
+    {"foldgauss.io.exchange.pseudomesh": (*_MESH["foldgauss.io.exchange.pseudomesh"], "_read_notes", "_check_notes")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 400 * size,
     (line_changed,),
@@ -312,10 +303,10 @@ NOTES = Target(
     _read_notes,
     (FormatError,),
     {
-        "foldgauss.io.exchange.mesh": (
-            *_MESH["foldgauss.io.exchange.mesh"],
-            "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parsed_vertex",
-            "_parsed_face", "_check_soup",
+        "foldgauss.io.exchange.pseudomesh": (
+            *_MESH["foldgauss.io.exchange.pseudomesh"],
+            "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parse_vertex",
+            "_parse_face", "_check_soup",
         )
     },
     lambda data: 0,

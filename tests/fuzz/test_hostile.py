@@ -21,8 +21,8 @@ import foldgauss
 from foldgauss.cli._profiles_file import kept_evidence
 from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
-from foldgauss.io.media.containers import shown_seconds
-from foldgauss.uncertainty.posterior import sampling as posterior
+from foldgauss.io.media.format_detection import read_shown_seconds
+from foldgauss.uncertainty.posterior import draws_file
 
 from . import media, models, scenes, texts
 from .models import sealed, tiny_model, unsealed
@@ -187,7 +187,7 @@ def _h5(change) -> bytes:
         path.write_bytes(media._chains(4, "earliest"))
         with h5py.File(path, "r+") as file:
             change(file)
-        posterior._seal(path)
+        draws_file._seal(path)
 
     return models.written(write, ".h5")
 
@@ -357,7 +357,7 @@ def _text_for_numbers(file) -> None:
 def test_chains_that_emcee_would_stumble_over_are_refused(change, tmp_path):
     (tmp_path / "c.h5").write_bytes(_h5(change))
     with pytest.raises(ValueError, match=r"backend: expected a file of draws, or none yet, got .*damaged"):
-        posterior._Kept(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
+        draws_file.DrawsFile(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
     assert not list(tmp_path.glob(".*"))
 
 
@@ -367,10 +367,10 @@ def test_the_library_never_sees_draws_that_are_damaged(tmp_path, monkeypatch):
     monkeypatch.setattr("h5py.File", lambda *_, **__: pytest.fail("it was opened"))
     for at in range(0, len(whole), len(whole) // 50):
         (tmp_path / "c.h5").write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
-        if at in range(len(posterior._SEAL) + 64, posterior._BLOCK):  # idle
+        if at in range(len(draws_file._SEAL) + 64, draws_file._BLOCK):  # idle
             continue
         with pytest.raises(ValueError, match=r"backend: .*damaged"):
-            posterior._Kept(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
+            draws_file.DrawsFile(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
 
 
 def _evidence_with(**changed) -> bytes:
@@ -399,7 +399,7 @@ def _evidence_with(**changed) -> bytes:
 def test_evidence_that_does_not_fit_is_drawn_anew(changed, tmp_path):
     path = tmp_path / "e.npz"
     path.write_bytes(media._evidence())
-    assert kept_evidence(path, "key", 3).num_drawn == 12
+    assert kept_evidence(path, "key", 3).num_rendered == 12
     assert kept_evidence(path, "other", 3) is None
     assert kept_evidence(path, "key", 4) is None
     path.write_bytes(_evidence_with(**changed))
@@ -505,7 +505,7 @@ def test_scripts_set_text_and_never_markup():
 def test_a_box_of_any_64_bits_is_passed_by():
     """Python's files cannot seek that far."""
     box = b"\0\0\0\x10ftypisom\0\0\0\0" + b"\0\0\0\1free" + b"\xff" * 8
-    assert shown_seconds(io.BytesIO(box)) is None
+    assert read_shown_seconds(io.BytesIO(box)) is None
 
 
 def test_a_gif_whose_frame_grows_is_damaged_there(tmp_path):

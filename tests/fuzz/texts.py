@@ -278,7 +278,7 @@ HISTORY = Target(
     lambda: [_history(), b"", _history() + b'{"step": 9, "prog'],
     _read_history,
     (ValueError,),
-    {"foldgauss.io.history": ("write_curves", "info_line", "_plain", "__call__", "_opened", "__enter__", "__exit__")},
+    {"foldgauss.io.history": ("write_curves", "info_line", "_to_json", "__call__", "_opened", "__enter__", "__exit__")},
     lambda data: 8 if data.startswith(b'{"step"') else 0,
     lambda size: 2 * CONSTANT + 200 * size,
     (one_line_changed,),

@@ -14,27 +14,27 @@ import numpy as np
 import pytest
 from soft_models import SIZE, soft_model
 
+import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
-from foldgauss.io.models.compact import MAGIC, VERSION, packed
+from foldgauss.io.models.compact import MAGIC, VERSION, pack_compact
 from foldgauss.io.models.video_model import read_metadata
-from foldgauss.io.page import html
 from foldgauss.render import RenderOptions
 from foldgauss.video import compress, layers
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
-    _degrees,
+    _choose_degrees,
     _log,
     column_names,
+    compute_columns,
     dequantize,
-    describe,
-    is_whole,
+    is_integral,
     legendre,
-    lower_paths,
     path_matrix,
+    path_span,
     quantize,
-    span_of,
+    unrounded_paths,
 )
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.row_layout import shift_path
@@ -50,8 +50,8 @@ def clip_of(model, noise=6.0):
 
 def fine(model, exponent=-22.0):
     """Quantized by even steps of 2^exponent."""
-    rules = {name: Rule(0.0, exponent) for name in column_names(model.degree) if not is_whole(name)}
-    return quantize(describe(model), np.zeros(model.num_gaussians, np.int32), rules)
+    rules = {name: Rule(0.0, exponent) for name in column_names(model.degree) if not is_integral(name)}
+    return quantize(compute_columns(model), np.zeros(model.num_gaussians, np.int32), rules)
 
 
 def same(one, other):
@@ -69,7 +69,7 @@ def pictures(model):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 7])
-def test_fine_steps_give_the_picture_back(degree):
+def test_fine_steps_reproduce_the_image(degree):
     model = soft_model(degree=degree, options=RenderOptions())
     again = dequantize(fine(model))
     for t in (0.0, 0.37, 1.0):
@@ -161,7 +161,7 @@ def test_kinds_are_kept(tmp_path):
 
 
 @pytest.mark.parametrize("passes", [0, 2])
-def test_kinds_outlive_fitting_anew(tmp_path, passes):
+def test_kinds_survive_fine_tuning(tmp_path, passes):
     model = of_kinds(soft_model(degree=3, options=RenderOptions()))
     made = compress(model, clip_of(model), passes=passes)
     again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
@@ -173,7 +173,7 @@ def test_kinds_outlive_fitting_anew(tmp_path, passes):
 
 
 @pytest.mark.parametrize("told", ["faint", "coarse"])
-def test_few_that_are_left_can_be_read(tmp_path, told):
+def test_file_with_few_gaussians_left_can_be_read(tmp_path, told):
     """Cells are counted anew, for those that stay."""
     model = crowd(soft_model(degree=3), 40)
     if told == "faint":
@@ -185,23 +185,23 @@ def test_few_that_are_left_can_be_read(tmp_path, told):
     same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantized)), made.model)
 
 
-def test_a_power_that_saves_little_goes():
+def test_power_that_saves_little_is_dropped():
     """Its squared error, in steps, against what a number's bits are worth."""
     saved = np.array([[9.0, 9.0, 9.0], [1.0, 0.5, 0.2], [0.8, 0.2, 4.0]])
-    np.testing.assert_array_equal(_degrees(saved), [1, 0, 2])
+    np.testing.assert_array_equal(_choose_degrees(saved), [1, 0, 2])
     model = soft_model(degree=3)
     coarse = fine(model, -7.0)
     degrees = dequantize(coarse).splats.degrees
     np.testing.assert_array_equal(degrees, coarse.columns["degree"])
     assert 0 < (degrees < 3).sum() < len(degrees)
-    place = lower_paths(coarse, describe(model))
+    place = unrounded_paths(coarse, compute_columns(model))
     np.testing.assert_array_equal((place[:, 1:] != 0).any(2), np.arange(3) < degrees[:, None])
 
 
 def test_kinds_save_bytes():
     plain = crowd(soft_model(degree=3))
     model = of_kinds(plain)
-    assert len(packed(fine(model))) < 0.8 * len(packed(fine(plain)))
+    assert len(pack_compact(fine(model))) < 0.8 * len(pack_compact(fine(plain)))
 
 
 # ------------------------------------------------------------------------------------ stated loss
@@ -230,7 +230,7 @@ def test_loss_without_the_clip_is_that_of_an_independent_error():
 
 
 @pytest.mark.parametrize("how", ["opaque", "alpha", "sum"])
-def test_fitting_anew_pays(how):
+def test_fine_tuning_makes_smaller_files(how):
     """A model that is not at its best: what is gained pays for coarser steps, within the loss allowed."""
     best = soft_model(options=RenderOptions(), compositing="sum" if how == "sum" else "over")
     if how == "sum":  # where they add up to no more than white
@@ -244,7 +244,7 @@ def test_fitting_anew_pays(how):
         alpha = 255 - (over_white - pictures(best)).mean(-1, keepdims=True)
         clip = np.concatenate([np.minimum(clip, alpha), alpha], -1).round().astype(np.uint8)
     plain, mended = (compress(model, clip, max_loss_db=0.2, passes=passes) for passes in (0, 30))
-    assert len(packed(mended.quantized)) < 0.95 * len(packed(plain.quantized))
+    assert len(pack_compact(mended.quantized)) < 0.95 * len(pack_compact(plain.quantized))
     lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
     assert lost == pytest.approx(mended.loss_db, abs=1e-9)
     assert lost <= 0.2
@@ -252,12 +252,12 @@ def test_fitting_anew_pays(how):
 
 def test_a_greater_loss_makes_a_smaller_file():
     model = soft_model(options=RenderOptions())
-    sizes = [len(packed(compress(model, max_loss_db=loss).quantized)) for loss in (0.02, 0.2, 2.0)]
+    sizes = [len(pack_compact(compress(model, max_loss_db=loss).quantized)) for loss in (0.02, 0.2, 2.0)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.85 * sizes[0]
 
 
-def test_gaussians_that_nobody_sees_are_left_out():
+def test_invisible_gaussians_are_dropped():
     model = soft_model(options=RenderOptions())
     hidden = eqx.tree_at(
         lambda m: m.splats.opacity_logit,
@@ -282,7 +282,7 @@ def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
     quantized = compress(soft_model(options=RenderOptions())).quantized
     path = save_compact(tmp_path / "m.fgz", quantized, metadata={"clip": "x", "bad": float("nan")})
     again = load_compact(path)
-    assert packed(again, read_metadata(path)) == path.read_bytes()
+    assert pack_compact(again, read_metadata(path)) == path.read_bytes()
     same(dequantize(again), dequantize(quantized))
     same(load_video_model(path), dequantize(quantized))
     assert read_metadata(path) == {"clip": "x", "bad": None}
@@ -292,11 +292,11 @@ def test_a_decoded_model_by_the_same_rules_is_the_same_file():
     """Quantising is a projection: what was rounded is not rounded further."""
     quantized = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantized
     columns = quantized.columns
-    again = quantize(describe(dequantize(quantized)), columns["class"], quantized.rules, columns["cell"])
-    assert packed(again) == packed(quantized)
+    again = quantize(compute_columns(dequantize(quantized)), columns["class"], quantized.rules, columns["cell"])
+    assert pack_compact(again) == pack_compact(quantized)
 
 
-def test_logarithm_is_one():
+def test_logarithm_matches_numpy():
     x = np.concatenate([np.random.default_rng(0).uniform(0, 1, 1000), [2.0**-40, 0.5, 1.0, 0.7071067811865476]])
     np.testing.assert_allclose(_log(x), np.log(x), rtol=1e-13, atol=1e-13)
 
@@ -319,9 +319,9 @@ def test_a_path_is_the_same_from_another_time():
 
 def test_paths_are_legendre_series_over_the_span():
     model = soft_model(degree=3)
-    facts, v = describe(model).facts, describe(model).values
-    matrix = path_matrix(v["time"], v["duration"], facts)
-    middle, half = span_of(v["time"], v["duration"], facts.reach)
+    info, v = compute_columns(model).info, compute_columns(model).values
+    matrix = path_matrix(v["time"], v["duration"], info)
+    middle, half = path_span(v["time"], v["duration"], info.reach)
     for w in (-1.0, 0.2, 1.0):
         u = v["time"] - (middle + half * w)
         by_matrix = (matrix * (u[:, None] ** np.arange(4))[:, :, None]).sum(1)
@@ -340,7 +340,7 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     if how == "crowd of kinds":
         model = of_kinds(model)
     path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantized)
-    decoder = Path(html.__file__).with_name("compact.js")
+    decoder = Path(foldgauss.io.page.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
         """
@@ -404,7 +404,7 @@ def test_extremes_of_values(leaf, value):
     assert all(np.isfinite(one).all() for one in jax.tree.leaves(made.model))
 
 
-def test_numbers_that_are_not_finite_are_refused():
+def test_nan_and_infinities_are_rejected():
     model = soft_model()
     for value in (np.nan, np.inf):
         broken = eqx.tree_at(lambda m: m.splats.loc, model, model.splats.loc.copy())
@@ -413,7 +413,7 @@ def test_numbers_that_are_not_finite_are_refused():
             compress(broken)
 
 
-def test_what_the_format_does_not_hold_is_refused():
+def test_models_that_the_format_cannot_hold_are_rejected():
     model = soft_model()
     powers = eqx.tree_at(lambda m: m.splats.envelope, model, TimeLikelihood(np.linspace(1, 2, model.num_gaussians)))
     with pytest.raises(ValueError, match=r"several|different"):
@@ -428,7 +428,7 @@ def test_what_the_format_does_not_hold_is_refused():
         with pytest.raises(ValueError, match=r"max_loss_db: expected a loss"):
             compress(model, max_loss_db=wrong)
     dark = eqx.tree_at(lambda m: m.splats.opacity_logit, model, np.full(model.num_gaussians, -90.0, np.float32))
-    with pytest.raises(ValueError, match=r"model: expected Gaussians that are seen"):
+    with pytest.raises(ValueError, match=r"model: expected visible Gaussians"):
         compress(dark)
 
 
@@ -437,7 +437,7 @@ def test_what_the_format_does_not_hold_is_refused():
 
 @pytest.fixture(scope="module")
 def good():
-    return packed(fine(soft_model(), -12.0), {"clip": "x"})
+    return pack_compact(fine(soft_model(), -12.0), {"clip": "x"})
 
 
 def resealed(data, change=lambda header: None, cut=None):
@@ -459,7 +459,7 @@ def refused(tmp_path, data, match):
         load_video_model(path)
 
 
-def test_truncated(tmp_path, good):
+def test_truncated_file_is_rejected(tmp_path, good):
     for length in (*range(4, 24), 60, len(good) // 2, len(good) - 1):
         refused(tmp_path, good[:length], "compact model")
 
@@ -472,13 +472,13 @@ def test_damaged_everywhere(tmp_path, good):
         refused(tmp_path, bytes(data), "compact model")
 
 
-def test_later_version(tmp_path, good):
+def test_later_version_is_rejected(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 9
     refused(tmp_path, bytes(data), r"expected a compact model of version 2, .* got version 9 .* Update foldgauss")
 
 
-def test_version_before(tmp_path, good):
+def test_earlier_version_is_rejected(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 1
     refused(
@@ -530,14 +530,14 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("scale_cutoff", True),
     ],
 )
-def test_header_of_a_stranger(tmp_path, good, key, value):
+def test_forged_header_is_rejected(tmp_path, good, key, value):
     def change(header):
         header[key] = value
 
     refused(tmp_path, resealed(good, change), "compact model")
 
 
-def test_columns_of_a_stranger(tmp_path, good):
+def test_forged_columns_are_rejected(tmp_path, good):
     def changed(own):
         return lambda header: header["columns"].__setitem__(5, own)
 
@@ -560,7 +560,7 @@ def test_columns_of_a_stranger(tmp_path, good):
         refused(tmp_path, resealed(good, lambda header, key=key: header.pop(key)), "compact model")
 
 
-def test_streams_of_a_stranger(tmp_path, good):
+def test_forged_streams_are_rejected(tmp_path, good):
     """With the right checksum: they decode to something or are refused, in no time and memory of note."""
     rng, path = np.random.default_rng(1), tmp_path / "m.fgz"
     start = len(MAGIC) + 12 + int.from_bytes(good[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
@@ -579,19 +579,19 @@ def test_streams_of_a_stranger(tmp_path, good):
 @pytest.mark.parametrize(
     ("name", "number"), [("without", 4), ("without", -1), ("degree", 4), ("degree", -1), ("shade", 10), ("shade", -1)]
 )
-def test_kinds_of_a_stranger(tmp_path, name, number):
+def test_forged_kinds_are_rejected(tmp_path, name, number):
     quantized = fine(of_kinds(soft_model(degree=3)), -12.0)
     columns = quantized.columns | {name: quantized.columns[name].copy()}
     columns[name][7] = number
-    data = packed(dataclasses.replace(quantized, columns=columns))
+    data = pack_compact(dataclasses.replace(quantized, columns=columns))
     refused(tmp_path, data, "compact model")
 
 
-def test_a_byte_for_every_eight_gaussians(tmp_path):
+def test_file_has_a_byte_for_every_eight_gaussians(tmp_path):
     """All alike, they need next to nothing, and the file is filled up: none may claim more than its length allows."""
-    described = describe(only(soft_model(degree=0), np.full(100_000, 20)))
+    described = compute_columns(only(soft_model(degree=0), np.full(100_000, 20)))
     origins = {name: float(value[0]) for name, value in described.values.items()}
-    rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0) if not is_whole(name)}
+    rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0) if not is_integral(name)}
     path = save_compact(tmp_path / "m.fgz", quantize(described, np.zeros(100_000, np.int32), rules))
     assert 100_000 / 8 <= path.stat().st_size < 100_000 / 8 + 30
     assert load_video_model(path).num_gaussians == 100_000

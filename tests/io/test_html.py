@@ -19,8 +19,8 @@ from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import OutputError, export, html_page, load_video_model, save_compact, save_video_model, write_html
-from foldgauss.io.page import html as page_module
-from foldgauss.io.page.html import _fine, bundled
+from foldgauss.io.page import player_page
+from foldgauss.io.page.player_page import bundle_script, quantize_finely
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, edit, fit, layers
 from foldgauss.video.compression.quantize import dequantize
@@ -124,10 +124,10 @@ def test_the_title_is_text_whatever_is_in_it(tmp_path):
 
 
 def test_scripts_are_bundled_whole():
-    script = bundled("main.js")
+    script = bundle_script("main.js")
     assert not re.search(r"^\s*(import|export)\b", script, re.MULTILINE)
     assert "</" not in re.sub(r"<\\/", "", script)
-    for path in page_module._SOURCES.iterdir():
+    for path in player_page._SOURCES.iterdir():
         if path.suffix == ".js":
             first = path.read_text(encoding="utf-8").splitlines()[0]
             assert script.count(first) == 1, path.name
@@ -144,7 +144,7 @@ def test_the_model_comes_back_from_the_page(tmp_path):
 
 
 def test_a_compact_file_goes_in_as_it_is(tmp_path):
-    path = save_compact(tmp_path / "m.fgz", _fine(soft_model()), metadata={"clip": "my clip"})
+    path = save_compact(tmp_path / "m.fgz", quantize_finely(soft_model()), metadata={"clip": "my clip"})
     page = html_page(path)
     assert data_of(page) == path.read_bytes()
     assert "<title>my clip</title>" in page
@@ -155,7 +155,7 @@ def test_gaussians_beyond_proportion_get_even_steps():
     thin = np.array(model.splats.log_scale)
     thin[5] = -40.0, -45.0
     model = eqx.tree_at(lambda m: m.splats.log_scale, model, thin)
-    again = dequantize(_fine(model))
+    again = dequantize(quantize_finely(model))
     np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=0.02)
 
 
@@ -212,7 +212,7 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert path.read_text(encoding="utf-8") == before
     export(soft_model(seed=1), "html", path, overwrite=True)
     assert path.read_text(encoding="utf-8") != before
-    monkeypatch.setattr(page_module, "LARGE", 1000)
+    monkeypatch.setattr(player_page, "LARGE", 1000)
     with pytest.warns(UserWarning, match="slow to open. Compress"):
         write_html(path, soft_model())
     with pytest.warns(UserWarning, match="Leave the original out"):
@@ -228,7 +228,7 @@ def test_notebooks_show_the_player(monkeypatch):
     baked = layers(model, model)
     assert "<iframe" in baked._repr_html_()
     assert _late(model)._repr_html_() is None
-    monkeypatch.setattr(page_module, "LARGEST_IN_NOTEBOOK", 1000)
+    monkeypatch.setattr(player_page, "LARGEST_IN_NOTEBOOK", 1000)
     assert model._repr_html_() is None
 
 
@@ -570,8 +570,8 @@ def test_segments_that_no_page_holds_are_told(monkeypatch):
     video, made = segmented(), []
     (frame,) = [one for tag, one in _Elements(video._repr_html_()).tags if tag == "iframe"]
     assert frame["srcdoc"] == html_page(video, title="foldgauss")
-    monkeypatch.setattr(page_module, "packed", lambda model: made.append(model) or bytes(1000))
-    monkeypatch.setattr(page_module, "LARGEST_IN_NOTEBOOK", 3000)
+    monkeypatch.setattr(player_page, "pack_compact", lambda model: made.append(model) or bytes(1000))
+    monkeypatch.setattr(player_page, "LARGEST_IN_NOTEBOOK", 3000)
     assert video._repr_html_() is None
     assert len(made) == 2  # more have no room
 
@@ -788,7 +788,7 @@ def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     """The fold equation stands once in Python; the brush has it again, and is held to that."""
     path = tmp_path / "m.fgz"
     path.write_bytes(data_of(html_page(soft_model(options=RenderOptions(), **how))))
-    for source in (page_module._DECODER, *(page_module._SOURCES / f"{name}.js" for name in MODULES)):
+    for source in (player_page._DECODER, *(player_page._SOURCES / f"{name}.js" for name in MODULES)):
         (tmp_path / source.name).write_bytes(source.read_bytes())
     (tmp_path / "package.json").write_text('{"type": "module"}')
     (tmp_path / "run.js").write_text(

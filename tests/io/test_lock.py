@@ -13,12 +13,12 @@ from soft_models import soft_model
 
 from foldgauss.io import write_3dgs_frames, write_frames, write_pseudomesh
 from foldgauss.io._atomic import OutputError, atomic_folder
-from foldgauss.io._lock import LEFT, only_writer
+from foldgauss.io._lock import STALE_AGE, lock_output
 
 HOLDING = """
 import pathlib, sys, time
-from foldgauss.io._lock import only_writer
-with only_writer(pathlib.Path(sys.argv[1])):
+from foldgauss.io._lock import lock_output
+with lock_output(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -38,22 +38,22 @@ def holder(tmp_path):
 
 def test_a_second_writer_is_refused_until_the_first_is_gone(tmp_path, holder):
     path = tmp_path / "m.safetensors"
-    with pytest.raises(OutputError, match="which another fit is"), only_writer(path):
+    with pytest.raises(OutputError, match="which another fit is"), lock_output(path):
         pass
-    with only_writer(tmp_path / "other.safetensors"):
+    with lock_output(tmp_path / "other.safetensors"):
         pass
     holder.send_signal(signal.SIGKILL)
     holder.wait()
-    with only_writer(path):
+    with lock_output(path):
         pass
     assert os.listdir(tmp_path) == []  # no locks are left lying about
 
 
 def test_within_a_process_too(tmp_path):
     path = tmp_path / "m.safetensors"
-    with only_writer(path), pytest.raises(OutputError, match="another fit"), only_writer(path):
+    with lock_output(path), pytest.raises(OutputError, match="another fit"), lock_output(path):
         pass
-    with only_writer(path):
+    with lock_output(path):
         pass
 
 
@@ -68,9 +68,9 @@ def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
     others += [path, kept, fresh]
     for file in (mine, stale, *others):
         file.write_text("x")
-    long_ago = time.time() - LEFT - 60
+    long_ago = time.time() - STALE_AGE - 60
     os.utime(stale, (long_ago, long_ago))
-    with only_writer(path, own=(kept,)):
+    with lock_output(path, own=(kept,)):
         assert not mine.exists()
         assert not stale.exists()
     assert all(file.exists() for file in others)
@@ -79,7 +79,7 @@ def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
 def test_a_folder_that_is_not_there(tmp_path):
     with (
         pytest.raises(OutputError, match="expected an existing folder"),
-        only_writer(tmp_path / "no" / "m.safetensors"),
+        lock_output(tmp_path / "no" / "m.safetensors"),
     ):
         pass
     assert os.listdir(tmp_path) == []
@@ -88,7 +88,7 @@ def test_a_folder_that_is_not_there(tmp_path):
 def test_what_cannot_be_removed_is_no_reason_not_to_work(tmp_path):
     """Another user's file in a folder of all, or a folder of such a name."""
     (tmp_path / ".m.own-01ab23cd.safetensors").mkdir()
-    with only_writer(tmp_path / "m.safetensors"):
+    with lock_output(tmp_path / "m.safetensors"):
         pass
     assert os.listdir(tmp_path) == [".m.own-01ab23cd.safetensors"]
 

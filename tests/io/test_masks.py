@@ -66,7 +66,7 @@ def test_refused(folder, tmp_path):
     fails("missing", folder / "none", error=FileNotFoundError)
     fails(r"label: expected one of \[1, 2\] .*, got 3", folder, label=3)
     for label in (0, 255, 1.5, True):
-        fails("label: expected an object's number, 1 to 254", folder, label=label)
+        fails("label: expected an object's label, 1 to 254", folder, label=label)
     fails("frames: expected a range in 12 images, got stop 13", folder, frames=(0, 13))
     fails("path: expected a folder with images", folder, frames=(5, 5))
     fails("frames: expected a folder or a video", folder / "mask0.png", frames=(0, 1))
@@ -74,10 +74,10 @@ def test_refused(folder, tmp_path):
     (folder / "empty").mkdir()
     fails("path: expected a folder with images", folder / "empty")
     write_image(folder / "colours.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
-    fails("number per pixel.*'RGB'", folder / "colours.png")
+    fails("label per pixel.*'RGB'", folder / "colours.png")
     video = write_video(tmp_path / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
     fails("label: expected images with labels, got the video", video, label=1)
     for level in (0, 1.5, None):
-        fails("level: expected a share of white", video, level=level)
+        fails("level: expected a fraction of white", video, level=level)
     (folder / "text.mp4").write_text("none")
     fails("does not open as a video", folder / "text.mp4")

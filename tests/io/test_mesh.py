@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io import FormatError, frame_gaussians, read_pseudomesh, write_pseudomesh
 from foldgauss.io._atomic import OutputError
-from foldgauss.io.exchange.mesh import NOTES, _axes, read_obj, read_pseudomesh, write_pseudomesh
-from foldgauss.io.exchange.ply import frame_gaussians
-from foldgauss.io.exchange.ply_format import FormatError
+from foldgauss.io.exchange.pseudomesh import NOTES, _axes, read_obj
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
 from foldgauss.video.models.renderer import VideoRenderer

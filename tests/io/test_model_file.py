@@ -420,4 +420,4 @@ def test_output_that_cannot_be_written(tmp_path, name):
     with pytest.raises(OutputError) as caught:
         save_model(tmp_path / name, _toy())
     assert "\n" not in str(caught.value)
-    assert "Cho" in str(caught.value) or "choose" in str(caught.value) or "plain" in str(caught.value)
+    assert "Cho" in str(caught.value) or "choose" in str(caught.value) or "regular" in str(caught.value)

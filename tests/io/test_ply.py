@@ -15,19 +15,23 @@ from numpy.lib import recfunctions
 from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import load_video_model, read_pseudomesh, save_video_model, write_pseudomesh
-from foldgauss.io._atomic import OutputError
-from foldgauss.io.exchange import ply as ply_file
-from foldgauss.io.exchange.ply import (
+from foldgauss.io import (
+    FormatError,
     frame_gaussians,
+    load_video_model,
     read_3dgs_ply,
+    read_pseudomesh,
     read_vegas_ply,
+    save_video_model,
     write_3dgs_frames,
     write_3dgs_ply,
     write_gaussians_ply,
+    write_pseudomesh,
     write_vegas_ply,
 )
-from foldgauss.io.exchange.ply_format import FormatError, read_ply, write_ply
+from foldgauss.io._atomic import OutputError
+from foldgauss.io.exchange import ply_file
+from foldgauss.io.exchange.ply_file import read_ply, write_ply
 from foldgauss.render import Gaussians3D, RenderOptions, Splats2D, cpu
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit, psnr
 from foldgauss.video.models.frame_times import make_time_logits

@@ -391,12 +391,12 @@ def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     assert "25 of 50 Gaussians, throughout the clip" in told
     assert "6, shared by 50 Gaussians" in told
     assert "4, shared by 50 Gaussians" in told
-    assert "10 of 50 Gaussians, no light comes through" in told
+    assert "10 of 50 Gaussians, without transmittance" in told
     assert f"{load_video_model(path).num_parameters:,}" in told
     assert f"{path.stat().st_size:,} bytes" in told
     run("info", save_video_model(tmp_path / "whole.safetensors", ragged_model(np.full(NUM, 3))))
     told = capsys.readouterr().out
-    assert not any(name in told for name in ("degrees", "lasting", "colours", "shapes", "solid"))
+    assert not any(name in told for name in ("degrees", "static", "colours", "shapes", "opaque"))
 
 
 def test_no_shape_of_a_ragged_model_is_compiled_for(tmp_path, caplog):

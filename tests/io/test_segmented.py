@@ -29,7 +29,7 @@ from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
-from foldgauss.video.tradeoff import halved
+from foldgauss.video.tradeoff import to_half_precision
 
 FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
 
@@ -125,7 +125,7 @@ def test_saved_again_it_has_the_same_bytes(work, tmp_path):
 
 
 def test_halves_are_kept_as_halves(tmp_path):
-    save_video_model(tmp_path / "half.safetensors", halved(soft_model()))
+    save_video_model(tmp_path / "half.safetensors", to_half_precision(soft_model()))
     join_segments(tmp_path / "long.safetensors", [(0, tmp_path / "half.safetensors")])
     kinds = {spec["dtype"] for spec in read_header(tmp_path / "long.safetensors")["tensors"].values()}
     assert "F16" in kinds

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from foldgauss.io import Clip, VideoError, read_video, write_frames, write_image, write_video
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media import video_file
-from foldgauss.io.media.video_file import Clip, VideoError, read_video, write_frames, write_image, write_video
+from foldgauss.io.media import resizing
 
 
 def _psnr(a, b):
@@ -119,7 +119,7 @@ def test_frame_range_is_half_open(clip_file, frames, first, count):
     ],
 )
 def testaspect_window(have, want, window):
-    rows, columns = video_file.aspect_window(have, want)
+    rows, columns = resizing.aspect_window(have, want)
     assert (rows.start, rows.stop, columns.start, columns.stop) == window
 
 
@@ -164,7 +164,7 @@ def test_damaged_video_tells_what_was_promised(tmp_path):
     _one_line(caught, "18:20", "of 132 frames decode")
     # What decodes past the damage is blemished, but in its place.
     assert "frames 17 to 23 cannot be decoded" in clip.notes[0]
-    assert "frames 0:17 are sound" in clip.notes[0]
+    assert "frames 0:17 are intact" in clip.notes[0]
     late = read_video(path, size=(16, 32), frames=(120, 130))
     assert late.num_frames == late.num_declared == 10
     np.testing.assert_array_equal(late.frames, clip.frames[120 - 7 : 130 - 7])
@@ -428,7 +428,7 @@ def test_bad_files_print_nothing(tmp_path, clip_file):
     (tmp_path / "damaged.mp4").write_bytes(damaged)
     program = """
 import sys, contextlib, numpy, pathlib
-from foldgauss.io.media.video_file import VideoError, read_video, write_video
+from foldgauss.io import VideoError, read_video, write_video
 for path in sorted(pathlib.Path(sys.argv[1]).iterdir()):
     with contextlib.suppress(VideoError):
         read_video(path)
@@ -624,14 +624,14 @@ def test_a_full_disk_is_noticed(tmp_path, name):
     """OpenCV says nothing when its writes fail; a limit on file size stands in for the full disk."""
     program = """
 import resource, sys, numpy
-from foldgauss.io import video_file
+from foldgauss.io import write_image, write_video
 noise = numpy.random.default_rng(0).integers(0, 256, (12, 64, 64, 3)).astype(numpy.uint8)
 resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))
 try:
     if sys.argv[1].endswith(".png"):
-        video_file.write_image(sys.argv[1], noise[0])
+        write_image(sys.argv[1], noise[0])
     else:
-        video_file.write_video(sys.argv[1], noise, 25)
+        write_video(sys.argv[1], noise, 25)
 except OSError as error:
     print(type(error).__name__)
 """
@@ -666,9 +666,9 @@ def test_a_gif_is_read(tmp_path):
 
 
 def test_frames_of_many_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(video_file, "BLOCK_BYTES", 3 * 20 * 24 * 3)
+    monkeypatch.setattr(resizing, "BLOCK_BYTES", 3 * 20 * 24 * 3)
     frames = np.random.default_rng(0).integers(0, 256, (8, 20, 24, 3), np.uint8)
-    kept = video_file._in_blocks(frames)
+    kept = resizing.copy_to_blocks(frames)
     assert len({id(frame.base) for frame in kept}) == 3
-    np.testing.assert_array_equal(video_file.stacked(kept), frames)
-    assert video_file._in_blocks(iter(())) == []
+    np.testing.assert_array_equal(resizing.stack_frames(kept), frames)
+    assert resizing.copy_to_blocks(iter(())) == []

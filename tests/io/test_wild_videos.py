@@ -18,10 +18,8 @@ import pytest
 from commands import run
 from PIL import Image
 
-from foldgauss.io import load_video_model
-from foldgauss.io.media import containers as _containers
-from foldgauss.io.media import video_file
-from foldgauss.io.media.video_file import VideoError, read_video, write_video
+from foldgauss.io import VideoError, load_video_model, read_video, write_video
+from foldgauss.io.media import format_detection, image_files, opencv, video_decoding
 
 OLD = int(cv2.__version__.split(".")[0]) < 5
 FLAT = np.array(
@@ -374,7 +372,7 @@ def test_a_clip_in_which_nothing_moves_is_read(tmp_path):
 
 def test_what_does_not_convert_is_asked_of_the_frames_that_stay(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(video_file, "_converts", lambda path, num_frames: asked.append(num_frames) or False)
+    monkeypatch.setattr(video_decoding, "_can_convert", lambda path, num_frames: asked.append(num_frames) or False)
     moving = _noise(6)
     read_video(_exact_avi(tmp_path / "a.avi", moving))
     assert asked == []
@@ -444,10 +442,10 @@ def test_edit_lists_that_are_none(tmp_path, mp4, length):
         at = mp4.index(name)
         (tmp_path / "a.mp4").write_bytes(mp4[:at] + b"free" + mp4[at + 4 :])
         with open(tmp_path / "a.mp4", "rb") as file:
-            assert _containers.shown_seconds(file) is None
+            assert format_detection.read_shown_seconds(file) is None
         (tmp_path / "a.mp4").write_bytes(mp4[: at + length])
         with open(tmp_path / "a.mp4", "rb") as file:
-            assert _containers.shown_seconds(file) is None
+            assert format_detection.read_shown_seconds(file) is None
 
 
 @pytest.mark.parametrize(
@@ -487,7 +485,7 @@ def test_a_rate_that_is_not_known_is_told(tmp_path):
     for name in ("a.h264", "fast.mp4"):
         clip = read_video(tmp_path / name)
         assert (clip.num_frames, clip.fps, len(clip.notes)) == (8, 25, 1)
-        assert "no rate is told that can be used; taken as 25" in clip.notes[0]
+        assert "no usable frame rate; 25 frames per second are assumed" in clip.notes[0]
         given = read_video(tmp_path / name, fps=30)
         assert (given.fps, given.notes) == (30, ())
 
@@ -536,7 +534,7 @@ def test_broken_frames_are_left_out(tmp_path, broken):
     sound = [k for k in range(8) if k not in broken and k - 1 not in broken]
     np.testing.assert_array_equal(clip.frames, _noise()[sound])
     assert clip.num_declared == 8
-    assert "cannot be decoded, and are left out" in clip.notes[0]
+    assert "cannot be decoded and are left out" in clip.notes[0]
     shown = np.array(sound) / 10
     if np.ptp(np.diff(sound)):  # there is a gap in the middle
         np.testing.assert_allclose(clip.times, shown - shown[0], atol=1e-3)
@@ -565,7 +563,7 @@ def test_a_gif_whose_frames_cannot_be_counted(tmp_path, monkeypatch):
     first, *rest = (Image.fromarray(frame) for frame in _waves())
     first.save(tmp_path / "a.gif", save_all=True, append_images=rest, duration=100)
     whole = read_video(tmp_path / "a.gif")
-    monkeypatch.setattr(video_file, "_promised_pictures", lambda animation: 0)
+    monkeypatch.setattr(image_files, "_count_declared_images", lambda animation: 0)
     clip = read_video(tmp_path / "a.gif")
     np.testing.assert_array_equal(clip.frames, whole.frames)
     np.testing.assert_array_equal(read_video(tmp_path / "a.gif", frames=(2, 4)).frames, whole.frames[2:4])
@@ -595,7 +593,7 @@ OTHERS = {
     "nothing": (lambda path: path.write_bytes(b""), "an empty file"),
     "zeros": (lambda path: path.write_bytes(bytes(5000)), "5000 bytes"),
     "text": (lambda path: path.write_text("Dear diary,\n" * 40), "a text"),
-    "sound": (_wav, "sound"),
+    "audio": (_wav, "audio"),
     "zip": (_zip, "a zip archive"),
     "model": (lambda path: path.write_bytes(struct.pack("<Q", 2) + b"{}"), "a model"),
     "list": (lambda path: path.write_text("#EXTM3U\nother.ts\n"), "a list of other files"),
@@ -623,7 +621,7 @@ def test_sound_with_a_cover_is_no_video(tmp_path):
     _ffmpeg(*given, "-c:a", "aac", "-c:v", "copy", "-disposition:v", "attached_pic", tmp_path / "a.m4a")
     _refused(tmp_path / "a.m4a", "cover")
     _ffmpeg("-f", "lavfi", "-i", "sine=d=0.2", "-c:a", "aac", tmp_path / "b.mp4")
-    _refused(tmp_path / "b.mp4", "sound")
+    _refused(tmp_path / "b.mp4", "audio")
 
 
 @pytest.mark.parametrize("name", ["clip.mp4", "clip.safetensors", "clip.txt", "clip"])
@@ -687,7 +685,7 @@ def test_names_that_are_no_unicode_are_refused(tmp_path, mp4, made):
             file.write(mp4 if made == "video" else _png(_noise(1)[0]))
     except OSError as error:
         pytest.skip(f"this file system has no such names: {error}")
-    _refused(name, "no Unicode")
+    _refused(name, "not Unicode")
 
 
 def test_a_pattern_is_no_file(tmp_path):
@@ -702,7 +700,7 @@ def test_a_pattern_is_no_file(tmp_path):
     "address", ["http://127.0.0.1:9/a.mp4", "rtsp://127.0.0.1/a", "file:///a.mp4", "concat:/a.mp4"]
 )
 def test_addresses_are_not_fetched(address):
-    with pytest.raises(FileNotFoundError, match=r"address.*Nothing is fetched: download it first"):
+    with pytest.raises(FileNotFoundError, match=r"address.*Download it first"):
         read_video(address)
 
 
@@ -725,15 +723,15 @@ def test_lists_let_nothing_in(tmp_path, monkeypatch, kind, name, hidden):
     path.write_text(LISTS[kind])
     _exact_avi(tmp_path / "clip.avi", _noise())
     if hidden:
-        monkeypatch.setattr(video_file, "kind_of", lambda head: None)
-    _refused(path, "does not open as a video" if hidden else "never opened")
+        monkeypatch.setattr(opencv, "describe_kind", lambda head: None)
+    _refused(path, "does not open as a video" if hidden else "are not opened")
 
 
 def test_the_second_door_is_needed(tmp_path):
     """Without it FFmpeg reads the file that a list names."""
     (tmp_path / "list.txt").write_text(LISTS["ffconcat"])
     _exact_avi(tmp_path / "clip.avi", _noise())
-    with video_file.quiet():
+    with opencv.silence_opencv():
         capture = cv2.VideoCapture(str(tmp_path / "list.txt"), cv2.CAP_FFMPEG)
         assert capture.read()[0]
         capture.release()
@@ -806,8 +804,8 @@ def test_images_of_one_colour_are_not_taken_for_them(tmp_path, suffix):
 
 def test_huge_videos_are_refused_before_a_frame_is_decoded(tmp_path, mp4, monkeypatch):
     (tmp_path / "a.mp4").write_bytes(mp4)
-    monkeypatch.setattr(video_file, "MAX_PIXELS", 48 * 64 - 1)
-    monkeypatch.setattr(video_file, "frames_grabbed", None)
+    monkeypatch.setattr(opencv, "MAX_PIXELS", 48 * 64 - 1)
+    monkeypatch.setattr(opencv, "grab_frames", None)
     _refused(tmp_path / "a.mp4", "at most 3,071 pixels", "48x64", "a.mp4")
 
 

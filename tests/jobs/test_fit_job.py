@@ -15,7 +15,7 @@ from drifting import CONFIG, write_drifting
 import foldgauss.jobs.fitting as fitting
 from foldgauss.io import index_video, load_video_model
 from foldgauss.io._atomic import OutputError
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.fitting import finished
 from foldgauss.video.fitting.economy import Economy
@@ -162,7 +162,7 @@ def test_a_span_is_found_by_its_index(clip, tmp_path):
 def test_a_job_waits_for_another_of_its_target_and_no_longer_than_it_may(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(fitting, "WAIT_SECONDS", 0.0)
     job = job_of(clip, tmp_path)
-    with only_writer(Path(job.target)), pytest.raises(OutputError, match="nobody else is writing"):
+    with lock_output(Path(job.target)), pytest.raises(OutputError, match="no other process is writing"):
         fit_job(job)
 
 

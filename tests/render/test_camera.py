@@ -65,7 +65,7 @@ def test_front_camera_is_to_pixels(aspect, size):
 
 
 @pytest.mark.parametrize("engine", ["reference", "cpu"])
-def test_front_picture_is_the_flat_one(engine):
+def test_front_camera_renders_the_flat_image(engine):
     gaussians = flat_scene()
     flat = render(gaussians.to_flat().to_pixels(SIZE), SIZE, engine=engine, options=SMOOTH)
     seen = render(project(gaussians, Camera.front(0.5), SIZE), SIZE, engine=engine, options=SMOOTH)
@@ -81,7 +81,7 @@ def test_published_geometry():
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-7, 1e-3])
-def test_flat_there_and_back(thickness):
+def test_to_flat_inverts_from_flat(thickness):
     rng = np.random.default_rng(0)
     leaves = rng.normal(size=(30, 2)), rng.normal(size=(30, 2, 2)), rng.uniform(size=30), rng.uniform(size=(30, 3))
     splats = Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
@@ -127,7 +127,7 @@ def test_mirror_in_double_precision(aspect, size):
         np.testing.assert_array_equal(splats[0].color, splats[1].color)  # ties: array order in both
 
 
-def test_layers_change_places_behind():
+def test_opposing_camera_reverses_layers():
     gaussians = flat_scene(2)
     layers = Gaussians3D(gaussians.mean.at[:, 2].set(jnp.asarray([0.1, -0.1])), *jax.tree.leaves(gaussians)[1:])
     front, behind = (project(layers, camera(0.5), SIZE).color for camera in (Camera.front, Camera.opposing))
@@ -223,7 +223,7 @@ def test_projection_is_the_pinhole_and_its_jacobian():
             np.testing.assert_allclose(covariance(seen), root @ jnp.swapaxes(root, 1, 2), rtol=1e-10, atol=1e-10)
 
 
-def test_linearised_no_farther_than_the_clamp():
+def test_jacobian_is_clipped():
     """Outside 1.3 fields of view the shape is that of the clamp's edge at the same depth; the mean is not held."""
     camera, focal = Camera.front(0.5), float(Camera.front(0.5).focal(SIZE))
     depth = float(-camera.position[2])
@@ -299,7 +299,7 @@ def test_depth_order_and_array_order():
             np.testing.assert_array_equal(one, other[nearest_first])
 
 
-def test_a_flat_picture_at_a_slant_needs_array_order():
+def test_flat_image_at_a_slant_needs_array_order():
     """One splat covers another of its plane from everywhere in front; by depth of centres it does not."""
     disc = (jnp.asarray([[0.0, 0.0], [0.05, 0.0]]), jnp.full((2, 2), 0.1), jnp.zeros(2), jnp.ones(2))
     gaussians = Gaussians3D.from_scale_angle(*disc, jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
@@ -309,7 +309,7 @@ def test_a_flat_picture_at_a_slant_needs_array_order():
     assert depth[24, 48, 0] < 0.5
 
 
-def test_behind_the_camera_nothing_is_drawn():
+def test_nothing_behind_the_camera_is_rendered():
     z = jnp.asarray([-5.0, -1.388888, -1.38, 0.0, jnp.nan, jnp.inf])
     mean = jnp.stack([jnp.zeros(6), jnp.zeros(6), z], -1)
     scene = Gaussians3D(mean, jnp.tile(0.1 * jnp.eye(3), (6, 1, 1)), jnp.full(6, 0.5), jnp.ones((6, 3)))
@@ -382,7 +382,7 @@ def test_gradients_by_finite_differences(view):
         check_gradient(lambda tree: smooth_loss(*tree), (scene, camera))
 
 
-def test_gradient_of_a_picture():
+def test_gradient_of_an_image():
     with jax.enable_x64(True):
         scene, camera = flat_scene(10, dtype=np.float64, thickness=1e-5), Camera.front(0.5).orbit(0.6, 0.2)
         weights = jnp.asarray(np.random.default_rng(2).normal(size=(*SIZE, 3)))
@@ -489,11 +489,11 @@ def test_errors(make, message):
         make()
 
 
-def test_a_blind_camera_is_nan_under_tracing():
+def test_undetermined_camera_is_nan_under_tracing():
     assert bool(jnp.isnan(jax.jit(Camera.look_at)(jnp.asarray([0.0, -1.0, 0.0])).rotation[0]).all())
 
 
-def test_what_orbit_is_told():
+def test_orbit_checks_arguments():
     """Degrees are warned of, and what is no angle or place is refused; turns that are meant are not."""
     camera = Camera.front(0.5)
     camera.orbit(6.0, -1.5).orbit(4 * math.pi)

@@ -53,7 +53,7 @@ def test_equals_the_dense_solution(compositing, engine):
     np.testing.assert_allclose(colors, dense, atol=2e-4)
 
 
-def test_finds_the_colours_that_made_the_picture():
+def test_recovers_the_colors_of_an_image():
     splats, size = scene("plain")
     splats = jax.tree.map(lambda leaf: leaf[:30], splats)
     image = render(splats, size, background=BACKGROUND)
@@ -62,7 +62,7 @@ def test_finds_the_colours_that_made_the_picture():
     np.testing.assert_allclose(render(recolored(splats, solved), size, background=BACKGROUND), image, atol=1e-4)
 
 
-def test_unseen_splats_keep_their_colours():
+def test_invisible_splats_keep_their_colors():
     splats, size = scene("plain")
     away = Splats2D(splats.mean + 1e4, splats.factor, splats.opacity, splats.color)
     np.testing.assert_array_equal(solve_colors(away, jnp.ones((*size, 3)), ridge=0.0), splats.color)
@@ -79,7 +79,7 @@ def bunny(size):
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-def test_beats_descended_colours_on_a_real_frame(compositing):
+def test_beats_gradient_descent_on_a_real_frame(compositing):
     """The best of three rates of Adam, 200 steps each, from the same start; the solve has at most 60 iterations."""
     size = (90, 160)
     image = jnp.asarray(bunny(size))
@@ -124,14 +124,14 @@ def test_beats_descended_colours_on_a_real_frame(compositing):
         ({"options": RenderOptions(tile_size=8), "engine": "cpu"}, "tile_size"),
     ],
 )
-def test_refusals(change, message):
+def test_invalid_arguments_raise(change, message):
     splats, size = scene("plain")
     arguments = {"splats": [splats], "images": [np.zeros((*size, 3), np.float32)]} | change
     with pytest.raises(ValueError, match=message):
         solve_colors(**arguments)
 
 
-def test_one_number_that_is_not_finite_is_refused():
+def test_values_that_are_not_finite_raise():
     """It would stop the solve of every channel, in silence."""
     splats, size = scene("plain")
     image = np.zeros((*size, 3), np.float32)

@@ -12,7 +12,7 @@ from scenes import scene
 from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions, Splats2D, cpu
 from foldgauss.render import _cpu_kernels as kernels
-from foldgauss.render.footprint import pixel_centres
+from foldgauss.render.footprint import pixel_centers
 from foldgauss.render.reference import render_reference, splat_alpha
 
 NAMES = ("mean", "factor", "opacity", "color", "background")
@@ -49,8 +49,8 @@ def near_a_threshold(leaves, size, options):
     loose = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1.0, low_pass=options.low_pass)
     with jax.enable_x64(True):
         splats = Splats2D(*(jnp.asarray(leaf, jnp.float64) for leaf in leaves[:4]))
-        raw = jax.lax.map(lambda one: splat_alpha(one, pixel_centres(size, jnp.float64), loose), splats)
-        kept = jax.lax.map(lambda one: splat_alpha(one, pixel_centres(size, jnp.float64), options), splats)
+        raw = jax.lax.map(lambda one: splat_alpha(one, pixel_centers(size, jnp.float64), loose), splats)
+        kept = jax.lax.map(lambda one: splat_alpha(one, pixel_centers(size, jnp.float64), options), splats)
         near = np.abs(np.asarray(raw) / options.alpha_cutoff - 1) < 1e-4
         if options.support_radius is not None:
             edge = np.asarray(splats.opacity)[:, None, None] * np.exp(-(options.support_radius**2) / 2)
@@ -105,7 +105,7 @@ def test_alpha_of_one(stop):
     """No light passes a splat of alpha 1: what lies behind gets no gradient, what lies before gets a finite one."""
     leaves, size = leaves_of("plain", change=opaque)
     options = RenderOptions(alpha_ceiling=1.0, transmittance_stop=stop)
-    assert (cpu.forward(*leaves, size, options=options).light == 0).any()
+    assert (cpu.forward(*leaves, size, options=options).transmittance == 0).any()
     assert_agrees(leaves, size, "over", options)
 
 
@@ -140,17 +140,17 @@ def test_support_radius(kind, radius):
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
 @pytest.mark.parametrize("kind", ["plain", "curtain", "tiny", "one pixel", "none"])
-def test_statistics(kind, compositing):
+def test_visibility(kind, compositing):
     """Against the weights of a dense picture, in double precision."""
     leaves, size = leaves_of(kind)
     options = RenderOptions()
-    trace = cpu.forward(*leaves, size, compositing=compositing, options=options, statistics=True)
+    trace = cpu.forward(*leaves, size, compositing=compositing, options=options, visibility=True)
     plain = cpu.forward(*leaves, size, compositing=compositing, options=options)
-    assert plain.statistics is None
+    assert plain.visibility is None
     np.testing.assert_array_equal(trace.image, plain.image)
     splats = Splats2D(*map(jnp.asarray, leaves[:4]))
     if len(leaves[2]):
-        alpha = jax.lax.map(lambda one: splat_alpha(one, pixel_centres(size, jnp.float32), options), splats)
+        alpha = jax.lax.map(lambda one: splat_alpha(one, pixel_centers(size, jnp.float32), options), splats)
     alpha = np.asarray(alpha if len(leaves[2]) else np.zeros((0, *size)), np.float64)
     light, weights, drawn = np.ones(size), np.zeros_like(alpha), np.zeros_like(alpha)
     for k, own in enumerate(alpha):
@@ -158,29 +158,29 @@ def test_statistics(kind, compositing):
         weights[k] = drawn[k] * light
         if compositing == "over":
             light = light * (1 - drawn[k])
-    contribution, largest_alpha = trace.statistics
+    contribution, largest_alpha = trace.visibility
     # A splat at the very cutoff may be drawn by one and not by the other; so may one at the stop.
     np.testing.assert_allclose(contribution, weights.sum((1, 2)), rtol=1e-4, atol=2.5 / 255)
     slack = np.where(largest_alpha > 0.02, 1e-4, 2 / 255)
     close = np.abs(largest_alpha - drawn.max((1, 2), initial=0)) <= slack
     assert close.mean() > 0.99 if len(close) else True
-    np.testing.assert_allclose(trace.light, light, atol=1e-4)
+    np.testing.assert_allclose(trace.transmittance, light, atol=1e-4)
 
 
-def test_statistics_see_what_is_hidden():
+def test_hidden_splats_have_small_contribution():
     """The comparison above has power: in a curtain most splats contribute nothing, and the first ones most."""
     leaves, size = leaves_of("curtain")
-    contribution, largest_alpha = cpu.forward(*leaves, size, statistics=True).statistics
+    contribution, largest_alpha = cpu.forward(*leaves, size, visibility=True).visibility
     assert np.mean(contribution == 0) > 0.5
     assert contribution[:10].sum() > 0.9 * contribution.sum()
     np.testing.assert_array_equal(contribution == 0, largest_alpha == 0)
 
 
-def test_light_is_what_the_background_gets():
+def test_transmittance_is_the_weight_of_the_background():
     leaves, size = leaves_of("plain")
     white = cpu.forward(*leaves[:3], np.zeros_like(leaves[3]), np.ones(3, np.float32), size)
-    np.testing.assert_array_equal(white.image[1], white.light)
-    assert white.light.min() < 0.5 < white.light.max()
+    np.testing.assert_array_equal(white.image[1], white.transmittance)
+    assert white.transmittance.min() < 0.5 < white.transmittance.max()
 
 
 def test_screen_gradient():
@@ -189,8 +189,8 @@ def test_screen_gradient():
 
 
 def results(leaves, size, weights, **how):
-    trace = cpu.forward(*leaves, size, statistics=True, **how)
-    return [trace.image, trace.light, *trace.statistics, *cpu.backward(trace, weights)]
+    trace = cpu.forward(*leaves, size, visibility=True, **how)
+    return [trace.image, trace.transmittance, *trace.visibility, *cpu.backward(trace, weights)]
 
 
 @pytest.mark.parametrize("channels", [3, 6])
@@ -211,16 +211,16 @@ def test_bits_do_not_depend_on_threads(kind, channels):
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-def test_several_frames_are_as_one_by_one(compositing):
+def test_several_frames_equal_single_frames(compositing):
     """To the bit; the frames may have different numbers of splats."""
     leaves, size = leaves_of("plain")
     frames = [[leaf[k:] for leaf in leaves[:4]] + leaves[4:] for k in (0, 20, len(leaves[0]))]
     weights = np.random.default_rng(0).normal(size=(3, 3, *size)).astype(np.float32)
-    traces = cpu.forward_frames(frames, size, compositing=compositing, statistics=True)
+    traces = cpu.forward_frames(frames, size, compositing=compositing, visibility=True)
     grads = cpu.backward_frames(traces, weights)
     for frame, weight, trace, grad in zip(frames, weights, traces, grads, strict=True):
         alone = results(frame, size, weight, compositing=compositing)
-        for one, two in zip(alone, [trace.image, trace.light, *trace.statistics, *grad], strict=True):
+        for one, two in zip(alone, [trace.image, trace.transmittance, *trace.visibility, *grad], strict=True):
             np.testing.assert_array_equal(one, two)
 
 
@@ -229,7 +229,7 @@ def test_no_frames():
     assert cpu.backward_frames([], []) == []
 
 
-def test_cut_lists_keep_the_gradient():
+def test_trimmed_lists_keep_the_gradient():
     """Behind the last light nothing is kept, and nothing is lost: the gradient is that of the whole list."""
     leaves, size = leaves_of("curtain")
     weights = np.ones((3, *size), np.float32)
@@ -244,15 +244,15 @@ def test_cut_lists_keep_the_gradient():
         np.testing.assert_array_equal(one[:first], other[:first])
 
 
-def test_other_tiles_are_refused_with_a_cure():
+def test_other_tile_sizes_raise():
     leaves, size = leaves_of("one")
     cpu.forward(*leaves, size, options=RenderOptions(tile_size=16))
-    with pytest.raises(ValueError, match=r"options.tile_size.*slower"):
+    with pytest.raises(ValueError, match=r"options.tile_size.*other sizes"):
         cpu.forward(*leaves, size, options=RenderOptions(tile_size=8))
 
 
 @pytest.mark.parametrize(("colors", "background"), [(0, 0), (2, 3), (3, 2), (3, 0)])
-def test_channels_that_do_not_fit_are_refused(colors, background):
+def test_mismatched_channels_raise(colors, background):
     leaves, size = leaves_of("one")
     leaves[3:] = np.zeros((1, colors), np.float32), np.zeros(background, np.float32)
     with pytest.raises(ValueError, match=r"color, background: expected .* at least one channel"):
@@ -260,10 +260,10 @@ def test_channels_that_do_not_fit_are_refused(colors, background):
 
 
 @pytest.mark.parametrize("shape", [(2, 17, 16), (3, 16, 16), (17, 16, 3), (17, 16)])
-def test_gradients_that_do_not_fit_are_refused(shape):
+def test_mismatched_gradients_raise(shape):
     leaves, size = leaves_of("one")
     trace = cpu.forward(*leaves, size)
-    with pytest.raises(ValueError, match=r"^grad_image: expected the picture's shape \(3, 17, 16\)"):
+    with pytest.raises(ValueError, match=r"^grad_image: expected the image's shape \(3, 17, 16\)"):
         cpu.backward(trace, np.zeros(shape, np.float32))
 
 
@@ -276,15 +276,15 @@ def test_nan_reaches_no_tile_and_no_cell():
     for column in range(8):
         block = np.ones((8, num), np.float32)
         block[column] = nan
-        kernels._tiles_of(num, block.ravel(), one, one, width, first, end)
+        kernels._find_tiles(num, block.ravel(), one, one, width, first, end)
         assert 0 <= first.min() <= end.max() <= 4
         assert (first <= end).all()
-        kernels._cells_of(num, block.ravel(), first_cell, end_cell)
+        kernels._find_cells(num, block.ravel(), first_cell, end_cell)
         assert 0 <= first_cell.min() <= first_cell.max() <= kernels.CELLS
         assert 0 <= end_cell.min() <= end_cell.max() <= kernels.CELLS
-    kernels._tiles_of(num, np.full(8 * num, nan), one, one, width, first, end)
+    kernels._find_tiles(num, np.full(8 * num, nan), one, one, width, first, end)
     np.testing.assert_array_equal(first, end)
-    kernels._cells_of(num, np.full(8 * num, nan), first_cell, end_cell)
+    kernels._find_cells(num, np.full(8 * num, nan), first_cell, end_cell)
     assert (end_cell <= first_cell).all()
 
 
@@ -322,7 +322,7 @@ def test_exponential():
 
 
 @pytest.mark.parametrize("changed", range(5))
-def test_arrays_that_do_not_fit_are_refused(changed):
+def test_mismatched_arrays_raise(changed):
     """The kernels check no bounds."""
     num = 200
     leaves = [np.zeros(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, 3), (3,))]

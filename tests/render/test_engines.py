@@ -15,9 +15,8 @@ import pytest
 from scenes import KINDS, check_slope, scene
 
 from foldgauss._runtime import threads as _threads
-from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project, render
-from foldgauss.render import api as door
-from foldgauss.render.footprint import pixel_centres
+from foldgauss.render import ENGINES, Camera, Gaussians3D, RenderOptions, Splats2D, api, cpu, project, render
+from foldgauss.render.footprint import pixel_centers
 from foldgauss.render.reference import splat_alpha
 
 #: Engine "pallas" takes no ceiling of 1 and, interpreted, long to compile: test_pallas.py.
@@ -29,7 +28,7 @@ OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, tra
 def near_a_threshold(splats, size, options):
     """Pixels where some alpha is within 1e-4 of the cutoff: there float32 may fall on either side."""
     loose = RenderOptions(alpha_cutoff=1e-8, low_pass=options.low_pass)
-    centres = pixel_centres(size, jnp.float32)
+    centres = pixel_centers(size, jnp.float32)
     if splats.opacity.size == 0:
         return np.zeros(size, bool)
     alphas = jax.lax.map(lambda splat: splat_alpha(splat, centres, loose), splats)
@@ -104,15 +103,15 @@ def test_cpu_in_chunks(monkeypatch):
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     weights = np.random.default_rng(0).normal(size=(3, *size)).astype(np.float32)
     results = []
-    for chunk in (cpu.CHUNK, 32):
-        monkeypatch.setattr(cpu, "CHUNK", chunk)
+    for chunk in (cpu.SPLATS_PER_TASK, 32):
+        monkeypatch.setattr(cpu, "SPLATS_PER_TASK", chunk)
         trace = cpu.forward(*leaves, size)
         results.append([trace.image, *cpu.backward(trace, weights)])
     for one, two in zip(*results, strict=True):
         np.testing.assert_array_equal(one, two)
 
 
-def test_lists_are_cut_behind_the_last_light():
+def test_lists_end_where_all_pixels_are_finished():
     splats, size = scene("curtain")
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     trace = cpu.forward(*leaves, size)
@@ -270,7 +269,7 @@ def squared_grads_and_picture(splats, size, engine):
 @pytest.mark.parametrize("engine", OTHERS)
 @pytest.mark.parametrize("leaf", ["mean", "factor", "opacity", "color"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_splat_that_is_not_finite_is_as_none(engine, leaf, value):
+def test_splats_that_are_not_finite_are_left_out(engine, leaf, value):
     """In the picture and in every gradient; its own gradient is 0."""
     splats, size = scene("plain")
     names = ("mean", "factor", "opacity", "color")
@@ -286,7 +285,7 @@ def test_a_splat_that_is_not_finite_is_as_none(engine, leaf, value):
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-def test_nothing_breaks_on_degenerate_splats(engine):
+def test_degenerate_splats_give_finite_images(engine):
     """Non-finite or singular splats are not drawn; the others are."""
     splats, size = scene("plain")
     bad = jnp.asarray([jnp.nan, jnp.inf, 0.0, 1e30])
@@ -330,7 +329,7 @@ SLANTED = [
 
 
 @pytest.mark.parametrize(("factor", "drawn"), SLANTED)
-def test_engines_agree_on_which_slanted_splats_are_drawn(factor, drawn):
+def test_engines_agree_on_which_slanted_splats_are_rendered(factor, drawn):
     """On a pixel's centre, where alpha is the opacity however thin the splat is."""
     splats = Splats2D(jnp.full((1, 2), 8.5), jnp.asarray([factor], jnp.float32), jnp.asarray([0.5]), jnp.ones((1, 3)))
     for engine in OTHERS:
@@ -342,7 +341,7 @@ def test_engines_agree_on_which_slanted_splats_are_drawn(factor, drawn):
         assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(grads)), engine
 
 
-def test_auto_takes_xla_where_the_cpu_engine_refuses():
+def test_auto_uses_xla_for_options_cpu_lacks():
     splats, size = scene("plain")
     options = RenderOptions(tile_size=8)
     np.testing.assert_array_equal(
@@ -367,14 +366,14 @@ def test_a_second_call_compiles_nothing(caplog):
 @pytest.mark.parametrize(
     "channels", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)]
 )
-def test_the_slower_callback_draws_the_same(channels, monkeypatch):
+def test_fallback_callback_renders_the_same(channels, monkeypatch):
     """Where JAX no longer has `buffer_callback`."""
     splats, size = scene("plain")
     color = jnp.asarray(np.random.default_rng(0).uniform(size=(len(splats.mean), channels)), jnp.float32)
     splats = dataclasses.replace(splats, color=color)
     draw = jax.value_and_grad(lambda own: jnp.sum(render(own, size, engine="cpu") ** 2))
     value, gradient = draw(splats)
-    monkeypatch.setattr(door, "buffer_callback", None)
+    monkeypatch.setattr(api, "buffer_callback", None)
     jax.clear_caches()
     again, same = draw(splats)
     assert value == again
@@ -395,7 +394,7 @@ def test_channels(engine, channels):
 
 @pytest.mark.parametrize("engine", OTHERS)
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-def test_exact_options_are_the_formula(engine, compositing):
+def test_exact_options_match_the_equation(engine, compositing):
     """The picture by its definition, in NumPy and double precision, with opacities of 0 and 1."""
     with jax.enable_x64(True):
         splats, size = scene("plain", dtype=np.float64)
@@ -404,7 +403,7 @@ def test_exact_options_are_the_formula(engine, compositing):
         splats = Splats2D(splats.mean, splats.factor, opacity, splats.color)
         options = RenderOptions.exact()
         picture = render(splats, size, background=BACKGROUND, compositing=compositing, engine=engine, options=options)
-    offsets = np.asarray(pixel_centres(size, np.float32), np.float64)[:, :, None] - np.asarray(splats.mean)
+    offsets = np.asarray(pixel_centers(size, np.float32), np.float64)[:, :, None] - np.asarray(splats.mean)
     inverse = np.linalg.inv(np.asarray(splats.factor) @ np.asarray(splats.factor).transpose(0, 2, 1))
     alpha = np.asarray(opacity) * np.exp(-0.5 * np.einsum("hwni,nij,hwnj->hwn", offsets, inverse, offsets))
     behind = np.cumprod(1 - alpha, axis=-1) if compositing == "over" else np.ones_like(alpha)
@@ -458,33 +457,33 @@ def test_gradient_at_alpha_one(engine):
         ({"engine": "xla", "options": RenderOptions(list_capacity=10)}, "list_capacity"),
     ],
 )
-def test_bad_arguments(changes, message):
+def test_invalid_arguments_raise(changes, message):
     splats, size = scene("plain")
     with pytest.raises(ValueError, match=message):
         render(splats, **({"size": size} | changes))
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-def test_colours_without_a_channel_are_refused(engine):
+def test_colors_without_a_channel_raise(engine):
     splats, size = scene("plain")
     bare = Splats2D(splats.mean, splats.factor, splats.opacity, splats.color[:, :0])
     with pytest.raises(ValueError, match=r"^splats.color: expected at least one channel"):
         render(bare, size, engine=engine)
 
 
-def test_a_batch_is_refused_with_a_cure():
+def test_batches_raise():
     splats, size = scene("plain")
     with pytest.raises(ValueError, match="vmap"):
         render(jax.tree.map(lambda leaf: leaf[None], splats), size)
 
 
-def test_bad_shapes():
+def test_mismatched_shapes_raise():
     splats, _ = scene("plain")
     with pytest.raises(ValueError, match="mean, factor, opacity, color"):
         Splats2D(splats.mean, splats.factor, splats.opacity[:-1], splats.color)
 
 
-def test_things_that_are_no_splats_are_refused():
+def test_other_types_raise():
     splats, size = scene("plain")
     with pytest.raises(ValueError, match=r"splats: expected Splats2D, got Gaussians3D.*project"):
         render(Gaussians3D.from_flat(splats), size)

@@ -41,7 +41,7 @@ def test_agrees_with_reference(kind, compositing, options):
 @pytest.mark.parametrize(
     "tile", [16, pytest.param(8, marks=pytest.mark.slow), pytest.param(32, marks=pytest.mark.slow)]
 )
-def test_several_rounds_are_one(tile):
+def test_several_rounds_equal_one(tile):
     """What does not fit into the lists at once is drawn later; of many rounds not every start is kept."""
     splats, size = scene("huge")
     judgement = judged("huge", "over", "default")
@@ -52,7 +52,7 @@ def test_several_rounds_are_one(tile):
     plan = pallas._plan(leaves, size, "over", options)
     if tile == 16:
         number, *_ = jax.jit(functools.partial(pallas._forward, plan))(leaves)
-        assert int(number) > tiles.KEPT_ROUNDS
+        assert int(number) > tiles.STORED_ROUNDS
     grads, picture = grads_and_picture("pallas", size, "over", options, *leaves_for(splats, judgement, size))
     check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
 
@@ -97,7 +97,7 @@ def test_it_lowers_for_a_gpu(compositing):
 @pytest.mark.parametrize(
     ("options", "name"), [({"alpha_ceiling": 1.0}, "alpha_ceiling"), ({"tile_size": 12}, "tile_size")]
 )
-def test_what_it_does_not_take(options, name):
+def test_unsupported_options_raise(options, name):
     splats, size = scene("one")
     with pytest.raises(ValueError, match=name):
         render(splats, size, engine="pallas", options=RenderOptions(**options))
@@ -115,7 +115,7 @@ def test_dtypes(dtype):
 
 
 @pytest.mark.slow
-def test_what_is_not_finite_is_left_out():
+def test_splats_that_are_not_finite_are_left_out():
     splats, size = scene("one")
     broken = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.full_like(leaf, jnp.nan)]), splats)
     one, other = (

@@ -22,7 +22,7 @@ def test_pixels_per_unit(size, aspect, unit):
     assert pixels_per_unit(size, aspect=aspect) == unit
 
 
-def test_to_pixels_keeps_the_centre_and_scales_all_lengths():
+def test_to_pixels_keeps_the_center_and_scales_lengths():
     factor = jnp.asarray([[[0.1, 0.02], [0.0, 0.05]]])
     splats = Splats2D(jnp.asarray([[0.25, -0.125]]), factor, jnp.ones(1), jnp.ones((1, 3)))
     pixels = splats.to_pixels((160, 320))
@@ -31,7 +31,7 @@ def test_to_pixels_keeps_the_centre_and_scales_all_lengths():
 
 
 @pytest.mark.parametrize("size", [(0, 5), (5,), (5, 5, 3), (2.5, 5), 5, None, "55"])
-def test_bad_sizes_of_pictures(size):
+def test_invalid_image_sizes_raise(size):
     splats = Splats2D(jnp.zeros((1, 2)), jnp.eye(2)[None], jnp.ones(1), jnp.ones((1, 3)))
     for call in (splats.to_pixels, lambda size: pixels_per_unit(size, aspect=1.0)):
         with pytest.raises(ValueError, match=r"^size: expected \(height, width\)"):
@@ -49,20 +49,20 @@ def test_bad_sizes_of_pictures(size):
         ((), (2, 2), (), (3,)),
     ],
 )
-def test_bad_shapes(shapes):
+def test_mismatched_shapes_raise(shapes):
     expected = r"shapes \(num, 2\), \(num, 2, 2\), \(num,\), \(num, channels\)"
     with pytest.raises(ValueError, match=f"^mean, factor, opacity, color: expected {expected}, got "):
         Splats2D(*map(jnp.zeros, shapes))
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 4), (0,)])
-def test_good_shapes(batch):
+def test_matching_shapes_are_accepted(batch):
     Splats2D(*(jnp.zeros((*batch, *shape)) for shape in ((2,), (2, 2), (), (3,))))
 
 
 @pytest.mark.parametrize("field", ["alpha_cutoff", "alpha_ceiling", "low_pass", "transmittance_stop", "support_radius"])
 @pytest.mark.parametrize("value", [-1.0, float("nan"), "much", float("inf")])
-def test_bad_options(field, value):
+def test_invalid_options_raise(field, value):
     with pytest.raises(ValueError, match=field):
         RenderOptions(**{field: value})
 
@@ -80,12 +80,12 @@ def test_bad_options(field, value):
         {"support_radius": 0.05},
     ],
 )
-def test_bad_sizes_and_bounds(change):
+def test_options_out_of_bounds_raise(change):
     with pytest.raises(ValueError, match=f"RenderOptions.{next(iter(change))}"):
         RenderOptions(**change)
 
 
-def test_options_are_kept_as_numbers_of_python():
+def test_options_are_stored_as_python_numbers():
     options = RenderOptions(
         low_pass=np.float32(0.25), support_radius=3, tile_size=np.int32(8), list_capacity=np.int64(2**30 - 2)
     )
@@ -94,7 +94,7 @@ def test_options_are_kept_as_numbers_of_python():
 
 
 @pytest.mark.parametrize("aspect", [0, -0.5, np.inf, np.nan, "wide"])
-def test_bad_aspects(aspect):
+def test_invalid_aspects_raise(aspect):
     splats = Splats2D(jnp.zeros((1, 2)), jnp.eye(2)[None], jnp.ones(1), jnp.ones((1, 3)))
     for call in (splats.to_pixels, pixels_per_unit):
         with pytest.raises(ValueError, match=r"^aspect: expected a frame's height / width"):

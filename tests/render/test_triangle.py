@@ -89,7 +89,7 @@ def test_round_trip_anywhere_in_space():
     np.testing.assert_allclose(third, 1, rtol=1e-4)
 
 
-def test_triangles_there_and_back():
+def test_triangle_round_trip():
     """A face with a right angle is the same face; any other becomes the right-angled one of its Gaussian."""
     rng = np.random.default_rng(1)
     vertices = jnp.asarray(rng.normal(size=(100, 3, 3)), jnp.float32)
@@ -138,7 +138,7 @@ def test_wrong_normal_would_fail():
     assert np.median(np.abs(np.linalg.norm(second, axis=-1) / scale[:, 1] - 1)) > 0.1
 
 
-def test_moving_the_origin_of_space_does_not_hurt():
+def test_accurate_far_from_the_origin():
     """Edges are kept: a splat of 1e-5 at a distance of 1000 comes back to 1e-6; through vertices it could not."""
     gaussians = Gaussians3D.from_scale_angle(*parameters(20, longest=1e-5), *rest(20))
     far = Gaussians3D(gaussians.mean + 1e3, gaussians.factor, gaussians.opacity, gaussians.color)
@@ -163,7 +163,7 @@ BAD_FACES = {
 
 
 @pytest.mark.parametrize("kind", BAD_FACES)
-def test_faces_without_area(kind):
+def test_faces_without_area_raise(kind):
     good = [[1.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]
     triangles = Triangles(jnp.zeros((2, 3)), jnp.asarray([good, BAD_FACES[kind]]), *rest(2))
     with pytest.raises(ValueError, match=r"edges: .*1 without area, the first at index 1\..*Move a vertex"):
@@ -178,13 +178,13 @@ def test_nan_in_nan_out():
     assert bool(jnp.isnan(triangles.to_gaussians().factor).all())
 
 
-def test_thin_slanted_faces_are_faces():
+def test_thin_slanted_faces_are_valid():
     edges = jnp.asarray([[[1.0, 0.0, 0.0], [1e4, 1.0, 0.0]]])
     factor = Triangles(jnp.zeros((1, 3)), edges, *rest(1)).to_gaussians().factor
     np.testing.assert_allclose(factor[0, :, :2], [[1, 0], [0, 1], [0, 0]], atol=1e-6)
 
 
-def test_a_factor_that_is_not_flat():
+def test_factor_that_is_not_flat_raises():
     tril = jnp.asarray([[[1.0, 0, 0], [0.5, 1, 0], [0.3, 0.2, 0.1]]])
     with pytest.raises(ValueError, match=r"gaussians\.factor.*from_flat"):
         Triangles.from_gaussians(Gaussians3D(jnp.zeros((1, 3)), tril, *rest(1)))

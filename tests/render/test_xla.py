@@ -65,11 +65,11 @@ def test_rounds_change_nothing(kind, compositing):
     check_same(*results, 1e-5)
 
 
-def test_more_pairs_than_room_is_no_loss(monkeypatch):
+def test_capacity_does_not_change_the_image(monkeypatch):
     """Eager, too: the room is counted, and bounded."""
     splats, size = scene("huge")
     truth = draw(splats, size)
-    monkeypatch.setattr(tiles, "MOST_SLOTS", 64)
+    monkeypatch.setattr(tiles, "MAX_SLOTS", 64)
     np.testing.assert_allclose(draw(splats, size), truth, atol=1e-6)
 
 
@@ -108,7 +108,7 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
     splats, size = scene("huge")
     leaves, weights = leaves_of(splats), weights_for(size)
-    calls, grads = counted(monkeypatch, "_draw_round"), []
+    calls, grads = counted(monkeypatch, "_composite_round"), []
     for options in (RenderOptions(), RenderOptions(list_capacity=capacity)):
         plan = xla._plan(leaves, size, "over", options)
         del calls[:]
@@ -122,7 +122,7 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
 
 
 @pytest.mark.parametrize("size", [(40, 40), (44, 43)])
-def test_pixels_outside_the_picture_keep_no_tile_waiting(size, monkeypatch):
+def test_pixels_outside_the_image_count_as_finished(size, monkeypatch):
     """Tiles that reach beyond the picture are left once dark like others."""
     splats, _ = scene("curtain")
     leaves, calls = leaves_of(splats), counted(monkeypatch, "_load")
@@ -186,7 +186,7 @@ def test_a_hundred_thousand_splats_on_one_pixel():
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-def test_needles_a_metre_long(compositing):
+def test_long_needles(compositing):
     """1e4 : 1, at all angles."""
     rng = np.random.default_rng(0)
     angle = rng.uniform(0, np.pi, 40)
@@ -255,7 +255,7 @@ def test_gradient_by_finite_differences(leaf, compositing):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
-def test_half_precision_is_drawn_in_single(dtype):
+def test_half_precision_is_rendered_in_single(dtype):
     splats, size = scene("plain")
     half = jax.tree.map(lambda leaf: leaf.astype(dtype), splats)
     back = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), half)

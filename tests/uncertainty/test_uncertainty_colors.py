@@ -1,4 +1,4 @@
-"""Profiles with colours integrated out, beside explicit covariances of all pixels."""
+"""ProfileCurves with colours integrated out, beside explicit covariances of all pixels."""
 
 import dataclasses
 
@@ -8,11 +8,11 @@ import pytest
 import scipy.stats
 from soft_models import NUM, NUM_FRAMES, soft_model
 
-from foldgauss.uncertainty import FrameNoise, evidence
-from foldgauss.uncertainty.likelihood import colors as module
-from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, solved
-from foldgauss.uncertainty.likelihood.colors import evidence_without_colors
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty import FrameNoise, likelihood_profiles
+from foldgauss.uncertainty.likelihood import color_marginalization as module
+from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_colors
+from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, solve_conjugate_gradient
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 
 SIZE, NOISE, PRIOR, FRAME = (20, 32), 0.03, 0.3, 3
 
@@ -33,9 +33,9 @@ def over():
 
 def _filmed(model):
     rng = np.random.default_rng(5)
-    shown = np.moveaxis(np.stack(list(Screen(model, _nothing()).pictures(model.frame_times.times()))), 1, -1)
+    shown = np.moveaxis(np.stack(list(Residuals(model, _nothing()).render_at(model.frame_times.times()))), 1, -1)
     video = np.clip(np.rint(255 * (shown + NOISE * rng.normal(size=shown.shape))), 0, 255).astype(np.uint8)
-    return model, video, evidence(model, video, noise=FrameNoise(np.array(NOISE), np.array(0.5)))
+    return model, video, likelihood_profiles(model, video, noise=FrameNoise(np.array(NOISE), np.array(0.5)))
 
 
 def _nothing():
@@ -43,22 +43,22 @@ def _nothing():
 
 
 def _equations(model, video, base, prior_scale=PRIOR):
-    times = base.profiles.modes()
+    times = base.curves.modes()
     times[[0, -1]] = 0, 1
-    return ColorEquations(Screen(model, video), base.noise, times, prior_scale)
+    return ColorEquations(Residuals(model, video), base.noise, times, prior_scale)
 
 
 def _by_hand(equations, k, t, prior_scale=PRIOR):
     """The density of frame k's pixels, with their covariance written out."""
     precision, rhs = np.eye(NUM) / prior_scale**2, np.zeros((NUM, 3))
-    frames = equations.screen.frames.reshape(NUM_FRAMES, -1, 3) / 255
+    frames = equations.residuals.frames.reshape(NUM_FRAMES, -1, 3) / 255
     for j in range(NUM_FRAMES):
         if j != k:
             a = equations.weights(equations.times[j]).toarray()
             precision += a.T @ a / equations.variance[j]
-            rhs += a.T @ (frames[j] - a @ equations.colour) / equations.variance[j]
+            rhs += a.T @ (frames[j] - a @ equations.color) / equations.variance[j]
     covariance = np.linalg.inv(precision)
-    colour, a = equations.colour + covariance @ rhs, equations.weights(t).toarray()
+    colour, a = equations.color + covariance @ rhs, equations.weights(t).toarray()
     pixels = equations.variance[k] * np.eye(len(a)) + a @ covariance @ a.T
     expected = a @ colour
     return sum(scipy.stats.multivariate_normal(expected[:, c], pixels).logpdf(frames[k][:, c]) for c in range(3))
@@ -73,7 +73,7 @@ def test_exact_profile_is_the_gaussian_density_of_all_pixels(scene):
     curve = module._Dense(equations, FRAME)
     times = _times(equations, FRAME)
     for t in times:
-        curve.draw(t)
+        curve.evaluate(t)
     expected = np.array([_by_hand(equations, FRAME, t) for t in times])
     assert np.ptp(expected) > 0.5
     np.testing.assert_allclose(curve.profile()[1], expected - expected.max(), rtol=1e-6, atol=1e-6)
@@ -86,8 +86,8 @@ def test_estimated_profile_is_the_exact_one_given_all_probes(over):
     exact = module._Dense(equations, FRAME)
     estimated = module._Estimated(equations, FRAME, np.sqrt(num_pixels) * np.eye(num_pixels))
     for t in equations.times[FRAME] + np.linspace(-0.3, 0.3, 31):
-        exact.draw(t)
-        estimated.draw(t)
+        exact.evaluate(t)
+        estimated.evaluate(t)
     without = np.array([point.log_likelihood for point in estimated.points])
     expected, found = exact.values() - without, estimated.values() - without
     assert np.ptp(expected) > 0.5
@@ -96,17 +96,17 @@ def test_estimated_profile_is_the_exact_one_given_all_probes(over):
 
 def test_estimate_is_near_the_exact_profile(over):
     model, video, base = over
-    exact = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR)
-    near = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16)
-    nodes, values = exact[FRAME].one(0)
+    exact = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR)
+    near = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16)
+    nodes, values = exact[FRAME].nodes_and_values(0)
     top = values > -module.REACH
     np.testing.assert_allclose(near[FRAME](nodes[top, None])[:, 0], values[top], atol=0.5)
 
 
 def test_sure_colours_give_the_base_profile_back(over):
     model, video, base = over
-    found = evidence_without_colors(model, video, base, frames=[FRAME], prior_scale=1e-7)
-    nodes, values = base.profiles.one(FRAME)
+    found = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=1e-7)
+    nodes, values = base.curves.nodes_and_values(FRAME)
     top = values > -8
     np.testing.assert_allclose(found[FRAME](nodes[top, None])[:, 0], values[top], atol=0.1)
 
@@ -114,15 +114,15 @@ def test_sure_colours_give_the_base_profile_back(over):
 def test_profiles_are_wider_and_others_are_kept(scene):
     model, video, base = scene
     done = []
-    found = evidence_without_colors(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
+    found = marginalize_colors(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
     assert done == [(1, 2), (2, 2)]
     for k in range(NUM_FRAMES):
         if k not in (2, 4):
-            np.testing.assert_array_equal(found.one(k), base.profiles.one(k))
+            np.testing.assert_array_equal(found.nodes_and_values(k), base.curves.nodes_and_values(k))
             continue
-        assert _spread(found[k]) > 1.02 * _spread(base.profiles[k])
-        nodes, values = found.one(k)
-        own, _ = base.profiles.one(k)
+        assert _spread(found[k]) > 1.02 * _spread(base.curves[k])
+        nodes, values = found.nodes_and_values(k)
+        own, _ = base.curves.nodes_and_values(k)
         assert (nodes[0], nodes[-1]) == (own[0], own[-1])  # the same domain
         assert values.max() == 0
         fine = found[k](np.linspace(own[0], own[-1], 5001)[:, None])[:, 0]
@@ -142,17 +142,17 @@ def test_information_is_what_colours_leave_of_it(scene):
     equations = _equations(*scene)
     t, step = equations.times[FRAME], 1e-3
     at = equations.at(FRAME, t)
-    slope = ((equations.weights(t + step) - equations.weights(t - step)) / (2 * step)) @ equations.colour
-    seen = at.weights.T @ slope / at.variance
+    slope = ((equations.weights(t + step) - equations.weights(t - step)) / (2 * step)) @ equations.color
+    profiles = at.weights.T @ slope / at.variance
     held = (slope**2).sum() / at.variance
-    free = held - (seen * np.linalg.solve(at.dense(), seen)).sum()
+    free = held - (profiles * np.linalg.solve(at.dense(), profiles)).sum()
     assert 0 < free < 0.99 * held
 
 
 def test_seeds_reproduce(over):
     model, video, base = over
     few = {"frames": [FRAME], "most_dense": 0, "probes": 2}
-    one, same, other = (evidence_without_colors(model, video, base, **few, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (marginalize_colors(model, video, base, **few, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.values, same.values)
     assert one.count[FRAME] != other.count[FRAME] or (one.values[FRAME] != other.values[FRAME]).any()
 
@@ -162,14 +162,16 @@ def test_conjugate_gradients_solve_and_hold_still_at_zero():
     root = rng.normal(size=(30, 20))
     matrix, rhs = root.T @ root + np.eye(20), rng.normal(size=(20, 3))
     rhs[:, 1] = 0
-    found = solved(lambda x: matrix @ x, lambda r: r / np.diag(matrix)[:, None], rhs, np.zeros_like(rhs), 1e-10)
+    found = solve_conjugate_gradient(
+        lambda x: matrix @ x, lambda r: r / np.diag(matrix)[:, None], rhs, np.zeros_like(rhs), 1e-10
+    )
     np.testing.assert_allclose(found, np.linalg.solve(matrix, rhs), atol=1e-8)
 
 
 def test_equations_that_are_not_solved_are_told():
     rhs = np.ones((4, 1))
-    with pytest.raises(ValueError, match="prior_scale: expected colours solved to 1e-05"):
-        solved(np.zeros_like, lambda r: r, rhs, np.zeros_like(rhs), 1e-5)
+    with pytest.raises(ValueError, match="prior_scale: expected colors solved to 1e-05"):
+        solve_conjugate_gradient(np.zeros_like, lambda r: r, rhs, np.zeros_like(rhs), 1e-5)
 
 
 def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
@@ -178,13 +180,13 @@ def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
     base_values[2] = -1.0  # an island
     times = np.linspace(0.45, 0.56, 9)
     values = -1500 * (times - 0.505) ** 2
-    nodes, joined = module._joined(times, values, base_nodes, base_values)
+    nodes, joined = module._join(times, values, base_nodes, base_values)
     assert (np.diff(nodes) > 0).all()
     assert (nodes[0], nodes[-1]) == (0, 1)
     np.testing.assert_array_equal(joined[np.isin(nodes, times)], values)
     assert joined[nodes < times[0]].max() <= values[0]
     assert joined[nodes > times[-1]].max() <= values[-1]
-    fine = module.Profiles.of([nodes], [joined])(np.linspace(0, 1, 9999)[:, None])
+    fine = module.ProfileCurves.from_nodes([nodes], [joined])(np.linspace(0, 1, 9999)[:, None])
     assert fine.max() <= 0.01
 
 
@@ -199,19 +201,19 @@ def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
         ({"prior_scale": float("nan")}, "prior_scale: expected a number > 0"),
         ({"most_dense": -1}, "most_dense: expected a whole number >= 0"),
         ({"probes": 0}, "probes: expected a whole number >= 1"),
-        ({"base": None}, "base: expected an Evidence"),
-        ({"video": np.zeros((4, *SIZE, 3), np.uint8)}, "base: expected evidence of 4 frames"),
+        ({"base": None}, "base: expected LikelihoodProfiles"),
+        ({"video": np.zeros((4, *SIZE, 3), np.uint8)}, "base: expected profiles of 4 frames"),
         ({"video": np.zeros((7, 5, 5, 3), np.uint8)}, "video: expected"),
     ],
 )
 def test_wrong_input_is_told(over, change, match):
     model, video, base = over
     with pytest.raises(ValueError, match=match):
-        evidence_without_colors(**{"model": model, "video": video, "base": base, **change})
+        marginalize_colors(**{"model": model, "video": video, "base": base, **change})
 
 
 def test_models_with_numbers_missing_are_told(over):
     model, video, base = over
     broken = dataclasses.replace(model.splats, loc=jnp.asarray(model.splats.loc).at[0, 0].set(jnp.nan))
     with pytest.raises(ValueError, match="model: expected finite numbers"):
-        evidence_without_colors(dataclasses.replace(model, splats=broken), video, base)
+        marginalize_colors(dataclasses.replace(model, splats=broken), video, base)

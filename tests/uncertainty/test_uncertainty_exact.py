@@ -8,19 +8,19 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from time_clips import free_times, parabolas
 
-from foldgauss.uncertainty import FrameTimeLogProb, Increments, Profiles, exact_times, laplace_times
+from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves, exact_posterior, laplace_approximation
 
 #: Far from each other, in standard deviations: the order ties nothing, and the posterior is Gaussian.
 FAR = np.array([0.2, 0.4, 0.55, 0.8]), np.array([0.01, 0.02, 0.015, 0.01])
 
 
-def knowing_only(num_frames: int, known: tuple[int, ...] = (), at: float = 0.4, width: float = 1e-6) -> Profiles:
+def knowing_only(num_frames: int, known: tuple[int, ...] = (), at: float = 0.4, width: float = 1e-6) -> ProfileCurves:
     """Flat profiles, but of the frames `known`, which are at `at` to within `width`."""
     vague = np.linspace(0, 1, 4 * num_frames)
     near = np.concatenate([[0], at + width * np.linspace(-40, 40, 801), [1]])
     nodes = [near if k in known else vague for k in range(num_frames)]
     values = [-(((near - at) / width) ** 2) / 2 if k in known else 0 * vague for k in range(num_frames)]
-    return Profiles.of(nodes, values)
+    return ProfileCurves.from_nodes(nodes, values)
 
 
 def assert_near(found, frames, priors, starts, lengths):
@@ -32,9 +32,9 @@ def assert_near(found, frames, priors, starts, lengths):
         np.testing.assert_allclose(found.interval(0.9)[:, k], start + length * prior.ppf([0.05, 0.95]), atol=5e-3 * std)
 
 
-def by_quadrature(profiles, increments, far: float, points: int):
+def by_quadrature(curves, increments, far: float, points: int):
     """Mean and covariance of the free times, and the log-evidence, by sums over a grid of log-ratios."""
-    log_prob, num = FrameTimeLogProb(profiles, increments), increments.num_free
+    log_prob, num = FrameTimeLogProb(curves, increments), increments.num_free
     z = np.linspace(-far, far, points)
     grid = np.stack(np.meshgrid(*[z] * num, indexing="ij"), -1).reshape(-1, num)
     heights, times = log_prob(grid), increments.times(grid)[:, increments.free]
@@ -48,30 +48,30 @@ def by_quadrature(profiles, increments, far: float, points: int):
 @pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
 def test_two_frames_agree_with_quadrature(concentration, means):
     # Also where frames are so near, or so far out of order, that only their order keeps them apart.
-    profiles, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
-    mean, covariance, evidence = by_quadrature(profiles, increments, 14 / min(concentration, 1), 501)
-    found = exact_times(profiles, increments)
+    curves, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
+    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 14 / min(concentration, 1), 501)
+    found = exact_posterior(curves, increments)
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
     np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
-    assert found.log_evidence == pytest.approx(evidence, abs=1e-3)
+    assert found.log_evidence == pytest.approx(likelihood_profiles, abs=1e-3)
 
 
 @pytest.mark.parametrize("concentration", [1.0, 4.0])
 def test_three_frames_agree_with_quadrature(concentration):
-    profiles, increments = parabolas((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), 401), free_times(5, concentration)
-    mean, covariance, evidence = by_quadrature(profiles, increments, 10.0, 91)
-    found = exact_times(profiles, increments)
+    curves, increments = parabolas((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), 401), free_times(5, concentration)
+    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 10.0, 91)
+    found = exact_posterior(curves, increments)
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
     np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
-    assert found.log_evidence == pytest.approx(evidence, abs=2e-3)
+    assert found.log_evidence == pytest.approx(likelihood_profiles, abs=2e-3)
 
 
 def test_draws_have_the_quadratures_covariance():
-    profiles, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4)
-    _, covariance, _ = by_quadrature(profiles, increments, 14, 501)
-    draws = exact_times(profiles, increments).sample(40_000, 1)[:, 1:-1]
+    curves, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4)
+    _, covariance, _ = by_quadrature(curves, increments, 14, 501)
+    draws = exact_posterior(curves, increments).sample(40_000, 1)[:, 1:-1]
     found = np.corrcoef(draws.T)[0, 1]
     assert found == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), abs=0.02)
     np.testing.assert_allclose(np.cov(draws.T).diagonal(), covariance.diagonal(), rtol=0.03)
@@ -80,7 +80,7 @@ def test_draws_have_the_quadratures_covariance():
 
 def test_frames_far_apart_are_gaussian():
     means, widths = FAR
-    found = exact_times(parabolas(*FAR, 801), free_times(6))
+    found = exact_posterior(parabolas(*FAR, 801), free_times(6))
     np.testing.assert_allclose(found.mean()[1:-1], means, atol=1e-5)
     np.testing.assert_allclose(found.std()[1:-1], widths, rtol=2e-3)
     normal = scipy.stats.norm(means, widths)
@@ -93,7 +93,7 @@ def test_frames_far_apart_are_gaussian():
 
 def test_draws_follow_the_known_marginals():
     means, widths = FAR
-    found = exact_times(parabolas(*FAR, 801), free_times(6))
+    found = exact_posterior(parabolas(*FAR, 801), free_times(6))
     draws = found.sample(5000, 3)
     for k in range(4):  # 1 in 1000 right runs fails each; a width wrong by a fifth does, too
         assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], widths[k]).cdf).pvalue > 1e-3
@@ -104,7 +104,7 @@ def test_draws_follow_the_known_marginals():
 
 @pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 4.0, 20.0])
 def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
-    found = exact_times(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
+    found = exact_posterior(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
     draws = found.sample(4000, 0)
     for n, (grid, density) in enumerate(zip(found.grids, found.densities, strict=True)):
         steps = (density[1:] + density[:-1]) / 2 * np.diff(grid)
@@ -121,7 +121,7 @@ LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (0.2, 1.0, 3.0, 20
 
 @pytest.mark.parametrize(("num", "concentration"), [*[(n, a) for n in (4, 30) for a in (0.2, 1.0, 3.0, 20.0)], *LONG])
 def test_profiles_that_know_nothing_leave_the_prior(num, concentration):
-    found = exact_times(knowing_only(num), free_times(num, concentration))
+    found = exact_posterior(knowing_only(num), free_times(num, concentration))
     frames = sorted({1, 2, num // 3, num // 2, num - 2})
     priors = [scipy.stats.beta(concentration * k, concentration * (num - 1 - k)) for k in frames]
     assert_near(found, frames, priors, [0] * len(frames), [1] * len(frames))
@@ -132,19 +132,19 @@ def test_profiles_that_know_nothing_leave_the_prior(num, concentration):
 def test_a_frame_that_is_known_parts_the_prior_in_two(concentration):
     # Its time is known to a millionth, and nothing of any other: Beta densities on both sides.
     num, known = 12, 5
-    found = exact_times(knowing_only(num, (known,)), free_times(num, concentration))
+    found = exact_posterior(knowing_only(num, (known,)), free_times(num, concentration))
     before, after = [1, 2, known - 1], [known + 1, known + 2, num - 2]
     priors = [scipy.stats.beta(concentration * k, concentration * (known - k)) for k in before]
     assert_near(found, before, priors, [0] * 3, [0.4] * 3)
     priors = [scipy.stats.beta(concentration * (k - known), concentration * (num - 1 - k)) for k in after]
     assert_near(found, after, priors, [0.4] * 3, [0.6] * 3)
     assert found.std()[known] == pytest.approx(1e-6, rel=2e-3)
-    evidence = scipy.stats.beta(concentration * known, concentration * (num - 1 - known)).logpdf(0.4)
-    assert found.log_evidence == pytest.approx(evidence + np.log(1e-6 * np.sqrt(2 * np.pi)), abs=3e-3)
+    likelihood_profiles = scipy.stats.beta(concentration * known, concentration * (num - 1 - known)).logpdf(0.4)
+    assert found.log_evidence == pytest.approx(likelihood_profiles + np.log(1e-6 * np.sqrt(2 * np.pi)), abs=3e-3)
 
 
 def test_many_frames_that_nothing_is_known_of_need_few_points():
-    found = exact_times(knowing_only(300), free_times(300))
+    found = exact_posterior(knowing_only(300), free_times(300))
     assert max(map(len, found.grids)) < 1000
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
@@ -153,7 +153,7 @@ def test_many_frames_that_nothing_is_known_of_need_few_points():
 @pytest.mark.parametrize("known", [(), (5,)])
 def test_increments_of_draws_are_of_the_prior(concentration, known):
     num = 12
-    draws = exact_times(knowing_only(num, known), free_times(num, concentration)).sample(10_000, 5)
+    draws = exact_posterior(knowing_only(num, known), free_times(num, concentration)).sample(10_000, 5)
     steps = np.diff(draws)
     assert (steps > 0).all()
     for k in (0, 1, 3, 7, 10):
@@ -181,8 +181,8 @@ def test_increments_of_draws_are_of_the_prior(concentration, known):
 def test_densities_are_densities_in_order(seed, concentration):
     rng = np.random.default_rng(seed)
     num = int(rng.integers(1, 6))
-    profiles = parabolas(np.sort(rng.uniform(0.1, 0.9, num)), rng.uniform(0.02, 0.3, num))
-    found = exact_times(profiles, free_times(num + 2, concentration))
+    curves = parabolas(np.sort(rng.uniform(0.1, 0.9, num)), rng.uniform(0.02, 0.3, num))
+    found = exact_posterior(curves, free_times(num + 2, concentration))
     for grid, density in zip(found.grids, found.densities, strict=True):
         assert (density >= 0).all()
         assert trapezoid(density, grid) == pytest.approx(1)
@@ -194,8 +194,8 @@ def test_densities_are_densities_in_order(seed, concentration):
 
 def test_runs_are_apart():
     held = np.array([0, 0.2, 0.4, 0.55, 0.8, 1])
-    profiles = parabolas(*FAR, 801)
-    part = exact_times(profiles, Increments.among(held, [1, 3, 4]))
+    curves = parabolas(*FAR, 801)
+    part = exact_posterior(curves, Increments.with_free(held, [1, 3, 4]))
     np.testing.assert_allclose(part.std()[[0, 2, 5]], 0)
     np.testing.assert_allclose(part.std()[[1, 3, 4]], FAR[1][[0, 2, 3]], rtol=5e-3)
     np.testing.assert_array_equal(part.sample(5)[:, 2], 0.4)
@@ -203,12 +203,12 @@ def test_runs_are_apart():
 
 def test_narrow_profiles_out_of_order_have_no_times():
     with pytest.raises(ValueError, match="order"):
-        exact_times(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001), free_times(4))
+        exact_posterior(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001), free_times(4))
 
 
 def test_shares_are_checked():
-    found = exact_times(parabolas([0.5], [0.1]), free_times(3))
-    with pytest.raises(ValueError, match="share"):
+    found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
+    with pytest.raises(ValueError, match="probability"):
         found.quantile(1.5)
 
 
@@ -217,7 +217,7 @@ def test_shares_are_checked():
 
 def test_laplace_is_exact_for_gaussians():
     means, widths = FAR
-    found = laplace_times(parabolas(*FAR, 801), free_times(6, 1e-6), np.linspace(0, 1, 6))
+    found = laplace_approximation(parabolas(*FAR, 801), free_times(6, 1e-6), np.linspace(0, 1, 6))
     np.testing.assert_allclose(found.mode[1:-1], means, atol=1e-5)
     np.testing.assert_allclose(found.std[1:-1], widths, rtol=1e-3)
     draws = found.sample(20_000, 0)
@@ -226,9 +226,9 @@ def test_laplace_is_exact_for_gaussians():
 
 
 def test_laplace_is_at_the_top_of_the_log_ratios_density():
-    profiles, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4, 2.0)
-    found = laplace_times(profiles, increments, np.linspace(0, 1, 4))
-    log_prob = FrameTimeLogProb(profiles, increments)
+    curves, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4, 2.0)
+    found = laplace_approximation(curves, increments, np.linspace(0, 1, 4))
+    log_prob = FrameTimeLogProb(curves, increments)
     top = increments.coordinates(found.mode)
     around = top + 1e-2 * np.random.default_rng(0).standard_normal((200, 2))
     assert (log_prob(around) <= log_prob(top)).all()
@@ -244,8 +244,8 @@ def test_laplace_is_at_the_top_of_the_log_ratios_density():
 
 
 def test_laplace_is_near_the_passes_where_frames_are_told_apart():
-    profiles, increments = parabolas((0.3, 0.5, 0.7), (0.02, 0.03, 0.02), 401), free_times(5)
-    exact = exact_times(profiles, increments)
-    found = laplace_times(profiles, increments, exact.quantile(0.5))
+    curves, increments = parabolas((0.3, 0.5, 0.7), (0.02, 0.03, 0.02), 401), free_times(5)
+    exact = exact_posterior(curves, increments)
+    found = laplace_approximation(curves, increments, exact.quantile(0.5))
     np.testing.assert_allclose(found.std, exact.std(), rtol=0.05, atol=1e-12)
     assert (np.diff(found.sample(500)) > 0).all()

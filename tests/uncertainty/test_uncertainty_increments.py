@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from time_clips import free_times
 
-from foldgauss.uncertainty import FrameTimeLogProb, Increments, Profiles
+from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves
 
 HELD = np.array([0.0, 0.1, 0.25, 0.3, 0.55, 0.7, 1.0])
 
@@ -16,7 +16,7 @@ HELD = np.array([0.0, 0.1, 0.25, 0.3, 0.55, 0.7, 1.0])
 @settings(max_examples=50, deadline=None)
 @given(z=st.lists(st.floats(-6, 6), min_size=5, max_size=5), frames=st.sets(st.integers(1, 5), min_size=1))
 def test_times_and_coordinates_are_inverse(z, frames):
-    increments = Increments.among(HELD, sorted(frames))
+    increments = Increments.with_free(HELD, sorted(frames))
     coordinates = np.array(z[: len(frames)])
     times = increments.times(coordinates)
     assert (np.diff(times) > 0).all()
@@ -26,7 +26,7 @@ def test_times_and_coordinates_are_inverse(z, frames):
 
 
 def test_runs_are_stretches_of_free_frames():
-    increments = Increments.among(HELD, [1, 2, 4])
+    increments = Increments.with_free(HELD, [1, 2, 4])
     assert increments.runs == [(1, 2), (4, 4)]
     assert increments.num_free == 3
     z = np.array([0.3, -0.2, 1.0])
@@ -59,7 +59,7 @@ def test_prior_integrates_to_one(concentration):
 
 
 def test_prior_of_several_runs_is_their_product():
-    both, one, other = (Increments.among(HELD, frames, 2.0) for frames in ([1, 2, 4], [1, 2], [4]))
+    both, one, other = (Increments.with_free(HELD, frames, 2.0) for frames in ([1, 2, 4], [1, 2], [4]))
     z = np.array([0.3, -0.2, 1.0])
     assert both.log_prior(z) == pytest.approx(one.log_prior(z[:2]) + other.log_prior(z[2:]))
 
@@ -101,7 +101,7 @@ def test_logits_are_centred_and_give_the_times_back():
         ({"held": HELD[::-1].copy()}, "held"),
         ({"held": HELD + 0.1}, "held: expected times in .*1.1 of frame 6"),
         ({"held": HELD - 0.1}, "held"),
-        ({"held": np.where(HELD == 0.55, 0.9, HELD)}, "held: expected rising times.*frame 4 .*frame 5"),
+        ({"held": np.where(HELD == 0.55, 0.9, HELD)}, "held: expected increasing times.*frame 4 .*frame 5"),
         ({"held": np.where(HELD == 0.55, 0.7, HELD)}, "held"),
         ({"held": np.full(7, np.nan)}, "held"),
         ({"held": "x"}, "held"),
@@ -110,7 +110,7 @@ def test_logits_are_centred_and_give_the_times_back():
 )
 def test_what_is_refused(change, word):
     with pytest.raises(ValueError, match=word):
-        Increments.among(**{"held": HELD, "frames": [1, 2], "concentration": 1.0, **change})
+        Increments.with_free(**{"held": HELD, "frames": [1, 2], "concentration": 1.0, **change})
 
 
 def test_shapes_and_order_are_checked():
@@ -119,17 +119,17 @@ def test_shapes_and_order_are_checked():
         increments.times(np.zeros(4))
     with pytest.raises(ValueError, match="times"):
         increments.coordinates(np.zeros(4))
-    with pytest.raises(ValueError, match="rise"):
+    with pytest.raises(ValueError, match="increasing"):
         increments.coordinates(np.array([0, 0.5, 0.4, 0.6, 1.0]))
 
 
 def test_the_times_of_free_frames_do_not_count():
-    assert Increments.among([0, np.nan, -7, 0.3, 0.55, 0.7, 1.0], [1, 2]).runs == [(1, 2)]
+    assert Increments.with_free([0, np.nan, -7, 0.3, 0.55, 0.7, 1.0], [1, 2]).runs == [(1, 2)]
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-300, 1e-17])
 def test_increments_that_float64_has_lost_count_as_the_least(gap):
-    increments = Increments.among(HELD, [1, 2])
+    increments = Increments.with_free(HELD, [1, 2])
     times = HELD.copy()
     times[1:3] = gap, 0.2
     found = increments.coordinates(times)
@@ -138,7 +138,7 @@ def test_increments_that_float64_has_lost_count_as_the_least(gap):
     assert np.isfinite(increments.logits(times)).all()
     for wrong in (-1e-18, -0.1, np.nan):
         times[1] = wrong
-        with pytest.raises(ValueError, match="times that rise"):
+        with pytest.raises(ValueError, match="increasing times"):
             increments.coordinates(times)
 
 
@@ -156,7 +156,7 @@ def test_low_concentrations_go_there_and_back():
 
 def test_nan_coordinates_are_an_error_and_not_a_density():
     nodes = np.linspace(0, 1, 5)
-    log_prob = FrameTimeLogProb(Profiles.of([nodes] * 4, [-nodes] * 4), free_times(4))
+    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 4, [-nodes] * 4), free_times(4))
     assert np.isfinite(log_prob(np.zeros((3, 2)))).all()
     with pytest.raises(ValueError, match="NaN"):
         log_prob(np.array([[0.0, np.nan]]))

@@ -22,12 +22,12 @@ def autocorrelation(residual: np.ndarray, most: int | None = None) -> np.ndarray
     return module.autocorrelation(covariances(residual, most))
 
 
-def effective_share(residual: np.ndarray) -> float:
-    return module.effective_share(covariances(residual))
+def effective_fraction(residual: np.ndarray) -> float:
+    return module.effective_fraction(covariances(residual))
 
 
-def score_share(residual: np.ndarray, slope: np.ndarray) -> float:
-    return module.score_share(residual, slope, covariances(residual))
+def score_fraction(residual: np.ndarray, slope: np.ndarray) -> float:
+    return module.score_fraction(residual, slope, covariances(residual))
 
 
 def kernel_correlation(spread: float, most: int) -> np.ndarray:
@@ -41,8 +41,8 @@ def kernel_correlation(spread: float, most: int) -> np.ndarray:
 
 def test_white_noise_counts_in_full():
     noise = smoothed(0.01)
-    assert effective_share(noise) == pytest.approx(1, abs=0.05)
-    assert score_share(noise, np.ones(SHAPE)) == pytest.approx(1, abs=0.1)
+    assert effective_fraction(noise) == pytest.approx(1, abs=0.05)
+    assert score_fraction(noise, np.ones(SHAPE)) == pytest.approx(1, abs=0.1)
     np.testing.assert_allclose(rings(autocorrelation(noise, 5)), [1, 0, 0, 0, 0, 0], atol=0.01)
 
 
@@ -50,19 +50,19 @@ def test_white_noise_counts_in_full():
 def test_smoothed_noise_counts_as_theory_says(spread):
     along = kernel_correlation(spread, 30)
     theory = 1 / along.sum() ** 2
-    found = np.mean([effective_share(smoothed(spread, seed)) for seed in range(4)])
+    found = np.mean([effective_fraction(smoothed(spread, seed)) for seed in range(4)])
     assert found == pytest.approx(theory, rel=0.15)
 
 
 def test_channels_that_are_one_count_as_one():
     one = smoothed(0.01)[:1]
-    assert effective_share(np.repeat(one, 3, axis=0)) == pytest.approx(1 / 3, rel=0.05)
+    assert effective_fraction(np.repeat(one, 3, axis=0)) == pytest.approx(1 / 3, rel=0.05)
 
 
 @pytest.mark.parametrize("mixture", [(1, 1, 1), (1, -1, 0), (0.6, 0.8, -1)])
 def test_channels_that_go_together_count_as_one_whatever_their_signs(mixture):
     one = smoothed(2.0)[:1]
-    shares = [effective_share(one * np.array(each)[:, None, None]) for each in (mixture, (1, 0, 0))]
+    shares = [effective_fraction(one * np.array(each)[:, None, None]) for each in (mixture, (1, 0, 0))]
     assert shares[0] == pytest.approx(shares[1], rel=0.05)
     assert shares[0] < 0.02
 
@@ -99,7 +99,7 @@ def test_score_share_is_the_scores_own_variance(spread):
     noises = np.stack([smoothed(spread, seed) for seed in range(300)])
     variance = (noises * slope).sum((1, 2, 3)).var()
     truth = min(1.0, (slope**2).sum() / variance)
-    found = np.mean([1 / score_share(noise, slope) for noise in noises[:20]])
+    found = np.mean([1 / score_fraction(noise, slope) for noise in noises[:20]])
     # 300 noises tell a variance to 8%.
     assert 1 / found == pytest.approx(truth, rel=0.25)
 
@@ -112,14 +112,14 @@ def test_scores_that_cancel_are_no_evidence():
     for seed in range(60):
         noise = smoothed(3.0, seed)
         truth.append((noise * slope).sum())
-        found.append(1 / score_share(noise - slope * (noise * slope).sum() / (slope**2).sum(), slope))
+        found.append(1 / score_fraction(noise - slope * (noise * slope).sum() / (slope**2).sum(), slope))
     assert np.mean(found) == pytest.approx(np.var(truth) / (slope**2).sum(), rel=0.4)
 
 
 def test_no_residual_at_all_counts_in_full():
     nothing = np.zeros(SHAPE)
-    assert effective_share(nothing) == 1
-    assert score_share(nothing, np.ones(SHAPE)) == 1
+    assert effective_fraction(nothing) == 1
+    assert score_fraction(nothing, np.ones(SHAPE)) == 1
     found = autocorrelation(nothing, 2)
     assert found[2, 2] == 1
     assert found.sum() == 1
@@ -129,18 +129,18 @@ def test_shares_are_never_above_one():
     # Residuals that alternate cancel: no evidence is worth more than it says.
     y, x = np.mgrid[:40, :40]
     board = np.where((x + y) % 2, 1.0, -1.0)[None]
-    assert effective_share(board) <= 1
-    assert score_share(board, np.ones((1, 40, 40))) <= 1
+    assert effective_fraction(board) <= 1
+    assert score_fraction(board, np.ones((1, 40, 40))) <= 1
 
 
 def test_frame_noise_is_checked_and_widened():
-    noise = FrameNoise(0.1, 0.5).of(3)
+    noise = FrameNoise(0.1, 0.5).for_frames(3)
     np.testing.assert_allclose(noise.weight, 0.5 / 0.02)
     assert noise.weight.shape == (3,)
-    for scale, share, word in ((0, 1, "scale"), (np.nan, 1, "scale"), (0.1, 1.5, "share"), (0.1, 0, "share")):
+    for scale, fraction, word in ((0, 1, "scale"), (np.nan, 1, "scale"), (0.1, 1.5, "fraction"), (0.1, 0, "fraction")):
         with pytest.raises(ValueError, match=word):
-            FrameNoise(scale, share)
+            FrameNoise(scale, fraction)
     with pytest.raises(ValueError, match="scale"):
-        FrameNoise(np.full(2, 0.1), 1.0).of(3)
+        FrameNoise(np.full(2, 0.1), 1.0).for_frames(3)
     with pytest.raises(ValueError, match="most"):
         autocorrelation(np.zeros((1, 5, 5)), 5)

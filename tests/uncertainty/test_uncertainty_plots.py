@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn_times import posterior_about
+from synthetic_posteriors import posterior_about
 
 from foldgauss.uncertainty.diagnostics import plots
 
@@ -80,7 +80,7 @@ def test_trace_has_a_line_for_each_ensemble(posterior):
 
 
 def test_correlation_says_what_counts(posterior):
-    ax = plots.plot_correlation(posterior.seen)
+    ax = plots.plot_correlation(posterior.profiles)
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 0.7 ** np.arange(12))
     assert ax.get_title() == "Residuals of 5.1 grey levels, one value in 10 counts"
 

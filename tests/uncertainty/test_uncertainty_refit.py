@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from foldgauss.uncertainty import RefitTimes, evidence, refit_frame_times, refits
-from foldgauss.uncertainty.likelihood.refit import Refit, blocks_of, merged, resampled
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty import RefitTimes, iter_refits, likelihood_profiles, refit_frame_times
+from foldgauss.uncertainty.likelihood.refit import Refit, merge_logits, resample_blocks, resample_frames
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import FitConfig, FrameTimes, LearningRates, fit
 
 CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2)
@@ -39,10 +39,10 @@ def own_times(model):
     return np.asarray(model.frame_times.times(), np.float64)
 
 
-def inner_std(profiles):
+def inner_std(curves):
     """Standard deviations of the times whose log-likelihoods are the profiles, but for the first and the last frame."""
     t = np.linspace(0, 1, 20_001)
-    log = np.stack([profiles[k](t[:, None])[:, 0] for k in range(1, profiles.num_frames - 1)])
+    log = np.stack([curves[k](t[:, None])[:, 0] for k in range(1, curves.num_frames - 1)])
     weight = np.exp(log - log.max(1, keepdims=True))
     weight /= weight.sum(1, keepdims=True)
     return np.sqrt((weight * (t - (weight @ t)[:, None]) ** 2).sum(1))
@@ -54,7 +54,7 @@ def inner_std(profiles):
 @pytest.mark.parametrize("block", [1, 5, 16])
 def test_kept_blocks_change_sign_as_one(block):
     residual = np.ones((3, 30, 41), np.float32)
-    drawn = blocks_of(residual, block, np.random.default_rng(1))
+    drawn = resample_blocks(residual, block, np.random.default_rng(1))
     assert (np.abs(drawn) == 1).all()
     assert (drawn == drawn[:1]).all()  # all channels
     for axis in (1, 2):
@@ -65,7 +65,7 @@ def test_kept_blocks_change_sign_as_one(block):
 def test_the_grid_of_blocks_lies_at_random():
     residual, offsets = np.ones((1, 8, 32), np.float32), []
     for seed in range(40):
-        drawn = blocks_of(residual, 8, np.random.default_rng(seed))
+        drawn = resample_blocks(residual, 8, np.random.default_rng(seed))
         offsets.append(int(np.flatnonzero((np.diff(drawn, axis=2) != 0).any((0, 1)))[0]) % 8)
     assert len(set(offsets)) > 5
 
@@ -73,7 +73,7 @@ def test_the_grid_of_blocks_lies_at_random():
 def test_moved_blocks_are_pieces_of_the_frame():
     height, width, block = 30, 42, 7
     named = 1 + np.arange(height * width, dtype=np.float32).reshape(1, height, width)
-    drawn = blocks_of(named, block, np.random.default_rng(2), place="moved")
+    drawn = resample_blocks(named, block, np.random.default_rng(2), place="moved")
     y, x = np.divmod(np.abs(drawn[0]).astype(int) - 1, width)
     down, right = (y - np.arange(height)[:, None]) % height, (x - np.arange(width)[None, :]) % width
     shift = down * width + right + height * width * (drawn[0] > 0)
@@ -88,7 +88,7 @@ def test_mean_and_variance_of_what_is_drawn(place):
     """At every pixel: z-scores of 600 draws, beyond 5 in one of 480 pixels with probability 3e-4."""
     rng = np.random.default_rng(3)
     residual = rng.normal(0, 1, (1, 20, 24)) * np.where(np.arange(24) < 12, 1.0, 3.0) + 0.4
-    drawn = np.stack([blocks_of(residual, 4, rng, place=place)[0] for _ in range(600)])
+    drawn = np.stack([resample_blocks(residual, 4, rng, place=place)[0] for _ in range(600)])
     power = residual[0] ** 2 if place == "kept" else np.full((20, 24), (residual**2).mean())
     assert np.abs(drawn.mean(0) / np.sqrt(power / 600)).max() < 5
     if place == "kept":
@@ -100,13 +100,13 @@ def test_mean_and_variance_of_what_is_drawn(place):
 
 
 def test_frames_spread_around_the_models_pictures(model, frames):
-    screen = Screen(model, frames)
-    pictures = np.stack(list(screen.pictures(own_times(model))))
-    draws = [resampled(screen, 4, np.random.default_rng(seed)) for seed in range(100)]
+    residuals = Residuals(model, frames)
+    pictures = np.stack(list(residuals.render_at(own_times(model))))
+    draws = [resample_frames(residuals, 4, np.random.default_rng(seed)) for seed in range(100)]
     assert draws[0].dtype == np.uint8
     assert draws[0].shape == frames.shape
     drawn = np.moveaxis(np.stack(draws).astype(np.float64), -1, 2) / 255
-    residual = np.stack([screen.residual(k, picture) for k, picture in enumerate(pictures)])
+    residual = np.stack([residuals.residual(k, picture) for k, picture in enumerate(pictures)])
     inside = (pictures - np.abs(residual) > 0) & (pictures + np.abs(residual) < 1)  # where nothing is clipped
     assert inside.mean() > 0.9
     missed, half = drawn.mean(0) - pictures, 0.5 / 255  # of two values each of which is rounded
@@ -123,15 +123,15 @@ def test_frames_spread_around_the_models_pictures(model, frames):
 def test_merged_weights_leave_gaps():
     logits = np.random.default_rng(1).normal(0, 1, 9)
     unseen = np.array([0, 1, 0, 0, 1, 1, 0, 0, 1, 0], bool)
-    kept = np.asarray(FrameTimes(merged(logits, unseen)).times())
+    kept = np.asarray(FrameTimes(merge_logits(logits, unseen)).times())
     np.testing.assert_allclose(kept, np.asarray(FrameTimes(logits.astype(np.float32)).times())[~unseen], atol=1e-6)
 
 
 def test_every_frame_is_unseen_once(model, frames):
-    config, seen = dataclasses.replace(CONFIG, steps=150), []
-    found = refit_frame_times(model, frames, config, replicates=3, of="frames", on_replicate=seen.append)
-    assert [each.number for each in seen] == [0, 1, 2]
-    assert [each.model.num_frames for each in seen] == [5, 5, 6]
+    config, completed = dataclasses.replace(CONFIG, steps=150), []
+    found = refit_frame_times(model, frames, config, replicates=3, method="frames", on_replicate=completed.append)
+    assert [each.number for each in completed] == [0, 1, 2]
+    assert [each.model.num_frames for each in completed] == [5, 5, 6]
     np.testing.assert_array_equal(found.unseen.sum(0), [0, 1, 1, 1, 1, 1, 0])
     assert (np.diff(found.times) >= 0).all()
     assert (found.times[:, 0] == 0).all()
@@ -149,11 +149,11 @@ def test_every_frame_is_unseen_once(model, frames):
 
 @pytest.fixture(scope="module")
 def replicates(model, frames):
-    return list(refits(model, frames, CONFIG, replicates=3, steps=40, seed=4, block=8))
+    return list(iter_refits(model, frames, CONFIG, replicates=3, steps=40, seed=4, block=8))
 
 
 def test_times_of_replicates(model, replicates):
-    found = RefitTimes.of(model, replicates)
+    found = RefitTimes.from_refits(model, replicates)
     assert found.times.shape == (3, 7)
     assert (np.diff(found.times) > 0).all()
     assert (found.times[:, 0] == 0).all()
@@ -166,17 +166,19 @@ def test_times_of_replicates(model, replicates):
 
 def test_seeds_reproduce_and_replicates_stand_alone(model, frames, replicates):
     how = {"replicates": 3, "steps": 40, "block": 8}
-    again = list(refits(model, frames, CONFIG, seed=4, first=1, **how))
+    again = list(iter_refits(model, frames, CONFIG, seed=4, first=1, **how))
     assert [each.number for each in again] == [1, 2]
     for one, other in zip(replicates[1:], again, strict=True):
         np.testing.assert_array_equal(one.times, other.times)
-    another = next(refits(model, frames, CONFIG, seed=5, **how))
+    another = next(iter_refits(model, frames, CONFIG, seed=5, **how))
     assert not np.array_equal(another.times, replicates[0].times)
     assert not np.array_equal(replicates[0].times, replicates[1].times)
 
 
 @pytest.mark.parametrize(
-    "how", [{"start": "scratch"}, {"of": "order"}, {"of": "order", "start": "scratch"}, {"place": "moved"}], ids=str
+    "how",
+    [{"start": "scratch"}, {"method": "order"}, {"method": "order", "start": "scratch"}, {"place": "moved"}],
+    ids=str,
 )
 def test_every_way_works(model, frames, how):
     found = refit_frame_times(model, frames, CONFIG, replicates=2, steps=30, **how)
@@ -188,8 +190,8 @@ def test_default_steps_are_the_end_of_the_plan(model, frames):
     config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, target_psnr=10.0), []
     original = FitConfig(num_gaussians=150, steps=30, degree=2)
     for each in (config, original):
-        how = {"replicates": 1, "of": "order", "steps": None if each is config else 30}
-        steps.append(next(refits(model, frames, each, **how)).times)
+        how = {"replicates": 1, "method": "order", "steps": None if each is config else 30}
+        steps.append(next(iter_refits(model, frames, each, **how)).times)
     np.testing.assert_array_equal(*steps)  # 30% of 100 steps, whatever the clock and the target say
 
 
@@ -205,7 +207,7 @@ def test_held_splats_give_what_the_profiles_say(place):
     pictures = np.stack(list(base.frames())).astype(np.float64)
     noisy = np.clip(np.rint(pictures + np.random.default_rng(1).normal(0, 6, clean.shape)), 0, 255).astype(np.uint8)
     config = dataclasses.replace(CONFIG, rates=HELD)
-    given = inner_std(evidence(base, noisy, noise="independent").profiles)
+    given = inner_std(likelihood_profiles(base, noisy, noise="independent").curves)
     std = np.concatenate([[0], given, [0]])
     how = {"replicates": 24, "block": 2, "place": place}
     assert 0.8 < refit_frame_times(base, noisy, config, steps=200, **how).ratio_to(std) < 1.2
@@ -274,18 +276,18 @@ def test_left_out_frames_share_one_deviation():
 
 
 def ended(model, frames, config=CONFIG, **how):
-    return next(refits(model, frames, config, **({"steps": 5} | how)))
+    return next(iter_refits(model, frames, config, **({"steps": 5} | how)))
 
 
 @pytest.mark.parametrize(
     ("how", "told"),
     [
-        ({"of": "rows"}, "of: expected one of"),
+        ({"method": "rows"}, "method: expected one of"),
         ({"place": "here"}, "place: expected one of"),
         ({"start": "middle"}, "start: expected one of"),
-        ({"of": "frames", "start": "model"}, "start: expected 'scratch'"),
-        ({"of": "frames", "replicates": 6}, "replicates: expected from 2 to 5"),
-        ({"of": "frames", "replicates": 1}, "replicates: expected from 2 to 5"),
+        ({"method": "frames", "start": "model"}, "start: expected 'scratch'"),
+        ({"method": "frames", "replicates": 6}, "replicates: expected from 2 to 5"),
+        ({"method": "frames", "replicates": 1}, "replicates: expected from 2 to 5"),
         ({"replicates": 0}, "replicates: expected"),
         ({"replicates": 2.0}, "replicates: expected"),
         ({"first": -1}, "first: expected"),
@@ -312,7 +314,7 @@ def test_videos_that_are_not_the_models(model, frames):
     clear = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], -1)
     with pytest.raises(ValueError, match="without alpha"):
         ended(model, clear)
-    assert np.isfinite(ended(model, clear, of="order").times).all()
+    assert np.isfinite(ended(model, clear, method="order").times).all()
 
 
 def test_configs_that_do_not_fit(model, frames):
@@ -330,7 +332,7 @@ def test_results_that_say_nothing(model, frames):
     one = Refit(0, own, np.zeros(7, bool), model, 30.0)
     for few in ([], [one], [one, one]):
         with pytest.raises(ValueError, match="refits: expected two or more"):
-            RefitTimes.of(model, few)
+            RefitTimes.from_refits(model, few)
     with pytest.raises(ValueError, match="replicates: expected a whole number >= 2"):
         refit_frame_times(model, frames, CONFIG, replicates=1)
     found = made(np.stack([own, own]), own)
@@ -351,7 +353,7 @@ def test_longer_refits_spread_more_and_order_less():
     for name, how in {
         "short": {"steps": 100},
         "long": {"steps": 1000},
-        "order": {"steps": 1000, "of": "order"},
+        "order": {"steps": 1000, "method": "order"},
         "scratch": {"start": "scratch"},
     }.items():
         found = refit_frame_times(whole, clip, config, replicates=10, **how)

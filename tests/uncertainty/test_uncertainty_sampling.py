@@ -16,13 +16,13 @@ from foldgauss.uncertainty import (
     FrameTimeLogProb,
     Increments,
     LikelihoodProfiles,
-    Profiles,
-    drawn_log_likelihood,
-    exact_times,
+    ProfileCurves,
+    exact_posterior,
     frame_time_log_prob,
     frame_time_posterior,
+    rendered_log_likelihood,
 )
-from foldgauss.uncertainty.posterior.laplace import laplace_times
+from foldgauss.uncertainty.posterior.laplace import laplace_approximation
 from foldgauss.uncertainty.posterior.moves import BlockSweep
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 
@@ -83,7 +83,8 @@ def test_few_frames_draw_the_known_posterior(near):
     assert worst_ks(near, exact_cdfs(near)) > 1e-3
     wide = toy(NEAR[0], np.array(NEAR[1]) * 1.2)
     assert (
-        worst_ks(near, exact_cdfs(dataclasses.replace(near, exact=exact_times(wide.profiles, wide.increments)))) < 1e-3
+        worst_ks(near, exact_cdfs(dataclasses.replace(near, exact=exact_posterior(wide.curves, wide.increments))))
+        < 1e-3
     )
 
 
@@ -131,7 +132,7 @@ def test_another_hill_is_reached():
     nodes = np.linspace(0, 1, 401)
     hills = np.logaddexp(-((nodes - 0.4) ** 2) / (2 * 0.015**2), -((nodes - 0.58) ** 2) / (2 * 0.015**2))
     flat = np.zeros_like(nodes)
-    log_prob = FrameTimeLogProb(Profiles.of([nodes] * 3, [flat, hills, flat]), free_times(3))
+    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 3, [flat, hills, flat]), free_times(3))
     found = sampled(log_prob, moves=BlockSweep(log_prob), walkers=16)
     left = (found.draws[:, 1] < 0.5).mean()
     if found.converged:
@@ -150,7 +151,7 @@ def two_hills():
 
     two = np.maximum(np.logaddexp(about(0.4, 0.004), about(0.6, 0.004)), -2000)
     values = [about(0, 0.01), about(0.2, 0.01), two, about(0.8, 0.01), about(1, 0.01)]
-    return FrameTimeLogProb(Profiles.of([nodes] * 5, values), free_times(5))
+    return FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 5, values), free_times(5))
 
 
 def test_few_frames_go_from_hill_to_hill(two_hills):
@@ -169,7 +170,7 @@ def test_ensembles_that_all_miss_a_hill_have_not_converged(two_hills):
     assert found.std()[2] < 0.005
     assert not found.converged
     assert found.message.startswith("Not converged")
-    assert "emcee and the exact passes disagree at frame 2" in found.message
+    assert "emcee and the exact posterior disagree at frame 2" in found.message
 
 
 def test_how_many_frames_tell_their_time():
@@ -177,18 +178,18 @@ def test_how_many_frames_tell_their_time():
     found = sampled(log_prob)
     assert found.converged
     assert found.identified().sum() == 4
-    assert found.message.endswith(" 2 of 3 frames tell their time.")
+    assert found.message.endswith(" 2 of 3 frame times are identified.")
 
 
 @pytest.mark.parametrize(("num", "frames"), [(5, [3]), (7, [2, 4]), (7, [1, 3, 4]), (3, None)])
 def test_single_frames_between_held_ones(num, frames):
     means = np.linspace(0, 1, num)
-    profiles = parabolas(means[1:-1], np.full(num - 2, 0.2 / num))
-    log_prob = FrameTimeLogProb(profiles, Increments.among(means, frames))
-    laplace = laplace_times(profiles, log_prob.increments, means)
+    curves = parabolas(means[1:-1], np.full(num - 2, 0.2 / num))
+    log_prob = FrameTimeLogProb(curves, Increments.with_free(means, frames))
+    laplace = laplace_approximation(curves, log_prob.increments, means)
     free = log_prob.increments.free
     np.testing.assert_allclose(laplace.mode, means, atol=1e-3)
-    np.testing.assert_allclose(laplace.std[free], exact_times(profiles, log_prob.increments).std()[free], rtol=0.05)
+    np.testing.assert_allclose(laplace.std[free], exact_posterior(curves, log_prob.increments).std()[free], rtol=0.05)
     draws = laplace.sample(4000)
     assert (np.diff(draws) > 0).all()
     assert (draws[:, ~free] == means[~free]).all()
@@ -202,7 +203,7 @@ def test_single_frames_between_held_ones(num, frames):
 def test_a_low_concentration_samples_gaps_that_float64_cannot_tell():
     # A thousandth of increments are below 1e-16.
     flat = [np.zeros(61)] * 16
-    log_prob = FrameTimeLogProb(Profiles.of([np.linspace(0, 1, 61)] * 16, flat), free_times(16, 0.2))
+    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([np.linspace(0, 1, 61)] * 16, flat), free_times(16, 0.2))
     found = sampled(log_prob, steps=1000)
     assert (np.diff(found.times) >= 0).all()
     assert np.isfinite(found.logits).all()
@@ -291,8 +292,8 @@ def test_a_run_of_another_process_keeps_its_file(tmp_path):
     path = tmp_path / "run.h5"
     holding = (
         "import pathlib, sys, time\n"
-        "from foldgauss.uncertainty.posterior import only_run\n"
-        "with only_run(pathlib.Path(sys.argv[1])):\n"
+        "from foldgauss.uncertainty.posterior.draws_file import lock_draws\n"
+        "with lock_draws(pathlib.Path(sys.argv[1])):\n"
         "    print('held', flush=True)\n"
         "    time.sleep(240)\n"
     )
@@ -363,7 +364,7 @@ def test_the_walkers_that_are_chosen_are_enough(num):
         ({"noise": white()}, "noise"),
         ({"level": "colors"}, "level"),
         ({"concentration": 2.0}, "concentration"),
-        ({"seen": 3}, "seen"),
+        ({"profiles": 3}, "profiles"),
         ({"moves": emcee.moves.DESnookerMove()}, "DESnookerMove"),
         ({"moves": [(emcee.moves.StretchMove(), 0.5), (emcee.moves.DESnookerMove(), 0.5)]}, "DESnookerMove"),
     ],
@@ -374,24 +375,24 @@ def test_what_is_refused(change, word):
 
 
 @pytest.fixture(scope="module")
-def seen():
+def profiles():
     """Of another clip."""
-    profiles = parabolas((0.3, 0.6), (0.1, 0.1), 5)  # 4 frames
-    return LikelihoodProfiles(profiles, FrameNoise(np.full(4, 0.02), np.ones(4)), np.ones(3), 9)
+    curves = parabolas((0.3, 0.6), (0.1, 0.1), 5)  # 4 frames
+    return LikelihoodProfiles(curves, FrameNoise(np.full(4, 0.02), np.ones(4)), np.ones(3), 9)
 
 
-def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, seen):
+def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, profiles):
     def drawn(*_, **__):
         raise AssertionError("pictures were drawn")
 
-    monkeypatch.setattr("foldgauss.uncertainty.posterior.sampling.evidence", drawn)
-    monkeypatch.setattr("foldgauss.uncertainty.posterior.log_prob.evidence", drawn)
+    monkeypatch.setattr("foldgauss.uncertainty.posterior.sampling.likelihood_profiles", drawn)
+    monkeypatch.setattr("foldgauss.uncertainty.posterior.log_prob.likelihood_profiles", drawn)
     frames = np.zeros((6, 4, 4, 3), np.uint8)
     (tmp_path / "text.h5").write_text("no such file")
     both = [
         ({"model": None}, "model"),
         ({"model": "x"}, "model"),
-        ({"model": EditedVideo((Layer(model()),))}, "model.*EditedVideo.*Take the model"),
+        ({"model": EditedVideo((Layer(model()),))}, "model.*EditedVideo.*Give the model"),
         ({"video": frames[:2]}, "video: expected at least 3 frames"),
         ({"video": None}, "video"),
         ({"frames": [9]}, "frames"),
@@ -400,9 +401,9 @@ def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, seen):
         ({"noise": "loud"}, "noise"),
         ({"concentration": "a"}, "concentration"),
         ({"concentration": -1}, "concentration"),
-        ({"seen": seen}, "video: expected the 4 frames that were `seen`"),
-        ({"seen": seen, "video": None, "noise": white()}, "noise"),
-        ({"seen": seen, "video": None, "level": "colors"}, "video"),
+        ({"profiles": profiles}, "video: expected the 4 frames of `profiles`"),
+        ({"profiles": profiles, "video": None, "noise": white()}, "noise"),
+        ({"profiles": profiles, "video": None, "level": "colors"}, "video"),
     ]
     alone = [
         ({"walkers": 3}, "walkers"),
@@ -418,17 +419,17 @@ def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, seen):
     for change, word in both + held:
         with pytest.raises(ValueError, match=word):
             frame_time_log_prob(**{"model": model(), "video": frames, "frames": [2], **change})
-    with pytest.raises(ValueError, match="seen"):
-        frame_time_posterior(log_prob=toy(*NEAR), seen=seen, progress=False)
+    with pytest.raises(ValueError, match="profiles"):
+        frame_time_posterior(log_prob=toy(*NEAR), profiles=profiles, progress=False)
 
 
 def test_what_drawn_likelihoods_refuse():
     frames = clip(uneven())
     with pytest.raises(ValueError, match="noise"):
-        drawn_log_likelihood(model(), frames, uneven(), "score")
+        rendered_log_likelihood(model(), frames, uneven(), "score")
     for times in (uneven()[:3], uneven() + 1, "x"):
         with pytest.raises(ValueError, match="times"):
-            drawn_log_likelihood(model(), frames, times, white())
+            rendered_log_likelihood(model(), frames, times, white())
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, "a", np.nan])
@@ -463,9 +464,9 @@ def test_draws_are_kept_twice_and_not_more():
 
 def test_a_nan_in_the_density_is_an_error():
     log_prob = toy(*NEAR)
-    values = log_prob.profiles.values.copy()
+    values = log_prob.curves.values.copy()
     values[1, 100:140] = np.nan
-    broken = FrameTimeLogProb(dataclasses.replace(log_prob.profiles, values=values), log_prob.increments)
+    broken = FrameTimeLogProb(dataclasses.replace(log_prob.curves, values=values), log_prob.increments)
     with pytest.raises(ValueError, match="NaN"):
         sampled(broken, steps=100)
 
@@ -490,7 +491,7 @@ def test_progress_is_told():
     told = []
     settings = {"noise": white(), "steps": 20, "ensembles": 2}
     frame_time_posterior(model(), clip(uneven()), frames=[3], **settings, progress=lambda *each: told.append(each))
-    assert {what for what, _, _ in told} == {"pictures", "steps"}
+    assert {what for what, _, _ in told} == {"images", "steps"}
     assert all(0 < done <= total for _, done, total in told)
 
 

@@ -5,21 +5,21 @@ import functools
 import numpy as np
 from soft_models import soft_model
 
-from foldgauss.uncertainty import FrameNoise, Increments, Profiles
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty import FrameNoise, Increments, ProfileCurves
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 
 SIZE, NUM_FRAMES, SCALE = (24, 32), 10, 0.02
 
 
-def parabolas(means, widths, num_nodes: int = 201) -> Profiles:
+def parabolas(means, widths, num_nodes: int = 201) -> ProfileCurves:
     """Gaussian log-likelihoods of the times of all frames between the first and the last, which know nothing."""
     nodes, flat = np.linspace(0, 1, num_nodes), np.zeros(num_nodes)
     inner = [-((nodes - m) ** 2) / (2 * w**2) for m, w in zip(means, widths, strict=True)]
-    return Profiles.of([nodes] * (len(inner) + 2), [flat, *inner, flat])
+    return ProfileCurves.from_nodes([nodes] * (len(inner) + 2), [flat, *inner, flat])
 
 
 def free_times(num_frames: int, concentration: float = 1.0) -> Increments:
-    return Increments.among(np.linspace(0, 1, num_frames), None, concentration)
+    return Increments.with_free(np.linspace(0, 1, num_frames), None, concentration)
 
 
 @functools.cache
@@ -36,8 +36,8 @@ def uneven(num_frames: int = NUM_FRAMES, seed: int = 3) -> np.ndarray:
 def clip(times, scale: float = SCALE, seed: int = 0, of=None) -> np.ndarray:
     """What the model shows at `times`, with white noise, in 8 bits."""
     of = model() if of is None else of
-    screen = Screen(of, np.zeros((3, *of.size, 3), np.uint8))
-    pictures = np.moveaxis(np.stack(list(screen.pictures(times))), 1, -1)
+    residuals = Residuals(of, np.zeros((3, *of.size, 3), np.uint8))
+    pictures = np.moveaxis(np.stack(list(residuals.render_at(times))), 1, -1)
     noisy = pictures + scale * np.random.default_rng(seed).standard_normal(pictures.shape)
     return np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
 

@@ -1,4 +1,4 @@
-"""Frames with alpha: what is behind them is not learned, that something is behind them is."""
+"""Frames with alpha: the fit learns alpha and not the background."""
 
 import dataclasses
 
@@ -8,7 +8,8 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
-from foldgauss.video.fitting.state import planar, to_model
+from foldgauss.video.fitting.schedule import to_planes
+from foldgauss.video.fitting.state import to_model
 from foldgauss.video.models.background import check_background, composite, random_background
 from foldgauss.video.models.renderer import VideoRenderer
 
@@ -30,7 +31,7 @@ def fitted():
     return fit(clip(), CONFIG)
 
 
-def test_composited_by_hand():
+def test_composite_of_known_values():
     frame = np.array([[[100, 50, 0, 128], [0, 0, 0, 0], [9, 8, 7, 255], [0, 0, 0, 51]]], np.uint8)
     over = composite(frame, np.float32([1, 0.5, 0]))
     assert over.tolist() == [[[227, 114, 0], [255, 128, 0], [9, 8, 7], [204, 102, 0]]]
@@ -39,10 +40,10 @@ def test_composited_by_hand():
 
 def test_targets_are_the_frames_over_the_background():
     frame, background = clip()[2], np.float32([0.2, 0.7, 1.0])
-    target = np.moveaxis(planar(frame, background), 0, -1)
+    target = np.moveaxis(to_planes(frame, background), 0, -1)
     np.testing.assert_allclose(255 * target, composite(frame, background), atol=0.51)
     np.testing.assert_array_equal(
-        planar(frame[..., :3].copy(), background), planar(frame[..., :3].copy(), 0 * background)
+        to_planes(frame[..., :3].copy(), background), to_planes(frame[..., :3].copy(), 0 * background)
     )
 
 
@@ -56,7 +57,7 @@ def test_alpha_is_learned(fitted):
     assert abs(fitted.history[-1].psnr - np.mean(list(scores.values()))) < 3
 
 
-def test_drawn_on_black_unless_told_otherwise(fitted):
+def test_default_background_is_black(fitted):
     model = fitted.model
     black, white = next(model.frames()), next(model.frames(background=WHITE))
     assert black[0, 0].max() < 16
@@ -76,7 +77,7 @@ def test_backgrounds_depend_on_seed_and_step():
     np.testing.assert_allclose(np.mean([random_background(0, k) for k in range(3000)], 0), 0.5, atol=0.03)  # 5 sigma
 
 
-def test_a_stopped_fit_goes_on_to_the_same_bits():
+def test_resumed_fit_has_the_same_bits():
     frames, config = clip(), dataclasses.replace(CONFIG, steps=30)
     kept = next(state for state, info in fit_steps(frames, config) if info.step == 12)
     for state, _ in fit_steps(frames, config, kept):

@@ -1,4 +1,4 @@
-"""The fused twin against the fold equation's one home, values and gradients."""
+"""The fused conditioning kernels against `FoldedGaussian.condition_time`: values and gradients."""
 
 import dataclasses
 
@@ -50,7 +50,7 @@ def in_pixels(splats):
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.0), (2.0, 0.05), (0.0, 0.0)])
 @pytest.mark.parametrize("degree", [0, 1, 3, 7])
-def test_values(degree, power, floor):
+def test_kernel_values_match_condition_time(degree, power, floor):
     splats = random_splats(degree=degree, power=power, floor=floor)
     home = jax.jit(in_pixels)(splats)
     _, _, done = twin(splats, power, floor)
@@ -67,7 +67,7 @@ def test_values(degree, power, floor):
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.0), (2.0, 0.05)])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_gradients(degree, power, floor):
+def test_kernel_gradients_match_autodiff(degree, power, floor):
     """Of a loss that looks at mean, covariance, opacity and colour with random weights; and of time."""
     splats = random_splats(degree=degree, power=power, floor=floor)
     rows, shape, done = twin(splats, power, floor)
@@ -108,7 +108,7 @@ def test_wrong_fold_sign_is_caught():
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_pack_and_unpack(degree):
+def test_unpack_inverts_pack(degree):
     splats = random_splats(degree=degree)
     again = unpack(pack(splats), degree, splats.envelope)
     for one, other in zip(jax.tree.leaves(splats), jax.tree.leaves(again), strict=True):

@@ -1,4 +1,4 @@
-"""Mixtures as pictures: the renderer draws the density, and splats hold the mixture."""
+"""Mixtures rendered as densities, and mixtures as splats."""
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def _off(image, mixture, size=SIZE, t=0.45):
 
 
 @pytest.mark.parametrize("engine", ["cpu", "reference"])
-def test_the_picture_is_the_density(engine):
+def test_image_is_the_density(engine):
     mixture = _mixture()
     image = density_image(mixture, 0.45, SIZE, engine=engine)
     assert image.shape == SIZE
@@ -55,7 +55,7 @@ def test_the_picture_is_the_density(engine):
 
 
 @pytest.mark.slow
-def test_the_picture_is_the_density_in_float64():
+def test_image_is_the_density_in_float64():
     with jax.enable_x64(True):
         mixture = _mixture()
         image = density_image(mixture, 0.45, SIZE, engine="reference")
@@ -63,14 +63,14 @@ def test_the_picture_is_the_density_in_float64():
         assert _off(image, mixture) < 1e-7
 
 
-def test_a_picture_sums_to_the_density_of_its_time():
+def test_image_sums_to_the_time_density():
     mixture = _mixture(loc=np.zeros((5, 2)), fold=ZeroFold(2))
     mass = density_image(mixture, 0.45, (60, 60)).sum() / pixels_per_unit((60, 60)) ** 2
     np.testing.assert_allclose(mass, mixture.marginal([-1]).pdf(jnp.array([0.45])), rtol=1e-3)
 
 
 @pytest.mark.slow
-def test_the_picture_has_the_densitys_gradient():
+def test_image_has_the_gradient_of_the_density():
     mixture = _mixture()
     drawn = jax.grad(lambda mixture: density_image(mixture, 0.45, SIZE).sum())(mixture)
     computed = jax.grad(lambda mixture: mixture.pdf(_grid(SIZE, 0.45)).sum())(mixture)
@@ -78,7 +78,7 @@ def test_the_picture_has_the_densitys_gradient():
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3 * float(jnp.abs(b).max()) + 1e-1)
 
 
-def test_a_component_without_weight_is_not_drawn():
+def test_component_of_weight_zero_is_not_rendered():
     mixture = _mixture()
     lighter = FoldedMixture(mixture.components, weights=[1.0, 0.0, 1.0, 0.0, 1.0])
     assert _off(density_image(lighter, 0.45, SIZE), lighter) < 1e-5
@@ -101,7 +101,7 @@ def test_splats_hold_the_mixture(parts):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
-def test_splats_of_a_mixture_are_drawn():
+def test_splats_of_a_mixture_are_rendered():
     mixture = _mixture()
     color = np.random.default_rng(1).uniform(size=(5, 3))
     at = FoldedSplats.from_mixture(mixture, color=color).at(jnp.asarray(0.5))
@@ -118,7 +118,7 @@ def test_round_covariances_and_dead_components_become_splats():
     np.testing.assert_allclose(back.components.scale_tril, mixture.components.scale_tril, rtol=1e-5, atol=1e-7)
 
 
-def test_wrong_mixtures_and_colours_are_named():
+def test_invalid_mixtures_and_colours_are_rejected():
     def from_mixture(**parts):
         return FoldedSplats.from_mixture(_mixture(**parts), color=[1.0, 1.0, 1.0])
 

@@ -1,4 +1,4 @@
-"""Fits whose steps are one program on a JAX device: as those of the CPU's kernels, and never by way of the host."""
+"""Fits by one compiled JAX program per step: equal to the CPU's, without calls to the host."""
 
 import copy
 import dataclasses
@@ -30,14 +30,15 @@ from foldgauss.video import (
     fit,
     fit_steps,
 )
-from foldgauss.video.fitting.adam import sparse_adam
-from foldgauss.video.fitting.loop import _Stepper, start
-from foldgauss.video.fitting.schedule import levels
+from foldgauss.video.fitting.adam import masked_adam, sparse_adam
+from foldgauss.video.fitting.loop import start
+from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.engines import choose_engine
-from foldgauss.video.fitting.steppers.jax_loss import losses, similarity
-from foldgauss.video.fitting.steppers.jax_step import _splats, adam, alive_at, lowered
-from foldgauss.video.fitting.steppers.jax_stepper import DeviceStepper, OnDevice
+from foldgauss.video.fitting.steppers.jax_loss import compute_losses, ssim
+from foldgauss.video.fitting.steppers.jax_step import _splats, find_alive, lower_step
+from foldgauss.video.fitting.steppers.jax_stepper import HeldArrays, JaxStepper
 from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns
@@ -82,9 +83,9 @@ def _compiled_quickly():
 def warm_state(config: FitConfig, steps: int = 20) -> FitState:
     """A state with moments: Adam's first steps go by the signs of gradients, which are rounding's where they are 0."""
     state = start(FRAMES, config)
-    step = _Stepper(FRAMES, config, state)
+    step = CpuStepper(FRAMES, config, state)
     for _ in range(steps):
-        step(state, 0.1)
+        step.step(state, 0.1)
         state.step += 1
     return state
 
@@ -100,9 +101,9 @@ def compare_steps(config: FitConfig, progress: float, level: int = -1, outside: 
     here, there = warm_state(config), warm_state(config)
     for state in (here, there):
         state.rows[:outside, columns(config.degree)["loc"]] = 5.0
-    figures = _Stepper(FRAMES, config, here)(here, progress, level)
-    stepper = DeviceStepper(FRAMES, config, there, "xla")
-    own = stepper(there, progress, level)
+    figures = CpuStepper(FRAMES, config, here).step(here, progress, level)
+    stepper = JaxStepper(FRAMES, config, there, "xla")
+    own = stepper.step(there, progress, level)
     close(own, figures, share=1e-6)
     assert own[2] == figures[2]
     for name in ("rows", "first", "second", "frame_errors", "time_logits"):
@@ -115,13 +116,13 @@ def compare_steps(config: FitConfig, progress: float, level: int = -1, outside: 
 
 
 @pytest.mark.parametrize("progress", [0.1, 1.0], ids=["image loss", "squared loss"])
-def test_a_step_is_that_of_the_cpu(progress):
+def test_step_matches_the_cpu(progress):
     _, there = compare_steps(CONFIG, progress)
     assert there.statistics is None
     assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
 
 
-def test_a_step_of_growing_batches_is_that_of_the_cpu():
+def test_step_of_growing_batches_matches_the_cpu():
     """Twice the views of a pass, all rows by momentum, statistics, and rows that are not in use."""
     here, there = compare_steps(GROWING, 0.1, outside=7)
     for one, other in zip(there.statistics, here.statistics, strict=True):
@@ -135,9 +136,9 @@ def test_a_step_of_growing_batches_is_that_of_the_cpu():
 
 
 @pytest.mark.slow
-def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
-    monkeypatch.setattr("foldgauss.video.fitting.schedule.LEAST_SIDE", 16)
-    assert [level.size for level in levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
+def test_coarse_step_matches_the_cpu(monkeypatch):
+    monkeypatch.setattr("foldgauss.video.fitting.schedule.MIN_SIDE", 16)
+    assert [level.size for level in plan_levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
     compare_steps(CONFIG, 0.1, level=0)
 
 
@@ -153,7 +154,7 @@ def test_a_coarse_step_is_that_of_the_cpu(monkeypatch):
     ],
     ids=str,
 )
-def test_steps_of_other_settings(changes):
+def test_steps_of_other_settings_match_the_cpu(changes):
     compare_steps(dataclasses.replace(CONFIG, **changes), 0.1)
 
 
@@ -170,13 +171,13 @@ def pictures_of(seed=0, shape=(2, 23, 31, 3)):
 
 
 @pytest.mark.parametrize(("ssim_fraction", "squared"), [(0.2, False), (0.0, False), (0.2, True)])
-def test_losses_are_those_of_the_cpu(ssim_fraction, squared):
+def test_losses_match_the_cpu(ssim_fraction, squared):
     """Values, errors and gradients."""
     rendered, target = pictures_of()
     rendered[0, 3:9, 4:9] = target[0, 3:9, 4:9]  # where |x - y| has a kink
 
     def total(rendered):
-        own, errors = losses(rendered, target, jnp.bool_(squared), ssim_fraction)
+        own, errors = compute_losses(rendered, target, jnp.bool_(squared), ssim_fraction)
         return jnp.sum(own), (own, errors)
 
     gradient, (values, errors) = jax.jit(jax.grad(total, has_aux=True))(rendered)
@@ -188,14 +189,14 @@ def test_losses_are_those_of_the_cpu(ssim_fraction, squared):
         close(np.moveaxis(gradient[k], -1, 0), judge.gradient)
 
 
-def test_similarity_is_that_of_the_cpu():
+def test_ssim_matches_the_cpu():
     rendered, target = (np.ascontiguousarray(one[0, ..., 0]) for one in pictures_of())
-    own = jax.jit(similarity)(rendered[..., None], target[..., None])
+    own = jax.jit(ssim)(rendered[..., None], target[..., None])
     close(own[..., 0], ssim_map(rendered, target))
 
 
 @pytest.mark.parametrize("unit_time", [0.0, 0.06])
-def test_adam_is_that_of_the_cpu(unit_time):
+def test_adam_matches_the_cpu(unit_time):
     """Of rows with any number of steps behind them, of all kinds; those that took no part stay to the bit."""
     rng, num, width = np.random.default_rng(0), 400, 17
     rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
@@ -207,7 +208,7 @@ def test_adam_is_that_of_the_cpu(unit_time):
     touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
     arrays = rows, grad, first, second, counts
     how = {"kinds": kinds, "unit_time": unit_time}
-    own = jax.jit(lambda *arrays: adam(*arrays, touched, rates, **how))(*arrays)
+    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, **how))(*arrays)
     judge = [array.copy() for array in arrays]
     sparse_adam(*judge, np.flatnonzero(touched), rates, **how)
     for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
@@ -216,23 +217,23 @@ def test_adam_is_that_of_the_cpu(unit_time):
 
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
-def test_conditioning_is_that_of_the_cpu(power, floor):
+def test_conditioning_matches_the_cpu(power, floor):
     """The fold equation's home, `FoldedGaussian.condition_time`, as the step calls it, against the fused twin."""
     config = dataclasses.replace(CONFIG, power=power, floor=floor)
     state = warm_state(config, steps=5)
-    step = DeviceStepper(FRAMES, CONFIG, copy.deepcopy(state), "xla")  # of whose plan only the sizes count
-    plan = dataclasses.replace(step.plans[-1], power=power, floor=floor)
+    step = JaxStepper(FRAMES, CONFIG, copy.deepcopy(state), "xla")  # of whose program only the sizes count
+    program = dataclasses.replace(step.programs[-1], power=power, floor=floor)
     window = np.empty((len(state.rows), 2), np.float32)
     update_windows(state.rows, np.arange(len(state.rows)), window)
 
     @jax.jit
     def conditioned(rows, t):
-        alive = alive_at(plan, rows, np.int32(150), t)
-        return alive, _splats(plan, rows, t, alive, jnp.bool_(False))
+        alive = find_alive(program, rows, np.int32(150), t)
+        return alive, _splats(program, rows, t, alive, jnp.bool_(False))
 
     for t in np.float32([0.0, 0.37, 1.0]):
         alive, splats = conditioned(state.rows, t)
-        judge = condition(state.rows, window, t, ConditioningSpec(3, power, floor, plan.size))
+        judge = condition(state.rows, window, t, ConditioningSpec(3, power, floor, program.size))
         np.testing.assert_array_equal(np.flatnonzero(alive), judge.alive)
         splats = jax.tree.map(lambda leaf, keep=judge.alive: np.asarray(leaf)[keep], splats)
         close(splats.mean, judge.mean)
@@ -240,10 +241,10 @@ def test_conditioning_is_that_of_the_cpu(power, floor):
         close(splats.color, judge.color)
         own, twin = (factor @ factor.swapaxes(1, 2) for factor in (splats.factor, judge.factor))
         close(own, twin)
-        assert not np.asarray(alive_at(plan, state.rows, np.int32(7), t))[7:].any()
+        assert not np.asarray(find_alive(program, state.rows, np.int32(7), t))[7:].any()
 
 
-def test_it_learns_as_well_as_the_cpu():
+def test_quality_matches_the_cpu():
     scores = {
         engine: evaluate(fit(FRAMES, dataclasses.replace(CONFIG, engine=engine)).model, FRAMES).mean_psnr
         for engine in ("xla", "cpu")
@@ -253,14 +254,14 @@ def test_it_learns_as_well_as_the_cpu():
 
 
 @pytest.mark.slow
-def test_pallas_steps_are_those_of_xla():
+def test_pallas_step_matches_xla():
     """Interpreted here; the same step but for the engine."""
     own = {}
     for engine in ("pallas", "xla"):
         state = warm_state(CONFIG)
-        step = DeviceStepper(FRAMES, CONFIG, state, engine)
+        step = JaxStepper(FRAMES, CONFIG, state, engine)
         for _ in range(2):
-            step(state, 0.1)
+            step.step(state, 0.1)
             state.step += 1
         own[engine] = state.land() or state
     for name in ("rows", "first", "second", "frame_errors", "time_logits"):
@@ -270,16 +271,16 @@ def test_pallas_steps_are_those_of_xla():
 # ------------------------------------------------------------------------------------------- on the device
 
 
-def test_what_a_step_consumes_is_gone():
+def test_step_donates_its_arrays():
     state = start(FRAMES, CONFIG)
-    step = DeviceStepper(FRAMES, CONFIG, state, "xla")
+    step = JaxStepper(FRAMES, CONFIG, state, "xla")
     before = jax.tree.leaves(state.held.arrays)
-    step(state, 0.0)
+    step.step(state, 0.0)
     assert before
     assert all(leaf.is_deleted() for leaf in before)
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(state.held.arrays))
-    assert not any(leaf.is_deleted() for leaf in step.pictures)
-    assert step.pictures[-1].dtype == np.uint8
+    assert not any(leaf.is_deleted() for leaf in step.images)
+    assert step.images[-1].dtype == np.uint8
 
 
 @pytest.mark.parametrize(
@@ -291,11 +292,11 @@ def test_what_a_step_consumes_is_gone():
         pytest.param("xla", GROWING, id="xla-growing", marks=pytest.mark.slow),
     ],
 )
-def test_no_step_asks_the_host(engine, config):
+def test_step_does_not_call_the_host(engine, config):
     """For a GPU the whole step is one program: triton's are the only calls out of it."""
-    step = DeviceStepper(FRAMES, config, start(FRAMES, config), "xla")
-    plan = dataclasses.replace(step.plans[-1], engine=engine)
-    text = lowered(plan, ("cuda",)).as_text()
+    step = JaxStepper(FRAMES, config, start(FRAMES, config), "xla")
+    program = dataclasses.replace(step.programs[-1], engine=engine)
+    text = lower_step(program, ("cuda",)).as_text()
     assert "callback" not in text
     assert "infeed" not in text
     assert "outfeed" not in text
@@ -321,7 +322,7 @@ def compiled_by(function) -> int:
     return len(count)
 
 
-def test_births_and_deaths_compile_nothing():
+def test_densification_compiles_nothing():
     steps, numbers = fit_steps(FRAMES, GROWING), []
     numbers.append(next(steps)[0].num_gaussians)
 
@@ -336,7 +337,7 @@ def test_births_and_deaths_compile_nothing():
     assert compiled_by(lambda: jax.jit(lambda x: x + 17)(1.0)) == 1  # it would have been seen
 
 
-def test_the_same_are_born_as_on_the_cpu():
+def test_densification_matches_the_cpu():
     """From one state, at the step of the first births: clones, halves at the same places, and moments that are 0."""
     kept, after = None, {}
     for state, _ in fit_steps(FRAMES, dataclasses.replace(GROWING, engine="cpu")):
@@ -357,9 +358,9 @@ def test_the_same_are_born_as_on_the_cpu():
     assert after["xla"].first[~born].any(axis=1).all()
 
 
-def test_only_what_is_looked_at_is_fetched(monkeypatch):
-    fetched, fetch = [], OnDevice.fetch
-    monkeypatch.setattr(OnDevice, "fetch", lambda self, name: fetched.append(name) or fetch(self, name))
+def test_only_arrays_that_are_read_are_fetched(monkeypatch):
+    fetched, fetch = [], HeldArrays.fetch
+    monkeypatch.setattr(HeldArrays, "fetch", lambda self, name: fetched.append(name) or fetch(self, name))
     steps = fit_steps(FRAMES, CONFIG)
     state, _ = next(steps)
     fetched.clear()
@@ -374,7 +375,7 @@ def test_only_what_is_looked_at_is_fetched(monkeypatch):
         state.rowz  # noqa: B018
 
 
-def test_what_is_set_is_taken_over():
+def test_assigned_arrays_are_used():
     steps = fit_steps(FRAMES, CONFIG)
     state, _ = next(steps)
     place = columns(CONFIG.degree)["loc"]
@@ -406,14 +407,14 @@ STEPS = 3
 
 
 def stepped(state: FitState) -> FitState:
-    step = DeviceStepper(FRAMES, GROWING, state, "xla")
+    step = JaxStepper(FRAMES, GROWING, state, "xla")
     for _ in range(STEPS):
-        state.error = step(state, 0.1)[0]
+        state.error = step.step(state, 0.1).loss
         state.step += 1
     return state
 
 
-def test_four_devices_are_as_one(tmp_path):
+def test_four_devices_match_one(tmp_path):
     """Frames of a batch are shared out; sums over devices differ by rounding alone."""
     flags = "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0"
     kept, done = tmp_path / "kept.safetensors", tmp_path / "done.safetensors"
@@ -438,7 +439,7 @@ def test_four_devices_are_as_one(tmp_path):
 # ---------------------------------------------------------------------------------------------- the door
 
 
-def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
+def test_auto_is_the_cpu_without_a_gpu(monkeypatch):
     assert choose_engine(FRAMES, FitConfig()) == "cpu"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert choose_engine(FRAMES, FitConfig()) == "xla"
@@ -457,13 +458,13 @@ def test_auto_is_the_cpu_where_there_is_no_gpu(monkeypatch):
     ],
     ids=str,
 )
-def test_what_it_does_not_know_is_refused(changes, message):
+def test_unsupported_settings_are_refused(changes, message):
     """Before anything is computed."""
     with pytest.raises(ValueError, match=message):
         choose_engine(FRAMES, dataclasses.replace(CONFIG, **changes))
 
 
-def test_a_fit_refuses_it(monkeypatch):
+def test_fit_refuses_unsupported_settings(monkeypatch):
     monkeypatch.setattr(sys.modules["foldgauss.video.fitting.loop"], "_warm_up", lambda *_: pytest.fail("too late"))
     with pytest.raises(ValueError, match="with an economy"):
         next(fit_steps(FRAMES, dataclasses.replace(CONFIG, economy=Economy())))
@@ -481,7 +482,7 @@ def test_unknown_engines_are_refused():
 
 
 @pytest.mark.parametrize("config", [CONFIG, GROWING], ids=["plain", "growing"])
-def test_a_stopped_fit_goes_on_to_the_same_bits(config, tmp_path):
+def test_resuming_keeps_the_bits(config, tmp_path):
     """From a checkpoint, written while the arrays are on the device."""
     path = tmp_path / "kept.safetensors"
     config = dataclasses.replace(config, steps=min(config.steps, 40))
@@ -496,13 +497,13 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(config, tmp_path):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_a_fit_that_comes_apart_is_taken_back():
+def test_diverging_fit_backs_off():
     config = dataclasses.replace(CONFIG, rates=LearningRates(log_scale=3e38), steps=12)
-    with pytest.warns(DivergenceWarning, match="the fit came apart at step"):
+    with pytest.warns(DivergenceWarning, match="the fit diverged at step"):
         done = [(np.isfinite(state.rows).all(), info.step) for state, info in fit_steps(FRAMES, config)]
     assert all(finite for finite, _ in done)
     assert done[-1][1] == 12
-    with pytest.raises(FitDiverged, match="What is kept is of step 0") as caught:
+    with pytest.raises(FitDiverged, match="The state is that of step 0") as caught:
         list(fit_steps(FRAMES, dataclasses.replace(config, on_divergence="stop")))
     assert np.isfinite(caught.value.state.rows).all()
 
@@ -515,16 +516,16 @@ def test_minutes_targets_and_plans():
     assert info.stopped_by == "target_psnr"
 
 
-def test_room_grows_with_what_has_none():
+def test_capacity_doubles_where_it_is_not_enough():
     """Without a bound of the user's there is room for some times as many, then for twice that."""
     config = dataclasses.replace(GROWING, max_gaussians=None)
-    stepper = DeviceStepper.__new__(DeviceStepper)
+    stepper = JaxStepper.__new__(JaxStepper)
     stepper.config, stepper.num_frames, stepper.size = config, 6, (32, 40)
-    assert [stepper._room(num) for num in (240, 241, 480, 900)] == [240, 480, 480, 960]
+    assert [stepper._choose_capacity(num) for num in (240, 241, 480, 900)] == [240, 480, 480, 960]
     stepper.config = GROWING
-    assert stepper._room(60) == 250
+    assert stepper._choose_capacity(60) == 250
     stepper.config = CONFIG
-    assert stepper._room(123) == 123
+    assert stepper._choose_capacity(123) == 123
 
 
 def test_the_command(tmp_path, capsys):
@@ -544,7 +545,7 @@ def test_the_command(tmp_path, capsys):
 # -------------------------------------------------------------------------------------- its own benchmark
 
 
-def test_figures_of_a_gpu_are_not_measured_without_one(capsys):
+def test_gpu_benchmark_requires_a_gpu(capsys):
     with pytest.raises(SystemExit):
         gpu.main([])
     assert "expected a GPU that JAX sees, got none" in capsys.readouterr().err

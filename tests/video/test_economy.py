@@ -1,4 +1,4 @@
-"""Only what the scene requires: the ledger against pictures drawn without a part, and clips of which it is known."""
+"""Pruning: scores against images rendered without a part, and clips whose simplest model is known."""
 
 import dataclasses
 import functools
@@ -11,15 +11,14 @@ from scenes_of_motion import SIZE, cut, disc, noise, still
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import cpu, pixels_per_unit
 from foldgauss.video import Economy, FitConfig, evaluate, fit
-from foldgauss.video.compression.finetune import refitted
+from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.fitting.adam import sparse_adam
-from foldgauss.video.fitting.codebook import Codebook, averaged, shared
+from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import fit_steps, start, to_model
-from foldgauss.video.fitting.pruning.description_length import MOST_SOLID, frame_weights
-from foldgauss.video.fitting.pruning.description_length import cut as cut_rows
+from foldgauss.video.fitting.pruning.description_length import MAX_OPAQUE_FRACTION, prune_rows, weigh_frames
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
-from foldgauss.video.fitting.pruning.scores import PruningScores, measured
+from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns, pack
 from foldgauss.video.models.sparse_storage import (
@@ -61,7 +60,7 @@ def weights(model) -> np.ndarray:
     lit = Contributions(model)
     out = np.zeros((model.num_frames, model.num_gaussians))
     for k in range(model.num_frames):
-        light = lit.frame(k)
+        light = lit.at_frame(k)
         out[k, light.alive] = light.total
     return out
 
@@ -69,7 +68,7 @@ def weights(model) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- what scenes require
 
 
-def test_a_still_costs_what_one_frame_costs():
+def test_still_clip_takes_as_many_parameters_as_one_frame():
     _, one, _, _ = fitted("one")
     frames, many, _, _ = fitted("still")
     assert many.num_parameters < 1.1 * one.num_parameters
@@ -80,7 +79,7 @@ def test_a_still_costs_what_one_frame_costs():
 
 
 @pytest.mark.parametrize(("name", "degree"), [("line", 1), ("parabola", 2)])
-def test_a_path_has_the_degree_that_it_needs(name, degree):
+def test_degree_is_that_of_the_motion(name, degree):
     frames, model, _, _ = fitted(name)
     assert evaluate(model, frames).mean_psnr > 38
     splats, seen = model.splats, weights(model)
@@ -91,7 +90,7 @@ def test_a_path_has_the_degree_that_it_needs(name, degree):
     assert sum(share[: degree + 1]) > 0.85  # few with more; measured 0.87 and 1.0
 
 
-def test_what_is_still_beside_it_stands_still():
+def test_static_background_is_static():
     _, model, _, _ = fitted("line")
     still_ones = np.asarray(model.splats.color_dc)[:, 0] < 0
     seen = weights(model).sum(0)
@@ -107,20 +106,20 @@ def test_gaussians_end_at_a_cut():
     assert evaluate(model, frames).mean_psnr > 35
 
 
-def test_noise_ends_growth():
+def test_noise_ends_births():
     _, model, _, counts = fitted("noise")
     assert max(counts) <= 1.5 * 300  # those born once do not pay, and none are born after them
     assert counts[-1] < 0.5 * 300
     assert model.num_gaussians == counts[-1]
 
 
-def test_what_pays_grows():
+def test_detail_causes_births():
     config = FitConfig(num_gaussians=160, steps=STEPS, economy=Economy())
     counts = [info.num_gaussians for _, info in fit_steps(cut(), config)]
     assert max(counts) > 1.4 * 160
 
 
-# ---------------------------------------------------------------------------------------------- the ledger
+# ---------------------------------------------------------------------------------------------- the scores
 
 
 def _scene(degree=2, power=1.0, floor=0.0):
@@ -162,7 +161,7 @@ def _error(rows, frames, shape, times, drawn) -> float:
 def _measured(rows, frames, shape, times, drawn, **how):
     window = np.empty((len(rows), 2), np.float32)
     update_windows(rows, np.arange(len(rows)), window)
-    return measured(rows, window, times, shape, _target(frames), **drawn, **how)
+    return measure_scores(rows, window, times, shape, _target(frames), **drawn, **how)
 
 
 @pytest.fixture(scope="module")
@@ -170,41 +169,41 @@ def scene():
     return _scene()
 
 
-def _mean_ledger(scene, draws=24):
-    ledgers = [_measured(*(scene[1], scene[0], *scene[2:]), seed=seed) for seed in range(draws)]
+def _mean_scores(scene, draws=24):
+    all_scores = [_measured(*(scene[1], scene[0], *scene[2:]), seed=seed) for seed in range(draws)]
     fields = {
-        field.name: np.mean([getattr(each, field.name) for each in ledgers], axis=0)
-        for field in dataclasses.fields(ledgers[0])
+        field.name: np.mean([getattr(each, field.name) for each in all_scores], axis=0)
+        for field in dataclasses.fields(all_scores[0])
         if field.name not in ("num_samples", "size")
     }
-    return dataclasses.replace(ledgers[0], **fields)
+    return dataclasses.replace(all_scores[0], **fields)
 
 
-def test_errors_are_those_of_the_pictures(scene):
+def test_scores_have_the_errors_of_the_frames(scene):
     frames, rows, shape, times, drawn = scene
-    ledger = _measured(rows, frames, shape, times, drawn)
-    assert ledger.squared_error == pytest.approx(_error(rows, frames, shape, times, drawn), rel=1e-4)
+    scores = _measured(rows, frames, shape, times, drawn)
+    assert scores.squared_error == pytest.approx(_error(rows, frames, shape, times, drawn), rel=1e-4)
 
 
-def test_leaving_out_costs_what_it_says(scene):
+def test_cost_of_removal_is_as_predicted(scene):
     frames, rows, shape, times, drawn = scene
-    ledger, before = _mean_ledger(scene), _error(rows, frames, shape, times, drawn)
-    chosen = np.argsort(-ledger.own)[:: len(rows) // 12]
+    scores, before = _mean_scores(scene), _error(rows, frames, shape, times, drawn)
+    chosen = np.argsort(-scores.second_order)[:: len(rows) // 12]
     cost = [_error(np.delete(rows, i, 0), frames, shape, times, drawn) - before for i in chosen]
-    told = ledger.removed[chosen]
+    told = scores.added_by_removal[chosen]
     scale = max(map(abs, cost))
     assert np.abs(told - cost).max() < 0.25 * scale
     assert np.corrcoef(told, cost)[0, 1] > 0.97
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_a_lower_path_costs_what_it_says(scene, degree):
+def test_cost_of_a_lower_degree_is_as_predicted(scene, degree):
     """Against the pictures themselves, where nothing but the path is wrong, and by little."""
     _, rows, shape, times, drawn = scene
     own = _pictures(rows, shape, times, drawn)
-    ledger, at, pixels = _mean_ledger((own, *scene[1:])), columns(shape.degree), pixels_per_unit(SIZE)
+    scores, at, pixels = _mean_scores((own, *scene[1:])), columns(shape.degree), pixels_per_unit(SIZE)
     place = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2) * pixels
-    added, path = ledger.lower(place.astype(float), degree, np.arange(len(rows)))
+    added, path = scores.lower_degree(place.astype(float), degree, np.arange(len(rows)))
     assert (path[:, degree + 1 :] == 0).all()
     ratios = []
     for i in np.flatnonzero((added > 1e-5) & (added < 1e-3))[:15]:
@@ -217,7 +216,7 @@ def test_a_lower_path_costs_what_it_says(scene, degree):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_the_lower_path_is_the_best(degree):
+def test_lower_degree_path_is_optimal(degree):
     """Against least squares over the frames, written out."""
     rng = np.random.default_rng(degree)
     u, factors = rng.uniform(-1, 1, 9), rng.normal(size=(9, 2, 2))
@@ -226,10 +225,10 @@ def test_the_lower_path_is_the_best(degree):
     span = 0.7
     moments = ((u / span)[:, None, None] ** np.arange(7)[:, None] * parts[:, None]).sum(0)
     none = np.zeros(1)
-    ledger = PruningScores(
+    scores = PruningScores(
         none, none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, none, none, none
     )
-    added, lower = ledger.lower(path[None], degree, np.array([0]))
+    added, lower = scores.lower_degree(path[None], degree, np.array([0]))
     powers = u[:, None] ** np.arange(4)
     # sum over frames of |F^T (powers (path - lower))|^2
     design = np.einsum("tij,tk->tjki", factors, powers).reshape(18, 4, 2)
@@ -240,7 +239,7 @@ def test_the_lower_path_is_the_best(degree):
     np.testing.assert_allclose(lower[0, : degree + 1], path[: degree + 1] + best.reshape(-1, 2), rtol=1e-3, atol=1e-4)
 
 
-def test_neighbours_that_err_alike_count_once():
+def test_correlated_errors_count_once():
     frames, rows, shape, times, drawn = _scene()
     same = np.repeat(frames[:1], 8, 0)
     still_rows = rows.copy()
@@ -248,7 +247,7 @@ def test_neighbours_that_err_alike_count_once():
     still_rows[:, columns(2)["log_time_scale"]] = 6
     one = _measured(still_rows, same[:1], shape, times[:1], drawn)
     many = _measured(still_rows, same, shape, times, drawn)
-    assert many.alike[0] > 0.999
+    assert many.correlation[0] > 0.999
     assert many.effective_samples < 1.02 * one.effective_samples
     rough = _measured(still_rows, noise(8), shape, times, drawn)
     assert rough.effective_samples > 0.9 * rough.num_samples
@@ -257,7 +256,7 @@ def test_neighbours_that_err_alike_count_once():
 # ---------------------------------------------------------------------------------------------- kinds, colours
 
 
-def test_kinds_are_those_of_the_stored_model():
+def test_kinds_match_the_stored_model():
     _, model, state, _ = fitted("line")
     kinds = model.splats.degrees + STATIC_BIT * model.splats.static + OPAQUE_BIT * model.splats.opaque
     np.testing.assert_array_equal(find_kinds(state.rows, model.degree), kinds)
@@ -266,7 +265,7 @@ def test_kinds_are_those_of_the_stored_model():
     assert (get_degrees(state.kinds) >= model.splats.degrees).all()  # a power may be there and be 0
 
 
-def test_what_a_kind_has_not_got_never_moves():
+def test_absent_parameters_never_move():
     frames = disc(lambda s: (15 + 50 * s, 24))
     config = FitConfig(num_gaussians=200, steps=300, economy=Economy(rounds=2, first_fraction=0.3, last_fraction=0.4))
     for state, info in fit_steps(frames, config):
@@ -280,7 +279,7 @@ def test_what_a_kind_has_not_got_never_moves():
     assert (state.rows[is_opaque(kinds), at["opacity_logit"].start] == OPAQUE_LOGIT).all()
 
 
-def test_forgotten_moments_are_those_of_numbers_that_are_gone():
+def test_moments_of_absent_parameters_are_cleared():
     first, second = np.ones((2, 3, 11 + 4), np.float32)
     clear_absent_moments(first, second, np.array([2, 1 + OPAQUE_BIT, STATIC_BIT], np.uint8), 2)
     at = columns(2)
@@ -292,23 +291,23 @@ def test_forgotten_moments_are_those_of_numbers_that_are_gone():
 
 
 @pytest.mark.parametrize("width", [2, 3])
-def test_numbers_are_shared_where_it_pays(width):
+def test_values_are_shared_where_it_pays(width):
     rng, weight = np.random.default_rng(0), np.ones((400, width))
     few = rng.normal(size=(8, width))[rng.integers(0, 8, 400)].astype(np.float32)
     many = rng.normal(size=(400, width)).astype(np.float32)
-    np.testing.assert_allclose(averaged(few, shared(few, weight, 1e-3, 0)), few, atol=1e-5)
-    assert shared(many, weight, 1e-6, 0) is None
-    assert len(np.unique(shared(many, weight, 10.0, 0))) == 8  # dear numbers: few rows
-    bounded = shared(many, weight, 10.0, 0, most=0.05 * width * 400)  # of an error of about width a row
+    np.testing.assert_allclose(average_clusters(few, find_clusters(few, weight, 1e-3, 0)), few, atol=1e-5)
+    assert find_clusters(many, weight, 1e-6, 0) is None
+    assert len(np.unique(find_clusters(many, weight, 10.0, 0))) == 8  # dear numbers: few rows
+    bounded = find_clusters(many, weight, 10.0, 0, max_error=0.05 * width * 400)  # of an error of about width a row
     assert len(np.unique(bounded)) > 8
-    assert ((many - averaged(many, bounded)) ** 2).sum() <= 0.05 * width * 400
-    assert shared(many, weight, 10.0, 0, most=0.0) is None
+    assert ((many - average_clusters(many, bounded)) ** 2).sum() <= 0.05 * width * 400
+    assert find_clusters(many, weight, 10.0, 0, max_error=0.0) is None
 
 
-def test_what_is_shared_learns_as_one():
+def test_shared_values_are_learned_as_one():
     """Adam on the sum of the gradients of those that took part; who did not moves along."""
     index = np.array([0, 1, 0, 2, 1])
-    palette, values = Codebook.of(index, 2), np.array([[1, 2], [3, 4], [1, 2], [5, 6], [3, 4]], np.float32)
+    palette, values = Codebook.create(index, 2), np.array([[1, 2], [3, 4], [1, 2], [5, 6], [3, 4]], np.float32)
     grad = np.array([[1, 0], [9, 9], [2, -4], [0.5, 1], [9, 9]], np.float32)
     before, rate = values.copy(), np.float32([0.1, 0.01])
     palette.step(values, grad, np.array([0, 2, 3]), rate)
@@ -319,7 +318,7 @@ def test_what_is_shared_learns_as_one():
     assert (grad[[0, 2, 3]] == 0).all()
     assert palette.counts.tolist() == [1, 0, 1]
     np.testing.assert_allclose(palette.first[0], 0.1 * np.array([3, -4]), rtol=1e-5)
-    alone, shown = Codebook.of(np.zeros(1, int), 2), np.zeros((1, 2), np.float32)
+    alone, shown = Codebook.create(np.zeros(1, int), 2), np.zeros((1, 2), np.float32)
     row, grad, moments = np.zeros((1, 11), np.float32), np.zeros((1, 11), np.float32), np.zeros((2, 1, 11), np.float32)
     counts, rates = np.zeros(1, np.int32), np.full(11, 0.1, np.float32)
     for gradient in np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32):
@@ -329,7 +328,7 @@ def test_what_is_shared_learns_as_one():
     np.testing.assert_allclose(shown, row[:, :2], rtol=1e-4)
 
 
-def test_shared_numbers_stay_shared():
+def test_shared_values_stay_shared():
     frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
     config = FitConfig(num_gaussians=400, steps=300, economy=Economy(bits=200.0))
     for state, _ in fit_steps(frames, config):
@@ -343,7 +342,7 @@ def test_shared_numbers_stay_shared():
     assert model.num_parameters < count_parameters(state.kinds) - len(state.rows)
 
 
-def test_turned_by_a_quarter_is_the_same(scene):
+def test_quarter_turn_changes_no_image(scene):
     frames, rows, shape, times, drawn = scene
     state = start(frames, FitConfig(num_gaussians=len(rows), steps=1, degree=shape.degree))
     state.rows = rows.copy()
@@ -360,56 +359,56 @@ def test_turned_by_a_quarter_is_the_same(scene):
     np.testing.assert_array_equal(state.rows[~turned], rows[~turned])
 
 
-def test_frames_count_by_what_a_db_of_them_costs():
-    assert (frame_weights(np.zeros(3, np.float32)) == 1).all()
-    weights = frame_weights(np.float32([1e-3, 2e-3, 4e-3, 0]))
+def test_frames_are_weighted_by_inverse_error():
+    assert (weigh_frames(np.zeros(3, np.float32)) == 1).all()
+    weights = weigh_frames(np.float32([1e-3, 2e-3, 4e-3, 0]))
     np.testing.assert_allclose(weights, np.array([4, 2, 1, 2]) / 9 * 4, rtol=1e-6)
-    one_black = frame_weights(np.float32([1e-12] + [1e-3] * 99))
+    one_black = weigh_frames(np.float32([1e-12] + [1e-3] * 99))
     assert 3 < one_black[0] / one_black[1] < 6  # an exact frame does not outweigh the others
     assert one_black.mean() == pytest.approx(1)
 
 
-def test_sums_are_weighted_by_frames(scene):
+def test_scores_are_linear_in_the_weights(scene):
     """Linear in the weights, frame by frame: the first frames' and the last frames' add up to all."""
     frames, rows, shape, times, drawn = scene
     parts = np.linspace(0.2, 1.8, len(times))
-    ledgers = [_measured(rows, frames, shape, times, drawn, weights=w) for w in (parts, 2 - parts, None)]
-    for name in ("slope", "own", "by_path", "by_color", "by_axes", "by_size", "squared_error"):
-        first, second, plain = (np.asarray(getattr(ledger, name)) for ledger in ledgers)
+    all_scores = [_measured(rows, frames, shape, times, drawn, weights=w) for w in (parts, 2 - parts, None)]
+    for name in ("first_order", "second_order", "by_path", "by_color", "by_axes", "by_size", "squared_error"):
+        first, second, plain = (np.asarray(getattr(scores, name)) for scores in all_scores)
         np.testing.assert_allclose(first + second, 2 * plain, rtol=1e-6, atol=1e-9 * np.abs(plain).max())
-    assert not np.allclose(ledgers[0].own, ledgers[2].own, rtol=0.01)
-    assert ledgers[0].psnr == ledgers[2].psnr
+    assert not np.allclose(all_scores[0].second_order, all_scores[2].second_order, rtol=0.01)
+    assert all_scores[0].psnr == all_scores[2].psnr
 
 
-def test_another_shape_costs_what_it_says(scene):
+def test_cost_of_another_shape_is_as_predicted(scene):
     """Against the pictures themselves, one axis longer by a little."""
     _, rows, shape, times, drawn = scene
     own = _pictures(rows, shape, times, drawn)
-    ledger, at = _mean_ledger((own, *scene[1:])), columns(shape.degree)["log_scale"]
+    scores, at = _mean_scores((own, *scene[1:])), columns(shape.degree)["log_scale"]
     for axis in (0, 1):
-        chosen = np.argsort(-ledger.by_axes[:, axis])[: len(rows) // 2 : 4]
+        chosen = np.argsort(-scores.by_axes[:, axis])[: len(rows) // 2 : 4]
         cost = []
         for i in chosen:
             changed = rows.copy()
             changed[i, at.start + axis] += 0.05
             cost.append(_error(changed, own, shape, times, drawn))
-        ratios = np.array(cost) / (0.05**2 * ledger.by_axes[chosen, axis])
+        ratios = np.array(cost) / (0.05**2 * scores.by_axes[chosen, axis])
         assert 0.8 < np.median(ratios) < 1.25
 
 
-def test_at_least_one_is_left():
+def test_one_gaussian_always_stays():
     _, model, state, _ = fitted("noise")
     rows = state.rows[:3]
     window = np.empty((3, 2), np.float32)
     update_windows(rows, np.arange(3), window)
     shape = ConditioningSpec(3, 1.0, 0.0, SIZE)
     times = np.asarray(model.frame_times.times())
-    ledger = measured(rows, window, times, shape, _target(noise()), compositing="over", options=model.options)
+    scores = measure_scores(rows, window, times, shape, _target(noise()), compositing="over", options=model.options)
     dear = Economy(bits=1e12, most_dropped=1.0)
-    assert len(cut_rows(rows, np.full(3, 3, np.uint8), ledger, dear, degree=3, pixels=80.0).stay) == 1
+    assert len(prune_rows(rows, np.full(3, 3, np.uint8), scores, dear, degree=3, pixels=80.0).stay) == 1
 
 
-def test_numbers_are_those_that_are_stored():
+def test_count_of_parameters_is_that_of_the_file():
     """Of each kind, one Gaussian among others of its own, so that kinds are told."""
     model = _fitted_model()
     kinds = find_kinds(pack(model.splats), model.degree)
@@ -429,12 +428,12 @@ def _fitted_model():
     return fit(frames, FitConfig(num_gaussians=400, steps=300, economy=Economy())).model
 
 
-def test_no_light_coming_through_costs_what_it_says(scene):
+def test_cost_of_opaque_is_as_predicted(scene):
     """Exactly, for one at a time: pictures are linear in an opacity."""
     frames, rows, shape, times, drawn = scene
     at = columns(shape.degree)["opacity_logit"].start
-    ledger, before = _mean_ledger(scene), _error(rows, frames, shape, times, drawn)
-    told = ledger.solid(1 / (1 + np.exp(-rows[:, at].astype(float))))
+    scores, before = _mean_scores(scene), _error(rows, frames, shape, times, drawn)
+    told = scores.added_by_opaque(1 / (1 + np.exp(-rows[:, at].astype(float))))
     chosen = np.flatnonzero(told > 0)[:: max(len(rows) // 15, 1)]
     cost = []
     for i in chosen:
@@ -446,30 +445,31 @@ def test_no_light_coming_through_costs_what_it_says(scene):
     assert np.abs(told[chosen] - cost).max() < 0.25 * max(map(abs, cost))
 
 
-def test_few_become_solid_at_once():
+def test_few_become_opaque_in_one_round():
     """However dear a number: what is behind one solid Gaussian depends on the others."""
     frames, rows, shape, times, drawn = _scene()
-    ledger, kinds = _measured(rows, frames, shape, times, drawn), np.full(len(rows), shape.degree, np.uint8)
+    scores, kinds = _measured(rows, frames, shape, times, drawn), np.full(len(rows), shape.degree, np.uint8)
     how = {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
-    made = cut_rows(rows, kinds, ledger, Economy(bits=1e6, most_dropped=1e-9), **how)
+    made = prune_rows(rows, kinds, scores, Economy(bits=1e6, most_dropped=1e-9), **how)
     solid = is_opaque(made.kinds)
-    assert 0 < solid.sum() <= np.ceil(MOST_SOLID * len(rows))
-    told = ledger.solid(1 / (1 + np.exp(-rows[:, columns(2)["opacity_logit"].start].astype(float))))[made.stay]
-    assert told[solid].max() <= told[~solid].min()
-    again = cut_rows(made.rows, made.kinds, _measured(made.rows, frames, shape, times, drawn), Economy(), **how)
+    assert 0 < solid.sum() <= np.ceil(MAX_OPAQUE_FRACTION * len(rows))
+    logit = rows[:, columns(2)["opacity_logit"].start].astype(float)
+    predicted = scores.added_by_opaque(1 / (1 + np.exp(-logit)))[made.stay]
+    assert predicted[solid].max() <= predicted[~solid].min()
+    again = prune_rows(made.rows, made.kinds, _measured(made.rows, frames, shape, times, drawn), Economy(), **how)
     assert is_opaque(again.kinds).sum() >= is_opaque(made.kinds)[again.stay].sum()  # those that are stay so
 
 
-def test_opacities_stay_where_they_are_asked_for():
+def test_opacities_stay_without_allow_opaque():
     frames, rows, shape, times, drawn = _scene()
-    ledger, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
+    scores, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
     kinds, how = np.full(len(rows), shape.degree, np.uint8), {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
-    assert is_opaque(cut_rows(rows, kinds, ledger, dear, **how).kinds).any()
-    assert not is_opaque(cut_rows(rows, kinds, ledger, dear, **how, solid=False).kinds).any()
+    assert is_opaque(prune_rows(rows, kinds, scores, dear, **how).kinds).any()
+    assert not is_opaque(prune_rows(rows, kinds, scores, dear, **how, allow_opaque=False).kinds).any()
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.6, 2.0])
-def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
+def test_cost_of_static_is_as_predicted(sigma):
     """One Gaussian that is there at all frames, against pictures of itself."""
     row, at = np.zeros((1, 11 + 2), np.float32), columns(1)
     row[:, at["log_scale"]], row[:, at["opacity_logit"]] = np.log([0.12, 0.08]), 1.0
@@ -477,17 +477,17 @@ def test_an_end_to_waxing_and_waning_costs_what_it_says(sigma):
     shape, times = ConditioningSpec(1, 1.0, 0.0, SIZE), np.linspace(0, 1, 9)
     drawn = {"compositing": "over", "options": FitConfig().options}
     own = _pictures(row, shape, times, drawn)
-    ledger = _mean_ledger((own, row, shape, times, drawn), draws=4)
-    assert ledger.misses[0] == 0
-    made = cut_rows(row, np.zeros(1, np.uint8), ledger, Economy(bits=1e12), degree=1, pixels=80.0, solid=False)
+    scores = _mean_scores((own, row, shape, times, drawn), draws=4)
+    assert scores.misses[0] == 0
+    made = prune_rows(row, np.zeros(1, np.uint8), scores, Economy(bits=1e12), degree=1, pixels=80.0, allow_opaque=False)
     assert made.kinds.tolist() == [STATIC_BIT]
     cost = _error(made.rows, own, shape, times, drawn)
-    assert cost == pytest.approx(ledger.lasting(ledger.mean_log_envelope)[0], rel=0.5, abs=1e-6)
+    assert cost == pytest.approx(scores.added_by_static(scores.mean_log_envelope)[0], rel=0.5, abs=1e-6)
 
 
-def test_refitting_keeps_what_a_gaussian_is():
+def test_finetuning_keeps_the_kinds():
     frames, model, _, _ = fitted("line")
-    again = refitted(model, lambda k, _: _target(frames)(k), 2)
+    again = finetune_model(model, lambda k, _: _target(frames)(k), 2)
     np.testing.assert_array_equal(again.splats.static, model.splats.static)
     assert (again.splats.degrees <= model.splats.degrees).all()
     assert evaluate(again, frames).mean_psnr > 45
@@ -525,7 +525,7 @@ def test_growth_and_economy_together():
     assert reached[1] > reached[0] - 0.5
 
 
-def test_rates_that_have_fallen_to_nothing_stay_there():
+def test_rates_decayed_to_zero_stay_zero():
     """In overtime they would else be below 0, and climb."""
     frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
     config = FitConfig(num_gaussians=120, steps=200, final_rate=0.0, economy=Economy(psnr=60))
@@ -536,14 +536,14 @@ def test_rates_that_have_fallen_to_nothing_stay_there():
 
 
 @pytest.mark.parametrize("value", [0, 255])
-def test_one_colour_ends_well(value):
+def test_clip_of_one_color_is_fitted(value):
     frames = np.full((6, *SIZE, 3), value, np.uint8)
     model = fit(frames, FitConfig(num_gaussians=200, steps=300, economy=Economy())).model
     assert evaluate(model, frames).mean_psnr > 40
     assert model.num_gaussians <= (20 if value == 0 else 300)  # white has to be covered
 
 
-def test_the_description_gets_shorter():
+def test_description_length_decreases():
     frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
 
     def length(economy):
@@ -568,7 +568,7 @@ def test_large_frames_grow_too():
 # ---------------------------------------------------------------------------------------------- a PSNR asked for
 
 
-def test_the_smallest_at_a_psnr():
+def test_smallest_model_reaches_its_psnr():
     frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
     smallest = fit(frames, FitConfig(num_gaussians=300, steps=STEPS, economy=Economy(psnr=34)))
     plain = fit(frames, FitConfig(num_gaussians=300, steps=STEPS, degree=1)).model
@@ -577,7 +577,7 @@ def test_the_smallest_at_a_psnr():
     assert smallest.model.num_parameters < 0.35 * plain.num_parameters
 
 
-def test_what_is_shown_over_black_counts():
+def test_psnr_of_alpha_is_over_black():
     """Frames with alpha are measured over other colours than they are held to: half of them are seen through."""
     shape = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
     alpha = np.where(np.abs(shape.astype(int) - shape[0, 0, 0]).max(-1, keepdims=True) > 20, 255, 0).astype(np.uint8)
@@ -587,7 +587,7 @@ def test_what_is_shown_over_black_counts():
     assert 26 <= evaluate(result.model, frames).mean_psnr < 28
 
 
-def test_a_psnr_out_of_reach_is_told():
+def test_unreachable_psnr_is_reported():
     result = fit(noise(4), FitConfig(num_gaussians=60, steps=60, economy=Economy(psnr=60)))
     assert result.history[-1].stopped_by == "steps"
     assert result.history[-1].step == 90  # in vain for half as long again
@@ -603,7 +603,7 @@ def test_a_psnr_out_of_reach_is_told():
     ],
     ids=["priced", "smallest", "grown"],
 )
-def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
+def test_resuming_keeps_the_bits(tmp_path, changes, at):
     frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
     config = FitConfig(num_gaussians=200, steps=120, **changes)
     kept = {}
@@ -614,7 +614,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
         again = load_checkpoint(path, config=config, source={})
         for state_again, _ in fit_steps(frames, config, again):
             pass
-        for name in ("rows", "first", "second", "counts", "kinds", "young", "frame_errors", "time_logits"):
+        for name in ("rows", "first", "second", "counts", "kinds", "newborn", "frame_errors", "time_logits"):
             np.testing.assert_array_equal(getattr(state_again, name), getattr(state, name))
         for one, other in ((state_again.colors, state.colors), (state_again.shapes, state.shapes)):
             jax.tree.map(np.testing.assert_array_equal, one, other)
@@ -632,20 +632,20 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(tmp_path, changes, at):
         ({"grows": "no"}, r"economy\.grows"),
     ],
 )
-def test_bad_numbers_are_refused(changes, name):
+def test_bad_settings_are_refused(changes, name):
     with pytest.raises(ValueError, match=rf"^{name}: expected"):
         Economy(**changes)
 
 
 @pytest.mark.parametrize("psnr", [None, 30])
-def test_a_target_is_not_for_economies(psnr):
+def test_target_psnr_and_sums_are_refused(psnr):
     with pytest.raises(ValueError, match=r"^compositing: expected 'over' with an economy"):
         FitConfig(compositing="sum", economy=Economy(psnr=psnr))
     with pytest.raises(ValueError, match=r"^target_psnr: expected None with an economy"):
         FitConfig(target_psnr=30, economy=Economy(psnr=psnr))
 
 
-def test_stock_is_taken_once_frames_are_whole_and_not_too_often():
+def test_rounds_follow_coarse_levels_at_intervals():
     economy = Economy(rounds=3, first_fraction=0.2, last_fraction=0.8)
     assert economy.steps(1000, passes=100, coarse=0.6).tolist() == [650, 725, 800]
     assert economy.steps(1000, passes=100, coarse=0).tolist() == [200, 500, 800]

@@ -1,4 +1,4 @@
-"""Clips at the extremes: fitted, kept, drawn and judged like any other, with no NaN and no frame left dark."""
+"""Extreme clips (one frame, one pixel, black, very long): fit, files and scores without NaN or dark frames."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.io import load_video_model, save_compact, save_video_model
-from foldgauss.uncertainty import evidence
+from foldgauss.uncertainty import likelihood_profiles
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -174,7 +174,7 @@ def test_one_frame_is_shown_at_all_times(still):
         assert psnr(first, shown[0]) < 60
 
 
-def test_one_frame_stands_behind_a_clip(still):
+def test_one_frame_can_be_a_background_layer(still):
     """A picture as the background of a video, at all of its times."""
     frames, picture = still
     clip = fit(constant(0, 4), FitConfig(num_gaussians=20, steps=2)).model
@@ -200,16 +200,16 @@ def test_one_frame_in_a_compact_file(tmp_path, still, passes):
 def test_one_frame_tells_no_times(still):
     frames, model = still
     with pytest.raises(ValueError, match="at least 3 frames"):
-        evidence(model, frames)
+        likelihood_profiles(model, frames)
 
 
 # -------------------------------------------------------------------------------------------- alternating
 
 
-def test_pictures_in_turn_have_no_dark_between_them():
+def test_slide_show_has_no_gaps():
     """Most intervals are cuts: gaps there would be the usual interval, and what is shown within them nothing."""
     frames = alternating("AABAABAAB", np.maximum(pictures_of(2), 100))
-    assert len(Motion.of(frames).cuts()) == 5
+    assert len(Motion.from_frames(frames).find_cuts()) == 5
     model = fit(frames, FitConfig(num_gaussians=600, steps=150)).model
     shown = np.stack(list(model.frames(interpolated_times(np.asarray(model.frame_times.times()), 4))))
     assert shown.mean((1, 2, 3)).min() > 0.5 * frames.mean((1, 2, 3)).min()
@@ -218,7 +218,7 @@ def test_pictures_in_turn_have_no_dark_between_them():
 @pytest.mark.parametrize(
     ("num_frames", "cuts"), [(2, [1]), (3, [2]), (5, [1, 3]), (9, [2, 3, 5, 6, 8]), (6, [1, 2, 3]), (8, [3])]
 )
-def test_gaps_stand_only_where_they_are_seen_as_cuts(num_frames, cuts):
+def test_gaps_exist_only_where_they_are_detected_as_cuts(num_frames, cuts):
     logits = make_time_logits(num_frames, cuts)
     found = np.flatnonzero(is_cut(FrameTimes(logits).times())) + 1
     assert found.tolist() == (cuts if logits.any() else [])
@@ -285,7 +285,7 @@ def test_ssim_of_small_pictures(size):
     assert ssim(one.swapaxes(0, 1), other.swapaxes(0, 1)) == pytest.approx(ssim(one, other))
 
 
-def test_frames_that_are_exact_cost_the_others_no_bits():
+def test_exact_frames_cost_the_others_no_bits():
     """Half of the frames are black: that they are no longer so to the last bit is no loss of tens of dB."""
     frames = np.concatenate([moving_blobs(4, *SIZE), constant(0, 4)])
     model = fit(frames, FitConfig(num_gaussians=500, steps=200)).model
@@ -309,6 +309,6 @@ def test_frames_that_are_exact_cost_the_others_no_bits():
     ],
     ids=["16 bits", "floats", "one picture", "a list", "no frames", "no pixels"],
 )
-def test_arrays_that_are_no_frames_come_with_a_cure(frames, words):
+def test_invalid_frames_are_rejected_with_a_cure(frames, words):
     with pytest.raises(ValueError, match=f"frames: expected a uint8 array.*{words}"):
         fit(frames, FitConfig(steps=1))

@@ -1,7 +1,6 @@
-"""The fit on small clips: it learns, repeats itself to the bit, stops and goes on."""
+"""The fit on small clips: quality, budgets, reproducible bits, resuming and starts from models."""
 
 import dataclasses
-import sys
 import time
 
 import jax
@@ -13,10 +12,11 @@ from test_motion import panning
 from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
+from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.config import chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
-
-fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
+from foldgauss.video.fitting.steppers import cpu_stepper
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
 
@@ -101,10 +101,11 @@ def test_a_frame_twice_in_a_batch_counts_twice(monkeypatch):
     for batch in ([1], [1, 1]):
         config = dataclasses.replace(CONFIG, batch_size=len(batch))
         state = start(frames, config)
-        monkeypatch.setattr(fit_module, "_update_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m))
-        stepper = fit_module._Stepper(frames, config, state)
-        monkeypatch.setattr(stepper, "_batch", lambda step, batch=batch: np.array(batch))
-        stepper(state, 0.0)
+        monkeypatch.setattr(
+            cpu_stepper, "update_frame_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m)
+        )
+        monkeypatch.setattr(cpu_stepper, "choose_views", lambda *given, batch=batch: np.array(batch))
+        CpuStepper(frames, config, state).step(state, 0.0)
         steps.append((seen["t"], state.rows.copy()))
     assert abs(steps[0][0][1]) > 0
     np.testing.assert_allclose(steps[0][0], steps[1][0], rtol=1e-5)
@@ -124,7 +125,7 @@ def test_rates_decay():
     assert moved[0.01] < 0.1 * moved[1.0]
 
 
-def test_a_finished_state_yields_once():
+def test_finished_state_yields_once():
     frames = moving_blobs()
     for state, _ in fit_steps(frames, CONFIG):
         pass
@@ -133,7 +134,7 @@ def test_a_finished_state_yields_once():
     assert again[0][1].progress == 1
 
 
-def test_what_lies_between_frames_is_learned():
+def test_interpolated_frames_are_learned():
     """Frames never seen come out better than without, and what is told is the quality at frames alone."""
     finer = panning(9, (2.0, 1.0), height=48, width=64)
     seen, never = np.ascontiguousarray(finer[::2]), finer[1::2]
@@ -148,7 +149,7 @@ def test_what_lies_between_frames_is_learned():
     assert abs(result.history[-1].psnr - evaluate(result.model, seen).mean_psnr) < 2
 
 
-def test_between_share_knows_no_alpha():
+def test_interpolation_refuses_alpha():
     frames = np.full((3, 20, 20, 4), 9, np.uint8)
     with pytest.raises(ValueError, match="interpolation_fraction"):
         fit(frames, FitConfig(num_gaussians=9, steps=2, interpolation_fraction=0.5))
@@ -161,7 +162,7 @@ def test_seed_matters():
 
 
 @pytest.mark.parametrize("interpolation_fraction", [0.0, 0.5])
-def test_a_stopped_fit_goes_on_to_the_same_bits(interpolation_fraction):
+def test_resuming_keeps_the_bits(interpolation_fraction):
     frames, config = moving_blobs(), dataclasses.replace(CONFIG, interpolation_fraction=interpolation_fraction)
     whole = leaves_of(fit(frames, config).model)
     for state, info in fit_steps(frames, config):
@@ -234,7 +235,7 @@ def white_squares() -> np.ndarray:
 
 
 @pytest.mark.parametrize("clip", [moving_blobs, white_squares])
-def test_a_target_is_neither_missed_nor_overshot(clip):
+def test_target_psnr_is_neither_missed_nor_overshot(clip):
     """The running PSNR lags, and with alpha is another one; the mean over the frames as shown decides."""
     frames = clip()
     config = dataclasses.replace(CONFIG, steps=1200, target_psnr=24.0)
@@ -249,7 +250,7 @@ def test_a_target_is_neither_missed_nor_overshot(clip):
     assert max(looked_at, default=0) < 24
 
 
-def test_minutes_are_turned_into_steps_once():
+def test_minutes_are_planned_once():
     """A fit by minutes that was stopped goes on by the plan that it had: to the same bits as if it had not been."""
     frames, config = moving_blobs(), dataclasses.replace(CONFIG, steps=None, minutes=0.05)
     kept = None
@@ -264,7 +265,7 @@ def test_minutes_are_turned_into_steps_once():
     np.testing.assert_array_equal(again.rows, state.rows)
 
 
-def test_size_of_the_file_bounds_the_number():
+def test_file_size_limits_the_number_of_gaussians():
     config = FitConfig(num_gaussians=10_000, max_size_mb=0.1)
     num = chosen_num_gaussians(config, 6, 48, 64)
     assert 0.9e5 < 4 * num * (11 + 2 * 3) + 4096 < 1e5
@@ -307,7 +308,7 @@ def test_bad_settings(changes, message):
         FitConfig(**changes)
 
 
-def test_numpy_numbers_are_numbers():
+def test_numpy_scalars_are_accepted():
     config = FitConfig(num_gaussians=np.int64(5), power=np.float32(1))
     assert (config.num_gaussians, config.power) == (5, 1.0)
     assert type(config.num_gaussians) is int
@@ -340,23 +341,23 @@ def test_bad_frames(frames):
         check_frames(frames)
 
 
-def test_time_left_is_that_of_the_steps(monkeypatch):
+def test_time_left_excludes_the_start(monkeypatch):
     """A start that takes its time says nothing about the steps: those of this clip take milliseconds each."""
-    start = fit_module.start
+    start = fit_module._start
 
     def slow(*given):
         state = start(*given)
         state.seconds += 1000
         return state
 
-    monkeypatch.setattr(fit_module, "start", slow)
+    monkeypatch.setattr(fit_module, "_start", slow)
     infos = [info for _, info in fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=20))]
     assert all(info.seconds_left == np.inf for info in infos[:5])  # not known yet
     assert all(0 < info.seconds_left < 200 for info in infos[5:-1])
     assert infos[-1].seconds_left == 0
 
 
-def test_compiling_is_not_counted(monkeypatch):
+def test_budgets_exclude_compilation(monkeypatch):
     """Kernels are ready before the first step, whatever the settings: no budget is spent on them."""
     seconds = []
     list(fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=1)))  # the test's own process compiles them too
@@ -372,7 +373,7 @@ def fitted():
     return frames, fit(frames, CONFIG).model
 
 
-def test_goes_on_from_a_model(fitted):
+def test_start_from_continues_a_model(fitted):
     frames, model = fitted
     before = [leaf.copy() for leaf in leaves_of(model)]
     steps = [info.step for state, info in fit_steps(frames, CONFIG, start_from(model, CONFIG, 90, 0.7))]
@@ -385,7 +386,7 @@ def test_goes_on_from_a_model(fitted):
         np.testing.assert_array_equal(kept, leaf)  # the model is not worked on
 
 
-def test_a_start_from_a_model_is_the_model(fitted):
+def test_start_from_reproduces_the_model(fitted):
     model = fitted[1]
     state = start_from(model, CONFIG, 10)
     assert (state.step, state.plan) == (0, 10)
@@ -393,7 +394,7 @@ def test_a_start_from_a_model_is_the_model(fitted):
         np.testing.assert_array_equal(ours, own)
 
 
-def test_frame_times_start_where_they_are_told():
+def test_start_uses_the_given_frame_times():
     frames, logits = moving_blobs(), np.log([1.0, 1, 3, 1, 2])
     state = start(frames, CONFIG, logits)
     np.testing.assert_allclose(to_model(state, CONFIG, (48, 64), 25.0).frame_times.times()[1:3], [1 / 8, 2 / 8], 1e-5)
@@ -411,12 +412,12 @@ def test_frame_times_start_where_they_are_told():
     ],
     ids=str,
 )
-def test_configs_of_other_models(fitted, changes, told):
+def test_start_from_refuses_configs_of_other_models(fitted, changes, told):
     with pytest.raises(ValueError, match=told):
         start_from(fitted[1], dataclasses.replace(CONFIG, **changes), 10)
 
 
-def test_starts_out_of_range(fitted):
+def test_start_from_refuses_arguments_out_of_range(fitted):
     for steps, progress in ((0, 0.5), (1.5, 0.5), (10, 1.0), (10, -0.1), (10, np.nan)):
         with pytest.raises(ValueError, match="expected"):
             start_from(fitted[1], CONFIG, steps, progress)

@@ -1,4 +1,4 @@
-"""Layers as one plain model: the same pictures, or a clear refusal."""
+"""Layers flattened to one plain model: the same images, or an error."""
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.segmented.flatten import flatten_video
 
 
-def test_layers_become_one_model_of_the_same_pictures():
+def test_flattened_layers_render_the_same_images():
     front = edit(soft_model(degree=1, options=RenderOptions())).select(OBJECT).move((0.2, 0.1)).video()
     video = layers(front, soft_model(seed=3, num_frames=9, options=RenderOptions()))
     flat = flatten_video(video)
@@ -22,7 +22,7 @@ def test_layers_become_one_model_of_the_same_pictures():
         np.testing.assert_array_equal(VideoRenderer(flat).frame(t), VideoRenderer(video).frame(t))
 
 
-def test_plain_models_stay_as_they_are():
+def test_flattening_a_plain_model_changes_nothing():
     model = soft_model()
     assert flatten_video(model) is model
     assert flatten_video(layers(model)) is model
@@ -45,12 +45,12 @@ def _with_a_cut():
         lambda: layers(_with_a_cut(), soft_model()),
     ],
 )
-def test_what_no_plain_model_holds_is_refused(video):
+def test_videos_that_cannot_be_flattened_are_rejected(video):
     with pytest.raises(ValueError, match=r"model: expected .*foldgauss render"):
         flatten_video(video())
 
 
-def test_a_cut_of_the_leading_layer_stays():
+def test_cut_of_the_leading_layer_is_kept():
     flat = flatten_video(layers(soft_model(), _with_a_cut()))
     assert len(jax.tree.leaves(flat.frame_times)) == 1
     assert flat.num_frames == 7

@@ -50,7 +50,7 @@ def test_interpolation():
     np.testing.assert_array_equal(interpolated_times(times, 1), times)
 
 
-def test_nothing_lies_between_shots():
+def test_times_snap_to_shots_at_a_cut():
     times = np.asarray(FrameTimes(make_time_logits(8, [3])).times())
     np.testing.assert_array_equal(np.flatnonzero(is_cut(times)), [2])
     assert times[3] - times[2] > 20 * (times[1] - times[0])
@@ -64,7 +64,7 @@ def test_nothing_lies_between_shots():
     np.testing.assert_array_equal(held[[0, 1, 2, 5]], t[[0, 1, 2, 5]].astype(np.float32))
 
 
-def test_bad_input():
+def test_invalid_input_is_rejected():
     with pytest.raises(ValueError, match="num_frames"):
         FrameTimes.uniform(0)
     with pytest.raises(ValueError, match="upsample"):

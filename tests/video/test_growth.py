@@ -1,7 +1,6 @@
-"""Births, deaths and resets: each criterion acts, on the Gaussians it names and on no others."""
+"""Densification: each criterion clones, splits, prunes or resets the Gaussians that meet it, and no others."""
 
 import dataclasses
-import sys
 
 import jax
 import numpy as np
@@ -9,12 +8,15 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import FitConfig, fit_steps
+from foldgauss.video.fitting.budget import StepPlanner
 from foldgauss.video.fitting.config import chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, GradientStatistics, Growth, dim, grown
+from foldgauss.video.fitting.densify import densify, reset_opacities
+from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, Growth
 from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.schedule import choose_views
+from foldgauss.video.fitting.state import OfGrowth, Sizes
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.row_layout import columns
-
-fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
 
 DEGREE, PLACE = 2, columns(2)
 GROWTH = Growth()
@@ -31,7 +33,7 @@ def gaussians(num=5, scale=SMALL, opacity_logit=1.0):
 
 def statistics(num=5, screen=(), time=(), steps=4):
     """Means over `steps` steps: for the named Gaussians as given, 0 for others."""
-    sums = GradientStatistics.zeros(num)
+    sums = OfGrowth().build(Sizes(num, 0, 0, growing=True))
     for part, means in ((sums.screen, screen), (sums.time, time)):
         for index, mean in dict(means).items():
             part[index] = steps * mean
@@ -39,8 +41,8 @@ def statistics(num=5, screen=(), time=(), steps=4):
     return sums
 
 
-def change(rows, sums, *, growth=GROWTH, most=1000, step=600, seed=0):
-    return grown(rows, sums, growth, degree=DEGREE, pixels=PIXELS, most=most, step=step, seed=seed)
+def change(rows, sums, *, growth=GROWTH, max_num=1000, step=600, seed=0):
+    return densify(rows, sums, growth, degree=DEGREE, pixels=PIXELS, max_num=max_num, step=step, seed=seed)
 
 
 def test_nothing_happens_below_the_thresholds():
@@ -50,7 +52,7 @@ def test_nothing_happens_below_the_thresholds():
 
 
 @pytest.mark.parametrize("criterion", ["screen", "time"])
-def test_a_small_one_is_cloned(criterion):
+def test_small_gaussians_are_cloned(criterion):
     rows = gaussians()
     stay, born = change(rows, statistics(**{criterion: {3: 2.1e-4}}))
     assert stay.tolist() == [0, 1, 2, 3, 4]
@@ -58,7 +60,7 @@ def test_a_small_one_is_cloned(criterion):
 
 
 @pytest.mark.parametrize("criterion", ["screen", "time"])
-def test_a_large_one_is_split(criterion):
+def test_large_gaussians_are_split(criterion):
     rows = gaussians(scale=LARGE)
     stay, born = change(rows, statistics(**{criterion: {1: 2.1e-4}}))
     assert stay.tolist() == [0, 2, 3, 4]
@@ -69,7 +71,7 @@ def test_a_large_one_is_split(criterion):
     assert not np.array_equal(born[0, PLACE["loc"]], born[1, PLACE["loc"]])
 
 
-def test_either_axis_makes_it_large():
+def test_either_axis_makes_a_gaussian_large():
     rows = gaussians()
     rows[2, PLACE["log_scale"]] = np.log([SMALL, LARGE])
     assert 2 not in change(rows, statistics(screen={2: 1e-3}))[0]
@@ -82,7 +84,7 @@ def test_halves_are_drawn_from_their_parent():
     share = angle / (2 * np.pi)
     rows[:, PLACE["angle_logit"]] = np.log(share / (1 - share))
     rows[:, PLACE["log_scale"]] = np.log(scales)
-    _, born = change(rows, statistics(num, screen=dict.fromkeys(range(num), 1.0)), most=10**6)
+    _, born = change(rows, statistics(num, screen=dict.fromkeys(range(num), 1.0)), max_num=10**6)
     away = born[:, PLACE["loc"]] - rows[0, PLACE["loc"]]
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     expected = turn @ np.diag(scales**2) @ turn.T
@@ -91,8 +93,8 @@ def test_halves_are_drawn_from_their_parent():
     np.testing.assert_allclose(away.mean(0), 0, atol=5 * scales[0] / np.sqrt(2 * num))
 
 
-def test_the_mean_is_over_the_steps_in_which_it_was_seen():
-    sums = GradientStatistics.zeros(3)
+def test_gradients_are_averaged_over_steps_in_which_it_was_seen():
+    sums = OfGrowth().build(Sizes(3, 0, 0, growing=True))
     by_time = np.float32([-4e-4, 4e-4, 0])
     sums.add([(np.array([0]), np.float32([3e-4]))], by_time)
     sums.add([(np.array([0, 2]), np.float32([1e-4, 5e-4])), (np.array([2]), np.float32([7e-4]))], -by_time)
@@ -103,7 +105,7 @@ def test_the_mean_is_over_the_steps_in_which_it_was_seen():
     assert len(born) == 2  # 0 by 4e-4 / 2 of the screen's and by time's 4e-4; 2 by 7e-4 / 1
 
 
-def test_the_faint_are_pruned():
+def test_faint_gaussians_are_pruned():
     rows = gaussians()
     rows[[1, 4], PLACE["opacity_logit"]] = np.log(0.0099 / 0.9901)
     rows[2, PLACE["opacity_logit"]] = np.log(0.0101 / 0.9899)
@@ -112,7 +114,7 @@ def test_the_faint_are_pruned():
     assert len(born) == 0  # its clone is as faint
 
 
-def test_the_big_are_pruned_late():
+def test_big_gaussians_are_pruned_late():
     rows = gaussians()
     rows[0, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 0.1 * EXTENT])
     rows[1, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 20 / 3 / PIXELS])
@@ -123,19 +125,19 @@ def test_the_big_are_pruned_late():
     assert change(rows, statistics(), step=3100, growth=few)[0].tolist() == [1, 2, 3, 4]
 
 
-def test_the_most_restless_go_first_where_there_is_no_room():
+def test_largest_gradients_come_first_at_the_limit():
     rows = gaussians(6)
     rows[4, PLACE["log_scale"]] = np.log(LARGE)
     wanted = statistics(6, screen={0: 3e-4, 2: 9e-4}, time={3: 5e-4, 4: 8e-4})
-    stay, born = change(rows, wanted, most=8)
+    stay, born = change(rows, wanted, max_num=8)
     assert stay.tolist() == [0, 1, 2, 3, 5]
     assert len(stay) + len(born) == 8
     np.testing.assert_array_equal(born[0], rows[2])
     for most in (6, 3):  # full, or more than full
-        assert len(change(rows, wanted, most=most)[1]) == 0
+        assert len(change(rows, wanted, max_num=most)[1]) == 0
 
 
-def test_one_is_always_left():
+def test_one_gaussian_always_stays():
     rows = gaussians(opacity_logit=-9.0)
     rows[3, PLACE["opacity_logit"]] = -8
     assert change(rows, statistics())[0].tolist() == [3]
@@ -150,11 +152,11 @@ def test_halves_depend_on_seed_and_step_alone():
     assert not np.array_equal(born(), born(step=700))
 
 
-def test_dimming():
+def test_reset_lowers_opacities_and_clears_moments():
     rows, moments = gaussians(), [np.ones((5, 11 + 2 * DEGREE), np.float32) for _ in range(2)]
     rows[2, PLACE["opacity_logit"]] = -7
     before = rows.copy()
-    dim(rows, *moments, GROWTH, DEGREE)
+    reset_opacities(rows, *moments, GROWTH, DEGREE)
     opacity = 1 / (1 + np.exp(-rows[:, PLACE["opacity_logit"]][:, 0]))
     np.testing.assert_allclose(opacity, [0.01, 0.01, 1 / (1 + np.exp(7)), 0.01, 0.01], rtol=1e-4)
     before[:, PLACE["opacity_logit"]] = rows[:, PLACE["opacity_logit"]]
@@ -243,13 +245,13 @@ def run(config, kept=None):
     numbers = []
     for state, info in fit_steps(FRAMES, config, kept):
         numbers.append(info.num_gaussians)
-        parts = (state.rows, state.first, state.second, state.counts, state.kinds, state.young)
+        parts = (state.rows, state.first, state.second, state.counts, state.kinds, state.newborn)
         assert len({len(part) for part in parts}) == 1
     return numbers, state
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_a_fit_grows_when_it_should():
+def test_fit_grows_on_schedule():
     numbers, state = run(CONFIG)
     changed = [step for step in range(2, 61) if numbers[step - 1] != numbers[step - 2]]
     assert changed
@@ -261,7 +263,7 @@ def test_a_fit_grows_when_it_should():
 
 @pytest.mark.usefixtures("unscaled")
 @pytest.mark.parametrize("criterion", ["screen_gradient", "time_gradient"])
-def test_either_gradient_alone_makes_it_grow(criterion):
+def test_either_gradient_alone_densifies(criterion):
     off = {"screen_gradient": 1e9, "time_gradient": 1e9, "reset_every": 1000}
     growth = dataclasses.replace(QUICK, **off)
     assert max(run(dataclasses.replace(CONFIG, growth=growth))[0]) == 150
@@ -270,7 +272,7 @@ def test_either_gradient_alone_makes_it_grow(criterion):
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_caps():
+def test_limits_bound_growth():
     numbers, _ = run(dataclasses.replace(CONFIG, max_gaussians=170))
     assert max(numbers) == 170
     small = dataclasses.replace(CONFIG, max_size_mb=0.015)
@@ -279,7 +281,7 @@ def test_caps():
     assert max(run(small)[0]) == most
 
 
-def test_caps_bound_the_start_too():
+def test_limits_bound_the_start():
     config = FitConfig(num_gaussians=500, max_gaussians=300)
     assert chosen_num_gaussians(config, 5, 24, 40) == 300
     assert chosen_num_gaussians(dataclasses.replace(config, max_size_mb=0.01), 5, 24, 40) < 100
@@ -309,7 +311,7 @@ def test_new_gaussians_come_last_with_empty_moments():
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_a_reset_dims_the_fit():
+def test_fit_resets_opacities_on_schedule():
     highest = {}
     for state, info in fit_steps(FRAMES, CONFIG):
         highest[info.step] = state.rows[:, PLACE["opacity_logit"]].max()
@@ -319,36 +321,37 @@ def test_a_reset_dims_the_fit():
     assert highest[60] > highest[40] + 0.3
 
 
-def test_the_screen_gradient_is_in_units_of_half_the_picture():
+def test_screen_gradient_is_in_units_of_half_the_image():
     """Against finite differences: the loss as one Gaussian's mean moves by a share of half the picture."""
     config = FitConfig(num_gaussians=1, degree=0, seed=3, ssim_fraction=0.0, growth=Growth(), follow_motion=False)
     frames = moving_blobs(2, 24, 40)
 
     def stepper_of(state):
-        return fit_module._Stepper(frames, config, state)
+        return CpuStepper(frames, config, state)
 
     state = start(frames, config)
     state.rows[:, PLACE["log_scale"]] = np.log(0.1)
     state.rows[:, PLACE["log_time_scale"]] = 1.0
-    unit, k = 40.0, stepper_of(state)._batch(0)[0]
+    unit, k = 40.0, choose_views(config, len(frames), 0)[0]
 
     def loss(dx, dy):
         rows = state.rows.copy()
         rows[0, PLACE["loc"]] += np.float32([dx * 20 / unit, dy * 12 / unit])
         step = stepper_of(state)
         moved = dataclasses.replace(state, rows=rows)
-        return step._frame(moved, k, np.float32(k), step.shapes[-1], squared=False, mirrored=False, views=None)[0].value
+        options = {"squared": False, "mirrored": False, "seen": None, "fraction": None}
+        return step._differentiate(moved, k, np.float32(k), step.shapes[-1], **options)[0].value
 
     small = 0.02
     slope = [(loss(small, 0) - loss(-small, 0)) / (2 * small), (loss(0, small) - loss(0, -small)) / (2 * small)]
-    stepper_of(state)(state, 0.0)
+    stepper_of(state).step(state, 0.0)
     assert state.statistics.seen.tolist() == [1]
     assert state.statistics.screen[0] == pytest.approx(np.hypot(*slope), rel=0.05)
 
 
 @pytest.mark.usefixtures("unscaled")
 @pytest.mark.parametrize("stop", [7, 10, 23, 45])
-def test_a_stopped_fit_goes_on_to_the_same_bits(stop):
+def test_resuming_keeps_the_bits(stop):
     whole = run(CONFIG)
     for state, info in fit_steps(FRAMES, CONFIG):
         if info.step == stop:
@@ -361,14 +364,13 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(stop):
         np.testing.assert_array_equal(one, other)
 
 
-def test_who_is_outside_the_picture_is_not_seen():
+def test_gaussians_outside_the_image_are_not_seen():
     config = dataclasses.replace(CONFIG, growth=Growth(), initialization="uniform", follow_motion=False)
     state = start(FRAMES, config)
     state.rows[:, PLACE["coefficients"]] = 0
     state.rows[:, PLACE["log_time_scale"]] = 1.0
     state.rows[:5, PLACE["loc"]] = 3.0
-    _, _, num_alive = fit_module._Stepper(FRAMES, config, state)(state, 0.0)
-    assert num_alive == 150
+    assert CpuStepper(FRAMES, config, state).step(state, 0.0).num_alive == 150
     assert state.statistics.seen[:5].tolist() == [0] * 5
     assert state.statistics.seen[5:].mean() > 0.8
 
@@ -389,13 +391,13 @@ def test_growth_waits_for_the_plan():
         assert state.statistics.seen.max() > info.step / 2  # gradients count from the first step on
     assert without > 10
     assert state.plan > 0
-    assert info.step % 10 == 0  # every = 1 of 30,000 is held at `LEAST_EVERY`
+    assert info.step % 10 == 0  # every = 1 of 30,000 is held at `MIN_EVERY`
 
 
 def test_minutes_bind_while_gaussians_grow(monkeypatch):
     """The pace at the start says nothing of ten times as many."""
     config = FitConfig.preset("paper", num_gaussians=20, degree=1, steps=None, minutes=0.01)
-    monkeypatch.setattr(fit_module._Pace, "plan", lambda *given: 10**6)
+    monkeypatch.setattr(StepPlanner, "plan", lambda *given: 10**6)
     *_, (state, last) = fit_steps(FRAMES, config)
     assert last.stopped_by == "minutes"
     assert state.seconds < 5

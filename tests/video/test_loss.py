@@ -63,7 +63,7 @@ def test_wrong_tap_would_be_caught():
     assert np.abs(right - wrong)[RADIUS:-RADIUS, RADIUS:-RADIUS].max() > 1e-3
 
 
-def test_equal_pictures_are_a_stationary_best():
+def test_equal_images_are_stationary():
     x, _ = pictures(60, 50)
     loss = image_loss(x, x.copy())
     assert loss.value == pytest.approx(0, abs=1e-6)

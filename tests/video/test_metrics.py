@@ -1,4 +1,4 @@
-"""Figures people compare: they must mean what others mean by them."""
+"""PSNR and SSIM follow their usual definitions."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel, evaluate, psnr, ssim
 
 
-def test_psnr_by_hand():
+def test_psnr_of_known_error():
     black = np.zeros((20, 20, 3), np.uint8)
     assert psnr(black, black + 10) == pytest.approx(20 * np.log10(255 / 10))
     assert psnr(black, black) == 100

@@ -1,4 +1,4 @@
-"""Playback draws what the model says, whatever the way there."""
+"""`VideoRenderer` renders the same images as the slow path."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def _model(power=2.0, floor=0.0, size=(37, 50)) -> VideoModel:
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
 @pytest.mark.parametrize("size", [None, (37, 50), (60, 41), (16, 90)])
-def test_it_draws_what_the_slow_way_draws(size, power, floor):
+def test_renderer_matches_model_render(size, power, floor):
     model = _model(power, floor)
     for t in (0.0, 0.31, 1.0):
         slow = np.asarray(model.render(t, size, engine="reference"))
@@ -56,7 +56,7 @@ def test_splats_are_those_of_the_model_that_are_alive():
 
 
 @pytest.mark.parametrize("name", ["power", "floor"])
-def test_one_envelope_for_all(name):
+def test_several_envelopes_are_rejected(name):
     model = _model(floor=0.1)
     values = np.full(300, getattr(model.splats.envelope, name), np.float32)
     some = lambda values: eqx.tree_at(lambda m: getattr(m.splats.envelope, name), model, jnp.asarray(values))  # noqa: E731
@@ -68,12 +68,12 @@ def test_one_envelope_for_all(name):
     assert bool(jnp.isfinite(some(values).render(0.31)).all())  # the cure
 
 
-def test_bytes_are_rounded_and_held():
+def test_bytes_are_rounded_and_clipped():
     image = np.broadcast_to(np.float32([-3, 0, 0.5 / 255 - 1e-6, 0.5 / 255 + 1e-6, 1, 7, np.inf]), (3, 2, 7))
     np.testing.assert_array_equal(to_bytes(np.ascontiguousarray(image))[1, :, 0], [0, 0, 0, 1, 255, 255, 255])
 
 
-def test_bad_models_and_sizes_are_refused():
+def test_invalid_models_and_sizes_are_rejected():
     model = _model()
     for size in ((0, 5), (5.5, 5), 5):
         for call in (VideoRenderer, lambda model, size: model.render(0.0, size)):
@@ -84,7 +84,7 @@ def test_bad_models_and_sizes_are_refused():
         VideoRenderer(broken)
 
 
-def test_between_shots_is_the_nearer_one():
+def test_gap_of_a_cut_shows_the_nearer_shot():
     frames = np.concatenate([np.full((3, 32, 48, 3), 200, np.uint8), np.full((3, 32, 48, 3), 40, np.uint8)])
     model = fit(frames, FitConfig(num_gaussians=200, steps=60)).model
     times = np.asarray(model.frame_times.times())

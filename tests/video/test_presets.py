@@ -1,7 +1,6 @@
-"""Presets: the published recipe as far as it can be read off, its starts, its two cameras; and drafts."""
+"""Presets: the published recipe, its initialization and its two cameras; drafts."""
 
 import dataclasses
-import sys
 
 import jax
 import numpy as np
@@ -15,10 +14,10 @@ from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planne
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.initialize import initialize_uniform
 from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.schedule import choose_views
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper, mirror
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.splats import SH_C0
-
-fit_module = sys.modules["foldgauss.video.fitting.loop"]  # the name of the package's function, too
 
 FRAMES = moving_blobs(4, 24, 40)
 TAN = np.tan(0.6911112 / 2)  # the published frame's half width, in its units
@@ -97,7 +96,7 @@ def test_uniform_starts_are_as_published():
     np.testing.assert_allclose(sigmoid(splats.opacity_logit), 0.1, rtol=1e-5)
 
 
-def test_uniform_starts_are_as_wide_as_their_neighbours_are_far():
+def test_uniform_starts_are_as_wide_as_the_distance_to_neighbors():
     splats = uniform(60)
     far = np.sort(np.linalg.norm(splats.loc[:, None] - splats.loc[None], axis=-1), axis=1)[:, 1:4].mean(1)
     np.testing.assert_allclose(np.exp(splats.log_scale), np.stack([far, far], -1), rtol=1e-4)
@@ -129,12 +128,12 @@ def splats_in_pixels(size, num=40):
     return [np.float32(leaf) for leaf in leaves]
 
 
-def test_the_camera_opposite_sees_the_mirrored_picture():
+def test_opposite_camera_sees_the_mirrored_image():
     """And so does `render.camera`'s."""
     size = (24, 40)
     mean, factor, *others = splats_in_pixels(size)
     front = cpu.forward(mean, factor, *others, np.zeros(3, np.float32), size)
-    seen = fit_module._mirrored(mean, factor, 40)
+    seen = mirror(mean, factor, 40)
     back = cpu.forward(*seen, *others, np.zeros(3, np.float32), size)
     np.testing.assert_allclose(back.image, front.image[:, :, ::-1], atol=2e-6)
     model = Splats2D((mean - [20, 12]).astype(np.float32) / 40, factor / 40, *others)
@@ -152,9 +151,9 @@ def test_both_views_give_the_same_gradients():
         pass
     gradients, losses = [], []
     for mirrored in (False, True):
-        step = fit_module._Stepper(FRAMES, config, state)
-        loss, _, by_time = step._frame(
-            state, 2, np.float32(0.6), step.shapes[-1], squared=False, mirrored=mirrored, views=None
+        step = CpuStepper(FRAMES, config, state)
+        loss, _, by_time = step._differentiate(
+            state, 2, np.float32(0.6), step.shapes[-1], squared=False, mirrored=mirrored, seen=None, fraction=None
         )
         gradients.append(np.append(step.grad, by_time))
         losses.append(loss.value)
@@ -165,13 +164,12 @@ def test_both_views_give_the_same_gradients():
 
 def test_a_pass_sees_every_frame_from_both_sides():
     config = FitConfig(num_gaussians=20, two_cameras=True, batch_size=2)
-    step = fit_module._Stepper(FRAMES, config, start(FRAMES, config))
-    passes = [np.concatenate([step._batch(4 * k + i) for i in range(4)]) for k in range(2)]
+    passes = [np.concatenate([choose_views(config, 4, 4 * k + i) for i in range(4)]) for k in range(2)]
     assert sorted(passes[0]) == sorted(passes[1]) == list(range(8))
     assert passes[0].tolist() != passes[1].tolist()
 
 
-def test_views_from_the_back_are_taken_for_what_they_are():
+def test_mirrored_views_are_learned():
     """An uneven clip is learned from both sides: were a target or a gradient not mirrored, it would not be."""
     config = FitConfig(num_gaussians=400, steps=200)
     one, two = (
@@ -185,7 +183,7 @@ def test_views_from_the_back_are_taken_for_what_they_are():
 # --------------------------------------------------------------------------------------------------- steps
 
 
-def test_all_take_part_where_only_alive_is_off():
+def test_dense_updates_move_all_gaussians():
     short = {"num_gaussians": 300, "steps": 12, "rates": PRESETS["paper"]["rates"]}
     for sparse_updates in (True, False):
         for state, info in fit_steps(FRAMES, FitConfig(sparse_updates=sparse_updates, **short)):
@@ -195,13 +193,13 @@ def test_all_take_part_where_only_alive_is_off():
 
 
 @pytest.mark.parametrize("decayed", ["all", "loc"])
-def test_which_rates_fall(decayed):
+def test_decayed_selects_the_rates(decayed):
     """Where the last step's rate is 0, only what does not fall still moves."""
     config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, decayed=decayed)
     state = start(FRAMES, config)
-    stepper, before = fit_module._Stepper(FRAMES, config, state), state.rows.copy()
+    stepper, before = CpuStepper(FRAMES, config, state), state.rows.copy()
     times = state.time_logits.copy()
-    stepper(state, 1.0)
+    stepper.step(state, 1.0)
     moved = {name: not np.array_equal(state.rows[:, at], before[:, at]) for name, at in columns(3).items()}
     assert not moved.pop("loc")
     assert set(moved.values()) == {decayed == "loc"}
@@ -234,7 +232,7 @@ def test_a_small_fit_by_the_paper():
         ({"max_gaussians": 10**12}, "max_gaussians"),
         ({"initialization": "random"}, "initialization: expected one of 'clip', 'uniform'"),
         ({"initialization": "uniform"}, "follow_motion: expected False"),
-        ({"decayed": "none"}, "falling: expected one of"),
+        ({"decayed": "none"}, "decayed: expected one of"),
         ({"two_cameras": 2}, "two_cameras"),
         ({"sparse_updates": None}, "sparse_updates"),
         ({"growth": True}, "growth: expected a Growth"),

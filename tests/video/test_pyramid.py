@@ -1,7 +1,6 @@
-"""Coarse to fine: which step sees frames of which size, and what the model makes of it."""
+"""Coarse to fine: which steps use frames of which size, step planning by level, and sum compositing."""
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -9,52 +8,56 @@ from clips import moving_blobs
 
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import Economy, FitConfig, evaluate, fit, fit_steps
+from foldgauss.video.fitting import budget
+from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.loop import start, to_model
-from foldgauss.video.fitting.schedule import level_at, levels, shrunk, work_done
+from foldgauss.video.fitting.schedule import find_level, plan_levels, shrink_frame, work_fraction
+from foldgauss.video.fitting.steppers import cpu_stepper
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
+from foldgauss.video.fitting.steppers.protocol import StepResult
 
-fit_module = sys.modules["foldgauss.video.fitting.loop"]
 HALF = FitConfig(num_gaussians=800, steps=60, quarter_fraction=0.0, half_fraction=0.5)
 
 
-def test_a_level_too_small_gives_its_share_to_the_next():
+def test_too_small_level_gives_its_fraction_to_the_next():
     config = FitConfig(quarter_fraction=0.15, half_fraction=0.25)
-    assert [(round(share, 6), size) for share, size in levels(config, (640, 1280))] == [
+    assert [(round(share, 6), size) for share, size in plan_levels(config, (640, 1280))] == [
         (0.15, (160, 320)),
         (0.25, (320, 640)),
         (0.6, (640, 1280)),
     ]
-    assert [(round(share, 6), size) for share, size in levels(config, (272, 640))] == [
+    assert [(round(share, 6), size) for share, size in plan_levels(config, (272, 640))] == [
         (0.4, (136, 320)),
         (0.6, (272, 640)),
     ]
-    assert levels(config, (160, 320)) == [(1.0, (160, 320))]
-    assert levels(dataclasses.replace(config, half_fraction=0.0), (640, 1280))[0].size == (160, 320)
-    assert [size for _, size in levels(config, (481, 853))] == [(120, 213), (240, 426), (481, 853)]
+    assert plan_levels(config, (160, 320)) == [(1.0, (160, 320))]
+    assert plan_levels(dataclasses.replace(config, half_fraction=0.0), (640, 1280))[0].size == (160, 320)
+    assert [size for _, size in plan_levels(config, (481, 853))] == [(120, 213), (240, 426), (481, 853)]
 
 
-def test_progress_goes_through_the_levels():
-    made = levels(FitConfig(quarter_fraction=0.25, half_fraction=0.25), (640, 1280))
-    assert [level_at(made, k / 8) for k in range(9)] == [0, 0, 1, 1, 2, 2, 2, 2, 2]
-    assert level_at(levels(FitConfig(quarter_fraction=0.5, half_fraction=0.5), (640, 1280)), 1.0) == 2
+def test_progress_determines_the_level():
+    made = plan_levels(FitConfig(quarter_fraction=0.25, half_fraction=0.25), (640, 1280))
+    assert [find_level(made, k / 8) for k in range(9)] == [0, 0, 1, 1, 2, 2, 2, 2, 2]
+    assert find_level(plan_levels(FitConfig(quarter_fraction=0.5, half_fraction=0.5), (640, 1280)), 1.0) == 2
 
 
-def test_a_pixel_is_the_mean_of_those_it_stands_for():
+def test_shrunk_pixel_is_the_mean_of_its_area():
     frame = np.random.default_rng(0).integers(0, 256, (8, 12, 3), np.uint8)
     mean = frame.reshape(4, 2, 6, 2, 3).mean((1, 3))
-    assert np.abs(shrunk(frame, (4, 6)) - mean).max() <= 0.5
-    assert shrunk(frame, (8, 12)) is frame
+    assert np.abs(shrink_frame(frame, (4, 6)) - mean).max() <= 0.5
+    assert shrink_frame(frame, (8, 12)) is frame
 
 
 @pytest.fixture
 def small(monkeypatch):
     """Levels for clips of a few dozen pixels; only the fit's own steps."""
-    monkeypatch.setattr("foldgauss.video.fitting.schedule.LEAST_SIDE", 8)
+    monkeypatch.setattr("foldgauss.video.fitting.schedule.MIN_SIDE", 8)
     monkeypatch.setattr(fit_module, "_warm_up", lambda *given: None)  # spies would see it
 
 
-def test_steps_see_their_level(small, monkeypatch):
-    frames, sizes, forward = moving_blobs(), [], fit_module.cpu.forward
-    monkeypatch.setattr(fit_module.cpu, "forward", lambda *a, **k: sizes.append(a[5]) or forward(*a, **k))
+def test_steps_use_the_size_of_their_level(small, monkeypatch):
+    frames, sizes, forward = moving_blobs(), [], cpu_stepper.cpu.forward
+    monkeypatch.setattr(cpu_stepper.cpu, "forward", lambda *a, **k: sizes.append(a[5]) or forward(*a, **k))
     fit(frames, HALF)
     full = frames.shape[1:3]
     before = [full] * len(frames)  # how good the start is
@@ -62,7 +65,7 @@ def test_steps_see_their_level(small, monkeypatch):
 
 
 @pytest.mark.parametrize("size", [(24, 40), (25, 41)])
-def test_the_model_stands_still_between_levels(small, size):
+def test_levels_neither_shift_nor_scale_the_model(small, size):
     """Fitted at half size alone, it is right at full size, too: nothing is shifted or scaled."""
     frames = moving_blobs(height=size[0], width=size[1])
     config = dataclasses.replace(HALF, steps=300, half_fraction=1.0)
@@ -72,9 +75,9 @@ def test_the_model_stands_still_between_levels(small, size):
     assert evaluate(model, shifted).mean_psnr < evaluate(model, frames).mean_psnr - 2
 
 
-def test_minutes_are_planned_by_the_pace_of_all_levels(small, monkeypatch):
+def test_minutes_are_planned_by_the_speed_of_all_levels(small, monkeypatch):
     """Steps of 0.1 s at half and 0.4 s at full size, measured in turn, fill the time together."""
-    pace = fit_module._Pace(dataclasses.replace(HALF, steps=None, minutes=100 / 60), [0.5, 0.5], num_frames=6)
+    pace = budget.StepPlanner(dataclasses.replace(HALF, steps=None, minutes=100 / 60), [0.5, 0.5], num_frames=6)
     state = start(moving_blobs(), HALF)
     state.plan, state.step, state.seconds = 0, 0, 0.0
     while not state.plan:
@@ -85,15 +88,15 @@ def test_minutes_are_planned_by_the_pace_of_all_levels(small, monkeypatch):
         state.plan = pace.plan(state, level, passed)
     m, spent = state.step, state.seconds
     coarse, fine = state.plan * 0.5 - m, state.plan * 0.5
-    assert spent + (0.1 * coarse + 0.4 * fine) * fit_module.SLOWER == pytest.approx(100, rel=0.02)
+    assert spent + (0.1 * coarse + 0.4 * fine) * budget.SLOWDOWN == pytest.approx(100, rel=0.02)
 
 
-def test_minutes_are_planned_for_taking_stock():
+def test_minutes_include_rounds_of_pruning():
     """Ten seconds at 0.01 s a step: an eighth of it goes to two rounds over six frames, at most."""
     plans = []
     for economy in (None, Economy(rounds=2)):
         config = FitConfig(num_gaussians=50, minutes=10 / 60, economy=economy)
-        pace = fit_module._Pace(config, [1.0], num_frames=6)
+        pace = budget.StepPlanner(config, [1.0], num_frames=6)
         state = start(moving_blobs(), config)
         state.plan, state.step, state.seconds = 0, 0, 0.0
         while not state.plan:
@@ -102,11 +105,11 @@ def test_minutes_are_planned_for_taking_stock():
             state.plan = pace.plan(state, 0, 0.01)
         plans.append(state.plan)
     plain, economical = plans
-    rounds = fit_module.ROUND * 2 * 6
-    assert economical == pytest.approx(plain / fit_module.GROWN - rounds, rel=0.05)
+    rounds = budget.STEPS_PER_ROUND * 2 * 6
+    assert economical == pytest.approx(plain / budget.BIRTH_SLOWDOWN - rounds, rel=0.05)
 
 
-def test_resumed_at_a_coarse_level(small, tmp_path):
+def test_resuming_at_a_coarse_level_keeps_the_bits(small, tmp_path):
     frames = moving_blobs()
     *_, (whole, _) = fit_steps(frames, HALF)
     rows = whole.rows.copy()
@@ -118,33 +121,36 @@ def test_resumed_at_a_coarse_level(small, tmp_path):
     np.testing.assert_array_equal(again.rows, rows)
 
 
-def test_a_target_is_looked_for_at_full_size(small):
+def test_target_psnr_is_evaluated_at_full_size(small):
     frames = moving_blobs()
     config = dataclasses.replace(HALF, steps=400, target_psnr=5.0)
-    assert [level.size for level in levels(config, (48, 64))] == [(48, 64)]
+    assert [level.size for level in plan_levels(config, (48, 64))] == [(48, 64)]
     *_, (_, last) = fit_steps(frames, config)
     assert (last.stopped_by, last.step) == ("target_psnr", 4 * len(frames))
 
 
-def test_the_running_psnr_starts_anew_at_another_level(small, monkeypatch):
-    frames, errors, step = moving_blobs(), [], fit_module._Stepper.__call__
-    monkeypatch.setattr(
-        fit_module._Stepper, "__call__", lambda *given: errors.append(step(*given)[1]) or (0.0, errors[-1], 1)
-    )
+def test_running_psnr_restarts_at_a_new_level(small, monkeypatch):
+    frames, errors, step = moving_blobs(), [], CpuStepper.step
+
+    def spy(*given):
+        errors.append(step(*given).squared_error)
+        return StepResult(0.0, errors[-1], 1)
+
+    monkeypatch.setattr(CpuStepper, "step", spy)
     seen = [info.psnr for _, info in fit_steps(frames, HALF)]
     assert seen[30] == pytest.approx(-10 * np.log10(errors[30]))
     assert seen[31] != pytest.approx(-10 * np.log10(errors[31]))
 
 
-def test_time_is_counted_by_area():
-    made = levels(FitConfig(quarter_fraction=0.0, half_fraction=0.5), (640, 1280))
-    assert work_done(made, 0.5) == pytest.approx(0.2)
-    assert work_done(made, 0.75) == pytest.approx(0.6)
-    assert work_done(made, 1.0) == 1
+def test_work_is_proportional_to_area():
+    made = plan_levels(FitConfig(quarter_fraction=0.0, half_fraction=0.5), (640, 1280))
+    assert work_fraction(made, 0.5) == pytest.approx(0.2)
+    assert work_fraction(made, 0.75) == pytest.approx(0.6)
+    assert work_fraction(made, 1.0) == 1
 
 
 @pytest.mark.parametrize("steps", [12, 300])
-def test_steps_with_time_to_spare_are_as_without(small, steps):
+def test_ample_minutes_change_nothing(small, steps):
     """Rates fall and frames grow, although the pace is measured first."""
     frames = moving_blobs()
     config = dataclasses.replace(HALF, steps=steps)
@@ -158,7 +164,7 @@ def test_steps_with_time_to_spare_are_as_without(small, steps):
         assert abs(timed[-1].psnr - alone[-1].psnr) < 1
 
 
-def test_sums_are_fitted_and_drawn_as_sums(tmp_path):
+def test_sums_are_fitted_and_rendered_as_sums(tmp_path):
     frames = moving_blobs()
     config = FitConfig(num_gaussians=800, steps=300, compositing="sum")
     model = fit(frames, config).model
@@ -176,7 +182,7 @@ def test_sums_are_fitted_and_drawn_as_sums(tmp_path):
     np.testing.assert_allclose(one, other, atol=1e-5)
 
 
-def test_sums_are_drawn_over_black_alone():
+def test_sums_are_rendered_over_black_only():
     model = to_model(start(moving_blobs(), HALF), dataclasses.replace(HALF, compositing="sum"), (48, 64), 25.0)
     for draw in (lambda: model.render(0.5, background=(1, 1, 1)), lambda: next(model.frames(background=(1, 1, 1)))):
         with pytest.raises(ValueError, match=r"^background: expected black for a model fitted with compositing 'sum'"):

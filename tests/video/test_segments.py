@@ -15,7 +15,7 @@ from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.io import save_selection
 from foldgauss.render import RenderOptions
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -37,7 +37,7 @@ from foldgauss.video.models.frame_times import is_cut, make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED
-from foldgauss.video.tradeoff import frames_per_second
+from foldgauss.video.tradeoff import measure_frame_rate
 
 #: Spans 0:7, 4:13 (three frames shared), 13:18 (a cut), 17:23 (one shared).
 FIRSTS, LENGTHS = (0, 4, 13, 17), (7, 9, 5, 6)
@@ -314,7 +314,7 @@ def test_played_through_each_segment_is_loaded_once(way):
     assert loaded == []
     playback = VideoRenderer(clip)
     for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
-        assert len(playback._stage._ready) <= MAX_PREPARED
+        assert len(playback._prepared._ready) <= MAX_PREPARED
     assert loaded == [0, 1, 2, 3][::way]
     assert not alive()  # a stage needs no model
 
@@ -331,7 +331,7 @@ def test_what_is_asked_for_once_loads_what_it_shows():
 
 def test_speed_is_measured_of_some_segments():
     clip, loaded, _ = counted()
-    assert frames_per_second(clip) > 0
+    assert measure_frame_rate(clip) > 0
     assert sorted(set(loaded)) == [0, 2, 3]
 
 
@@ -413,7 +413,7 @@ def test_segments_that_do_not_go_together_are_refused():
         flatten_video,
         lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
         lambda clip: Selection.all(clip),
-        lambda clip: Screen(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
+        lambda clip: Residuals(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
         lambda clip: save_selection("never", Selection(np.ones(NUM, bool)), clip),
     ],
 )

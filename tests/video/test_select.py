@@ -1,4 +1,4 @@
-"""Selections: the right Gaussians, by what they add to the picture."""
+"""Selections: the right Gaussians, by their contribution to the image."""
 
 import dataclasses
 
@@ -91,7 +91,7 @@ def test_sets_are_sets(one, other):
     assert (a == b) == (sets["a"] == sets["b"])
 
 
-def test_a_selection_does_not_change():
+def test_selection_is_immutable():
     mask = np.zeros(5, bool)
     one = Selection(mask)
     mask[2] = True
@@ -129,7 +129,7 @@ def test_bad_sets():
 def weights(model, k):
     """The definition, pixel by pixel: (num_gaussians, height, width), float64."""
     lit, options = Contributions(model), model.options
-    splats = lit.frame(k).splats
+    splats = lit.at_frame(k).splats
     y, x = np.mgrid[: model.size[0], : model.size[1]] + 0.5
     found, light = np.zeros((lit.num_gaussians, *model.size)), np.ones(model.size)
     for i, mean, factor, opacity in zip(splats.alive, splats.mean, splats.factor, splats.opacity, strict=True):
@@ -159,7 +159,7 @@ def test_contribution_is_its_definition(compositing):
     np.testing.assert_allclose(matte(model, own, 0.25), share, atol=2e-3)
 
 
-def test_mattes_of_parts_come_to_one():
+def test_mattes_of_a_partition_sum_to_one():
     parts = [matte(MODEL, truth(name), 0.37) for name in (DISC, BOX, BACKGROUND)]
     np.testing.assert_allclose(sum(parts), 1, atol=1e-5)
     assert all(part.min() >= 0 for part in parts)
@@ -168,7 +168,7 @@ def test_mattes_of_parts_come_to_one():
 
 
 @pytest.mark.parametrize("t", [0.0, 0.5, 0.77])
-def test_nothing_changes_beyond_the_influence(t):
+def test_removal_changes_only_pixels_of_influence(t):
     selection = truth(DISC)
     reached = influence(MODEL, selection, t)
     before, after = (VideoRenderer(model).frame(t).astype(int) for model in (MODEL, without(MODEL, selection)))
@@ -192,7 +192,7 @@ def test_masks_of_all_frames_give_exactly_the_object(name):
 
 @pytest.mark.parametrize("name", [DISC, BOX])
 @pytest.mark.parametrize("k", [0, 6, 11])
-def test_one_mask_brings_the_object_through_all_frames(name, k):
+def test_one_mask_selects_the_object_in_all_frames(name, k):
     missed, wrong = errors(by_mask(MODEL, object_masks(name)[k], frame=k), truth(name))
     assert missed < 0.05
     assert wrong < 0.02
@@ -230,7 +230,7 @@ def test_more_of_a_gaussian_has_to_be_inside_for_a_higher_threshold():
     np.testing.assert_array_equal(more.mask[seen], inside[seen] >= 0.5 * total[seen])
 
 
-def test_those_between_frames_go_by_their_place():
+def test_gaussians_between_frames_are_decided_by_position():
     """Alive for less than a frame, between two: no picture of a frame shows them."""
     between = np.flatnonzero(np.abs((MODEL.splats.gaussians().time_loc * 11) % 1 - 0.5) < 0.1)
     change = np.asarray(MODEL.splats.log_time_scale).copy()
@@ -248,7 +248,7 @@ def test_those_between_frames_go_by_their_place():
     np.testing.assert_array_equal(alone.mask[hidden], (LABEL[hidden] == DISC) & early)
 
 
-def test_nothing_is_followed_across_a_cut():
+def test_labels_do_not_propagate_across_a_cut():
     logits = np.zeros(11, np.float32)
     logits[5] = np.log(25.0)
     model = dataclasses.replace(MODEL, frame_times=FrameTimes(logits))
@@ -266,12 +266,12 @@ def test_nothing_is_followed_across_a_cut():
 @pytest.mark.parametrize(
     ("mask", "options", "match"),
     [
-        (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask with something in it"),
-        ({}, {}, "^mask: expected a mask with something in it"),
+        (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask that is not empty"),
+        ({}, {}, "^mask: expected a mask that is not empty"),
         (np.ones((48, 48), bool), {"frame": 0}, "^mask: expected the aspect of the model's 48x72, got 48x48"),
-        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* Of labels"),
-        (np.full((48, 72), 1.5), {"frame": 0}, r"shares in \[0, 1\]"),
-        (np.full((48, 72), np.nan), {"frame": 0}, r"shares in \[0, 1\]"),
+        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* From labels"),
+        (np.full((48, 72), 1.5), {"frame": 0}, r"fractions in \[0, 1\]"),
+        (np.full((48, 72), np.nan), {"frame": 0}, r"fractions in \[0, 1\]"),
         (np.ones((48, 72), bool), {}, "frame=k"),
         (np.ones((5, 48, 72), bool), {}, "^mask: expected one of shape .*, or 12 of them"),
         (np.ones(5, bool), {"frame": 0}, "^mask: expected one of shape"),
@@ -283,7 +283,7 @@ def test_nothing_is_followed_across_a_cut():
         (np.ones((48, 72), bool), {"frames": (3, 3)}, "^frames"),
         (np.ones((48, 72), bool), {"frames": (0, 13)}, "^frames"),
         (np.ones((48, 72), bool), {"frames": 3}, "^frames.*frame=k"),
-        ({0: np.ones((48, 72), bool)}, {"frame": 0}, "frames named once"),
+        ({0: np.ones((48, 72), bool)}, {"frame": 0}, "frames given once"),
         ({0: np.ones((2, 48, 72), bool)}, {}, "^mask: expected bool"),
         ({99: np.ones((48, 72), bool)}, {}, "^frame"),
         (np.ones((48, 72), bool), {"frame": 0, "threshold": 0}, "^threshold"),
@@ -328,7 +328,7 @@ def test_colors(name):
     assert len(by_color(MODEL, COLOR[name], tolerance=0)) == 0
 
 
-def test_the_color_seen_is_that_of_the_picture():
+def test_seen_color_is_that_of_the_image():
     """Two of opposite tints, one on the other, look grey."""
     color = np.asarray(MODEL.splats.color_dc).copy()
     disc = truth(DISC).indices
@@ -381,7 +381,7 @@ def test_a_click_grows_to_the_object(name, k):
     assert wrong < 0.02
 
 
-def test_a_click_ends_where_another_motion_begins():
+def test_click_stops_at_a_motion_boundary():
     """Disc and wall of one colour."""
     color = np.broadcast_to(np.float32([0.5, 0.2, 0.1]), (len(LABEL), 3))
     model = eqx.tree_at(lambda m: m.splats.color_dc, MODEL, color)
@@ -395,7 +395,7 @@ def test_bad_clicks():
     for click in ((-1, 5), (72, 5), (5, 48), (np.nan, 1), (1,), "here"):
         with pytest.raises(ValueError, match=r"^click: expected \(x, y\)"):
             by_click(MODEL, click, frame=0)
-    with pytest.raises(ValueError, match=r"^click: expected a place where something is drawn"):
+    with pytest.raises(ValueError, match=r"^click: expected a pixel where something is rendered"):
         by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0)
 
 
@@ -483,7 +483,7 @@ def test_a_fitted_object_is_selected(fitted, name):
         ({"box": [[1, 2], [3]], "frame": 0}, "box"),
     ],
 )
-def test_options_of_what_is_not_asked(options, name):
+def test_options_without_their_criterion_are_rejected(options, name):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         select(MODEL, **options)
 
@@ -529,6 +529,6 @@ def test_frames_with_open_ends():
             by_box(model, box, frames=frames)
 
 
-def test_numbers_beyond_are_in_no_selection():
+def test_indices_out_of_range_are_in_no_selection():
     chosen = Selection(np.array([True, False, True]))
     assert [k in chosen for k in (0, 1, 2, 3, -1)] == [True, False, True, False, False]

@@ -4,7 +4,8 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from foldgauss.io.media.video_file import ANIMATION_SUFFIXES, IMAGE_SUFFIXES
+from foldgauss.io.media.image_files import IMAGE_SUFFIXES
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 

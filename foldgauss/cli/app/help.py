@@ -38,7 +38,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             ),
             Example("A small file that is good enough", "foldgauss fit holiday.mp4 --economy --max-size-mb 2"),
             Example("Frames as images; go on with a fit that was stopped", "foldgauss fit frames/ --resume"),
-            Example("For slow motion", "foldgauss fit holiday.mp4 --between-share 0.5"),
+            Example("For slow motion", "foldgauss fit holiday.mp4 --interpolation-fraction 0.5"),
             Example("A long clip, in segments of 10 seconds, by four processes", "foldgauss fit film.mp4 --workers 4"),
             Example(
                 "The same by a cluster of dask, whose workers see these folders",

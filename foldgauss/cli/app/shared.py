@@ -20,23 +20,18 @@ from foldgauss.cli.app.application import WrongUse, as_option, err, out
 from foldgauss.cli.app.application import app as app
 from foldgauss.cli.app.completion import clip_files, model_files
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.media.frame_index import LazyFrames, index_video
-from foldgauss.io.media.video_file import (
-    ANIMATION_SUFFIXES,
-    MAX_FPS,
-    MAX_GIF_FPS,
-    VIDEO_SUFFIXES,
-    Clip,
-    memory_limit,
-    read_video,
-    write_image,
-    write_video,
-)
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import index_video
+from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.resizing import memory_limit
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, MAX_GIF_FPS, VIDEO_SUFFIXES, write_image, write_video
 from foldgauss.io.models.segmented import is_segmented
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.io.provenance import are_others
+from foldgauss.io.provenance import describe_source as describe_source
 from foldgauss.io.provenance import fingerprint as fingerprint
-from foldgauss.io.provenance import provenance as provenance
+from foldgauss.io.provenance import has_other_frames
 from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK
@@ -269,7 +264,7 @@ def is_other_clip(model_path: Path, clip: Clip, got: Callable[[], float]) -> boo
     """
     about = read_origin(model_path)
     had = about.get("mean_psnr")
-    return had is not None and are_others(about, clip) and got() < had - OTHER
+    return had is not None and has_other_frames(about, clip) and got() < had - OTHER
 
 
 #: dB: decoders differ by less.
@@ -278,7 +273,7 @@ OTHER = 3.0
 
 def _say_other_frames(about: dict[str, Any], clip: Clip) -> None:
     """Any clip of the right size may be compared with a model, but not unawares."""
-    if are_others(about, clip):
+    if has_other_frames(about, clip):
         err.print(
             f"warning: the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
             "another clip or range, or the same one decoded by another version of OpenCV.",

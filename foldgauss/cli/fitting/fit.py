@@ -13,17 +13,15 @@ import typer
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.shared import (
-    AlphaCutoff,
     Frames,
     NewClip,
     Overwrite,
     Size,
     Stopped,
-    SupportRadius,
-    TransmittanceStop,
     WrongUse,
     app,
     as_option,
+    describe_source,
     err,
     evaluate_with_progress,
     figures_of,
@@ -33,7 +31,6 @@ from foldgauss.cli.app.shared import (
     parse_frames,
     parse_size,
     print_figures,
-    provenance,
     refuse_existing,
     refuse_foreign,
     refuse_input,
@@ -45,44 +42,26 @@ from foldgauss.cli.app.signals import noted_signals
 from foldgauss.cli.fitting.jobs_view import WorkerOptions
 from foldgauss.cli.fitting.long import fit_in_segments
 from foldgauss.cli.fitting.options import (
-    WATCHED,
-    BatchSize,
-    BetweenShare,
+    PROGRESS,
     CheckpointSeconds,
-    Compositing,
-    Degree,
-    Engine,
-    Gaussians,
-    HalfShare,
     LogJson,
-    MaxGaussians,
-    MaxSizeMb,
-    Minutes,
-    OnDivergence,
-    Power,
-    Preset,
-    QuarterShare,
     Quiet,
     Scheduler,
-    Seed,
     SegmentSeconds,
-    SmallestAtPsnr,
-    SsimShare,
-    Steps,
-    TargetPsnr,
     Threads,
-    UseEconomy,
     Workers,
-    config_of,
+    fit_options,
     manner_of,
 )
 from foldgauss.cli.fitting.progress import Manner, Observer, previewing, print_json, watching
 from foldgauss.io._atomic import OutputError, check_writable
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.io.media.pictures import comparison
-from foldgauss.io.media.video_file import Clip, read_video, write_image, write_video
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.contact_sheet import make_comparison_sheet
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.video_writing import write_image, write_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name, save_video_model
 from foldgauss.jobs.fitting import CHECKPOINT_SECONDS
@@ -120,13 +99,13 @@ def demo(
     frames = {"psnr": scores.psnr, "ssim": scores.ssim}
     write_json(out_dir / DEMO_RECORD, figures | frames)  # first: whatever stops this demo, the next may replace it
     path = save_video_model(
-        out_dir / "model.safetensors", model, metadata=provenance(clip, DEMO_CONFIG.seed) | scores_of(scores)
+        out_dir / "model.safetensors", model, metadata=describe_source(clip, DEMO_CONFIG.seed) | scores_of(scores)
     )
     figures["file_bytes"] = path.stat().st_size
     write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
-    picture = comparison([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
+    picture = make_comparison_sheet([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
     write_image(out_dir / "comparison.png", picture)
     write_json(out_dir / DEMO_RECORD, figures | frames)
     print_figures("Demo", figures)
@@ -149,49 +128,28 @@ def _is_demos(path: Path) -> bool:
 
 
 @app.command()
+@fit_options
 def fit(
     context: typer.Context,
     video: NewClip,
+    config: FitConfig,
     out_path: Annotated[
         Path | None,
         typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name, in this folder]."),
     ] = None,
-    preset: Preset = "standard",
     size: Size = None,
     frames: Frames = None,
     overwrite: Overwrite = False,
-    gaussians: Gaussians = None,
-    max_gaussians: MaxGaussians = None,
-    economy: UseEconomy = False,
-    smallest_at_psnr: SmallestAtPsnr = None,
-    max_size_mb: MaxSizeMb = None,
-    degree: Degree = None,
-    steps: Steps = None,
-    minutes: Minutes = None,
-    target_psnr: TargetPsnr = None,
-    batch_size: BatchSize = None,
-    power: Power = None,
-    compositing: Compositing = None,
-    interpolation_fraction: BetweenShare = None,
-    ssim_fraction: SsimShare = None,
-    quarter_fraction: QuarterShare = None,
-    half_fraction: HalfShare = None,
-    engine: Engine = "auto",
-    seed: Seed = 0,
-    alpha_cutoff: AlphaCutoff = None,
-    support_radius: SupportRadius = None,
-    transmittance_stop: TransmittanceStop = None,
-    on_divergence: OnDivergence = "back-off",
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=WATCHED),
+        typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=PROGRESS),
     ] = False,
     history: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE.jsonl",
             help="Write every step's figures here as it is done; FILE.png: the curves.",
-            rich_help_panel=WATCHED,
+            rich_help_panel=PROGRESS,
         ),
     ] = None,
     preview: Annotated[
@@ -199,7 +157,7 @@ def fit(
         typer.Option(
             metavar="FILE.png",
             help="Keep a picture of the running fit here, new every 10 s.",
-            rich_help_panel=WATCHED,
+            rich_help_panel=PROGRESS,
         ),
     ] = None,
     checkpoint_seconds: CheckpointSeconds = None,
@@ -220,11 +178,10 @@ def fit(
         check_model_name(target, "out")
     except ValueError as error:
         raise WrongUse(as_option(str(error))) from error
-    config = config_of(context.params)
     kept = target.with_name(f"{target.name}.checkpoint")
     manner = manner_of(quiet, log_json)
     hands = WorkerOptions(workers, scheduler, threads)
-    context.with_resource(only_writer(target, own=(kept,)))
+    context.with_resource(lock_output(target, own=(kept,)))
     refuse_existing(target, overwrite)
     begun = kept_seconds(target) is not None and not kept.exists() and (resume or not overwrite)
     if begun or not (segment_seconds is None and workers is None and scheduler is None):
@@ -267,7 +224,7 @@ def fit(
     with watching(manner, err, history=recorded, preview=previews) as observe:
         state, info = _run_fit(clip.frames, config, observe, state, keep, begin, seconds=checkpoint_seconds)
     model = to_model(state, config, clip.size, clip.fps)
-    about = noted(clip, seed, frames)
+    about = noted(clip, config.seed, frames)
     try:
         save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
     except OSError as error:
@@ -287,6 +244,7 @@ def fit(
     except OSError as error:  # of the second write; the model is there
         err.print(f"warning: {target} is written, but its scores could not be noted in it: {error}", soft_wrap=True)
     kept.unlink(missing_ok=True)
+    smallest_at_psnr = None if config.economy is None else config.economy.psnr
     if smallest_at_psnr is not None and info.stopped_by != "smallest_at_psnr":
         got = f"{scores.mean_psnr:.2f} dB after {info.step:,} steps"
         err.print(
@@ -305,7 +263,7 @@ def fit(
 
 def noted(clip: Clip, seed: int, frames: str | None) -> dict[str, Any]:
     """What `fit` notes in a model's file, but for its scores."""
-    return provenance(clip, seed) | {"frames": parse_frames(frames)}
+    return describe_source(clip, seed) | {"frames": parse_frames(frames)}
 
 
 def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:

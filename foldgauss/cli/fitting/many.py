@@ -11,12 +11,9 @@ from rich.table import Column, Table
 from foldgauss.cli.app.application import WrongUse, as_option, err, out
 from foldgauss.cli.app.completion import files
 from foldgauss.cli.app.shared import (
-    AlphaCutoff,
     Frames,
     Overwrite,
     Size,
-    SupportRadius,
-    TransmittanceStop,
     app,
     parse_frames,
     parse_size,
@@ -25,39 +22,20 @@ from foldgauss.cli.app.shared import (
 from foldgauss.cli.fitting.fit import make_folder
 from foldgauss.cli.fitting.jobs_view import WorkerOptions, run_jobs, tell_json
 from foldgauss.cli.fitting.options import (
-    BatchSize,
-    BetweenShare,
     CheckpointSeconds,
-    Compositing,
-    Degree,
-    Engine,
-    Gaussians,
-    HalfShare,
     LogJson,
-    MaxGaussians,
-    MaxSizeMb,
-    Minutes,
-    OnDivergence,
-    Power,
-    Preset,
-    QuarterShare,
     Quiet,
     Scheduler,
-    Seed,
-    SmallestAtPsnr,
-    SsimShare,
-    Steps,
-    TargetPsnr,
     Threads,
-    UseEconomy,
     Workers,
-    config_of,
+    fit_options,
     manner_of,
 )
-from foldgauss.io._lock import only_writer
+from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Outcome, find_clips, jobs_of
 from foldgauss.jobs.fitting import begin, begun, finished
 from foldgauss.jobs.many import RECORDS
+from foldgauss.video.fitting.config import FitConfig
 
 SUMMARY = "summary.json"
 #: The summary is written anew no more often: there may be thousands of clips.
@@ -67,6 +45,7 @@ MOST_ROWS = 60
 
 
 @app.command(name="fit-many")
+@fit_options
 def fit_many(
     context: typer.Context,
     folder: Annotated[
@@ -75,36 +54,14 @@ def fit_many(
             metavar="FOLDER", help="Folder with video files, and folders of images.", autocompletion=files()
         ),
     ],
+    config: FitConfig,
     out_dir: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder for the models [default: FOLDER-models, in this folder]."),
     ] = None,
-    preset: Preset = "standard",
     size: Size = None,
     frames: Frames = None,
     overwrite: Overwrite = False,
-    gaussians: Gaussians = None,
-    max_gaussians: MaxGaussians = None,
-    economy: UseEconomy = False,
-    smallest_at_psnr: SmallestAtPsnr = None,
-    max_size_mb: MaxSizeMb = None,
-    degree: Degree = None,
-    steps: Steps = None,
-    minutes: Minutes = None,
-    target_psnr: TargetPsnr = None,
-    batch_size: BatchSize = None,
-    power: Power = None,
-    compositing: Compositing = None,
-    interpolation_fraction: BetweenShare = None,
-    ssim_fraction: SsimShare = None,
-    quarter_fraction: QuarterShare = None,
-    half_fraction: HalfShare = None,
-    engine: Engine = "auto",
-    seed: Seed = 0,
-    alpha_cutoff: AlphaCutoff = None,
-    support_radius: SupportRadius = None,
-    transmittance_stop: TransmittanceStop = None,
-    on_divergence: OnDivergence = "back-off",
     checkpoint_seconds: CheckpointSeconds = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -117,7 +74,7 @@ def fit_many(
     Models go to DIR under the clips' names, what became of each to DIR/summary.json. Given again, the command does what
     is left, from where stopped fits were kept. It exits with 1 where a clip failed.
     """
-    config, manner = config_of(context.params), manner_of(quiet, log_json)
+    manner = manner_of(quiet, log_json)
     hands = WorkerOptions(workers, scheduler, threads)
     found = find_clips(folder)
     out_dir = Path(f"{folder.resolve().name}-models") if out_dir is None else out_dir
@@ -125,7 +82,7 @@ def fit_many(
         raise WrongUse(f"--out: expected another folder than the clips', got {out_dir}.")
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)
-    context.with_resource(only_writer(out_dir / SUMMARY, what="fit-many"))
+    context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))
     try:
         how = {"size": parse_size(size), "frames": parse_frames(frames), "checkpoint_seconds": checkpoint_seconds}
         jobs = jobs_of(found.clips, out_dir, config, **how)

@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
 from foldgauss.io.history import HistoryFile, info_line
-from foldgauss.io.media.pictures import comparison
-from foldgauss.io.media.video_file import Clip, write_image
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.contact_sheet import make_comparison_sheet
+from foldgauss.io.media.video_writing import write_image
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import FitInfo, FitState, to_model
 from foldgauss.video.models.metrics import psnr
@@ -74,7 +75,7 @@ def previewing(path: Path, clip: Clip, config: FitConfig) -> Observer:
         model = to_model(state, config, clip.size, clip.fps)
         picture = VideoRenderer(model).frame(np.asarray(model.frame_times.times())[k])
         caption = f"frame {k}, step {info.step}, {psnr(original, picture):.1f} dB"
-        write_image(path, comparison([original], [picture], [caption]))
+        write_image(path, make_comparison_sheet([original], [picture], [caption]))
 
     return observe
 

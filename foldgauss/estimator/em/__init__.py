@@ -1,1 +1,5 @@
-"""Expectation maximisation of mixtures, on arrays: `loop` drives it, `statistics` and `updates` are its two halves."""
+"""Expectation maximization of Folded-Gaussian mixtures on arrays.
+
+`loop.run_em` iterates; `statistics.accumulate` is the E-step, `updates.update_components` the M-step. `initialization`
+makes the initial parameters, `prune` removes components and powers, `online` updates by batches.
+"""

@@ -1,7 +1,7 @@
 """Cholesky factors and their inverses for batches of small matrices, by products only.
 
-jaxlib 0.10's triangular solver for batches may wait for itself on two cores (see `_triangular`); and here the
-factor of a singular matrix is NaN, never an error.
+The factor of a singular matrix is NaN. jaxlib 0.10's own triangular solver for batches may deadlock on two cores (see
+`foldgauss._numerics.triangular`).
 """
 
 import jax.numpy as jnp

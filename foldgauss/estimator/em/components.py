@@ -1,11 +1,11 @@
-"""Mixture components as arrays, made for many points at once: points by rows, components by columns.
+"""Mixture components as arrays, and their densities at many points: points by rows, components by columns.
 
 In fitting, the curve of component k is a polynomial in its own dimensionless v = (time_loc - t) / time_scale:
 
     loc + f(time_loc - t) = sum_j curve_j v^j
 
-so that all numbers are of order one once the points are centred and scaled. The fold equation keeps its one home,
-`FoldedGaussian.condition_time`, to which tests hold this twin.
+so that all parameters are of order one once the points are centered and scaled. Tests compare this with
+`FoldedGaussian.condition_time`, where the fold equation is defined.
 """
 
 import functools
@@ -24,13 +24,13 @@ from foldgauss._numerics.triangular import UNROLLED_SIZE
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.cholesky import inverse_lower, log_det
 
-__all__ = ["Pairs", "Parameters", "log_likelihoods", "moved", "pairs_of", "to_powers"]
+__all__ = ["Densities", "Parameters", "change_variable", "evaluate_densities", "log_likelihoods", "to_powers"]
 
 _LOG_2PI = math.log(2 * math.pi)
 
 
 class Parameters(NamedTuple):
-    """K components; further leading axes are restarts, by vmap."""
+    """K components; vmap adds a leading axis for restarts."""
 
     log_weights: Float[Array, " k"]
     time_loc: Float[Array, " k"]
@@ -43,9 +43,9 @@ class Parameters(NamedTuple):
         return self.curve.shape[-2] - 1
 
 
-class Pairs(NamedTuple):
-    """What a density needs of every pair of point and component. Space is a list of columns where it is small:
-    stacking them would be a pass over memory of its own (see `_triangular`)."""
+class Densities(NamedTuple):
+    """The density of every pair of point and component, and its terms. Few space coordinates are a list of columns:
+    stacking them would be another pass over memory (see `foldgauss._numerics.triangular`)."""
 
     v: Float[Array, "n k"]
     whitened: list[Array]  # L^-1 (s - curve): d-1 arrays (n, k), or one (n, k, d-1)
@@ -53,31 +53,31 @@ class Pairs(NamedTuple):
     log_density: Float[Array, "n k"]  # with the weight of the component
 
 
-def pairs_of(params: Parameters, envelope: AbstractEnvelope, x: Float[Array, "n d"]) -> Pairs:
-    """log (w_k FN_k(x_i)) of every pair (eq:foldgauss), with what it is made of."""
+def evaluate_densities(params: Parameters, envelope: AbstractEnvelope, x: Float[Array, "n d"]) -> Densities:
+    """log (w_k FN_k(x_i)) of every pair (eq:foldgauss), and its terms."""
     envelope, dim = cast(envelope, x.dtype), params.tril.shape[-1]
     t = x[:, -1:]
     v = (params.time_loc[None] - t) * (1 / params.time_scale)[None]
     inverse = inverse_lower(params.tril)
     if dim <= UNROLLED_SIZE:
-        residual = [x[:, j : j + 1] - _horner(params.curve[:, :, j], v) for j in range(dim)]
-        whitened = [_sum(inverse[None, :, a, b] * residual[b] for b in range(a + 1)) for a in range(dim)]
-        square = _sum(e * e for e in whitened)
+        residual = [x[:, j : j + 1] - _evaluate_polynomial(params.curve[:, :, j], v) for j in range(dim)]
+        whitened = [_add_up(inverse[None, :, a, b] * residual[b] for b in range(a + 1)) for a in range(dim)]
+        square = _add_up(e * e for e in whitened)
     else:
-        fitted = _horner(params.curve, v[..., None])
+        fitted = _evaluate_polynomial(params.curve, v[..., None])
         whitened = [jnp.einsum("kab,nkb->nka", inverse, x[:, None, :-1] - fitted)]
         square = (whitened[0] * whitened[0]).sum(-1)
     constant = params.log_weights - 0.5 * log_det(params.tril) - jnp.log(params.time_scale) - 0.5 * (dim + 1) * _LOG_2PI
     if isinstance(envelope, Constant):
-        return Pairs(v, whitened, None, constant[None] - 0.5 * (square + v * v))
+        return Densities(v, whitened, None, constant[None] - 0.5 * (square + v * v))
     log_a = envelope.log_a(t, time_loc=params.time_loc[None], time_scale=params.time_scale[None])
-    # exp(-log_a) overflows only where the density is below every number; 0 * inf would be NaN.
+    # exp(-log_a) overflows only where the density underflows; 0 * inf would be NaN.
     over_a = square * jnp.exp(jnp.minimum(-log_a, 0.95 * float(np.log(jnp.finfo(v.dtype).max))))
-    return Pairs(v, whitened, log_a, constant[None] - 0.5 * (over_a + v * v + dim * log_a))
+    return Densities(v, whitened, log_a, constant[None] - 0.5 * (over_a + v * v + dim * log_a))
 
 
-def moved(curve: Float[Array, "*batch q+1 dim"], shift, ratio) -> Float[Array, "*batch q+1 dim"]:
-    """The same curve in powers of v' where v = shift + ratio v': the binomial theorem."""
+def change_variable(curve: Float[Array, "*batch q+1 dim"], shift, ratio) -> Float[Array, "*batch q+1 dim"]:
+    """The same curve in powers of v' where v = shift + ratio v', by the binomial theorem."""
     degree = curve.shape[-2] - 1
     rows = [curve[..., j, :] for j in range(degree + 1)]
     for start in range(degree):  # Taylor's shift by Horner's scheme
@@ -90,22 +90,24 @@ def moved(curve: Float[Array, "*batch q+1 dim"], shift, ratio) -> Float[Array, "
 
 
 def to_powers(coefficients: Float[Array, "*batch k dim"]) -> Float[Array, "*batch k dim"]:
-    """Coefficients of `hermite` to coefficients of powers."""
+    """Convert coefficients of `hermite` to coefficients of powers."""
     matrix = jnp.asarray(hermite_to_powers(coefficients.shape[-2] - 1), coefficients.dtype)
     return jnp.einsum("jk,...kd->...jd", matrix, coefficients)
 
 
-def _horner(coefficients: Float[Array, "k q+1 *dim"], v: Float[Array, "n k *one"]) -> Float[Array, "n k *dim"]:
+def _evaluate_polynomial(
+    coefficients: Float[Array, "k q+1 *dim"], v: Float[Array, "n k *one"]
+) -> Float[Array, "n k *dim"]:
     value = coefficients[None, :, -1]
     for j in reversed(range(coefficients.shape[1] - 1)):
         value = value * v + coefficients[None, :, j]
     return value
 
 
-def _sum(terms):
+def _add_up(terms):
     return functools.reduce(operator.add, terms)
 
 
 def log_likelihoods(log_density: Float[Array, "n k"]) -> Float[Array, " n"]:
-    """log sum_k, -inf where every term is."""
+    """log sum_k; -inf where every term is."""
     return jax.nn.logsumexp(log_density, axis=-1)

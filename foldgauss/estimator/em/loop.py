@@ -1,6 +1,6 @@
-"""Expectation maximisation: the loop. What a step does stands in `statistics` and `updates`.
+"""The EM iteration, for several restarts at once: convergence, annealing, resets of empty components.
 
-**Source:** Dempster, Laird and Rubin 1977; generalised EM where the envelope hangs on time.
+**Source:** Dempster, Laird and Rubin 1977; generalized EM where the envelope depends on time.
 """
 
 from enum import IntEnum
@@ -14,23 +14,32 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.components import Parameters
-from foldgauss.estimator.em.statistics import Blocks, Points, Statistics, Times, accumulate, summed, time_steps
-from foldgauss.estimator.em.updates import Model, newton_step, profile, updated
+from foldgauss.estimator.em.statistics import (
+    Blocks,
+    Points,
+    SufficientStatistics,
+    Times,
+    accumulate,
+    step_times,
+    sum_over_points,
+)
+from foldgauss.estimator.em.updates import Model, newton_step, profile_log_likelihood, update_components
 
-__all__ = ["EMStatus", "Run", "State", "best", "expectation_maximisation", "log_likelihood", "step", "used_degrees"]
+__all__ = ["EMStatus", "Run", "State", "broadcast_degrees", "log_likelihood", "run_em", "select_best", "step"]
 
-#: Of what a step of time promises, the share that it must bring.
+#: Armijo's condition: the fraction of the predicted gain that a Newton step of the times must achieve.
 _ARMIJO = 1e-4
 #: Steps from the first inverse temperature to 1.
 ANNEALING_STEPS = 50
-#: Mean log-likelihoods that differ by less than so many times their dtype's eps are equal.
+#: Mean log-likelihoods that differ by less than this many epsilons of their dtype count as equal.
 _ROUNDING = 64
-#: On the way, centres are moved by this share of their own spread: components that heat has made one can part again.
+#: While annealing, centers are perturbed by this fraction of their standard deviation, so that coinciding components
+#: can separate.
 _JITTER = 0.05
 
 
 class EMStatus(IntEnum):
-    """How a run ended. Only CONVERGED is convergence."""
+    """How a run ended."""
 
     CONVERGED = 0
     NOT_CONVERGED = 1
@@ -40,20 +49,20 @@ class EMStatus(IntEnum):
 
 class State(NamedTuple):
     params: Parameters
-    share: Float[Array, " k"]  # of Newton's step of time; smaller after a step that did not go up
+    step_fraction: Float[Array, " k"]  # of Newton's step of the times; reduced after a rejected step
 
 
 class Info(NamedTuple):
-    """About one step: of the parameters it began with."""
+    """Diagnostics of one step, for the parameters before it."""
 
     log_likelihood: Float[Array, ""]
     mass: Float[Array, " k"]
     stuck: Bool[Array, " k"]  # no update was possible
-    refused: Float[Array, ""]  # what steps of time promised and did not bring
+    rejected: Float[Array, ""]  # predicted gain of rejected steps of the times
 
 
 class Run(NamedTuple):
-    """One restart's end: the last parameters, and the mean log-likelihood before each of its steps."""
+    """The result of one restart: the last parameters, and the mean log-likelihood before each of its steps."""
 
     params: Parameters
     log_likelihood: float
@@ -66,119 +75,126 @@ class Run(NamedTuple):
 def step(
     state: State, points: Points, envelope: AbstractEnvelope, model: Model, inverse_temperature=None
 ) -> tuple[State, Info]:
-    """One iteration: exact EM for a constant envelope, else generalised EM with a step of time that goes up."""
+    """One iteration: exact EM for a constant envelope, else generalized EM with an ascent step of the times."""
     params = state.params
     if isinstance(envelope, Constant):
-        return _stepped(state, accumulate(params, envelope, points, inverse_temperature=inverse_temperature), model)
+        return _m_step(state, accumulate(params, envelope, points, inverse_temperature=inverse_temperature), model)
     here = accumulate(params, envelope, points, order=2, inverse_temperature=inverse_temperature)
-    trial = _trial(state, here, model)
-    there = accumulate(params, envelope, points, times=trial.times, inverse_temperature=inverse_temperature)
-    return _stepped_in_time(state, here, trial, there, model)
+    proposal = _propose_times(state, here, model)
+    there = accumulate(params, envelope, points, times=proposal.times, inverse_temperature=inverse_temperature)
+    return _m_step_with_times(state, here, proposal, there, model)
 
 
-class _Trial(NamedTuple):
-    """A step of time that is to be tried."""
+class _TimeProposal(NamedTuple):
+    """A proposed step of the times."""
 
     steps: Float[Array, "2 k"]
-    promise: Float[Array, " k"]
+    predicted: Float[Array, " k"]
     times: Times
 
 
-def _stepped(state: State, sums: Statistics, model: Model) -> tuple[State, Info]:
-    new, stuck = updated(state.params, sums, model)
-    return State(new, state.share), Info(sums.log_likelihood, sums.mass, stuck, jnp.zeros((), sums.mass.dtype))
+def _m_step(state: State, sums: SufficientStatistics, model: Model) -> tuple[State, Info]:
+    new, stuck = update_components(state.params, sums, model)
+    return State(new, state.step_fraction), Info(sums.log_likelihood, sums.mass, stuck, jnp.zeros((), sums.mass.dtype))
 
 
-def _trial(state: State, here: Statistics, model: Model) -> _Trial:
-    direction, promise = newton_step(here, model, state.params.degree)
-    steps = state.share[None] * direction
-    return _Trial(steps, promise, time_steps(Times(state.params.time_loc, state.params.time_scale), steps))
+def _propose_times(state: State, here: SufficientStatistics, model: Model) -> _TimeProposal:
+    direction, predicted = newton_step(here, model, state.params.degree)
+    steps = state.step_fraction[None] * direction
+    return _TimeProposal(steps, predicted, step_times(Times(state.params.time_loc, state.params.time_scale), steps))
 
 
-def _stepped_in_time(
-    state: State, here: Statistics, trial: _Trial, there: Statistics, model: Model
+def _m_step_with_times(
+    state: State, here: SufficientStatistics, proposal: _TimeProposal, there: SufficientStatistics, model: Model
 ) -> tuple[State, Info]:
-    (steps, promise, _), params = trial, state.params
-    before = profile(here, model, params.degree, jnp.zeros_like(steps), here.gram[0], here.log_a[0])
-    after = profile(here, model, params.degree, steps, there.gram[0], there.log_a[0])
-    rises = after >= before + _ARMIJO * state.share * promise  # so written, a NaN does not rise
+    (steps, predicted, _), params = proposal, state.params
+    before = profile_log_likelihood(here, model, params.degree, jnp.zeros_like(steps), here.gram[0], here.log_a[0])
+    after = profile_log_likelihood(here, model, params.degree, steps, there.gram[0], there.log_a[0])
+    rises = after >= before + _ARMIJO * state.step_fraction * predicted  # false for NaN
     gram = jnp.where(rises[:, None, None], there.gram[0], here.gram[0])
-    new, stuck = updated(params, here._replace(gram=gram[None]), model, jnp.where(rises[None], steps, 0))
-    share = jnp.where(rises, jnp.minimum(1, 2 * state.share), 0.25 * state.share)
-    refused = jnp.where(rises, 0, promise).sum()
-    return State(new, share), Info(here.log_likelihood, here.mass, stuck, refused)
+    new, stuck = update_components(params, here._replace(gram=gram[None]), model, jnp.where(rises[None], steps, 0))
+    step_fraction = jnp.where(rises, jnp.minimum(1, 2 * state.step_fraction), 0.25 * state.step_fraction)
+    rejected = jnp.where(rises, 0, predicted).sum()
+    return State(new, step_fraction), Info(here.log_likelihood, here.mass, stuck, rejected)
 
 
 @eqx.filter_jit
-def _steps(states: State, frozen, points, envelope, model, inverse_temperature):
-    """A step of every restart; frozen ones stay."""
+def _step_restarts(states: State, frozen, points, envelope, model, inverse_temperature):
+    """Step every restart except frozen ones."""
 
-    def one(state, stays):
-        return _held(stays, state, *step(state, points, envelope, model, inverse_temperature))
+    def one(state, frozen):
+        return _freeze(frozen, state, *step(state, points, envelope, model, inverse_temperature))
 
-    return _of_each(one, states, frozen)
-
-
-def _held(stays, state: State, new: State, info: Info) -> tuple[State, Info]:
-    return jax.tree.map(lambda a, b: jnp.where(stays, a, b), state, new), info
+    return _map_restarts(one, states, frozen)
 
 
-def _of_each(function, *arguments):
-    """The function of each restart (leading axis)."""
-    if len(jax.tree.leaves(arguments)[0]) == 1:  # without an axis of size one in every array
+def _freeze(frozen, state: State, new: State, info: Info) -> tuple[State, Info]:
+    return jax.tree.map(lambda a, b: jnp.where(frozen, a, b), state, new), info
+
+
+def _map_restarts(function, *arguments):
+    """Apply a function to each restart (leading axis)."""
+    if len(jax.tree.leaves(arguments)[0]) == 1:  # avoids an axis of size one in every array
         return jax.tree.map(lambda z: z[None], function(*jax.tree.map(lambda z: z[0], arguments)))
     return jax.vmap(function)(*arguments)
 
 
-# --- the same step over blocks: the sums are one program, called for each block, what is made of them another ------
+# --- the same step over blocks: the sums are one program, called for each block, the M-step another ----------------
 
 
-def _steps_of_blocks(states: State, frozen, blocks: Blocks, envelope, model, inverse_temperature):
-    """As `_steps`."""
+def _step_over_blocks(states: State, frozen, blocks: Blocks, envelope, model, inverse_temperature):
+    """As `_step_restarts`, for points that are read block by block."""
     if isinstance(envelope, Constant):
-        sums = summed(_sums, blocks, states.params, envelope, None, 0, inverse_temperature)
-        return _stepped_each(states, frozen, sums, model)
-    here = summed(_sums, blocks, states.params, envelope, None, 2, inverse_temperature)
-    trial = _trial_each(states, here, model)
-    there = summed(_sums, blocks, states.params, envelope, trial.times, 0, inverse_temperature)
-    return _stepped_in_time_each(states, frozen, here, trial, there, model)
+        sums = sum_over_points(_accumulate_restarts, blocks, states.params, envelope, None, 0, inverse_temperature)
+        return _m_step_each(states, frozen, sums, model)
+    here = sum_over_points(_accumulate_restarts, blocks, states.params, envelope, None, 2, inverse_temperature)
+    proposal = _propose_times_each(states, here, model)
+    there = sum_over_points(
+        _accumulate_restarts, blocks, states.params, envelope, proposal.times, 0, inverse_temperature
+    )
+    return _m_step_with_times_each(states, frozen, here, proposal, there, model)
 
 
-def _sums(params: Parameters, envelope, times: Times | None, order: int, inverse_temperature, points: Points):
+def _accumulate_restarts(
+    params: Parameters, envelope, times: Times | None, order: int, inverse_temperature, points: Points
+):
     def one(params, times):
         return accumulate(params, envelope, points, times=times, order=order, inverse_temperature=inverse_temperature)
 
-    return _of_each(one, params, times)
+    return _map_restarts(one, params, times)
 
 
 @eqx.filter_jit
-def _stepped_each(states, frozen, sums, model):
-    return _of_each(lambda stays, state, sums: _held(stays, state, *_stepped(state, sums, model)), frozen, states, sums)
+def _m_step_each(states, frozen, sums, model):
+    def one(frozen, state, sums):
+        return _freeze(frozen, state, *_m_step(state, sums, model))
+
+    return _map_restarts(one, frozen, states, sums)
 
 
 @eqx.filter_jit
-def _trial_each(states, here, model):
-    return _of_each(lambda state, here: _trial(state, here, model), states, here)
+def _propose_times_each(states, here, model):
+    return _map_restarts(lambda state, here: _propose_times(state, here, model), states, here)
 
 
 @eqx.filter_jit
-def _stepped_in_time_each(states, frozen, here, trial, there, model):
-    def one(stays, state, *sums):
-        return _held(stays, state, *_stepped_in_time(state, *sums, model))
+def _m_step_with_times_each(states, frozen, here, proposal, there, model):
+    def one(frozen, state, *sums):
+        return _freeze(frozen, state, *_m_step_with_times(state, *sums, model))
 
-    return _of_each(one, frozen, states, here, trial, there)
+    return _map_restarts(one, frozen, states, here, proposal, there)
 
 
 def log_likelihood(params: Parameters, points: Points | Blocks, envelope: AbstractEnvelope) -> Float[Array, ""]:
     """sum_i w_i log p(x_i)."""
-    return summed(_log_likelihood, points, params, envelope)
+    return sum_over_points(_log_likelihood, points, params, envelope)
 
 
 def _log_likelihood(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, ""]:
     return accumulate(params, envelope, points).log_likelihood
 
 
-def expectation_maximisation(
+def run_em(
     starts: Parameters,
     points: Points | Blocks,
     envelope: AbstractEnvelope,
@@ -191,41 +207,41 @@ def expectation_maximisation(
     annealing: float = 1.0,
     observe=None,
 ) -> list[Run]:
-    """EM from every start (leading axis), all in one program, or in one for each block; `total` is the weights' sum.
+    """Run EM from every start (leading axis) in one program, or one for each block; `total` is the sum of weights.
 
-    A component with less mass than `least_mass` is given half of the heaviest one instead, so many times as there are
-    components. A run converges where the mean log-likelihood moves by less than `tol`, at temperature 1, without a
-    reset, and with no larger promise refused to its times.
+    A component with less mass than `least_mass` is reset to half of the heaviest one, at most as often as there are
+    components. A run has converged when the mean log-likelihood changes by less than `tol`, at temperature 1, without a
+    reset, and with no larger predicted gain rejected.
     """
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
-    take_steps = _steps_of_blocks if isinstance(points, Blocks) else _steps
+    step_all = _step_over_blocks if isinstance(points, Blocks) else _step_restarts
     before, lasts = states, np.full(restarts, -np.inf)
     statuses = np.full(restarts, EMStatus.NOT_CONVERGED)
     done, num_steps = np.zeros(restarts, bool), np.zeros(restarts, int)
     resets, histories = np.zeros(restarts, int), [[] for _ in range(restarts)]
     for number in range(1, max_steps + 1):
-        heat = annealing ** max(1 - (number - 1) / ANNEALING_STEPS, 0)
-        cold = heat == 1.0
-        temperature = None if cold else jnp.asarray(heat, starts.time_loc.dtype)
-        new, info = take_steps(states, jnp.asarray(done), points, envelope, model, temperature)
-        values, refused = np.asarray(info.log_likelihood) / total, np.asarray(info.refused) / total
+        inverse_temperature = annealing ** max(1 - (number - 1) / ANNEALING_STEPS, 0)
+        annealed = inverse_temperature == 1.0
+        beta = None if annealed else jnp.asarray(inverse_temperature, starts.time_loc.dtype)
+        new, info = step_all(states, jnp.asarray(done), points, envelope, model, beta)
+        values, rejected = np.asarray(info.log_likelihood) / total, np.asarray(info.rejected) / total
         broken = ~done & ~np.isfinite(values)
-        small = (np.abs(values - lasts) < tol) & (refused < max(tol, 1e-12)) & cold & (number > 1)
-        lasts, going = np.where(done, lasts, values), ~done
-        for r in np.flatnonzero(going):
+        small = (np.abs(values - lasts) < tol) & (rejected < max(tol, 1e-12)) & annealed & (number > 1)
+        lasts, running = np.where(done, lasts, values), ~done
+        for r in np.flatnonzero(running):
             histories[r].append(float(values[r]))
-        num_steps[going] = number
+        num_steps[running] = number
         statuses[broken] = EMStatus.NOT_FINITE
-        if not cold:
-            new = _jittered(new, number)
-        if broken.any():  # back to the last parameters whose likelihood was a number
-            new = _chosen(broken, before, new)
-        dead = going[:, None] & ~broken[:, None] & (np.asarray(info.mass) < least_mass)
-        reset = dead.any(1) & (resets < dead.shape[1]) & (number < max_steps)
+        if not annealed:
+            new = _jitter(new, number)
+        if broken.any():  # back to the last parameters with a finite likelihood
+            new = _select_restarts(broken, before, new)
+        empty = running[:, None] & ~broken[:, None] & (np.asarray(info.mass) < least_mass)
+        reset = empty.any(1) & (resets < empty.shape[1]) & (number < max_steps)
         for r in np.flatnonzero(reset):
-            new = _reset(new, r, dead[r], np.asarray(info.mass[r]))
-            resets[r] += int(dead[r].sum())
-        converged = going & ~broken & small & ~reset
+            new = _reset_components(new, r, empty[r], np.asarray(info.mass[r]))
+            resets[r] += int(empty[r].sum())
+        converged = running & ~broken & small & ~reset
         singular = (np.asarray(info.stuck) & (np.asarray(info.mass) > 0)).any(1)
         statuses[converged] = np.where(singular, EMStatus.SINGULAR, EMStatus.CONVERGED)[converged]
         done = done | broken | converged
@@ -247,18 +263,18 @@ def expectation_maximisation(
     ]
 
 
-def best(runs: list[Run]) -> Run:
+def select_best(runs: list[Run]) -> Run:
     """The run of the largest likelihood, the first of those equal up to rounding; a broken one only if all are.
 
-    Otherwise the order in which points are summed would choose among starts that lead to one end.
+    Without this tolerance the order of summation would choose among runs that reach the same optimum.
     """
-    top = max(runs, key=_goodness)
+    top = max(runs, key=_rank)
     rounding = _ROUNDING * float(jnp.finfo(top.params.curve.dtype).eps) * max(1.0, abs(top.log_likelihood))
-    sound, least = top.status != EMStatus.NOT_FINITE, top.log_likelihood - rounding
-    return next((run for run in runs if _goodness(run) >= (sound, least)), top)
+    least = top.status != EMStatus.NOT_FINITE, top.log_likelihood - rounding
+    return next((run for run in runs if _rank(run) >= least), top)
 
 
-def _goodness(run: Run) -> tuple[bool, float]:
+def _rank(run: Run) -> tuple[bool, float]:
     return run.status != EMStatus.NOT_FINITE, run.log_likelihood
 
 
@@ -266,14 +282,14 @@ def _last_finite(history: list[float]) -> float:
     return next((value for value in reversed(history) if np.isfinite(value)), -np.inf)
 
 
-def _chosen(flags: np.ndarray, these: State, others: State) -> State:
-    """These where the restart's flag is true."""
+def _select_restarts(flags: np.ndarray, these: State, others: State) -> State:
+    """`these` for restarts whose flag is true, else `others`."""
     choose = lambda a, b: jnp.where(jnp.asarray(flags).reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
     return jax.tree.map(choose, these, others)
 
 
-def _jittered(states: State, number: int) -> State:
-    """Components that lie on each other stay there: EM moves them as one.
+def _jitter(states: State, number: int) -> State:
+    """Perturb the centers: components that coincide would otherwise stay together, as EM updates them alike.
 
     **Source:** Rose 1998, Deterministic annealing for clustering, compression, classification, regression.
     """
@@ -283,15 +299,15 @@ def _jittered(states: State, number: int) -> State:
     )
     return State(
         params._replace(curve=params.curve.at[:, :, 0].add(jnp.einsum("rkab,rkb->rka", params.tril, noise))),
-        states.share,
+        states.step_fraction,
     )
 
 
-def _reset(states: State, restart: int, dead: np.ndarray, mass: np.ndarray) -> State:
-    """Each dead component takes half of the heaviest one, both a little apart along its longest axis."""
+def _reset_components(states: State, restart: int, empty: np.ndarray, mass: np.ndarray) -> State:
+    """Replace each empty component by half of the heaviest one; both are shifted apart along its longest axis."""
     log_weights, time_loc, time_scale, curve, tril = (np.array(z) for z in states.params)
-    mass = np.where(dead, 0, mass)
-    for k in np.flatnonzero(dead):
+    mass = np.where(empty, 0, mass)
+    for k in np.flatnonzero(empty):
         donor = int(np.argmax(mass))
         for z in (time_loc, time_scale, curve, tril):
             z[restart, k] = z[restart, donor]
@@ -303,9 +319,9 @@ def _reset(states: State, restart: int, dead: np.ndarray, mass: np.ndarray) -> S
         log_weights[restart, [donor, k]] = half
         mass[[donor, k]] = mass[donor] / 2
     params = Parameters(*(jnp.asarray(z) for z in (log_weights, time_loc, time_scale, curve, tril)))
-    return State(params, states.share)
+    return State(params, states.step_fraction)
 
 
-def used_degrees(degrees, num_components: int) -> Int[Array, " k"]:
-    """One degree for all, or one for each."""
+def broadcast_degrees(degrees, num_components: int) -> Int[Array, " k"]:
+    """One degree for all components, or one for each."""
     return jnp.broadcast_to(jnp.asarray(degrees, jnp.int32), (num_components,))

@@ -1,7 +1,7 @@
-"""Online EM: sums of all batches so far, older ones forgotten slowly, kept in the frame of the present components.
+"""Online EM: decaying averages of the sufficient statistics of all batches, relative to the current components.
 
 **Source:** Cappé and Moulines 2009, On-line expectation-maximization algorithm for latent data models (a = 1 only:
-there the sums are the sufficient statistics of every later frame too).
+then statistics relative to one set of components can be converted to any other).
 """
 
 import equinox as eqx
@@ -13,38 +13,38 @@ from jaxtyping import Array, Float
 from foldgauss._numerics.regression import hermite_to_powers
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.cholesky import inverse_lower
-from foldgauss.estimator.em.components import Parameters, moved, to_powers
-from foldgauss.estimator.em.statistics import Points, Statistics, accumulate
-from foldgauss.estimator.em.updates import Model, updated
+from foldgauss.estimator.em.components import Parameters, change_variable, to_powers
+from foldgauss.estimator.em.statistics import Points, SufficientStatistics, accumulate
+from foldgauss.estimator.em.updates import Model, update_components
 
-__all__ = ["FORGETTING", "batch_sums", "online_step", "seen_from"]
+__all__ = ["FORGETTING", "change_reference", "compute_batch_statistics", "update_online"]
 
-#: A batch counts for its share of all weight so far to this power: between 1/2 and 1 it converges.
+#: A batch is weighted by its fraction of all weight so far to this power; EM converges for values in (1/2, 1].
 FORGETTING = 0.7
 
 
 @eqx.filter_jit
-def batch_sums(params: Parameters, points: Points) -> Statistics:
-    """The sums of one batch, as they stand."""
+def compute_batch_statistics(params: Parameters, points: Points) -> SufficientStatistics:
+    """The sufficient statistics of one batch."""
     return accumulate(params, Constant(), points)
 
 
 @eqx.filter_jit
-def online_step(
-    params: Parameters, sums: Statistics, new: Statistics, model: Model, share: Float[Array, ""]
-) -> tuple[Parameters, Statistics]:
-    """A batch's sums weighed in with `share` (both are taken per unit of weight), and the components' update.
+def update_online(
+    params: Parameters, sums: SufficientStatistics, new: SufficientStatistics, model: Model, fraction: Float[Array, ""]
+) -> tuple[Parameters, SufficientStatistics]:
+    """Average in a batch's statistics with weight `fraction` (both per unit of weight), and update the components.
 
-    Apart from `batch_sums`, so that this is compiled once, whatever the batches' sizes.
+    Separate from `compute_batch_statistics`, so that this is compiled once for batches of all sizes.
     """
     unit = lambda sums: jax.tree.map(lambda z: z / sums.mass.sum(), sums)  # noqa: E731
-    sums = jax.tree.map(lambda old, new: (1 - share) * old + share * new, unit(sums), unit(new))
-    after, _ = updated(params, sums, model)
-    return after, seen_from(sums, params, after)
+    sums = jax.tree.map(lambda old, new: (1 - fraction) * old + fraction * new, unit(sums), unit(new))
+    after, _ = update_components(params, sums, model)
+    return after, change_reference(sums, params, after)
 
 
-def seen_from(sums: Statistics, here: Parameters, there: Parameters) -> Statistics:
-    """The same points' sums in the frame of other components: a linear map of (basis, residual)."""
+def change_reference(sums: SufficientStatistics, here: Parameters, there: Parameters) -> SufficientStatistics:
+    """Convert statistics relative to components `here` to components `there`: a linear map of (basis, residual)."""
     size, dim = here.degree + 1, here.tril.shape[-1]
     # v' = shift + ratio v
     shift = (there.time_loc - here.time_loc) / there.time_scale
@@ -52,12 +52,12 @@ def seen_from(sums: Statistics, here: Parameters, there: Parameters) -> Statisti
     to_hermite = jnp.asarray(np.linalg.inv(hermite_to_powers(here.degree)), shift.dtype)
     in_hermite = lambda powers: jnp.einsum("ij,kjc->kic", to_hermite, powers)  # noqa: E731
     eye = jnp.broadcast_to(jnp.eye(size, dtype=shift.dtype)[None], (len(shift), size, size))
-    basis = in_hermite(moved(to_powers(eye), shift, ratio))  # column j: He_j(v') in Hermite polynomials of v
-    apart = in_hermite(here.curve - moved(there.curve, shift, ratio))
+    basis = in_hermite(change_variable(to_powers(eye), shift, ratio))  # column j: He_j(v') in Hermite polynomials of v
+    offset = in_hermite(here.curve - change_variable(there.curve, shift, ratio))
     whitening = inverse_lower(there.tril)
     change = jnp.zeros((len(shift), size + dim, size + dim), shift.dtype)
     change = change.at[:, :size, :size].set(jnp.swapaxes(basis, 1, 2))
-    change = change.at[:, size:, :size].set(jnp.einsum("kab,kjb->kaj", whitening, apart))
+    change = change.at[:, size:, :size].set(jnp.einsum("kab,kjb->kaj", whitening, offset))
     change = change.at[:, size:, size:].set(jnp.einsum("kab,kbc->kac", whitening, here.tril))
     return sums._replace(
         first=shift * sums.mass + ratio * sums.first,

@@ -1,4 +1,4 @@
-"""Points centred and scaled for fitting, and components taken back to the units of the points."""
+"""Centering and scaling of points for fitting, and conversion of components back to the units of the points."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from foldgauss.estimator.em.components import Parameters
 from foldgauss.fold import PolynomialFold
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["Prepare", "Scaling", "from_mixture", "scaling_of", "to_mixture"]
+__all__ = ["RowTransform", "Scaling", "compute_scaling", "to_mixture"]
 
 
 class Scaling(NamedTuple):
@@ -23,7 +23,7 @@ class Scaling(NamedTuple):
     scale: Float[np.ndarray, " d"]
 
     def apply(self, x: np.ndarray) -> np.ndarray:
-        """y in the dtype of x, rows in order. Centred in float64: an offset costs the variances no digits."""
+        """y in the dtype of x. Centered in float64, so that an offset costs the variances no digits."""
         return ((x.astype(np.float64) - self.shift) / self.scale).astype(x.dtype)
 
     @property
@@ -32,8 +32,8 @@ class Scaling(NamedTuple):
         return float(np.log(self.scale).sum())
 
 
-class Prepare(NamedTuple):
-    """Pieces of chunks made ready for fitting: rows with weight, their columns in `order`, scaled."""
+class RowTransform(NamedTuple):
+    """Prepares pieces of chunks for fitting: rows of positive weight, columns in `order`, scaled."""
 
     order: Int[np.ndarray, " d"]
     scaling: Scaling
@@ -41,25 +41,25 @@ class Prepare(NamedTuple):
     dtype: np.dtype
 
     def __call__(self, piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-        there = piece.weights > 0
-        x, weights = (z.astype(self.dtype, copy=False) for z in (piece.x[there][:, self.order], piece.weights[there]))
+        kept = piece.weights > 0
+        x, weights = (z.astype(self.dtype, copy=False) for z in (piece.x[kept][:, self.order], piece.weights[kept]))
         return self.scaling.apply(x), weights if self.factor == 1 else weights * self.dtype.type(self.factor)
 
 
-def scaling_of(mean, variance, envelope: AbstractEnvelope, covariance: str) -> Scaling:
-    """Mean 0 and variance 1 per coordinate, as far as the model allows."""
+def compute_scaling(mean, variance, envelope: AbstractEnvelope, covariance: str) -> Scaling:
+    """The scaling to mean 0 and variance 1 per coordinate, as far as the model allows."""
     shift, scale = mean.copy(), np.sqrt(variance)
-    # A constant column is left in its own units.
+    # A constant column is not scaled.
     scale = np.where(scale > 8 * np.finfo(np.float64).eps * np.abs(shift), scale, 1.0)
-    if covariance == "spherical":  # equal in the units of the points, so in all units that are equal
+    if covariance == "spherical":  # needs one scale for all space coordinates
         scale[:-1] = np.sqrt(np.mean(scale[:-1] ** 2))
-    if not isinstance(envelope, Constant | TimeLikelihood):  # a user's function of t means t
+    if not isinstance(envelope, Constant | TimeLikelihood):  # a user's function of t is defined in the original units
         shift[-1], scale[-1] = 0.0, 1.0
     return Scaling(shift, scale)
 
 
 def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope) -> FoldedMixture:
-    """The mixture in the units of the points."""
+    """Convert components to a mixture in the units of the points."""
     dtype = params.curve.dtype
     log_weights, time_loc, time_scale, curve, tril = (np.asarray(z, np.float64) for z in params)
     space, time = scaling.scale[:-1], scaling.scale[-1]
@@ -76,27 +76,3 @@ def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope)
         validate_args=False,
     )
     return FoldedMixture(components, logits=jnp.asarray(log_weights, dtype))
-
-
-def from_mixture(mixture: FoldedMixture, scaling: Scaling, degree: int, dtype) -> Parameters:
-    """The components of a mixture with polynomial folds of at most this degree."""
-    components = mixture.components
-    space, time = scaling.scale[:-1], scaling.scale[-1]
-    loc, tril, time_loc, time_scale = (
-        np.asarray(z, np.float64)
-        for z in (components.loc, components.scale_tril, components.time_loc, components.time_scale)
-    )
-    curve = np.zeros((len(loc), degree + 1, loc.shape[1]))
-    curve[:, 0] = (loc - scaling.shift[:-1]) / space
-    if isinstance(components.fold, PolynomialFold):
-        rows = np.asarray(components.fold.coefficients, np.float64)
-        used = rows.shape[1]
-        curve[:, 1 : used + 1] = rows * time_scale[:, None, None] ** np.arange(1, used + 1)[None, :, None] / space
-    parts = (
-        np.asarray(mixture.log_weights, np.float64),
-        (time_loc - scaling.shift[-1]) / time,
-        time_scale / time,
-        curve,
-        tril / space[:, None],
-    )
-    return Parameters(*(jnp.asarray(z, dtype) for z in parts))

@@ -1,12 +1,12 @@
-"""What one pass over the points leaves for the update of the components: sums, in chunks, over devices.
+"""The E-step: sufficient statistics of the components, summed over points in chunks and over devices.
 
 For component k, with responsibilities r_i, frequency weights w_i and z_i = (He_0(v_i) .. He_q(v_i), e_i) with the
 whitened residual e_i = L^-1 (s_i - curve):
 
     gram = sum_i w_i r_i / a_i z_i z_i'
 
-holds the whole weighted regression of space on time. It is centred before it is squared: v is of order one, and the
-residuals are those from the component's present curve, whitened.
+holds the whole weighted regression of space on time. It is centered before it is squared: v is of order one, and the
+residuals are whitened and relative to the component's current curve.
 """
 
 import contextlib
@@ -27,35 +27,35 @@ from foldgauss._numerics.regression import hermite_columns
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.chunks import Chunks, Piece
-from foldgauss.estimator.em.components import Pairs, Parameters, log_likelihoods, pairs_of
+from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities, log_likelihoods
 
 __all__ = [
     "PAIRS_PER_CHUNK",
     "Blocks",
     "Points",
-    "Statistics",
+    "SufficientStatistics",
     "Times",
     "accumulate",
-    "blocks_of",
-    "points_of",
-    "precision",
-    "scores",
-    "summed",
-    "time_steps",
+    "enable_dtype",
+    "log_densities",
+    "make_blocks",
+    "make_points",
+    "step_times",
+    "sum_over_points",
 ]
 
-#: Pairs of point and component held at once. Arrays of this many numbers stay in a core's cache.
+#: Densities of point and component held at once. Arrays of this many numbers stay in a core's cache.
 PAIRS_PER_CHUNK = 2**17
-#: The least number of rows that a program is compiled for: small batches of any size share one.
-_LEAST_ROWS = 256
-#: Of points that are read chunk by chunk, so many times the rows held at once go into one call of a program.
-_ROUNDS_PER_BLOCK = 8
+#: The smallest number of rows that a program is compiled for: small batches of any size share one.
+_MIN_ROWS = 256
+#: Of points that are read piece by piece, this many chunks are passed to one call of a program.
+_CHUNKS_PER_BLOCK = 8
 
 
 class Points(eqx.Module):
     """Points in chunks of equal size, the last one padded with rows of weight 0.
 
-    The leading axis counts devices; an array sharded along it is summed over by JAX's own partitioner.
+    The leading axis is that of devices; arrays sharded along it are summed by JAX's partitioner.
     """
 
     x: Float[Array, "devices chunks rows d"]
@@ -64,15 +64,15 @@ class Points(eqx.Module):
 
 
 class Times(NamedTuple):
-    """time_loc and time_scale of each component: where the envelope is to be taken."""
+    """time_loc and time_scale of each component, at which the envelope is evaluated."""
 
     loc: Float[Array, " k"]
     scale: Float[Array, " k"]
 
 
-class Statistics(NamedTuple):
-    """`log_a` and `gram` have a leading axis: the value, and with `order=2` its derivatives by the times' steps
-    (d0, d1, d00, d01, d11), see `time_steps`."""
+class SufficientStatistics(NamedTuple):
+    """Sums over points. `log_a` and `gram` have a leading axis: the value, and with `order=2` its derivatives by the
+    steps of the times (d0, d1, d00, d01, d11), see `step_times`."""
 
     log_likelihood: Float[Array, ""]
     mass: Float[Array, " k"]  # sum of w r
@@ -82,11 +82,11 @@ class Statistics(NamedTuple):
     gram: Float[Array, "order k m m"]
 
 
-def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1) -> Points:
-    """Points (n, d) and weights (n,), chunked and padded; few distinct shapes, so that few programs are compiled."""
+def make_points(x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1) -> Points:
+    """Chunk and pad points (n, d) and weights (n,) to few distinct shapes, so that few programs are compiled."""
     n, d = x.shape
     per_device = -(-n // devices)
-    rows = min(_most_rows(num_components), _power_of_two(per_device))
+    rows = min(_rows_per_chunk(num_components), _padded_rows(per_device))
     chunks = -(-per_device // rows)
     missing = devices * chunks * rows - n
     x = np.concatenate([x, np.zeros((missing, d), x.dtype)]) if missing else x
@@ -100,19 +100,19 @@ def points_of(x: np.ndarray, weights: np.ndarray, num_components: int, devices: 
     return Points(jax.device_put(x, where), jax.device_put(weights, where), n)
 
 
-def _most_rows(num_components: int) -> int:
+def _rows_per_chunk(num_components: int) -> int:
     return max(2 ** int(math.log2(max(PAIRS_PER_CHUNK // num_components, 16))), 16)
 
 
-def _power_of_two(num_rows: int) -> int:
-    return max(2 ** math.ceil(math.log2(max(num_rows, 1))), _LEAST_ROWS)
+def _padded_rows(num_rows: int) -> int:
+    return max(2 ** math.ceil(math.log2(max(num_rows, 1))), _MIN_ROWS)
 
 
-# --- points that are read chunk by chunk ----------------------------------------------------------------------
+# --- points that are read piece by piece ----------------------------------------------------------------------
 
 
 class Blocks(NamedTuple):
-    """Points that are read anew in every pass; `prepare` makes scaled points and weights of a piece."""
+    """Points that are read anew in every pass; `prepare` converts a piece to scaled points and weights."""
 
     chunks: Chunks
     prepare: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
@@ -122,44 +122,44 @@ class Blocks(NamedTuple):
     devices: int = 1
 
 
-def summed(function: Callable, points: Points | Blocks, *arguments):
+def sum_over_points(function: Callable, points: Points | Blocks, *arguments):
     """`function(*arguments, points)`, compiled, of a function that is a sum over points; of blocks, in float64.
 
     Blocks are added up in the order of their rows, so that who computed them makes no difference.
     """
     if isinstance(points, Points):
         return _compiled(function)(*arguments, points)
-    # Workers get NumPy's arrays: JAX's belong to a process.
+    # Workers get NumPy arrays: JAX arrays belong to a process.
     arguments = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, arguments)
     devices = 1 if points.chunks.on_workers else points.devices
     settings = (points.prepare, points.dtype, points.num_components, devices, function, arguments)
-    total = functools.reduce(_added, points.chunks.run(_sums_of_part, *settings, each=points.sizes))
+    total = functools.reduce(_add, points.chunks.run(_sum_part, *settings, each=points.sizes))
     return jax.tree.map(lambda z: jnp.asarray(z, points.dtype), total)
 
 
-def _sums_of_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
+def _sum_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
     check_not_forked()
     total, last = None, None
-    with precision(dtype):
-        for block in blocks_of(map(prepare, pieces), size, num_components, devices):
-            # JAX returns before the sums are there: meanwhile the next block is read.
+    with enable_dtype(dtype):
+        for block in make_blocks(map(prepare, pieces), size, num_components, devices):
+            # JAX returns before the sums are computed: meanwhile the next block is read.
             last, before = _compiled(function)(*arguments, block), last
-            total = _added(total, before)
-        return _added(total, last)
+            total = _add(total, before)
+        return _add(total, last)
 
 
-def _added(total, more):
-    """Pytrees of sums in NumPy's float64; None is nothing yet."""
+def _add(total, more):
+    """Add pytrees of sums in float64; None is zero."""
     if more is None:
         return total
     more = jax.tree.map(lambda z: np.asarray(z, np.float64), more)
     return more if total is None else jax.tree.map(np.add, total, more)
 
 
-def blocks_of(rows: Iterable[tuple], size: int, num_components: int, devices: int = 1) -> Iterator[Points]:
-    """All of `rows`, (points, weights) of any lengths, `size` in all, in blocks of one shape: compiled once."""
-    most = devices * _ROUNDS_PER_BLOCK * _most_rows(num_components)
-    size, held, count = min(devices * _power_of_two(-(-size // devices)), most), [], 0
+def make_blocks(rows: Iterable[tuple], size: int, num_components: int, devices: int = 1) -> Iterator[Points]:
+    """Regroup `rows`, (points, weights) of any lengths, `size` in all, to blocks of one shape: compiled once."""
+    most = devices * _CHUNKS_PER_BLOCK * _rows_per_chunk(num_components)
+    size, held, count = min(devices * _padded_rows(-(-size // devices)), most), [], 0
     for y, weights in rows:
         while len(y):
             taken = min(len(y), size - count)
@@ -178,7 +178,7 @@ def _block(held: list[tuple], size: int, num_components: int, devices: int) -> P
     for part, mass in held:
         y[row : row + len(part)], weights[row : row + len(part)] = part, mass
         row += len(part)
-    return points_of(y, weights, num_components, devices)
+    return make_points(y, weights, num_components, devices)
 
 
 @functools.cache
@@ -186,8 +186,8 @@ def _compiled(function: Callable) -> Callable:
     return eqx.filter_jit(function)
 
 
-def precision(dtype) -> contextlib.AbstractContextManager:
-    """Where float64 data are computed, float64 is enabled; the user's own setting is left as it is."""
+def enable_dtype(dtype) -> contextlib.AbstractContextManager:
+    """A context that enables float64 in JAX if the dtype is float64, and then restores the user's setting."""
     return jax.enable_x64(True) if dtype == np.float64 else contextlib.nullcontext()
 
 
@@ -203,25 +203,24 @@ def accumulate(
     order: int = 0,
     inverse_temperature: Float[Array, ""] | None = None,
     responsibilities: Float[Array, "devices chunks rows k"] | None = None,
-) -> Statistics:
-    """The sums of `Statistics`, with the envelope at `times` (default: where the components are).
+) -> SufficientStatistics:
+    """Compute the sufficient statistics, with the envelope at `times` (default: those of the components).
 
-    Responsibilities are those of `params`, or given. With an inverse temperature b below 1 they are
-    proportional to the densities to the power b.
+    Responsibilities are those of `params` unless passed. With an inverse temperature b below 1 they are proportional
+    to the densities to the power b.
     """
-
     envelope = cast(envelope, points.x.dtype)
 
     def of_chunk(chunk):
         x, weights, given = chunk
-        pairs = pairs_of(params, envelope, x)
-        log_likelihood, shares = _shared(pairs.log_density, weights)
+        pairs = evaluate_densities(params, envelope, x)
+        log_likelihood, mass = _weigh_responsibilities(pairs.log_density, weights)
         if given is not None:
-            shares = weights[:, None] * given
+            mass = weights[:, None] * given
         elif inverse_temperature is not None:
-            shares = _shared(inverse_temperature * pairs.log_density, weights)[1]
+            mass = _weigh_responsibilities(inverse_temperature * pairs.log_density, weights)[1]
         total = jnp.where(weights > 0, weights * log_likelihood, 0).sum()
-        return _summed(params, envelope, x[:, -1:], pairs, shares, total, times, order)
+        return _sum_chunk(params, envelope, x[:, -1:], pairs, mass, total, times, order)
 
     def of_device(chunks):
         if chunks[0].shape[0] == 1:
@@ -236,11 +235,13 @@ def accumulate(
     return jax.tree.map(lambda z: z.sum(0), jax.vmap(of_device)(chunks))
 
 
-def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, " devices*chunks*rows"]:
+def log_densities(
+    params: Parameters, envelope: AbstractEnvelope, points: Points
+) -> Float[Array, " devices*chunks*rows"]:
     """log p(x) of every point."""
 
     def of_chunk(x):
-        return log_likelihoods(pairs_of(params, envelope, x).log_density)
+        return log_likelihoods(evaluate_densities(params, envelope, x).log_density)
 
     def of_device(chunks):
         return of_chunk(chunks[0])[None] if chunks.shape[0] == 1 else lax.map(of_chunk, chunks)
@@ -250,10 +251,10 @@ def scores(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Fl
     return value.reshape(-1)
 
 
-def _shared(log_density: Float[Array, "n k"], weights: Float[Array, " n"]):
-    """log sum_k of every point, and its weight shared out by responsibilities: one exponential a pair for both."""
+def _weigh_responsibilities(log_density: Float[Array, "n k"], weights: Float[Array, " n"]):
+    """log sum_k of every point, and its responsibilities times its weight, with one exponential a pair for both."""
     largest = log_density.max(-1)
-    # A point that no component reaches belongs to none; its log-likelihood of -inf tells the tale.
+    # Where all densities underflow, responsibilities are 0 and the log-likelihood is -inf.
     largest = jnp.where(jnp.isneginf(largest), 0, largest)
     density = jnp.exp(log_density - largest[:, None])
     total = density.sum(-1)
@@ -261,7 +262,7 @@ def _shared(log_density: Float[Array, "n k"], weights: Float[Array, " n"]):
     return jnp.log(total) + largest, density * share[:, None]
 
 
-def _summed(params, envelope, t, pairs: Pairs, mass, total, times, order) -> Statistics:
+def _sum_chunk(params, envelope, t, pairs: Densities, mass, total, times, order) -> SufficientStatistics:
     degree, v = params.degree, pairs.v
     basis = hermite_columns(v, degree)
     if isinstance(envelope, Constant):
@@ -269,15 +270,15 @@ def _summed(params, envelope, t, pairs: Pairs, mass, total, times, order) -> Sta
         log_a = [jnp.zeros(mass.shape[1], v.dtype)]
     else:
         times = Times(params.time_loc, params.time_scale) if times is None else times
-        log_as = _log_a(envelope, t, times, order)
+        log_as = _log_a_derivatives(envelope, t, times, order)
         log_a = [(mass * z).sum(0) for z in log_as]
-        weights = _over_a(mass, log_as)
+        weights = _divide_by_a(mass, log_as)
     gram = jnp.stack([_gram(w, basis, pairs.whitened) for w in weights])
     if isinstance(envelope, Constant) and degree:  # He_0 = 1 and He_1 = v: the gram has these sums already
         mass, first, second = gram[0, :, 0, 0], gram[0, :, 0, 1], gram[0, :, 1, 1]
     else:
         mass, first, second = mass.sum(0), (mass * v).sum(0), (mass * v * v).sum(0)
-    return Statistics(total, mass, first, second, jnp.stack(log_a), gram)
+    return SufficientStatistics(total, mass, first, second, jnp.stack(log_a), gram)
 
 
 def _gram(weights, basis, whitened):
@@ -285,7 +286,7 @@ def _gram(weights, basis, whitened):
     if whitened[0].ndim == 3:
         z = jnp.concatenate([jnp.stack(basis, -1), whitened[0]], -1)
         return jnp.einsum("nk,nka,nkb->kab", weights, z, z)
-    # Made once: else XLA would make them again in each of the sums.
+    # The barrier keeps XLA from recomputing them in each of the sums.
     weights, basis, whitened = lax.optimization_barrier((weights, basis, whitened))
     z = basis + whitened
     upper = {}
@@ -297,19 +298,19 @@ def _gram(weights, basis, whitened):
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-# --- the envelope's derivatives by steps of time ------------------------------------------------------------
+# --- the envelope's derivatives by steps of the times -------------------------------------------------------
 
 
-def time_steps(times: Times, steps: Float[Array, "2 ..."]) -> Times:
-    """time_loc + time_scale d0, time_scale exp(d1): steps of natural size."""
+def step_times(times: Times, steps: Float[Array, "2 ..."]) -> Times:
+    """Move time_loc to time_loc + time_scale d0 and time_scale to time_scale exp(d1): steps of natural size."""
     return Times(times.loc + times.scale * steps[0], times.scale * jnp.exp(steps[1]))
 
 
-def _log_a(envelope, t, times: Times, order: int) -> list[Float[Array, "n k"]]:
+def _log_a_derivatives(envelope, t, times: Times, order: int) -> list[Float[Array, "n k"]]:
     """log a, with order 2 also its derivatives by d0, d1, d00, d01, d11 at 0."""
 
     def value(steps):
-        at = time_steps(times, steps)
+        at = step_times(times, steps)
         return envelope.log_a(t, time_loc=at.loc[None], time_scale=at.scale[None])
 
     zero = jnp.zeros((2, *times.loc.shape), times.loc.dtype)
@@ -321,10 +322,10 @@ def _log_a(envelope, t, times: Times, order: int) -> list[Float[Array, "n k"]]:
     return [value(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
 
 
-def _over_a(mass, log_a) -> list[Float[Array, "n k"]]:
+def _divide_by_a(mass, log_a) -> list[Float[Array, "n k"]]:
     """mass / a and its derivatives: e^-l, -l_i e^-l, (l_i l_j - l_ij) e^-l."""
     largest = 0.95 * float(np.log(jnp.finfo(mass.dtype).max))
-    # One exponential of the sum: 1/a alone overflows where the responsibility is small enough.
+    # One exponential of the sum: 1/a alone may overflow where the responsibility is small.
     log_mass = jnp.log(jnp.where(mass > 0, mass, 1))
     weight = jnp.where(mass > 0, jnp.exp(jnp.minimum(log_mass - log_a[0], largest)), 0)
     if len(log_a) == 1:

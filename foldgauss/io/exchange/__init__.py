@@ -1,1 +1,5 @@
-"""Formats of other programs: PLY of VeGaS and 3DGS, meshes."""
+"""Formats of other programs.
+
+`export_import.export` and `import_model` choose the format by its name; `vegas_ply` reads and writes videos of the
+published VeGaS code, `gaussians_ply` static 3DGS scenes, and `pseudomesh` frames as triangles for mesh tools.
+"""

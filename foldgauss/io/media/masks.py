@@ -1,20 +1,33 @@
-"""Masks of one object from files: an image, a folder of images, or a video."""
+"""Object masks from images, folders of images and videos."""
 
 import os
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
+from PIL import Image
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss.io._atomic import checked_path
-from foldgauss.io.media.labels import VOID, read_labels
-from foldgauss.io.media.video_file import IMAGE_SUFFIXES, aspect_window, image_paths, read_video
+from foldgauss.io._atomic import check_path
+from foldgauss.io.media.clip import Range, format_size
+from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths
+from foldgauss.io.media.resizing import aspect_window
+from foldgauss.io.media.video_reading import read_video
 from foldgauss.render.splats import check_size
 
-Range = tuple[int | None, int | None]
-
-DARK_LEVEL = 0.5  # of white: what is darker in a video is no mask
+MASK_LEVEL = 0.5  # fraction of white from which a pixel of a video belongs to the mask
+#: Pillow modes whose stored values are labels: palette, grayscale, and black and white.
+_LABEL_MODES = ("P", "L", "1")
+_COLOR_MODES = ("RGB", "RGBA")
+#: Other formats are not decoded, whatever the suffix: Pillow would pass some, such as PostScript, to other programs.
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+#: Limits on the pixels of a mask: 8K, or the largest ratio of deflate at 1 bit per pixel, whichever is larger.
+MAX_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 8 * 1032
+_WHITE = 255
+#: The label of pixels without annotation.
+VOID = 255
 
 
 def read_masks(
@@ -23,28 +36,28 @@ def read_masks(
     label: int | None = None,
     frames: Range | None = None,
     size: tuple[int, int] | None = None,
-    level: float = DARK_LEVEL,
+    level: float = MASK_LEVEL,
 ) -> Bool[np.ndarray, "height width"] | Bool[np.ndarray, "num_frames height width"]:
-    """The masks of an object, ready for `foldgauss.video.by_mask`.
+    """The masks of an object, as `foldgauss.video.by_mask` takes them.
 
-    - An image (palette or grey, as the annotations of DAVIS): bool (height, width). A folder of them, in natural order:
-      bool (num_frames, height, width). `label` is the object's number; None: all objects, so whatever is not 0
-      (background) and not 255 (void). Black and white images have the one object 1.
-    - A video: bool (num_frames, height, width), where the brightest channel is at least `level` of white.
+    - An image (palette or grayscale, as the annotations of DAVIS): bool (height, width). A folder of them, in natural
+      order: bool (num_frames, height, width). `label` is the object's label; None selects all objects, which is
+      everything except 0 (background) and 255 (void). Black and white images have one object with label 1.
+    - A video: bool (num_frames, height, width), True where the brightest channel is at least `level` of white.
 
-    `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end. `size` = (height, width) cuts the
-    masks to that aspect around the centre, as `read_video` does with frames: give it where the fit was given it.
+    `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end. `size` = (height, width) crops the
+    masks to that aspect around the center, as `read_video` crops frames: use the same value as for the fit.
 
     **Example:** `by_mask(model, read_masks("DAVIS/Annotations/480p/bear", label=1))`.
 
-    **Raises:** `FileNotFoundError`; ValueError for images that are no masks, a label that is in none of them, options
+    **Raises:** `FileNotFoundError`; ValueError for images that are not masks, a label that none of them has, options
     that do not apply, and as `read_video`.
     """
-    path = checked_path(path)
+    path = check_path(path)
     if not os.path.exists(path):
         raise FileNotFoundError(f"path: expected an image, a folder or a video, got {str(path)!r}, which is missing.")
     if label is not None and not (is_integer(label, 1) and label < VOID):
-        raise invalid("label", expected=f"an object's number, 1 to {VOID - 1}", got=repr(label))
+        raise invalid("label", expected=f"an object's label, 1 to {VOID - 1}", got=repr(label))
     masks = _read(path, label, frames, level)
     if size is None:
         return masks
@@ -53,24 +66,24 @@ def read_masks(
 
 
 def _read(path: Path, label: int | None, frames: Range | None, level: float) -> Bool[np.ndarray, "*num height width"]:
-    """The masks as they are."""
-    if level != DARK_LEVEL and (path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES):
+    """The masks in their own size."""
+    if level != MASK_LEVEL and (path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES):
         raise invalid("level", expected="a video with it", got=f"images, {str(path)!r}", cure="They have labels.")
     if path.is_dir():
-        return _of_label(_images(path, frames), label, path)
+        return _select_label(_choose_images(path, frames), label, path)
     if path.suffix.lower() in IMAGE_SUFFIXES:
         if frames is not None:
             raise invalid("frames", expected="a folder or a video with them", got=f"the image {str(path)!r}")
-        return _of_label([path], label, path)[0]
+        return _select_label([path], label, path)[0]
     if label is not None:
         cure = "Leave label out, or give a folder of PNGs."
         raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
     if not is_within(level, "(0, 1]"):
-        raise invalid("level", expected="a share of white in (0, 1]", got=repr(level))
+        raise invalid("level", expected="a fraction of white in (0, 1]", got=repr(level))
     return read_video(path, frames=frames).over_black.max(-1) >= 255 * level
 
 
-def _images(folder: Path, frames: Range | None) -> list[Path]:
+def _choose_images(folder: Path, frames: Range | None) -> list[Path]:
     images = image_paths(folder)
     start, stop = frames if frames is not None else (None, None)
     for name, k in (("start", start), ("stop", stop)):
@@ -81,10 +94,82 @@ def _images(folder: Path, frames: Range | None) -> list[Path]:
     return images[start:stop]
 
 
-def _of_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:
+def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:
     labels = read_labels(paths)
-    there = sorted(set(np.unique(labels).tolist()) - {0, VOID})
-    if label is not None and label not in there:
-        expected = f"one of {there} in {str(source)!r}" if there else f"masks with objects in {str(source)!r}"
+    present = sorted(set(np.unique(labels).tolist()) - {0, VOID})
+    if label is not None and label not in present:
+        expected = f"one of {present} in {str(source)!r}" if present else f"masks with objects in {str(source)!r}"
         raise invalid("label", expected=expected, got=label)
     return (labels != 0) & (labels != VOID) if label is None else labels == label
+
+
+# ----------------------------------------------------------------------------------------------- labels
+
+
+class _TooLarge(Exception):
+    """More pixels than the file can hold."""
+
+
+def read_labels(paths: Sequence[Path]) -> np.ndarray:
+    """Label images as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 void.
+
+    A palette image gives the *index* of each pixel, whatever its color (OpenCV gives the color, hence Pillow here); a
+    grayscale one its level, also where that is stored as three equal channels. Masks that are all black and white, as
+    those of DAVIS 2016, become 0 and 1. Raises ValueError for an image that does not decode, has colors instead of
+    labels, or differs in size.
+    """
+    masks, gray = [], True
+    for path in paths:
+        mask, mode = _read_label_image(path)
+        gray = gray and mode != "P"
+        if masks and mask.shape != masks[0].shape:
+            raise invalid(
+                "path",
+                expected=f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}",
+                got=f"{format_size(mask.shape)} in {str(path)!r}",
+            )
+        masks.append(mask)
+    labels = np.stack(masks)
+    if gray and set(np.unique(labels)) <= {0, _WHITE}:
+        labels = (labels == _WHITE).astype(np.uint8)
+    return labels
+
+
+def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
+    """(labels, Pillow mode) of one mask."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about damage: the image either decodes or raises
+            mode, pixels = _decode(path)
+    except (_TooLarge, Image.DecompressionBombError) as error:
+        most = max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size)
+        most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
+        raise invalid(
+            "path",
+            expected=f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes",
+            got=f"more in {str(path)!r}",
+            cure="Is it a mask? If so, crop it, or store it uncompressed.",
+        ) from error
+    except Exception as error:  # Pillow's decoders raise anything: SyntaxError, struct.error, zlib.error, IndexError
+        raise invalid(
+            "path", expected="masks that decode", got=f"{str(path)!r}, which does not", cure="Copy it again."
+        ) from error
+    if mode in _COLOR_MODES and (pixels[..., :3] == pixels[..., :1]).all():  # grayscale as paint programs store it
+        mode, pixels = "L", pixels[..., 0]
+    if mode not in _LABEL_MODES:
+        raise invalid(
+            "path",
+            expected="masks with a label per pixel (palette or grayscale)",
+            got=f"an image of mode {mode!r} in {str(path)!r}",
+            cure="Its colors were stored in place of the labels; use the original PNG.",
+        )
+    return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
+
+
+def _decode(path: Path) -> tuple[str, np.ndarray]:
+    """(Pillow mode, stored pixel values); the size is checked before memory is allocated."""
+    with Image.open(path, formats=_FORMATS) as image:
+        width, height = image.size
+        if width * height > max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size):
+            raise _TooLarge
+        return image.mode, np.array(image)

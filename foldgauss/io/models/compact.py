@@ -1,7 +1,7 @@
 """Compact model files, .fgz: quantized, entropy-coded, checked, and decoded to the same bits everywhere.
 
-The layout is in docs/format.md. Files may come from strangers: a checksum finds damage, no number is trusted before it
-has been held against the bytes that are there, and nothing but `ModelFileError` is raised for what a file says.
+The layout is in docs/format.md. Files are not trusted: a checksum detects damage, counts are checked
+against the size of the file, and invalid content raises only `ModelFileError`.
 """
 
 import dataclasses
@@ -15,34 +15,34 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import atomic_path, checked_path
+from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.models import range_coder
-from foldgauss.io.models.columns import Walk
+from foldgauss.io.models.column_contexts import Walk
 from foldgauss.io.models.model_file import ModelFileError, plain, to_json
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression.quantize import (
     FEATURES,
+    MAX_CELL_BITS,
     MAX_DEGREE,
-    MOST_CELL_BITS,
-    MOST_SHARED,
-    Facts,
+    MAX_SHARED,
+    CompactInfo,
     Quantized,
     Rule,
     column_names,
     dequantize,
-    is_whole,
+    is_integral,
 )
 from foldgauss.video.models.video_model import VideoModel
 
 COMPACT_SUFFIX = ".fgz"
-#: As PNG's: a byte that no text has, line ends of both kinds that a careless transfer would change, an end of file.
+#: As in PNG: a byte that is not ASCII, line ends of both kinds, which a transfer as text would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
 VERSION = 2
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
-#: No byte may hold more Gaussians or frames, so that a small file cannot ask for much memory: filled up with spaces.
+#: Limit of Gaussians and frames per byte, so that a small file cannot claim much memory; files are padded with spaces.
 _MOST_PER_BYTE = 8
-_SIDE = 1 << 20  # no picture is longer: a decoder holds it in memory
+_SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
 def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
@@ -50,9 +50,9 @@ def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dic
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
     """
-    path = checked_path(path, "path, quantized")
+    path = check_path(path, "path, quantized")
     check_compact_name(path)
-    data = packed(quantized, metadata)
+    data = pack_compact(quantized, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -64,21 +64,21 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
         raise invalid(parameter, expected=f"a name ending in {COMPACT_SUFFIX}", got=repr(str(path)))
 
 
-def packed(quantized: Quantized, metadata: dict | None = None) -> bytes:
+def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    facts, walk = quantized.facts, Walk(quantized.rules, quantized.facts)
+    info, walk = quantized.info, Walk(quantized.rules, quantized.info)
     streams, described = [], []
-    for name in column_names(facts.degree, facts.shared):
+    for name in column_names(info.degree, info.shared):
         numbers = quantized.columns[name]
         column = walk.column(name)
-        streams.append(range_coder.encode(_steps(numbers, facts) if name == "cell" else numbers, column))
+        streams.append(range_coder.encode(_wrapped_differences(numbers, info) if name == "cell" else numbers, column))
         walk.add(name, numbers)
         rule = quantized.rules.get(name)
-        own = [] if is_whole(name) else [rule.origin, rule.exponent, *rule.slopes]
+        own = [] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes]
         described.append([len(streams[-1]), *own])
     intervals = quantized.intervals
     streams.append(range_coder.encode(intervals, range_coder.Column.plain(len(intervals))))
-    header = dataclasses.asdict(facts) | {
+    header = dataclasses.asdict(info) | {
         "num_frames": len(intervals) + 1,
         "columns": described,
         "intervals": len(streams[-1]),
@@ -86,26 +86,26 @@ def packed(quantized: Quantized, metadata: dict | None = None) -> bytes:
     }
     text = to_json("header", header).encode()
     data = b"".join(streams)
-    text += b" " * (-(-(facts.num_gaussians + header["num_frames"]) // _MOST_PER_BYTE) - len(text) - len(data))
+    text += b" " * (-(-(info.num_gaussians + header["num_frames"]) // _MOST_PER_BYTE) - len(text) - len(data))
     body = text + data
     numbers = (VERSION, len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
-def _steps(cells: np.ndarray, facts: Facts) -> np.ndarray:
+def _wrapped_differences(cells: np.ndarray, info: CompactInfo) -> np.ndarray:
     """From each cell to the next, around the end."""
-    return np.diff(cells, prepend=0) & ((1 << sum(facts.cells)) - 1)
+    return np.diff(cells, prepend=0) & ((1 << sum(info.cells)) - 1)
 
 
-def _cells(steps: np.ndarray, facts: Facts) -> np.ndarray:
-    return (np.cumsum(steps, dtype=np.int64) & ((1 << sum(facts.cells)) - 1)).astype(np.int32)
+def _cells(steps: np.ndarray, info: CompactInfo) -> np.ndarray:
+    return (np.cumsum(steps, dtype=np.int64) & ((1 << sum(info.cells)) - 1)).astype(np.int32)
 
 
 # ---------------------------------------------------------------------------------------------- reading
 
 
 def is_compact(path: str | os.PathLike) -> bool:
-    """Whether a file starts as compact ones do; False for one that is missing or cannot be read."""
+    """Whether a file starts with the magic bytes of compact files; False for one that cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(4) == MAGIC[:4]
@@ -118,13 +118,13 @@ def load_compact(path: str | os.PathLike) -> Quantized:
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
-    path = checked_path(path)
-    return _unpacked(path, path.read_bytes())[0]
+    path = check_path(path)
+    return _unpack(path, path.read_bytes())[0]
 
 
 def load_compact_model(path: str | os.PathLike) -> VideoModel:
     """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
-    path = checked_path(path)
+    path = check_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
@@ -133,22 +133,22 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
 
 
 def compact_metadata(path: str | os.PathLike) -> dict:
-    """What `save_compact` was given as `metadata`. Raises as `load_compact`."""
-    path = checked_path(path)
+    """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
+    path = check_path(path)
     return _header(path, path.read_bytes())[0]["metadata"]
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[Quantized, dict]:
+def _unpack(path: Path, data: bytes) -> tuple[Quantized, dict]:
     header, body = _header(path, data)
     try:
-        return _decoded(header, body, len(data)), header["metadata"]
+        return _decode(header, body, len(data)), header["metadata"]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         text = " ".join(str(error).split())[:200]
         raise _unreadable(path, f"one that does not fit together ({type(error).__name__}: {text})") from error
 
 
 def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
-    """The header and what follows it, once the file is known to be whole."""
+    """The header and the bytes after it, once the checksum is verified."""
     if not data.startswith(MAGIC):
         got = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
         raise _unreadable(path, got)
@@ -182,37 +182,41 @@ def _no_number(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _decoded(header: dict, body: bytes, whole_length: int) -> Quantized:
-    facts = _facts(header)
-    num, num_frames = facts.num_gaussians, header["num_frames"]
+def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
+    info = _info(header)
+    num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
-    names = column_names(facts.degree, facts.shared)
+    names = column_names(info.degree, info.shared)
     described = header["columns"]
     _check(isinstance(described, list) and len(described) == len(names), "columns", "others")
     lengths = [own[0] for own in described] + [header["intervals"]]
     _check(all(is_integer(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
-    rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_whole(name)}
-    _check(all(is_whole(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)), "rule", "none")
-    walk, columns, start = Walk(rules, facts), {}, 0
+    rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_integral(name)}
+    _check(
+        all(is_integral(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)),
+        "rule",
+        "none",
+    )
+    walk, columns, start = Walk(rules, info), {}, 0
     for name, length in zip(names, lengths[:-1], strict=True):
         numbers = range_coder.decode(body[start : start + length], walk.column(name))
-        columns[name] = _cells(numbers, facts) if name == "cell" else numbers
-        _check_numbers(name, columns[name], facts)
+        columns[name] = _cells(numbers, info) if name == "cell" else numbers
+        _check_numbers(name, columns[name], info)
         walk.add(name, columns[name])
         start += length
     intervals = range_coder.decode(body[start:], range_coder.Column.plain(num_frames - 1))
-    return Quantized(facts, rules, columns, intervals)
+    return Quantized(info, rules, columns, intervals)
 
 
-def _check_numbers(name: str, numbers: np.ndarray, facts: Facts) -> None:
-    """Numbers that others are looked up by."""
-    most = {"without": 3, "degree": facts.degree, "shade": facts.shared - 1}.get(name)
+def _check_numbers(name: str, numbers: np.ndarray, info: CompactInfo) -> None:
+    """Check the columns that are used as indices."""
+    most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}.get(name)
     if most is not None:
         _check(numbers.min() >= 0 and numbers.max() <= most, name, "numbers out of range")
 
 
-def _facts(header: dict) -> Facts:
+def _info(header: dict) -> CompactInfo:
     size, options = header["size"], header["options"]
     _check(
         isinstance(size, list) and len(size) == 2 and all(is_integer(n, 1) and n <= _SIDE for n in size), "size", size
@@ -221,14 +225,14 @@ def _facts(header: dict) -> Facts:
     _check(is_integer(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
     cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
     _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
-    _check(sum(cells) <= MOST_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
-    _check(is_integer(shared, 0) and shared <= min(num, MOST_SHARED), "shared", shared)
+    _check(sum(cells) <= MAX_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
+    _check(is_integer(shared, 0) and shared <= min(num, MAX_SHARED), "shared", shared)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
     check_one_of("compositing", header["compositing"], COMPOSITINGS)
-    names = [field.name for field in dataclasses.fields(Facts)]
-    return Facts(
+    names = [field.name for field in dataclasses.fields(CompactInfo)]
+    return CompactInfo(
         **{name: header[name] for name in names}
         | {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**options)}
     )

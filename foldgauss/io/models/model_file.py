@@ -72,11 +72,11 @@ def register_model(
     to_stored: Callable[[Any], Any] = _as_it_is,
     from_stored: Callable[[Any], Any] = _as_it_is,
 ) -> None:
-    """Teach this module to save and load `model_type` under the name `kind`.
+    """Register `model_type` for saving and loading under the name `kind`.
 
     `to_header(model)` gives the static facts as a dict that JSON can hold. `from_header(dict)` gives the
     skeleton: the same pytree with a `jax.ShapeDtypeStruct` for every array leaf and everything else in
-    place. It must allocate nothing in proportion to numbers in the dict: that may come from a stranger.
+    place. It must allocate nothing in proportion to numbers in the dict, which is not trusted.
 
     Where a model is stored in another form than it has in memory, `to_stored` gives that pytree, which `to_header` and
     `from_header` are then about, and `from_stored` is its inverse. The latter raises ValueError for leaves that do not
@@ -238,7 +238,7 @@ def _scalar(value: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Provenance in JSON's terms: an infinite PSNR (a perfect frame) must not cost the user the fit."""
+    """Metadata as JSON types: NaN and infinities, such as the PSNR of a perfect frame, become null."""
     if isinstance(value, dict):
         return {str(key): plain(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -310,7 +310,7 @@ def _described(path: Path, kind_name: str, header: dict, tensors: dict[str, dict
 
 
 def read_header(path: str | os.PathLike) -> dict:
-    """What the file says of itself, without reading its tensors.
+    """The header of a file, without reading its tensors.
 
     Keys: `format`, `version`, `kind` (strings), `header` and `metadata` (dicts), and `tensors`, which maps
     each key to `{"dtype": "F32", "shape": [..]}`.
@@ -331,7 +331,7 @@ def read_header(path: str | os.PathLike) -> dict:
 
 
 def _check_container(path: Path) -> None:
-    """Judge the first bytes against the file's size, before a library allocates anything by them."""
+    """Check the first bytes against the file's size, before the library allocates memory."""
     if not os.path.exists(path):
         raise FileNotFoundError(
             f"path: expected a model file, got {str(path)!r}, which is missing. Check the spelling."

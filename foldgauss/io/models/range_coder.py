@@ -1,8 +1,8 @@
-"""An adaptive binary range coder for columns of whole numbers: the same bits everywhere.
+"""An adaptive binary range coder for columns of integers, with the same bits on every platform.
 
 A number becomes a zero flag, a sign and an exponential Golomb code of its magnitude. Flag, sign, exponent and the two
-leading bits below it are coded with probabilities that learn from what came before; further bits are as good as random
-and cost one bit each. Three *contexts* of a number, small numbers that both sides know, have a probability each, and
+leading bits below it are coded with adaptive probabilities; further bits are nearly uniform and
+cost one bit each. Three *contexts* of a number, small numbers that both sides know, have a probability each, and
 the three are mixed as logits with weights that learn, too. The third context is what Gaussians nearby lead one to
 expect. All is arithmetic of whole numbers but for that expectation, which is float64 in a stated order.
 
@@ -26,7 +26,7 @@ NODES = 2 + 32 + 3 * 32
 CONTEXTS, MODELS = 256, 3
 #: Bytes that no number's code exceeds: 2 + 31 + 30 bits of four bytes each.
 ROOM = 256
-#: A probability is the share of ones so far, until so many bits were seen; from then on old ones are forgotten.
+#: Number of bits up to which a probability is the fraction of ones so far; later it is an exponential mean.
 MEMORY = 400
 #: Weights of the mixture, times 65536, at first; and how fast they learn, times 2^18.
 WEIGHT, RATE = 29491, 6
@@ -56,7 +56,7 @@ LOGIT = np.minimum(np.searchsorted(LOGISTIC, np.arange(4096) * 16 + 8), 4095) - 
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """What both sides know of a column before its numbers.
+    """What encoder and decoder know of a column before its values.
 
     `present`: which rows have a number; the others' is 0. `contexts` below 256. A number q is the value
     `origin + q step`; that of the rows `near` (-1: none), divided by their own `scale` and multiplied by the row's,
@@ -73,7 +73,7 @@ class Column:
 
     @classmethod
     def plain(cls, num: int) -> "Column":
-        """One of which nothing is known."""
+        """A column without contexts."""
         one, none = np.ones(num), np.zeros((num, 0), np.int32)
         return cls(np.ones(num, bool), np.zeros((num, 2), np.uint8), np.zeros(num), one, one, none)
 
@@ -87,7 +87,7 @@ class Column:
 
 
 @exact_kernel
-def _expected(i, near, seen, origin, step, scale):
+def _expect(i, near, seen, origin, step, scale):
     """The context of what rows nearby lead to expect: 0 for nothing, else 16 and the sign times the size."""
     total, count = 0.0, 0
     for k in range(near.shape[1]):
@@ -105,7 +105,7 @@ def _expected(i, near, seen, origin, step, scale):
 
 
 @exact_kernel
-def _mixed(node, own, chances, weights, logits, logistic, logit):
+def _mix(node, own, chances, weights, logits, logistic, logit):
     """The probability of a one at a node, times 65536; `own` are the contexts."""
     total = 0
     for m in range(MODELS):
@@ -158,7 +158,7 @@ def _put(out, place, interval, p, bit):
 @exact_kernel
 def _put_learned(out, place, interval, state, node, bit):
     own, chances, weights, logits, logistic, logit = state
-    p = _mixed(node, own, chances, weights, logits, logistic, logit)
+    p = _mix(node, own, chances, weights, logits, logistic, logit)
     place = _put(out, place, interval, p, bit)
     _learn(node, own, chances, weights, logits, p, bit)
     return place
@@ -175,7 +175,7 @@ def _encode(values, present, contexts, origin, step, scale, near, fill, state, o
             return 0
         value = _i(values[k])
         own[0], own[1] = contexts[k, 0], contexts[k, 1]
-        own[2] = _expected(k, near, seen, origin, step, scale)
+        own[2] = _expect(k, near, seen, origin, step, scale)
         seen[k] = (origin[k] + value * step[k]) / scale[k]
         place = _put_learned(out, place, interval, state, 0, value == 0)
         if value == 0:
@@ -223,7 +223,7 @@ def _get(data, reader, p):
 @exact_kernel
 def _get_learned(data, reader, state, node):
     own, chances, weights, logits, logistic, logit = state
-    p = _mixed(node, own, chances, weights, logits, logistic, logit)
+    p = _mix(node, own, chances, weights, logits, logistic, logit)
     bit = _get(data, reader, p)
     _learn(node, own, chances, weights, logits, p, bit)
     return bit
@@ -244,7 +244,7 @@ def _decode(data, present, contexts, origin, step, scale, near, fill, most, stat
         if reader[3] > len(data) + 4:
             return False
         own[0], own[1] = contexts[k, 0], contexts[k, 1]
-        own[2] = _expected(k, near, seen, origin, step, scale)
+        own[2] = _expect(k, near, seen, origin, step, scale)
         if not _get_learned(data, reader, state, 0):
             negative = _get_learned(data, reader, state, 1)
             exponent = 0

@@ -1,4 +1,4 @@
-"""Models of a clip's segments in one file, each loaded when it is asked for. The layout is in docs/formats.md."""
+"""Models of a clip's segments in one file, each loaded on access. The layout is in docs/formats.md."""
 
 import math
 import os
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
-from foldgauss.io._atomic import check_writable, checked_path
+from foldgauss.io._atomic import check_path, check_writable
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.model_file import (
     ModelFileError,
@@ -33,7 +33,7 @@ SEGMENTED = "segmented-video"
 #: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`.
 PARTS = ("video", "edited-video")
 _KEY = re.compile(r"segments\.(0|[1-9][0-9]{0,8})\.(.+)", re.DOTALL)
-#: What a stranger's header may say of a degree: more has no meaning, and numbers beyond have no digits.
+#: Upper limit of a degree in a header, which is not trusted.
 _MAX_DEGREE = 1 << 20
 
 
@@ -51,7 +51,7 @@ def join_segments(
 
     Example: `join_segments("long.safetensors", [(0, "a.safetensors"), (95, "b.safetensors")])`
     """
-    path = checked_path(path, "path, sources")
+    path = check_path(path, "path, sources")
     files, entries, specs, segments = [], [], {}, []
     for number, source in enumerate(sources):
         first, file = _source(number, source)
@@ -66,7 +66,7 @@ def join_segments(
             segments.append(_segment(entries[-1], about["tensors"], partial(_load, file)))
         except (KeyError, TypeError, ValueError) as error:
             raise _unfit(file, f"one with {error}", "Fit it again.") from error
-    SegmentedVideo(segments)  # they go together
+    SegmentedVideo(segments)  # raises ValueError unless they fit together
     check_writable(path)
 
     def tensors(keys: list[str]) -> Iterator[np.ndarray]:
@@ -105,7 +105,7 @@ def _source(number: int, source: object) -> tuple[int, Path]:
         raise invalid(f"sources[{number}]", expected=expected, got=short_repr(source)) from None
     if not is_integer(first, 0):
         raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
-    file = checked_path(file, "path, sources")
+    file = check_path(file, "path, sources")
     if is_compact(file):
         raise _unfit(file, "a compact one", "Join the models before they are compressed.")
     return int(first), file
@@ -121,7 +121,7 @@ def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
 
 def is_segmented(path: str | os.PathLike) -> bool:
     """Whether a file holds a video in segments; no tensor is read. Raises as `load_video_model`."""
-    path = checked_path(path)
+    path = check_path(path)
     return not is_compact(path) and read_header(path)["kind"] == SEGMENTED
 
 
@@ -166,7 +166,7 @@ def _segments(path: Path, about: dict) -> list[Segment]:
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
-    """What tells a file from another that took its name."""
+    """Properties that change when another file takes this name."""
     found = path.stat()
     return found.st_ino, found.st_size, found.st_mtime_ns
 
@@ -177,10 +177,10 @@ def _load(path: Path) -> VideoModel | EditedVideo:
 
 
 def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
-    """What a header says of a segment, as far as it is told without loading the model.
+    """The segment that a header describes; its model is loaded on access.
 
-    Raises ValueError, KeyError or TypeError for what no header of ours says, and for more frames or Gaussians than
-    there are tensors of.
+    Raises ValueError, KeyError or TypeError for an invalid header, and for counts of frames or Gaussians
+    that differ from the shapes of the tensors.
     """
     check_one_of("kind", entry["kind"], PARTS)
     if not isinstance(entry["metadata"], dict):

@@ -1,4 +1,4 @@
-"""Selections on disk: which Gaussians, and of which model."""
+"""Selection files: a mask of Gaussians, with a digest of the model that it belongs to."""
 
 import dataclasses
 import hashlib
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import checked_path
+from foldgauss.io._atomic import check_path
 from foldgauss.io.models.model_file import ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -21,7 +21,7 @@ SELECTION = "selection"
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Kept:
-    """What the file holds: the mask, and the digest of the model that it is for."""
+    """The content of the file: the mask, and the digest of its model."""
 
     mask: np.ndarray
     digest: str = dataclasses.field(metadata={"static": True})
@@ -34,7 +34,7 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
 
     **Example:** `save_selection("bear.selection", by_mask(model, masks), model)`.
     """
-    checked_path(path, "path, selection, model")
+    check_path(path, "path, selection, model")
     if not isinstance(selection, Selection):
         cure = "The order is (path, selection, model); Selection(mask) makes one of a mask."
         raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
@@ -55,7 +55,7 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     order of Gaussians, or other values; `FileNotFoundError`, and `ModelFileError` for a file of another kind, a
     damaged or newer one.
     """
-    checked_path(path, "path, model")
+    check_path(path, "path, model")
     if not isinstance(model, VideoModel):
         cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else "The order is (path, model)."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)

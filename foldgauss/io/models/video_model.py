@@ -13,7 +13,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io._atomic import checked_path
+from foldgauss.io._atomic import check_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import ModelFileError, load_part, read_header, register_model, save_model
 from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
@@ -43,7 +43,7 @@ def save_video_model(
     """
     if isinstance(model, Edit):
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
-    checked_path(path, "path, model")
+    check_path(path, "path, model")
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
         expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
         raise invalid("model", expected=expected, got=type(model).__name__)
@@ -69,13 +69,13 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
 
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
-    """Read a fitted, an edited or a segmented video, or a compact file (told by its first bytes, not by its name).
+    """Read a fitted, an edited or a segmented video, or a compact file (detected from its first bytes).
 
-    Of segments no more than the header is read: see `SegmentedVideo`, which loads them as they are drawn.
+    Of segments no more than the header is read: see `SegmentedVideo`, which loads them on access.
 
     Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
     """
-    path = checked_path(path)
+    path = check_path(path)
     if is_compact(path):
         return load_compact_model(path)
     about = read_header_of_kind(path, VIDEO, EDITED, SEGMENTED)
@@ -86,14 +86,14 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
 
 def read_metadata(path: str | os.PathLike) -> dict:
     """What was noted when a model's file was written, of either kind. Raises as `load_video_model`."""
-    path = checked_path(path)
+    path = check_path(path)
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
 def read_origin(path: str | os.PathLike) -> dict:
     """`read_metadata`, without those of `fit`'s notes that are of another kind than `fit` writes: none are there.
 
-    A file may come from a stranger, and metadata are free.
+    Metadata are free and not trusted.
     """
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
 
@@ -111,7 +111,7 @@ def _is_range(value: object) -> bool:
     return value[1] is None or value[1] > (value[0] or 0)
 
 
-#: What `fit` and `compress` note of a model's clip and are asked for later, and how it is told.
+#: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
     "clip": _is_text,
     "frames_digest": _is_text,

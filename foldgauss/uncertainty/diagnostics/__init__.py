@@ -1,1 +1,5 @@
-"""Irregular frames, calibration, plots and reports of a posterior."""
+"""What is done with a posterior of frame times.
+
+`irregularities` finds duplicated and dropped frames, `report` and `plots` present the posterior, and `calibration`
+checks the method by simulation.
+"""

@@ -1,7 +1,7 @@
-r"""Is a posterior of frame times as wide as it says? Simulation-based calibration.
+r"""Simulation-based calibration of the posterior of frame times.
 
-Times drawn from the prior, frames drawn at these times, noise, and the posterior of the times given the frames: then
-the rank of the true time among draws of the posterior is uniform, if prior, noise, profiles and sampler are all right.
+Times are drawn from the prior, frames are rendered at these times with noise, and the posterior given the frames is
+sampled: the rank of the true time among the draws is uniform if prior, noise, profiles and sampler are correct.
 """
 
 import dataclasses
@@ -14,33 +14,33 @@ import scipy.stats
 from jaxtyping import Bool, Float32, Float64, Int
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.uncertainty.likelihood.likelihood_profiles import Drawn
+from foldgauss.uncertainty.likelihood.likelihood_profiles import ProfileBuilder
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
-from foldgauss.uncertainty.likelihood.residuals import Screen
-from foldgauss.uncertainty.posterior.exact import exact_times
+from foldgauss.uncertainty.likelihood.residuals import Residuals
+from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
 from foldgauss.video.models.video_model import VideoModel
 
 SAMPLERS = ("exact", "emcee")
-#: Draws of which ranks are taken, unless said otherwise: 100 ranks, of which 5 and 25 are whole shares.
+#: Default number of draws: 99 give 100 ranks, of which 5% and 25% are integers.
 DRAWS = 99
-#: Steps of emcee a replicate, unless said otherwise: enough for 99 draws of some hundred independent ones.
+#: Default steps of emcee per replicate: enough for about a hundred independent draws.
 STEPS = 600
-#: Pictures kept between replicates take at most so many bytes.
-KEPT = 2**30
-#: Simulated sets of ranks behind an envelope: its level is right to 0.1%.
+#: Bytes of rendered images that are cached between replicates.
+CACHE_BYTES = 2**30
+#: Simulated sets of ranks per envelope: the standard error of its level is 0.1%.
 ENVELOPES = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedRanks:
-    """Ranks of what is true among draws of the posterior, 0 to `num_ranks` - 1; uniform if all is right.
+    """Ranks of the true quantities among draws of the posterior, 0 to `num_ranks` - 1; uniform if calibrated.
 
-    **Shapes:** `ranks` (replicates, quantities), a quantity for each of `names`: the times of the free frames, of one
-    free frame taken at random in every replicate ("any frame"), and the log-likelihood of all times together.
-    Replicates are independent, quantities of one replicate are not. `true` (replicates, num_frames): the times drawn.
-    `converged`: share of the replicates whose sampler says that it has; 1 for exact passes.
+    **Shapes:** `ranks` (replicates, quantities), with the quantities `names`: the times of the free frames, the time of
+    one free frame chosen at random in every replicate ("any frame"), and the joint log-likelihood. Replicates are
+    independent, quantities of one replicate are not. `true` (replicates, num_frames): the true times.
+    `converged`: fraction of replicates whose sampler converged; 1 for exact sampling.
     """
 
     ranks: Int[np.ndarray, "replicates quantities"]
@@ -50,15 +50,15 @@ class SimulatedRanks:
     converged: float
 
     def ecdf(self) -> Float64[np.ndarray, "quantities num_ranks"]:
-        """Share of each quantity's ranks below 1, 2, ..., `num_ranks`."""
+        """Fraction of each quantity's ranks below 1, 2, ..., `num_ranks`."""
         below = self.ranks[:, :, None] < np.arange(1, self.num_ranks + 1)
         return below.mean(0)
 
     def inside(self, level: float = 0.99) -> Bool[np.ndarray, " quantities"]:
-        """Which quantities' ranks lie in the simultaneous envelope everywhere (see `ecdf_band`)."""
+        """Quantities whose ranks lie entirely within the simultaneous envelope (see `ecdf_band`)."""
         low, high = ecdf_band(len(self.ranks), self.num_ranks, level)
-        shares = self.ecdf()
-        return ((shares >= low - 1e-12) & (shares <= high + 1e-12)).all(1)
+        fractions = self.ecdf()
+        return ((fractions >= low - 1e-12) & (fractions <= high + 1e-12)).all(1)
 
     def coverage(self, level: float) -> Float64[np.ndarray, " quantities"]:
         """See `coverage`."""
@@ -79,45 +79,45 @@ def simulated_ranks(
     correlation: float | None = None,
     steps: int = STEPS,
 ) -> SimulatedRanks:
-    """Ranks over `replicates` simulated videos of `num_frames` frames whose times come from the prior.
+    """Ranks over `replicates` simulated videos of `num_frames` frames whose times are drawn from the prior.
 
-    Frames are what `model` shows plus Gaussian noise of standard deviation `noise.scale`: white, or smoothed by a
-    Gaussian of `correlation` pixels' standard deviation, and the same afterwards. They are neither rounded nor clipped.
-    Profiles come about as `evidence` makes them, with `assumed_noise`: "effective", "score" or "independent", which
-    measure it, or a FrameNoise; default `noise`. Then `sampler`: "exact" passes, or "emcee" for `steps` steps.
+    Frames are images of `model` plus Gaussian noise of standard deviation `noise.scale`: white, or smoothed by a
+    Gaussian of `correlation` pixels' standard deviation and rescaled. They are neither rounded nor clipped. Profiles
+    are computed as by `likelihood_profiles` with `assumed_noise`: "effective", "score" or "independent", which estimate
+    it, or a FrameNoise (default: `noise`). `sampler`: "exact", or "emcee" with `steps` steps.
 
-    Pictures are kept between replicates, up to 1 GB: small models take milliseconds a replicate by exact passes.
+    Images are cached between replicates, up to 1 GB: with exact sampling small models take milliseconds per replicate.
 
     **Source:** Talts, Betancourt, Simpson, Vehtari and Gelman 2018; the log-likelihood as a quantity: Modrak et al.
     2023.
-    **Raises:** ValueError for settings out of range, and what the posterior raises.
+    **Raises:** ValueError for settings out of range, and the errors of the posterior.
 
     **Example:** `simulated_ranks(model, FrameNoise(0.02, 1.0), num_frames=10, replicates=300).inside()`.
     """
     _check_simulation(num_frames, replicates, sampler, draws, correlation)
     if not isinstance(noise, FrameNoise):
         raise invalid("noise", expected="a FrameNoise", got=noise, cure="As FrameNoise(0.02, 1.0).")
-    noise = noise.of(num_frames)
+    noise = noise.for_frames(num_frames)
     assumed = noise if assumed_noise is None else assumed_noise
     if isinstance(assumed, FrameNoise):
-        assumed = assumed.of(num_frames)
+        assumed = assumed.for_frames(num_frames)
     elif assumed not in NOISES:
         raise invalid("assumed_noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=assumed_noise)
-    increments = Increments.among(np.linspace(0.0, 1.0, num_frames), None, concentration)
-    pictures = _KeptPictures(model)
+    increments = Increments.with_free(np.linspace(0.0, 1.0, num_frames), None, concentration)
+    cache = _RenderCache(model)
     ranks, true, converged = [], [], 0
     for seeds in np.random.SeedSequence(seed).spawn(replicates):
         rng = np.random.default_rng(seeds)
         times = increments.draw_prior(rng, 1)[0]
-        frames = pictures.noisy(times, noise.scale, correlation, rng)
-        drawn = Drawn(_Simulated(pictures, frames))
-        drawn.coarse()
-        log_prob = FrameTimeLogProb(drawn.evidence(assumed).profiles, increments)
-        some, good = _posterior_draws(log_prob, sampler, draws, steps, int(rng.integers(2**31)))
+        frames = cache.simulate_frames(times, noise.scale, correlation, rng)
+        builder = ProfileBuilder(_SimulatedResiduals(cache, frames))
+        builder.compare_coarse()
+        log_prob = FrameTimeLogProb(builder.build(assumed).curves, increments)
+        sample, success = _sample_posterior(log_prob, sampler, draws, steps, int(rng.integers(2**31)))
         any_frame = int(rng.integers(1, num_frames - 1))
-        ranks.append(_ranks(log_prob, times, some, any_frame))
+        ranks.append(_ranks(log_prob, times, sample, any_frame))
         true.append(times)
-        converged += good
+        converged += success
     names = [f"frame {k}" for k in range(1, num_frames - 1)] + ["any frame", "log-likelihood"]
     return SimulatedRanks(np.array(ranks), draws + 1, names, np.array(true), converged / replicates)
 
@@ -125,10 +125,10 @@ def simulated_ranks(
 def ecdf_band(
     replicates: int, num_ranks: int, level: float = 0.99, *, seed: int = 0
 ) -> Float64[np.ndarray, "2 num_ranks"]:
-    """Least and greatest share of uniform ranks below 1, 2, ..., `num_ranks` that is seen with probability `level`.
+    """Simultaneous envelope of the empirical CDF of uniform ranks, at 1, 2, ..., `num_ranks`.
 
-    Simultaneously: of independent uniform ranks, so many sets of `replicates` stay inside everywhere. Pointwise
-    binomial intervals, whose own level is set by simulation.
+    The ECDF of `replicates` independent uniform ranks stays entirely within it with probability `level`. It consists
+    of pointwise binomial intervals, whose pointwise level is calibrated by simulation.
 
     **Source:** Saeilynoja, Buerkner and Vehtari 2022, algorithm 1. **Raises:** ValueError for settings out of range.
     """
@@ -142,14 +142,14 @@ def ecdf_band(
 @functools.lru_cache(maxsize=32)
 def _band(replicates: int, num_ranks: int, level: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    shares = np.arange(1, num_ranks) / num_ranks  # below the last rank are all
+    fractions = np.arange(1, num_ranks) / num_ranks  # all ranks are at most the last
     counts = rng.multinomial(replicates, np.full(num_ranks, 1 / num_ranks), ENVELOPES)[:, :-1].cumsum(1)
-    # Both tails of every count there can be, looked up.
+    # Two-sided tail probabilities of all possible counts.
     every = np.arange(replicates + 1)[:, None]
-    below = scipy.stats.binom.cdf(every, replicates, shares)
-    tails = 2 * np.minimum(below, scipy.stats.binom.sf(every - 1, replicates, shares))
+    below = scipy.stats.binom.cdf(every, replicates, fractions)
+    tails = 2 * np.minimum(below, scipy.stats.binom.sf(every - 1, replicates, fractions))
     least = tails[counts, np.arange(num_ranks - 1)].min(1)
-    # The greatest pointwise level, of those that are there, that so many sets stay above.
+    # The largest attained pointwise level that the fraction `level` of sets stay above.
     pointwise = np.quantile(least, 1 - level, method="lower")
     inside = tails >= pointwise * (1 - 1e-9)
     low = inside.argmax(0)
@@ -160,44 +160,46 @@ def _band(replicates: int, num_ranks: int, level: float, seed: int) -> np.ndarra
 def coverage(
     ranks: Int[np.ndarray, "replicates quantities"], num_ranks: int, level: float
 ) -> Float64[np.ndarray, " quantities"]:
-    """Share of replicates in which the central interval that holds `level` of the draws holds what is true.
+    """Fraction of replicates in which the central interval with the fraction `level` of the draws contains the truth.
 
-    Raises ValueError where `level` leaves no whole number of ranks on either side.
+    Raises ValueError if `level` does not leave an integer number of ranks on either side.
     """
     tail = (1 - level) / 2 * num_ranks
     if not 0 < level < 1 or abs(tail - round(tail)) > 1e-6 or round(tail) < 1:
-        cure = "With 99 draws there are 100 ranks, and 0.5 and 0.9 will do."
-        raise invalid("level", expected=f"a share that leaves whole ranks of {num_ranks}", got=level, cure=cure)
+        cure = "With 99 draws there are 100 ranks, and 0.5 and 0.9 are valid."
+        raise invalid(
+            "level", expected=f"a fraction that leaves an integer number of {num_ranks} ranks", got=level, cure=cure
+        )
     tail, ranks = round(tail), np.asarray(ranks)
     return ((ranks >= tail) & (ranks < num_ranks - tail)).mean(0)
 
 
-class _KeptPictures:
-    """What a model shows, drawn once for each time asked for, as long as there is room."""
+class _RenderCache:
+    """Rendered images of a model by time, kept up to `CACHE_BYTES`."""
 
     def __init__(self, model: VideoModel):
-        self.screen = Screen(model, np.zeros((3, *model.size, 3), np.uint8))
+        self.residuals = Residuals(model, np.zeros((3, *model.size, 3), np.uint8))
         self.kept: dict[float, np.ndarray] = {}
-        self.most = max(KEPT // (12 * model.size[0] * model.size[1]), 1)
+        self.most = max(CACHE_BYTES // (12 * model.size[0] * model.size[1]), 1)
 
     def __call__(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
         times = [float(t) for t in times]
         missing = [t for t in dict.fromkeys(times) if t not in self.kept]
-        new = dict(zip(missing, self.screen.pictures(missing), strict=True))
+        new = dict(zip(missing, self.residuals.render_at(missing), strict=True))
         for t in missing[: max(self.most - len(self.kept), 0)]:
             self.kept[t] = new[t]
         for t in times:
             yield self.kept[t] if t in self.kept else new[t]
 
-    def noisy(
+    def simulate_frames(
         self, times: np.ndarray, scale: np.ndarray, correlation: float | None, rng: np.random.Generator
     ) -> Float32[np.ndarray, "num_frames 3 height width"]:
-        pictures = np.stack(list(self.screen.pictures(times)))
-        return pictures + scale[:, None, None, None].astype(np.float32) * _noise(pictures.shape, correlation, rng)
+        images = np.stack(list(self.residuals.render_at(times)))
+        return images + scale[:, None, None, None].astype(np.float32) * _draw_noise(images.shape, correlation, rng)
 
 
-def _noise(shape: tuple[int, ...], correlation: float | None, rng: np.random.Generator) -> np.ndarray:
-    """Of variance 1, stationary: neighbours over an edge are those on the other side."""
+def _draw_noise(shape: tuple[int, ...], correlation: float | None, rng: np.random.Generator) -> np.ndarray:
+    """Stationary noise of variance 1, periodic at the borders."""
     white = rng.standard_normal(shape, np.float32)
     if correlation is None:
         return white
@@ -208,37 +210,37 @@ def _noise(shape: tuple[int, ...], correlation: float | None, rng: np.random.Gen
     return scipy.ndimage.gaussian_filter(white, spread, mode="wrap") / np.float32(np.sqrt((kernel**2).sum()))
 
 
-class _Simulated:
-    """A Screen of pictures that are kept, and frames that are not of 8 bits."""
+class _SimulatedResiduals:
+    """Stands in for `Residuals`, with cached images and frames that are not rounded to 8 bits."""
 
-    def __init__(self, pictures: _KeptPictures, frames: Float32[np.ndarray, "num_frames 3 height width"]):
-        self.pictures, self.frames, self.model = pictures, frames, pictures.screen.model
+    def __init__(self, cache: _RenderCache, frames: Float32[np.ndarray, "num_frames 3 height width"]):
+        self.frames, self.model, self.render_at = frames, cache.residuals.model, cache
 
-    def squared_errors(self, picture: np.ndarray, which: Iterable[int]) -> np.ndarray:
-        misses = (self.frames[np.asarray(which)] - picture).reshape(len(which), -1)
+    def squared_errors(self, image: np.ndarray, which: Iterable[int]) -> np.ndarray:
+        misses = (self.frames[np.asarray(which)] - image).reshape(len(which), -1)
         return np.einsum("kp,kp->k", misses, misses, dtype=np.float64)
 
-    def residual(self, k: int, picture: np.ndarray) -> np.ndarray:
-        return self.frames[k] - picture
+    def residual(self, k: int, image: np.ndarray) -> np.ndarray:
+        return self.frames[k] - image
 
 
-def _posterior_draws(
+def _sample_posterior(
     log_prob: FrameTimeLogProb, sampler: str, draws: int, steps: int, seed: int
 ) -> tuple[Float64[np.ndarray, "draws num_frames"], bool]:
     if sampler == "exact":
-        return exact_times(log_prob.profiles, log_prob.increments).sample(draws, seed), True
+        return exact_posterior(log_prob.curves, log_prob.increments).sample(draws, seed), True
     from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 
     found = frame_time_posterior(log_prob=log_prob, steps=steps, ensembles=2, seed=seed, progress=False)
     if len(found.draws) < draws:
-        raise invalid("steps", expected=f"so many that {draws} draws are kept", got=steps)
+        raise invalid("steps", expected=f"enough steps for {draws} kept draws", got=steps)
     which = np.random.default_rng(seed).choice(len(found.draws), draws, replace=False)
     return found.draws[which], found.converged
 
 
 def _ranks(log_prob: FrameTimeLogProb, true: np.ndarray, draws: np.ndarray, any_frame: int) -> np.ndarray:
     below = (draws < true).sum(0)
-    # Of profiles alone: where a true time is known to be, all are finite.
+    # The likelihood alone is finite at the true times, which the profiles cover.
     likelihood = (log_prob.log_likelihood(draws) < log_prob.log_likelihood(true)).sum()
     return np.array([*below[1:-1], below[any_frame], likelihood])
 

@@ -1,7 +1,7 @@
-"""Pictures of a posterior of frame times; matplotlib is imported when one is drawn.
+"""Plots of the posterior of frame times; matplotlib is imported on first use.
 
-Times are shown in frames: one is the mean distance between neighbours, cuts left out; without cuts 1 / (num_frames - 1)
-of the model's time.
+The unit of times is one frame: the mean step between neighbors, cuts excluded; without cuts 1 / (num_frames - 1) of
+the model's time.
 """
 
 from collections.abc import Sequence
@@ -12,10 +12,16 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.plot import import_pyplot
-from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, cuts, even_pace, intervals, irregularities
+from foldgauss.uncertainty.diagnostics.irregularities import (
+    Irregularity,
+    even_times,
+    find_cuts,
+    increment_intervals,
+    irregularities,
+)
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +30,7 @@ __all__ = ["plot_correlation", "plot_increments", "plot_pairs", "plot_times", "p
 
 _BLUE, _RED, _GREY, _ORANGE, _GREEN = "#1f4e79", "#d1242f", "#57606a", "#bc4c00", "#1a7f37"
 _FLAG = {"duplicated": (_RED, "v"), "dropped": (_ORANGE, "^")}
-_MOST_PAIRS, _POINTS, _STEPS_DRAWN = 6, 2000, 1000
+_MOST_PAIRS, _POINTS, _STEPS_SHOWN = 6, 2000, 1000
 _COLORS = (_BLUE, _ORANGE, _GREEN, _RED, "#8250df", _GREY)
 
 
@@ -35,11 +41,12 @@ def plot_times(
     fitted: Float[np.ndarray, " num_frames"] | None = None,
     flagged: Sequence[Irregularity] | None = None,
 ) -> np.ndarray:
-    """Above where each frame is: its time less even spacing within its shot. Below how sure that is: half widths.
+    """Plot times less even spacing within the shot (upper panel) and half widths of their intervals (lower panel).
 
-    Above, in frames: the posterior mean, its central 50 and 90% as bands, `fitted` (the model's own times) as a dotted
-    line, and flagged intervals marked (default: `irregularities(posterior)`). Below, on a logarithmic scale: half the
-    width of the central 50 and 90% of the draws; Laplace's approximation and the exact passes beside the latter.
+    Upper panel, in frames: the posterior mean, its central 50 and 90% as bands, `fitted` (the model's own times) as a
+    dotted line, and `flagged` intervals marked (default: `irregularities(posterior)`). Lower panel, on a logarithmic
+    scale: half the width of the central 50 and 90% of the draws, and 90% by Laplace's approximation and the exact
+    posterior.
 
     **Shapes:** `axes`, given or made, are (2,). **Units:** frames.
 
@@ -54,7 +61,7 @@ def plot_times(
         pyplot = import_pyplot("plot_times")
         axes = pyplot.subplots(2, 1, sharex=True, layout="constrained", figsize=(9, 6))[1]
     flagged = irregularities(posterior) if flagged is None else flagged
-    frames, (even, unit) = np.arange(num_frames), even_pace(posterior)
+    frames, (even, unit) = np.arange(num_frames), even_times(posterior)
     mean = (posterior.mean() - even) / unit
     inner, outer = ((posterior.interval(level) - even) / unit for level in (0.5, 0.9))
     upper, lower = axes
@@ -106,14 +113,14 @@ def plot_increments(
     level: float = 0.9,
     flagged: Sequence[Irregularity] | None = None,
 ) -> "Axes":
-    """Each increment in units of the median one, with its central `level`; duplicated and dropped frames marked.
+    """Plot each increment in units of the median one, with its central interval; mark duplicated and dropped frames.
 
-    A cut's increment, which is no pace, is left out. Raises as `plot_times` and `intervals` do.
+    Cuts are omitted. Raises as `plot_times` and `increment_intervals` do.
     """
     ax = _axes(ax, "plot_increments", (9, 4))
     flagged = irregularities(posterior) if flagged is None else flagged
-    found = intervals(posterior, level)
-    shown = np.flatnonzero(~cuts(posterior))
+    found = increment_intervals(posterior, level)
+    shown = np.flatnonzero(~find_cuts(posterior))
     at = shown + 0.5
     ax.axhline(1, color=_GREY, linewidth=0.6)
     ax.vlines(at, found.low[shown], found.high[shown], color=_BLUE, alpha=0.45, linewidth=_bar_width(len(found.mean)))
@@ -130,7 +137,11 @@ def plot_increments(
                 textcoords="offset points", ha="left", rotation=35, fontsize="x-small", color=color,
             )  # fmt: skip
     ax.set_ylim(min(-0.05, ax.get_ylim()[0]), 0.1 + 1.06 * max(found.high[shown].max(), found.mean[shown].max()))
-    ax.set(xlabel="interval (its first frame + 1/2)", ylabel="increment / median increment", title="Pace of the clip")
+    ax.set(
+        xlabel="interval (its first frame + 1/2)",
+        ylabel="increment / median increment",
+        title="Playback speed of the clip",
+    )
     ax.legend(fontsize="small", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.17), frameon=False)
     ax.grid(alpha=0.25)
     return ax
@@ -139,14 +150,14 @@ def plot_increments(
 def plot_pairs(
     posterior: FrameTimePosterior, frames: Sequence[int] | None = None, axes: "np.ndarray | None" = None
 ) -> np.ndarray:
-    """A corner plot: how the times of a few frames go together, in frames from their means.
+    """A corner plot of the joint distribution of a few frames' times, in frames from their means.
 
-    `frames`, drawn ones, at most six (default: the four next to the frame that is least sure). On the diagonal the
-    draws (filled), the exact marginal (line) and Laplace's (dashed); below, draws and their correlation.
+    `frames`: at most six free frames (default: four around the frame with the widest posterior). On the diagonal the
+    draws (filled), the exact marginal (line) and Laplace's approximation (dashed); below it draws and correlations.
 
-    **Shapes:** `axes` (len(frames), len(frames)). Raises ValueError for frames that were held, or too many.
+    **Shapes:** `axes` (len(frames), len(frames)). Raises ValueError for held frames, or too many.
     """
-    frames = _around_widest(posterior) if frames is None else _drawn_frames(posterior, frames)
+    frames = _frames_around_widest(posterior) if frames is None else _check_frames(posterior, frames)
     num = len(frames)
     if num > _MOST_PAIRS:
         raise invalid("frames", expected=f"at most {_MOST_PAIRS}", got=num)
@@ -154,7 +165,7 @@ def plot_pairs(
         pyplot = import_pyplot("plot_pairs")
         size = max(1.9 * num, 3.5)
         axes = pyplot.subplots(num, num, sharex="col", layout="constrained", figsize=(size, size), squeeze=False)[1]
-    (_, unit), draws = even_pace(posterior), posterior.draws
+    (_, unit), draws = even_times(posterior), posterior.draws
     mean = posterior.mean()
     shown = (draws - mean)[np.unique(np.linspace(0, len(draws) - 1, _POINTS).astype(int))] / unit
     everything = (draws[:, frames] - mean[frames]) / unit
@@ -196,30 +207,30 @@ def plot_pairs(
 def plot_trace(
     posterior: FrameTimePosterior, frames: Sequence[int] | None = None, axes: "np.ndarray | None" = None
 ) -> np.ndarray:
-    """The course of sampling, a colour an ensemble: mean over its walkers (lines), and the middle 90% of them (bands).
+    """Trace plot, one color per ensemble: mean over its walkers (bold lines) and their central 90% (thin lines).
 
-    `frames`: default the two with the greatest R-hat and the longest autocorrelation. Ensembles that have converged run
-    over one another without drifts. To the right the draws of each ensemble as a histogram: these should agree.
+    `frames`: default the two with the largest R-hat and autocorrelation time. Converged ensembles overlap without
+    drift. To the right the draws of each ensemble as a histogram: these should agree.
 
     **Shapes:** `axes` (len(frames), 2). **Units:** frames from the mean; kept states.
     """
     if frames is None:
         worst = [posterior.free[np.argmax(posterior.r_hat)], posterior.free[np.argmax(posterior.tau)]]
         frames = list(dict.fromkeys(int(k) for k in worst))
-    frames = _drawn_frames(posterior, frames)
+    frames = _check_frames(posterior, frames)
     if axes is None:
         pyplot = import_pyplot("plot_trace")
         axes = pyplot.subplots(
             len(frames), 2, sharex="col", sharey="row", layout="constrained", squeeze=False,
             figsize=(9, 0.6 + 2.2 * len(frames)), width_ratios=(4, 1),
         )[1]  # fmt: skip
-    (_, unit), mean = even_pace(posterior), posterior.mean()
+    (_, unit), mean = even_times(posterior), posterior.mean()
     order = posterior.free.tolist()
     for k, (left, right) in zip(frames, axes, strict=True):
-        drawn = (posterior.times[..., k] - mean[k]) / unit
-        stride = max(drawn.shape[1] // _STEPS_DRAWN, 1)
-        edges = np.linspace(*np.quantile(drawn, [0.001, 0.999]), 41)
-        for n, walkers in enumerate(drawn):
+        draws = (posterior.times[..., k] - mean[k]) / unit
+        stride = max(draws.shape[1] // _STEPS_SHOWN, 1)
+        edges = np.linspace(*np.quantile(draws, [0.001, 0.999]), 41)
+        for n, walkers in enumerate(draws):
             color, some = _COLORS[n % len(_COLORS)], walkers[::stride]
             at = np.arange(len(some)) * stride
             low, high = np.quantile(some, [0.05, 0.95], axis=1)
@@ -229,10 +240,10 @@ def plot_trace(
             counts, _ = np.histogram(walkers, edges, density=True)
             right.stairs(counts, edges, orientation="horizontal", color=color, linewidth=1)
         n = order.index(k)
-        told = f"R-hat {posterior.r_hat[n]:.4f}, tau {posterior.tau[n]:,.0f} steps, ESS {posterior.ess[n]:,.0f}"
-        left.set_title(f"frame {k}: {told}", fontsize="small")
+        text = f"R-hat {posterior.r_hat[n]:.4f}, tau {posterior.tau[n]:,.0f} steps, ESS {posterior.ess[n]:,.0f}"
+        left.set_title(f"frame {k}: {text}", fontsize="small")
         left.set_ylabel(f"$t_{{{k}}}$ from its mean\n(frames)")
-        left.set_xlim(0, drawn.shape[1])
+        left.set_xlim(0, draws.shape[1])
         left.grid(alpha=0.25)
         right.set_xticks([])
     axes[-1, 0].set_xlabel("kept states after burn-in (bold: mean of the walkers; thin: their central 90%)")
@@ -241,23 +252,23 @@ def plot_trace(
     return axes
 
 
-def plot_correlation(seen: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axes":
-    """Correlation of residuals by distance, and what share of the pixels' values counts as independent for it.
+def plot_correlation(profiles: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axes":
+    """Plot the correlation of residuals by distance; the title states the effective number of independent values.
 
-    White noise would fall from 1 to 0 within a pixel; what lies above is counted once only. **Units:** pixels.
+    White noise would fall from 1 to 0 within a pixel. **Units:** pixels.
     """
     ax = _axes(ax, "plot_correlation", (6, 3.6))
-    correlation = np.asarray(seen.residual_correlation)
+    correlation = np.asarray(profiles.residual_correlation)
     below = np.flatnonzero(correlation < LAST_CORRELATION)
     reach = int(below[0]) if below.size else len(correlation) - 1
     last = min(len(correlation), max(3 * reach, 12) + 1)
     ax.plot(np.arange(last), correlation[:last], "o-", color=_BLUE, markersize=3.5, linewidth=1.2)
     ax.axhline(0, color=_GREY, linewidth=0.6)
     ax.axhline(LAST_CORRELATION, color=_RED, linewidth=0.8, linestyle="--")
-    ax.text(last - 1, LAST_CORRELATION, f"{LAST_CORRELATION:g}: taken for none", color=_RED, fontsize="small",
+    ax.text(last - 1, LAST_CORRELATION, f"{LAST_CORRELATION:g}: cutoff", color=_RED, fontsize="small",
             ha="right", va="bottom")  # fmt: skip
-    told = seen.noise.told()
-    ax.set_title(told[0].upper() + told[1:], fontsize="medium")
+    text = profiles.noise.describe()
+    ax.set_title(text[0].upper() + text[1:], fontsize="medium")
     ax.set(xlabel="distance (pixels)", ylabel="correlation of residuals", xlim=(-0.02 * last, last - 1))
     ax.grid(alpha=0.25)
     return ax
@@ -268,29 +279,29 @@ def _axes(ax, caller: str, size: tuple[float, float]):
 
 
 def _bar_width(num: int) -> float:
-    """Of bars side by side in a picture of 9 inches, in points."""
+    """Width of bars side by side in a figure of 9 inches, in points."""
     return float(np.clip(360 / num, 0.6, 4))
 
 
-def _drawn_frames(posterior: FrameTimePosterior, frames: Sequence[int]) -> list[int]:
+def _check_frames(posterior: FrameTimePosterior, frames: Sequence[int]) -> list[int]:
     frames = [int(k) for k in frames]
     if not frames or len(set(frames)) < len(frames) or not set(frames) <= set(posterior.free.tolist()):
-        raise invalid("frames", expected="frames whose times were drawn, each once", got=frames)
+        raise invalid("frames", expected="frames whose times were sampled, each once", got=frames)
     return frames
 
 
-def _around_widest(posterior: FrameTimePosterior) -> list[int]:
-    """The drawn frame that is least sure, and those next to it: four in all, as far as there are so many."""
+def _frames_around_widest(posterior: FrameTimePosterior) -> list[int]:
+    """The free frame with the widest posterior and its neighbors, four in all if there are as many."""
     free = posterior.free
     widest = int(np.argmax(posterior.std()[free]))
     first = int(np.clip(widest - 1, 0, max(len(free) - 4, 0)))
     return free[first : first + 4].tolist()
 
 
-def _marginal(posterior: FrameTimePosterior, ax, k: int, drawn: np.ndarray, unit: float, reach: float) -> None:
+def _marginal(posterior: FrameTimePosterior, ax, k: int, draws: np.ndarray, unit: float, reach: float) -> None:
     n = posterior.free.tolist().index(k)
     mean, grid = posterior.mean()[k], posterior.exact.grids[n]
-    ax.hist(drawn, np.linspace(-reach, reach, 41), density=True, color=_BLUE, alpha=0.35, label="emcee")
+    ax.hist(draws, np.linspace(-reach, reach, 41), density=True, color=_BLUE, alpha=0.35, label="emcee")
     ax.plot((grid - mean) / unit, posterior.exact.densities[n] * unit, color="black", linewidth=1, label="exact")
     mode, std = (posterior.laplace.mode[k] - mean) / unit, posterior.laplace.std[k] / unit
     at = np.linspace(-reach, reach, 201)

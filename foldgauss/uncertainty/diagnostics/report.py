@@ -1,4 +1,4 @@
-"""A posterior of frame times in words and as a table."""
+"""Summary of the posterior of frame times as Markdown and as a table."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -7,18 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, even_pace, irregularities, judged
-from foldgauss.uncertainty.posterior.sampling import FrameTimePosterior
+from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, even_times, irregularities, is_assessable
+from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 
 def frame_table(
     posterior: FrameTimePosterior, fitted: Float[np.ndarray, " num_frames"] | None = None
 ) -> dict[str, np.ndarray]:
-    """Columns with an entry for each frame: `frame`, `fitted` (NaN if not given), `mean`, `std`, `low_50`, `high_50`,
+    """Columns with one entry per frame: `frame`, `fitted` (NaN if not given), `mean`, `std`, `low_50`, `high_50`,
     `low_90`, `high_90`, `laplace_mode`, `laplace_std`, `exact_mean`, `exact_std`, `r_hat`, `tau`, `ess`, `identified`.
 
-    **Units:** times of the model, [0, 1]; `tau` in steps. Frames whose times were held have a spread of 0, no `r_hat`,
-    `tau` and `ess` (NaN), and count as identified. Raises ValueError for `fitted` of another length.
+    **Units:** times of the model, [0, 1]; `tau` in steps. Held frames have a spread of 0, NaN for `r_hat`, `tau` and
+    `ess`, and count as identified. Raises ValueError for `fitted` of another length.
     """
     num_frames = posterior.times.shape[-1]
     fitted = np.full(num_frames, np.nan) if fitted is None else np.asarray(fitted, np.float64)
@@ -52,24 +52,24 @@ def summary(
     flagged: Sequence[Irregularity] | None = None,
     level: Literal["splats", "colors"] | None = None,
 ) -> str:
-    """What was found, how far to trust it, and what it is conditioned on, in Markdown.
+    """Results, convergence, and what the posterior is conditioned on, in Markdown.
 
-    `fitted`: the model's own times, which are compared. `flagged`: default `irregularities(posterior)`. `level`: what
-    the posterior is given, all of the splats, or all but their colours; default: as its evidence says.
+    `fitted`: the model's own times, for comparison. `flagged`: default `irregularities(posterior)`. `level`: whether
+    all splats are held or their colors are integrated out; default: that of its profiles.
 
     **Example:** `print(summary(posterior, model.frame_times.times()))`.
     """
     flagged = irregularities(posterior) if flagged is None else flagged
-    seen = posterior.seen
-    level = level or ("splats" if seen is None else seen.level)
+    profiles = posterior.profiles
+    level = level or ("splats" if profiles is None else profiles.level)
     parts = [
         posterior.message,
-        *(f"**Note:** {note}" for note in (() if seen is None else seen.notes)),
+        *(f"**Note:** {note}" for note in (() if profiles is None else profiles.notes)),
         _sampling(posterior),
-        "## How sure\n\n" + _sureness(posterior),
-        "## Pace\n\n" + _pace(posterior, flagged),
-        "## Against other times\n\n" + _against(posterior, fitted),
-        "## What this is conditioned on\n\n" + _conditions(posterior, level),
+        "## Precision\n\n" + _precision(posterior),
+        "## Playback speed\n\n" + _playback_speed(posterior, flagged),
+        "## Comparison with other times\n\n" + _comparison(posterior, fitted),
+        "## Conditioned on\n\n" + _conditions(posterior, level),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -79,52 +79,53 @@ def _sampling(posterior: FrameTimePosterior) -> str:
     free = posterior.free
     worst, longest, least = posterior.r_hat.argmax(), posterior.tau.argmax(), posterior.ess.argmin()
     rows = [
-        ("frames, drawn", f"{num_frames}, {len(free)}"),
+        ("frames, sampled", f"{num_frames}, {len(free)}"),
         ("ensembles, walkers each", f"{ensembles}, {walkers}"),
         ("states kept of each, after burn-in", f"{steps:,}"),
         ("acceptance", f"{posterior.acceptance.mean():.2f}"),
-        ("greatest R-hat (below 1.01 wanted)", f"{posterior.r_hat[worst]:.4f}, frame {free[worst]}"),
+        ("largest R-hat (required: below 1.01)", f"{posterior.r_hat[worst]:.4f}, frame {free[worst]}"),
         ("longest autocorrelation time", f"{posterior.tau[longest]:,.0f} steps, frame {free[longest]}"),
-        ("least effective sample size", f"{posterior.ess[least]:,.0f}, frame {free[least]}"),
+        ("smallest effective sample size", f"{posterior.ess[least]:,.0f}, frame {free[least]}"),
     ]
     return _table(("sampling", ""), rows)
 
 
-def _sureness(posterior: FrameTimePosterior) -> str:
-    """Spreads in frames, and whether the three ways to find them agree."""
-    free, (_, unit) = posterior.free, even_pace(posterior)
+def _precision(posterior: FrameTimePosterior) -> str:
+    """Standard deviations in frames, and whether the three methods agree."""
+    free, (_, unit) = posterior.free, even_times(posterior)
     std = posterior.std()[free]
-    drawn, exact, laplace = std / unit, posterior.exact.std()[free] / unit, posterior.laplace.std[free] / unit
-    widest, apart = drawn.argmax(), np.abs(posterior.mean() - posterior.exact.mean())[free] / exact / unit
+    sampled, exact, laplace = std / unit, posterior.exact.std()[free] / unit, posterior.laplace.std[free] / unit
+    widest, apart = sampled.argmax(), np.abs(posterior.mean() - posterior.exact.mean())[free] / exact / unit
     lines = [
-        f"Standard deviation of a time: median {np.median(drawn):.3g} frames, greatest {drawn[widest]:.3g} "
+        f"Standard deviation of a time: median {np.median(sampled):.3g} frames, largest {sampled[widest]:.3g} "
         f"(frame {free[widest]}). One frame is 1 / {1 / unit:.4g} of the model's time.",
-        f"emcee beside the exact passes: means differ by at most {apart.max():.2g} standard deviations; spreads are "
-        f"{_factor(drawn, exact)} times as great. Laplace's approximation: {_factor(laplace, exact)} times.",
+        f"emcee against the exact posterior: means differ by at most {apart.max():.2g} standard deviations, the ratio "
+        f"of standard deviations is {_factor(sampled, exact)}. Laplace's approximation: {_factor(laplace, exact)}.",
     ]
     unknown = np.flatnonzero(~posterior.identified())
     if len(unknown):
         lines.append(
-            f"**Not identified: {_listed(unknown)}.** There the pictures say little more than the order of the frames, "
-            "and intervals are the prior's."
+            f"**Not identified: {_listed(unknown)}.** The frames carry little information beyond their order, "
+            "and the intervals are those of the prior."
         )
     return "\n\n".join(lines)
 
 
-def _pace(posterior: FrameTimePosterior, flagged: Sequence[Irregularity]) -> str:
-    asked = judged(posterior)
+def _playback_speed(posterior: FrameTimePosterior, flagged: Sequence[Irregularity]) -> str:
+    assessable = is_assessable(posterior)
     others = (
         ""
-        if asked.all()
-        else (f" {int((~asked).sum())} others were not judged: cuts, frames that are held or do not tell their time.")
+        if assessable.all()
+        else (
+            f" {int((~assessable).sum())} others were not assessed: cuts, and frames that are held or not identified."
+        )
     )
     caution = (
-        "A gap, or a frame shown twice, in the very frames that the model was fitted to may be taken up by its clock "
-        "and its folds; the model of a clip that has the frames left out sees it."
+        "A gap or a duplicate among the frames that the model was fitted to may be absorbed by its frame times and "
+        "folds; a model fitted to a clip that contains the missing frames reveals it."
     )
     if not flagged:
-        found = "none looks like that of a duplicated frame, or of frames left out"
-        return f"Of {int(asked.sum())} intervals {found}.{others} {caution}"
+        return f"None of {int(assessable.sum())} intervals shows a duplicated or dropped frame.{others} {caution}"
     rows = [
         (
             "{}, {}".format(*one.frames),
@@ -140,14 +141,14 @@ def _pace(posterior: FrameTimePosterior, flagged: Sequence[Irregularity]) -> str
     beside = {(first + step, last + step) for first, last in twice for step in (-1, 1)}
     if any(one.kind == "dropped" and one.frames in beside for one in flagged):
         text += (
-            "\n\nA long step beside a duplicated frame: that frame stands in the place of one that was left out; or "
-            "the splats themselves stand still there, since they were fitted to it, and it may lie anywhere there."
+            "\n\nA long step beside a duplicated frame: the duplicate replaces a dropped frame; or the splats are "
+            "static there, since they were fitted to the duplicate, and its time is arbitrary within that interval."
         )
     return f"{text}\n\n{caution}{others}"
 
 
-def _against(posterior: FrameTimePosterior, fitted) -> str:
-    """Log-likelihoods of whole sets of times."""
+def _comparison(posterior: FrameTimePosterior, fitted) -> str:
+    """Log-likelihoods of alternative frame times."""
     log_prob = posterior.log_prob
     times = {"posterior mean": posterior.mean(), "evenly spaced": np.linspace(0, 1, posterior.times.shape[-1])}
     if fitted is not None:
@@ -155,18 +156,18 @@ def _against(posterior: FrameTimePosterior, fitted) -> str:
     rows = [(name, f"{float(log_prob.log_likelihood(each)):,.1f}") for name, each in times.items()]
     some = posterior.draws[:: max(len(posterior.draws) // 1000, 1)]
     rows.append(("draws, mean", f"{float(log_prob.log_likelihood(some).mean()):,.1f}"))
-    return _table(("times", "log-likelihood (nats; 0: each frame about its best)"), rows)
+    return _table(("times", "log-likelihood (nats; 0: each frame near its mode)"), rows)
 
 
 def _conditions(posterior: FrameTimePosterior, level: str) -> str:
     increments = posterior.log_prob.increments
-    held = "durations, colours" if level == "splats" else "durations; their colours are integrated out"
+    held = "durations, colors" if level == "splats" else "durations; their colors are integrated out"
     lines = [
-        f"- The splats, held as they were fitted: places, folds, {held}. A warp of time that the folds have taken up "
-        "does not show: intervals are those of times given the folds."
+        f"- The splats, held as fitted: positions, folds, {held}. A smooth warp of time that the folds have absorbed "
+        "is not visible: intervals are those of times given the folds."
     ]
-    if posterior.seen is not None:
-        lines.append(f"- The noise: {posterior.seen.noise.told()}.")
+    if posterior.profiles is not None:
+        lines.append(f"- The noise: {posterior.profiles.noise.describe()}.")
     lines.append(f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.")
     held = np.flatnonzero(~increments.free)[1:-1]
     text = "- The first frame at 0 and the last at 1"

@@ -1,4 +1,4 @@
-"""The normal equations of the colours of a model, given what it shows of a video at given times."""
+"""Normal equations of the colors of a model's splats, given the frames of a video at given times."""
 
 import functools
 from collections.abc import Callable
@@ -13,21 +13,21 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu
-from foldgauss.render.weights import weights
+from foldgauss.render.weights import build_weight_matrix
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
-from foldgauss.uncertainty.likelihood.residuals import Screen
+from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.splats import SH_C0
 
-#: Frames whose products are added up at once.
-TOGETHER = 8
-#: Gaussians of a block of the preconditioner: twice as many cost about as much time as they save.
+#: Frames whose Gram matrices are computed at once.
+BATCH = 8
+#: Gaussians per block of the preconditioner: larger blocks cost about as much time as they save.
 BLOCK = 512
 #: Gaussians per task.
 CHUNK = 1024
-#: Solving that has not ended by then will not. The 40,000 Gaussians of a fitted clip take 40 to 200.
-MOST_STEPS = 2000
+#: Iteration limit of the solver. The 40,000 Gaussians of a fitted clip take 40 to 200.
+MAX_ITERATIONS = 2000
 
 _behind = np.asarray(BLACK, np.float32)
 _level = 1 / 255
@@ -35,62 +35,64 @@ _d = nb.float64
 
 
 class ColorEquations:
-    r"""H c = b of all colours' offsets c from the model's own, of every frame at its time.
+    r"""H c = b for the offsets c of all colors from the model's own, given every frame at its time.
 
     $$ H = \lambda^{-2} I + \sum_j A_j^T A_j / s_j^2, \quad b = \sum_j A_j^T (y_j - A_j c_0) / s_j^2 $$
 
-    with $\lambda$ the `prior_scale` and $s_j^2$ = scale^2 / share. Pictures are A c: linear, since the
-    clamp of colours at 0 is left out of it. `matrix`: sparse (num, num), `rhs`: (num, 3).
+    with $\lambda$ the `prior_scale` and $s_j^2$ = scale^2 / fraction. Images are A c, linear in c, since
+    the clamp of colors at 0 is neglected. `matrix`: sparse (num, num), `rhs`: (num, 3).
     """
 
     def __init__(
-        self, screen: Screen, noise: FrameNoise, times: Float64[np.ndarray, " num_frames"], prior_scale: float
+        self, residuals: Residuals, noise: FrameNoise, times: Float64[np.ndarray, " num_frames"], prior_scale: float
     ):
-        self.screen, self.times, self.variance = screen, times, 1 / (2 * noise.weight)
-        self.num = screen.model.num_gaussians
-        dc = np.asarray(screen.model.splats.color_dc, np.float64)
-        self.colour = np.maximum(0.5 + SH_C0 * dc, 0.0)
-        self._stage = PreparedModel(screen.model, screen.model.size)
-        self._add_up(prior_scale)
+        self.residuals, self.times, self.variance = residuals, times, 1 / (2 * noise.weight)
+        self.num = residuals.model.num_gaussians
+        dc = np.asarray(residuals.model.splats.color_dc, np.float64)
+        self.color = np.maximum(0.5 + SH_C0 * dc, 0.0)
+        self._prepared = PreparedModel(residuals.model, residuals.model.size)
+        self._accumulate(prior_scale)
 
     def weights(self, t: float) -> scipy.sparse.csr_array:
-        """A(t): (pixels, num), in double precision; the picture at t is A(t) times the colours."""
-        alive = self._stage.at(t)
+        """A(t): (pixels, num), in double precision; the image at t is A(t) times the colors."""
+        alive = self._prepared.at(t)
         leaves = alive.mean, alive.factor, alive.opacity, alive.color, _behind
-        model = self.screen.model
-        found = weights(cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options))
+        model = self.residuals.model
+        found = build_weight_matrix(
+            cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options)
+        )
         indices = alive.alive.astype(np.int32)[found.indices]
         shape = (found.shape[0], self.num)
         return scipy.sparse.csr_array((found.data.astype(np.float64), indices, found.indptr), shape=shape)
 
     def residual(self, k: int, weights: scipy.sparse.csr_array) -> Float64[np.ndarray, "pixels 3"]:
-        """Frame k less what the model's own colours show."""
-        return self.screen.frames[k].reshape(-1, 3) * _level - weights @ self.colour
+        """Frame k less the image with the model's own colors."""
+        return self.residuals.frames[k].reshape(-1, 3) * _level - weights @ self.color
 
-    def _add_up(self, prior_scale: float) -> None:
+    def _accumulate(self, prior_scale: float) -> None:
         half = scipy.sparse.csr_array((self.num, self.num))
-        self.rhs, some = np.zeros((self.num, 3)), []
+        self.rhs, batch = np.zeros((self.num, 3)), []
         for k, t in enumerate(self.times):
             here = self.weights(t)
             self.rhs += here.T @ self.residual(k, here) / self.variance[k]
             here.data /= np.sqrt(self.variance[k])
-            some.append(here)
-            if len(some) == TOGETHER or k + 1 == len(self.times):
-                half = half + _upper_gram(scipy.sparse.vstack(some, format="csr"))
-                some = []
+            batch.append(here)
+            if len(batch) == BATCH or k + 1 == len(self.times):
+                half = half + _upper_gram(scipy.sparse.vstack(batch, format="csr"))
+                batch = []
         diagonal = half.diagonal()
         own = scipy.sparse.diags_array(prior_scale**-2 - diagonal)
         self.matrix = (half + half.T + own).tocsr()
         self.matrix.sort_indices()
 
     def at(self, k: int, t: float) -> "FrameAt":
-        """The same with frame k at time t instead of its own."""
+        """The equations with frame k at time t instead of its own."""
         return FrameAt(self, k, t)
 
     @functools.cached_property
     def precondition(self) -> Callable[[np.ndarray], np.ndarray]:
-        """The inverse of the matrix' blocks of neighbouring Gaussians, in single precision."""
-        blocks = _neighbours(np.asarray(self.screen.model.splats.loc, np.float64), BLOCK)
+        """Block-Jacobi preconditioner over blocks of neighboring Gaussians, in single precision."""
+        blocks = _partition(np.asarray(self.residuals.model.splats.loc, np.float64), BLOCK)
         order = np.concatenate(blocks)
         matrix = self.matrix[order][:, order]
         ends = np.cumsum([len(block) for block in blocks])
@@ -109,21 +111,23 @@ class ColorEquations:
 
     @functools.cached_property
     def solution(self) -> Float64[np.ndarray, "num 3"]:
-        """Offsets of the colours given all frames at their times: where solving begins for others."""
-        return solved(lambda x: self.matrix @ x, self.precondition, self.rhs, np.zeros_like(self.rhs), 1e-4)
+        """Offsets of the colors given all frames at their times: the initial guess for other times."""
+        return solve_conjugate_gradient(
+            lambda x: self.matrix @ x, self.precondition, self.rhs, np.zeros_like(self.rhs), 1e-4
+        )
 
 
 class FrameAt:
-    """The equations with one frame at a time of its own: what is taken off, and what is put there."""
+    """The equations with one frame moved to another time, as a low-rank update."""
 
     def __init__(self, equations: ColorEquations, k: int, t: float):
         self.equations, self.k, self.t = equations, k, t
         self.variance = equations.variance[k]
         self.weights = equations.weights(t)
-        self.misses = equations.residual(k, self.weights)
+        self.residual = equations.residual(k, self.weights)
         self._taken = equations.weights(equations.times[k])
         without = equations.rhs - self._taken.T @ equations.residual(k, self._taken) / self.variance
-        self.rhs = without + self.weights.T @ self.misses / self.variance
+        self.rhs = without + self.weights.T @ self.residual / self.variance
 
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         changed = self.weights.T @ (self.weights @ x) - self._taken.T @ (self._taken @ x)
@@ -134,23 +138,22 @@ class FrameAt:
         return self.equations.matrix.toarray() + changed.toarray() / self.variance
 
 
-def solved(
+def solve_conjugate_gradient(
     product: Callable[[np.ndarray], np.ndarray],
     precondition: Callable[[np.ndarray], np.ndarray],
     rhs: Float64[np.ndarray, "num columns"],
     start: Float64[np.ndarray, "num columns"],
     tolerance: float | Float[np.ndarray, " columns"],
 ) -> Float64[np.ndarray, "num columns"]:
-    """Conjugate gradients, every column by itself, until residuals are `tolerance` of the right-hand sides.
+    """Preconditioned conjugate gradients, columnwise, until residuals are `tolerance` times the right-hand sides.
 
-    In the preconditioner's norm. Raises ValueError where they do not come down so far. Source: Hestenes and Stiefel
-    1952.
+    Norms are those of the preconditioner. Raises ValueError without convergence. Source: Hestenes and Stiefel 1952.
     """
     x, goal = start.copy(), np.maximum(tolerance**2 * (rhs * precondition(rhs)).sum(0), np.finfo(float).tiny)
     left = rhs - product(x)
     turned = precondition(left)
     direction, size = turned.copy(), (left * turned).sum(0)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_ITERATIONS):
         if (size <= goal).all():
             break
         across = product(direction)
@@ -162,14 +165,14 @@ def solved(
         size, before = (left * turned).sum(0), size
         direction = turned + np.divide(size, before, out=np.zeros_like(size), where=before > 0) * direction
     else:
-        got = f"{np.sqrt((size / goal).max()):.2g} times that after {MOST_STEPS}"
-        cure = "A smaller prior_scale makes it easier."
-        raise invalid("prior_scale", expected=f"colours solved to {np.max(tolerance):g}", got=got, cure=cure)
+        got = f"{np.sqrt((size / goal).max()):.2g} times that after {MAX_ITERATIONS}"
+        cure = "A smaller prior_scale converges faster."
+        raise invalid("prior_scale", expected=f"colors solved to {np.max(tolerance):g}", got=got, cure=cure)
     return x
 
 
-def _neighbours(places: Float64[np.ndarray, "num 2"], most: int) -> list[np.ndarray]:
-    """Parts of at most so many, by halving along the longer side."""
+def _partition(places: Float64[np.ndarray, "num 2"], most: int) -> list[np.ndarray]:
+    """Blocks of at most `most` Gaussians, by recursive bisection along the longer side."""
     parts, left = [], [np.arange(len(places))]
     while left:
         part = left.pop()
@@ -183,19 +186,19 @@ def _neighbours(places: Float64[np.ndarray, "num 2"], most: int) -> list[np.ndar
 
 
 def _upper_gram(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
-    """The upper half, diagonal included, of rows^T rows; columns of each row must be sorted."""
+    """The upper triangle of rows^T rows; the columns of each row must be sorted."""
     num = rows.shape[1]
     columns = rows.tocsc()
-    # Where each entry stands in its row: what follows it there is what it is multiplied by.
+    # Position of each entry in its row: it is multiplied by the entries that follow it there.
     entry = scipy.sparse.csr_array((np.arange(rows.nnz), rows.indices, rows.indptr), shape=rows.shape).tocsc().data
     starts = range(0, num, CHUNK)
     parts: list = [None] * len(starts)
 
-    def add_up(n: int) -> None:
+    def accumulate(n: int) -> None:
         span = starts[n], min(starts[n] + CHUNK, num)
         parts[n] = _gram(*span, num, rows.indptr, rows.indices, rows.data, columns.indptr, columns.indices, entry)
 
-    run_tasks(add_up, range(len(starts)))
+    run_tasks(accumulate, range(len(starts)))
     counts, indices, values = (np.concatenate(each) for each in zip(*parts, strict=True))
     indptr = np.concatenate([[0], np.cumsum(counts)])
     return scipy.sparse.csr_array((values, indices, indptr), shape=(num, num))
@@ -203,8 +206,8 @@ def _upper_gram(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
 
 @kernel
 def _gram(start, stop, num, row_start, indices, values, column_start, pixels, entry):
-    """Rows start..stop of the upper half of A^T A: how many entries each has, their columns, their values."""
-    sums, seen, touched = np.zeros(num), np.zeros(num, np.bool_), np.empty(num, np.int32)
+    """Rows start..stop of the upper triangle of A^T A: number of entries per row, their columns, their values."""
+    sums, present, touched = np.zeros(num), np.zeros(num, np.bool_), np.empty(num, np.int32)
     counts = np.zeros(stop - start, np.int64)
     room, total = 64 * (stop - start), 0
     found, products = np.empty(room, np.int32), np.empty(room)
@@ -214,8 +217,8 @@ def _gram(start, stop, num, row_start, indices, values, column_start, pixels, en
             first, own = entry[n], values[entry[n]]
             for e in range(first, row_start[pixels[n] + 1]):
                 j = indices[e]
-                if not seen[j]:
-                    seen[j] = True
+                if not present[j]:
+                    present[j] = True
                     touched[count] = j
                     count += 1
                 sums[j] += own * values[e]
@@ -228,7 +231,7 @@ def _gram(start, stop, num, row_start, indices, values, column_start, pixels, en
         for n in range(count):
             j = which[n]
             found[total + n], products[total + n] = j, sums[j]
-            sums[j], seen[j] = _d(0), False
+            sums[j], present[j] = _d(0), False
         total += count
         counts[i - start] = count
     return counts, found[:total], products[:total]

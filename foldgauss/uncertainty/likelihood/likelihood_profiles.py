@@ -1,4 +1,4 @@
-"""Profiles of a model's frame times: which times are drawn, and what comes of it."""
+"""Likelihood profiles of frame times: adaptive choice of the times at which the model is rendered and compared."""
 
 import dataclasses
 import itertools
@@ -14,140 +14,142 @@ from foldgauss.uncertainty.likelihood.noise import (
     FrameNoise,
     autocorrelation,
     covariances,
-    effective_share,
+    effective_fraction,
     rings,
-    score_share,
+    score_fraction,
 )
-from foldgauss.uncertainty.likelihood.profiles import Profiles
-from foldgauss.uncertainty.likelihood.residuals import Screen, Sketches
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
+from foldgauss.uncertainty.likelihood.residuals import Residuals, Sketches
 from foldgauss.video.models.video_model import VideoModel
 
 #: Coarse nodes in each interval between two frame times.
 COARSE = 4
-#: A profile is drawn finer wherever it can come within DEPTH nats of its maximum, until the cubic meets what is drawn
-#: half way to MISS nats and MISS_SHARE of the distance from the maximum, and pictures of adjoining nodes differ by at
-#: most TRAVEL nats, or nodes are the share FINEST of a coarse step apart.
-DEPTH, MISS, MISS_SHARE, TRAVEL, FINEST = 25.0, 0.02, 0.02, 4.0, 1 / 512
-#: Distances of sketches are right to some 6%: this much is added.
+#: A profile is refined wherever it can come within DEPTH nats of its maximum, until the cubic predicts the value half
+#: way to MISS nats plus MISS_FRACTION of the distance from the maximum, and images of adjacent nodes differ by at most
+#: TRAVEL nats, or until nodes are FINEST of a coarse step apart.
+DEPTH, MISS, MISS_FRACTION, TRAVEL, FINEST = 25.0, 0.02, 0.02, 4.0, 1 / 512
+#: Factor on distances of sketches, which have errors of about 6%.
 CAUTION = 1.2
-#: A frame shows nothing of its time where its profile rises by less than this many nats.
+#: A profile that rises by less than this many nats does not identify the time of its frame.
 FLAT = 0.5
-#: Clips of up to so many frames are compared at all times, longer ones within REACH frames to begin with.
+#: Clips of up to this many frames are compared at all times, longer ones at first within REACH frames.
 MOST_EVERYWHERE, REACH = 400, 100
-#: Noise of rounding to 8 bits: no frame is known better.
+#: Standard deviation of rounding to 8 bits, the lower bound of the noise.
 LEAST_SCALE = 1 / (255 * np.sqrt(12))
-#: Slopes are differences over this many of the finest steps to both sides.
+#: Slopes dR/dt are central differences over this many of the finest steps.
 SLOPE_STEP = 64
-#: The least share of the frames' variance that a model of them explains. And a model whose errors are so many times
-#: those of the clip's own mean frame may be one of another clip of the same place.
+#: A model must explain this fraction of the frames' variance; and a warning is given if its squared error exceeds this
+#: multiple of the mean frame's, as that of a model of another clip of the same scene may.
 EXPLAINED, WORSE_THAN_MEAN = 0.2, 1.5
-#: The first and the last frame are at 0 and 1; a best time that is so many nats better and so many frames away is told.
+#: A warning is given if the first or last frame fits better by PINNED nats at a time AWAY frames from 0 or 1.
 PINNED, AWAY = 10.0, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
 class LikelihoodProfiles:
-    """What the pictures say of every frame's time: profiles, and the noise they were made with.
+    """Log-likelihood curves of all frames as functions of their times, and the noise that they assume.
 
-    `residual_correlation` (lags,): correlation of residuals by distance in pixels, mean over the frames.
-    `num_drawn`: pictures drawn for it. `level`: what is held, "splats" or, but for colours, "colors". `notes`: what was
-    warned of.
+    `residual_correlation` (lags,): correlation of residuals by distance in pixels, averaged over frames.
+    `num_rendered`: number of rendered images. `level`: "splats" if all splats are held, "colors" if their colors are
+    integrated out. `notes`: texts of the warnings.
     """
 
-    profiles: Profiles
+    curves: ProfileCurves
     noise: FrameNoise
     residual_correlation: Float64[np.ndarray, " lags"]
-    num_drawn: int
+    num_rendered: int
     level: str = "splats"
     notes: tuple[str, ...] = ()
 
 
-def evidence(
+def likelihood_profiles(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     *,
     noise: str | FrameNoise = "score",
     reach: int | None = None,
-    on_picture: Callable[[int, int], None] | None = None,
+    on_render: Callable[[int, int], None] | None = None,
 ) -> LikelihoodProfiles:
-    """Draw the model at as many times as the profiles of all frames need.
+    """Compute the likelihood profiles of all frames by rendering the model at adaptively chosen times.
 
-    `video` need not be what the model was fitted to, nor have as many frames: every frame is looked for at every time,
-    or only within `reach` frame times of its own (default for more than 400 frames: 100, or as many as are needed). But
-    its first frame is the model's first, at time 0, and its last the last, at 1: where that looks wrong, a warning says
-    so, and likewise where the video may be another one of the same place. `noise`: "effective" or "score" (see
-    `effective_share`, `score_share`), "independent", or a `FrameNoise`. `on_picture` is called with how many are drawn
-    and how many there will be, as far as is known.
+    `video` need not be the clip that the model was fitted to, nor have as many frames: each frame is compared at all
+    times, or only within `reach` frame times of its own (default for more than 400 frames: 100, widened as needed). But
+    its first frame is at time 0 of the model and its last at 1; a warning is given if that does not fit, or if the
+    model may be of another clip of the same scene. `noise`: "effective" or "score" (see
+    `effective_fraction`, `score_fraction`), "independent", or a `FrameNoise`. `on_render` is called with the
+    numbers of images rendered and planned so far.
 
-    Raises ValueError for a video of another size, one that the model does not explain, one that shows nothing of its
+    Raises ValueError for a video of another size, one that the model does not explain, one that does not identify its
     times, and best times at the ends of a given `reach`.
     """
-    screen = Screen(model, video)
-    num_frames = len(screen.frames)
+    residuals = Residuals(model, video)
+    num_frames = len(residuals.frames)
     if num_frames < 3:
         cure = "The first frame is at time 0 and the last at 1: others are needed."
         raise invalid("video", expected="at least 3 frames", got=num_frames, cure=cure)
     if isinstance(noise, FrameNoise):
-        noise = noise.of(num_frames)
+        noise = noise.for_frames(num_frames)
     elif not isinstance(noise, str) or noise not in NOISES:
         raise invalid("noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=noise)
-    _check_changes(screen.frames)
-    drawn = Drawn(screen, reach, on_picture)
-    drawn.coarse()
-    notes = _explained(screen.frames, drawn)
-    seen = drawn.evidence(noise)
-    _check_identified(seen.profiles)
-    notes += _ends(seen.profiles, drawn.model_times)
+    _check_changes(residuals.frames)
+    builder = ProfileBuilder(residuals, reach, on_render)
+    builder.compare_coarse()
+    notes = _check_explained(residuals.frames, builder)
+    profiles = builder.build(noise)
+    _check_identified(profiles.curves)
+    notes += _check_ends(profiles.curves, builder.model_times)
     for note in notes:
         warnings.warn(note, UserWarning, stacklevel=2)
-    return dataclasses.replace(seen, notes=tuple(notes))
+    return dataclasses.replace(profiles, notes=tuple(notes))
 
 
-class Drawn:
-    """Squared errors of every frame at the times drawn for it, and which times those are."""
+class ProfileBuilder:
+    """Squared errors of all frames at the times compared so far, refined where the profiles require it."""
 
-    def __init__(self, screen: Screen, reach: int | None = None, on_picture: Callable[[int, int], None] | None = None):
-        self.screen, self.on_picture, self.num_drawn, self.num_planned = screen, on_picture, 0, 0
-        num_frames = len(screen.frames)
-        self.model_times = np.asarray(screen.model.frame_times.times(), np.float64)
+    def __init__(
+        self, residuals: Residuals, reach: int | None = None, on_render: Callable[[int, int], None] | None = None
+    ):
+        self.residuals, self.on_render, self.num_rendered, self.num_planned = residuals, on_render, 0, 0
+        num_frames = len(residuals.frames)
+        self.model_times = np.asarray(residuals.model.frame_times.times(), np.float64)
         self.finest = FINEST / COARSE * float(np.median(np.diff(self.model_times)))
         self.own_reach = reach is None
         self.reach = (None if num_frames <= MOST_EVERYWHERE else REACH) if reach is None else reach
         if self.reach is not None and not is_integer(self.reach, 1):
             raise invalid("reach", expected="a whole number >= 1, or None", got=reach)
-        self.sketches = Sketches(3 * screen.model.size[0] * screen.model.size[1])
+        self.sketches = Sketches(3 * residuals.model.size[0] * residuals.model.size[1])
         self.samples = [_Samples() for _ in range(num_frames)]
 
-    def _pictures(self, times):
+    def _render(self, times):
         self.num_planned += len(times)
-        for t, picture in zip(times, self.screen.pictures(times), strict=True):
-            yield t, picture
-            self.num_drawn += 1
-            if self.on_picture is not None:
-                self.on_picture(self.num_drawn, self.num_planned)
+        for t, image in zip(times, self.residuals.render_at(times), strict=True):
+            yield t, image
+            self.num_rendered += 1
+            if self.on_render is not None:
+                self.on_render(self.num_rendered, self.num_planned)
 
-    def coarse(self) -> None:
-        """Compare all frames with pictures over all the time, or the time within reach."""
+    def compare_coarse(self) -> None:
+        """Compare all frames with images at coarse steps over all times, or the times within reach."""
         known = self.model_times
         times = np.interp(np.arange(COARSE * (len(known) - 1) + 1) / COARSE, np.arange(len(known)), known)
-        while not self._compared(np.unique(times)):
+        while not self._compare(np.unique(times)):
             self.reach *= 2
 
-    def _compared(self, times: np.ndarray) -> bool:
-        """Compare; false where a frame's best time is at the end of a reach that may be widened."""
-        known, num_frames = self.model_times, len(self.screen.frames)
+    def _compare(self, times: np.ndarray) -> bool:
+        """False if the best time of a frame is at the end of a reach that may be widened."""
+        known, num_frames = self.model_times, len(self.residuals.frames)
         position = np.interp(times, known, np.arange(len(known))) * ((num_frames - 1) / (len(known) - 1))
         found = [([], [], []) for _ in range(num_frames)]
-        for n, (t, picture) in enumerate(self._pictures(times)):
+        for n, (t, image) in enumerate(self._render(times)):
             near = np.arange(num_frames)
             if self.reach is not None:
                 near = near[np.abs(near - position[n]) <= self.reach]
-            sketch = self.sketches.of(picture)
-            for k, error in zip(near, self.screen.squared_errors(picture, near), strict=True):
+            sketch = self.sketches.sketch(image)
+            for k, error in zip(near, self.residuals.squared_errors(image, near), strict=True):
                 for each, value in zip(found[k], (t, error, sketch), strict=True):
                     each.append(value)
         for each, columns in zip(self.samples, found, strict=True):
-            each.begin(*map(np.array, columns))
+            each.set_coarse(*map(np.array, columns))
         if self.reach is None:
             return True
         edge = [k for k, each in enumerate(self.samples) if each.best_at_end(times)]
@@ -156,65 +158,65 @@ class Drawn:
             raise invalid("reach", expected="enough for every frame", got=got, cure="Give more, or None.")
         return not edge
 
-    def evidence(self, kind: str | FrameNoise) -> LikelihoodProfiles:
-        """After `coarse`: the noise, and profiles as fine as it asks for."""
-        noise, correlation = self.noise(kind)
+    def build(self, kind: str | FrameNoise) -> LikelihoodProfiles:
+        """After `compare_coarse`: estimate the noise and refine the profiles accordingly."""
+        noise, correlation = self.estimate_noise(kind)
         self.refine(noise)
-        if not isinstance(kind, FrameNoise):  # once more, with the residuals where they are least
-            noise, correlation = self.noise(kind)
+        if not isinstance(kind, FrameNoise):  # again, with the residuals at the refined modes
+            noise, correlation = self.estimate_noise(kind)
             self.refine(noise)
-        return LikelihoodProfiles(self.profiles(noise), noise, correlation, self.num_drawn)
+        return LikelihoodProfiles(self.curves(noise), noise, correlation, self.num_rendered)
 
     def refine(self, noise: FrameNoise) -> None:
-        """Draw pictures between the nodes of every frame but the first and the last, whose times are fixed."""
+        """Insert nodes into the profiles of all frames but the first and the last, whose times are fixed."""
         inner = range(1, len(self.samples) - 1)
         while wanted := [(t, k) for k in inner for t in self.samples[k].wanted(noise.weight[k], self.finest)]:
-            drawn = [
-                (self.screen.squared_errors(picture, [k])[0], self.sketches.of(picture))
-                for (_, k), (_, picture) in zip(wanted, self._pictures([t for t, _ in wanted]), strict=True)
+            compared = [
+                (self.residuals.squared_errors(image, [k])[0], self.sketches.sketch(image))
+                for (_, k), (_, image) in zip(wanted, self._render([t for t, _ in wanted]), strict=True)
             ]
             first = 0
             for k, group in itertools.groupby(wanted, key=lambda each: each[1]):
                 last = first + len(list(group))
-                self.samples[k].insert(*map(np.array, zip(*drawn[first:last], strict=True)), noise.weight[k])
+                self.samples[k].insert(*map(np.array, zip(*compared[first:last], strict=True)), noise.weight[k])
                 first = last
 
-    def noise(self, kind: str | FrameNoise) -> tuple[FrameNoise, np.ndarray]:
-        """Of the residuals of every frame where its error is least; and their correlation by distance."""
+    def estimate_noise(self, kind: str | FrameNoise) -> tuple[FrameNoise, np.ndarray]:
+        """The noise from the residuals at every frame's mode, and their mean correlation by distance."""
         num_frames = len(self.samples)
         modes = [each.mode for each in self.samples]
-        scale, share, together, correlations = np.empty(num_frames), np.ones(num_frames), 0.0, 0.0
-        for k, (_, picture) in enumerate(self._pictures(modes)):
-            residual = self.screen.residual(k, picture)
+        scale, fraction, together, correlations = np.empty(num_frames), np.ones(num_frames), 0.0, 0.0
+        for k, (_, image) in enumerate(self._render(modes)):
+            residual = self.residuals.residual(k, image)
             scale[k] = max(float(np.sqrt(np.mean(np.square(residual, dtype=np.float64)))), LEAST_SCALE)
             covariance = covariances(residual)
             together = together + covariance / scale[k] ** 2
             correlations = correlations + rings(autocorrelation(covariance))
             if kind == "effective":
-                share[k] = effective_share(covariance)
+                fraction[k] = effective_fraction(covariance)
         if kind == "score":
             step = self.finest * SLOPE_STEP
             times = [np.clip([t - step, t, t + step], 0.0, 1.0) for t in modes]
-            pictures = self._pictures(np.concatenate(times))
+            images = self._render(np.concatenate(times))
             for k, (before, _, after) in enumerate(times):
-                one, middle, other = (next(pictures)[1] for _ in range(3))
+                one, middle, other = (next(images)[1] for _ in range(3))
                 slope = (other - one) / np.float32(after - before)
-                share[k] = score_share(self.screen.residual(k, middle), slope, together)
-        found = kind if isinstance(kind, FrameNoise) else FrameNoise(scale, share)
+                fraction[k] = score_fraction(self.residuals.residual(k, middle), slope, together)
+        found = kind if isinstance(kind, FrameNoise) else FrameNoise(scale, fraction)
         return found, correlations / num_frames
 
-    def profiles(self, noise: FrameNoise) -> Profiles:
+    def curves(self, noise: FrameNoise) -> ProfileCurves:
         errors = [each.errors for each in self.samples]
-        return Profiles.of(
+        return ProfileCurves.from_nodes(
             [each.times for each in self.samples],
             [-weight * (error - error.min()) for weight, error in zip(noise.weight, errors, strict=True)],
         )
 
 
 class _Samples:
-    """Squared errors of a frame at rising times, sketches of the pictures, and which intervals need none drawn."""
+    """Squared errors of one frame at increasing times, sketches of the images there, and settled intervals."""
 
-    def begin(self, times: np.ndarray, errors: np.ndarray, sketches: np.ndarray) -> None:
+    def set_coarse(self, times: np.ndarray, errors: np.ndarray, sketches: np.ndarray) -> None:
         self.times, self.errors, self.sketches = times, errors, sketches
         self.settled = np.zeros(len(times) - 1, bool)
         self.asked = np.empty(0, int)
@@ -224,34 +226,34 @@ class _Samples:
         return float(self.times[np.argmin(self.errors)])
 
     def best_at_end(self, times: np.ndarray) -> bool:
-        """Whether the error is least at an end of this frame's times that is none of `times`."""
+        """Whether the error is least at the first or last time of this frame that is not an end of all `times`."""
         best = int(np.argmin(self.errors))
         at_start = best <= 1 and self.times[0] > times[0]
         return at_start or (best >= len(self.times) - 2 and self.times[-1] < times[-1])
 
     def wanted(self, weight: float, finest: float) -> np.ndarray:
-        """Times half way of the intervals that have to be drawn."""
+        """Midpoints of the intervals that must be refined."""
         below = weight * (self.errors - self.errors.min())
         apart = CAUTION * weight * np.square(np.diff(self.sketches, axis=0)).sum(1)
-        # How near the maximum an interval comes: with the residual at a right angle to the way that the picture goes.
+        # Bound on the maximum in an interval, if the image moves directly towards the frame.
         nearest = np.sqrt(np.minimum(below[:-1], below[1:]))
         reached = np.maximum(nearest - np.sqrt(apart), 0.0) ** 2 <= DEPTH
         slopes = weight * np.abs(np.gradient(self.errors, self.times, edge_order=2))
         width = np.diff(self.times)
-        # Two nodes may be as high as each other on two sides of a hill: then their slopes are not 0.
+        # Two nodes on both sides of a mode may have equal values: then their slopes are not 0.
         bent = np.maximum(np.abs(np.diff(below)), np.maximum(slopes[:-1], slopes[1:]) * width / 4) > MISS
         open_ones = (apart > TRAVEL) | (bent & ~self.settled)
         self.asked = np.flatnonzero(reached & open_ones & (width > 2 * finest))
         return (self.times[self.asked] + self.times[self.asked + 1]) / 2
 
     def insert(self, errors: np.ndarray, sketches: np.ndarray, weight: float) -> None:
-        """Take in what was drawn at the times last asked for."""
+        """Insert the values at the midpoints last requested."""
         left = self.asked
         slopes = np.gradient(self.errors, self.times, edge_order=2)
         width = np.diff(self.times)[left]
         guess = (self.errors[left] + self.errors[left + 1]) / 2 + (slopes[left] - slopes[left + 1]) * width / 8
         depth = weight * np.maximum(errors - self.errors.min(), 0)
-        met = weight * np.abs(errors - guess) <= MISS + MISS_SHARE * depth
+        met = weight * np.abs(errors - guess) <= MISS + MISS_FRACTION * depth
         middles = (self.times[left] + self.times[left + 1]) / 2
         self.settled[left] = met
         self.settled = np.insert(self.settled, left, met)
@@ -263,16 +265,16 @@ class _Samples:
 def _check_changes(frames: np.ndarray) -> None:
     first = frames[0]
     if all(np.array_equal(first, frame) for frame in frames[1:]):
-        cure = "There is nothing to be learned of times where nothing changes."
+        cure = "Times cannot be inferred where nothing changes."
         raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
 
 
-def _explained(frames: np.ndarray, drawn: Drawn) -> list[str]:
-    """Raises by what is left of the frames' variance over space and time; notes by what is left of that over time."""
+def _check_explained(frames: np.ndarray, builder: ProfileBuilder) -> list[str]:
+    """Raises if the model explains too little of the variance over space and time; warns by the variance over time."""
     mean = np.mean(frames, axis=0, dtype=np.float64)
     over_time = sum(float(np.square(frame - mean).sum()) for frame in frames) / 255**2
     over_all = over_time + len(frames) * float(np.square(mean - mean.mean((0, 1))).sum()) / 255**2
-    left = sum(float(each.errors.min()) for each in drawn.samples)
+    left = sum(float(each.errors.min()) for each in builder.samples)
     cure = "Give the model of this video, at its size and crop."
     if left > (1 - EXPLAINED) * over_all:
         got = f"a model that explains {100 * (1 - left / over_all) if over_all else 0:.0f}% of their variance"
@@ -288,23 +290,23 @@ def _explained(frames: np.ndarray, drawn: Drawn) -> list[str]:
     ]
 
 
-def _check_identified(profiles: Profiles) -> None:
-    rises = np.nanmax(profiles.values, axis=1) - np.nanmin(profiles.values, axis=1)
+def _check_identified(curves: ProfileCurves) -> None:
+    rises = np.nanmax(curves.values, axis=1) - np.nanmin(curves.values, axis=1)
     if (rises[1:-1] < FLAT).all():
         got = f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times"
         cure = "The times are not identified: nothing changes, or the noise is too great (5 grey levels: 5 / 255)."
-        raise invalid("video", expected="frames that tell their times", got=got, cure=cure)
+        raise invalid("video", expected="frames that identify their times", got=got, cure=cure)
 
 
-def _ends(profiles: Profiles, model_times: np.ndarray) -> list[str]:
-    """Notes of a first or last frame that is better somewhere else than at 0 or 1."""
+def _check_ends(curves: ProfileCurves, model_times: np.ndarray) -> list[str]:
+    """Warnings for a first or last frame that fits better at other times than 0 and 1."""
     step, notes = np.median(np.diff(model_times)), []
-    for k, end in ((0, 0.0), (profiles.num_frames - 1, 1.0)):
-        best = profiles.modes()[k]
-        lost = -float(profiles[k](np.array([end]))[0])
+    for k, end in ((0, 0.0), (curves.num_frames - 1, 1.0)):
+        best = curves.modes()[k]
+        lost = -float(curves[k](np.array([end]))[0])
         if lost > PINNED and abs(best - end) > AWAY * step:
             notes.append(
                 f"Frame {k} is held at time {end:g}, but {best:.4f}, {abs(best - end) / step:.1f} frames away, is"
-                f" better by {lost:.0f}: a video begins and ends where its model does; times beside it will be wrong."
+                f" better by {lost:.0f}: a video must begin and end as its model does, or nearby times will be wrong."
             )
     return notes

@@ -1,7 +1,7 @@
-"""How noisy frames are, and how much of their pixels' evidence is independent.
+"""The noise model: residual scale per frame, and the power to which the likelihood is tempered.
 
-A pixel's residual is much like its neighbour's: a plain Gaussian likelihood of a million pixels is far too sure. So the
-log-likelihood is scaled by a share below 1, of which two estimates are offered; none is a free lunch, see each.
+Residuals of neighboring pixels are correlated, so a Gaussian likelihood of independent pixels is far too narrow. The
+log-likelihood is therefore multiplied by a fraction below 1, of which there are two estimates with different biases.
 """
 
 import dataclasses
@@ -13,70 +13,72 @@ from jaxtyping import Float, Float64
 
 from foldgauss._runtime.checks import invalid
 
-#: Names of what `frame_time_log_prob` takes for `noise`, besides a FrameNoise.
+#: Names that `frame_time_log_prob` accepts for `noise`, besides a FrameNoise.
 NOISES = ("score", "effective", "independent")
-#: Lags are summed until the mean correlation around a ring falls below this.
+#: Lags are summed until the mean correlation on a ring falls below this.
 LAST_CORRELATION = 0.02
-#: Pixels over which the size of residuals is taken: they are greatest at edges, which is where pictures tell time.
+#: Standard deviation in pixels of the local residual power: residuals are largest at edges, which also determine time.
 LOCAL = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameNoise:
-    r"""Noise of every frame: residuals of standard deviation `scale`, of which a `share` counts.
+    r"""Noise of every frame: residuals of standard deviation `scale`, and the `fraction` that tempers the likelihood.
 
-    $$ \ell_k(t) = -\frac{\text{share}_k}{2\, \text{scale}_k^2} \sum_p (y_{kp} - R_p(t))^2 $$
+    $$ \ell_k(t) = -\frac{\text{fraction}_k}{2\, \text{scale}_k^2} \sum_p (y_{kp} - R_p(t))^2 $$
 
-    **Shapes:** `scale` (num_frames,) in units of the pixels' range [0, 1], `share` (num_frames,) in (0, 1]; or numbers
-    for all frames. A share of 1 says that all pixels and channels are independent.
+    **Shapes:** `scale` (num_frames,) in units of the pixels' range [0, 1], `fraction` (num_frames,) in (0, 1]; or one
+    number each for all frames. A fraction of 1 means that all pixels and channels are independent.
 
     **Source:** a tempered ("composite") likelihood; Pauli, Racugno and Ventura 2011, Bayesian composite marginal
-    likelihoods. **Raises:** ValueError for numbers out of range.
+    likelihoods. **Raises:** ValueError for values out of range.
     """
 
     scale: Float64[np.ndarray, " num_frames"]
-    share: Float64[np.ndarray, " num_frames"]
+    fraction: Float64[np.ndarray, " num_frames"]
 
     def __post_init__(self):
-        told = {
+        limits = {
             "scale": (np.inf, "numbers > 0", "5 grey levels are 5 / 255."),
-            "share": (1.0, "numbers in (0, 1]", "1 counts every value, 1/30 one in 30."),
+            "fraction": (1.0, "numbers in (0, 1]", "1 counts every value, 1/30 one value in 30."),
         }
-        for name, (limit, expected, cure) in told.items():
+        for name, (limit, expected, cure) in limits.items():
             values = np.asarray(getattr(self, name), np.float64)
             if not (np.isfinite(values).all() and (values > 0).all() and (values <= limit).all()):
                 raise invalid(name, expected=expected, got=values.tolist(), cure=cure)
             object.__setattr__(self, name, values)
 
-    def of(self, num_frames: int) -> "FrameNoise":
-        """The same with an entry for each of `num_frames` frames."""
-        for name in ("scale", "share"):
+    def for_frames(self, num_frames: int) -> "FrameNoise":
+        """Broadcast to one entry per frame."""
+        for name in ("scale", "fraction"):
             if getattr(self, name).shape not in ((), (1,), (num_frames,)):
                 got = f"shape {getattr(self, name).shape}"
                 raise invalid(f"noise.{name}", expected=f"a number or {num_frames} of them", got=got)
-        return FrameNoise(*(np.broadcast_to(value, num_frames).copy() for value in (self.scale, self.share)))
+        return FrameNoise(*(np.broadcast_to(value, num_frames).copy() for value in (self.scale, self.fraction)))
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words: how great residuals are, and how many of them count."""
-        low, middle, high = (f"{n:,.0f}" if n >= 10 else f"{n:.2g}" for n in 1 / np.quantile(self.share, [1, 0.5, 0]))
+        low, middle, high = (
+            f"{n:,.0f}" if n >= 10 else f"{n:.2g}" for n in 1 / np.quantile(self.fraction, [1, 0.5, 0])
+        )
         counted = "all values count" if middle == "1" else f"one value in {middle} counts"
         between = "" if low == high else f" (frames: one in {low} to {high})"
         return f"residuals of {255 * np.median(self.scale):.2g} grey levels, {counted}{between}"
 
     @property
     def weight(self) -> Float64[np.ndarray, " num_frames"]:
-        """What a squared error is multiplied by: share / (2 scale^2)."""
-        return self.share / (2 * self.scale**2)
+        """The factor of squared errors in the log-likelihood: fraction / (2 scale^2)."""
+        return self.fraction / (2 * self.scale**2)
 
 
 _Covariance = Float64[np.ndarray, "channels channels rows columns"]
 
 
 def covariances(residual: Float[np.ndarray, "channels height width"], most: int | None = None) -> _Covariance:
-    """Means of r_c(p) r_d(p + lag) for all pairs of channels, lags up to `most` in y and x; 0 in the middle.
+    """Means of r_c(p) r_d(p + lag) for all pairs of channels and lags up to `most` in y and x; lag 0 in the middle.
 
-    No mean is taken off: residuals of a fit have mean 0, and what is left of it is part of what is correlated. Each lag
-    is divided by the number of pairs it has. `most` defaults to a third of the shorter side.
+    The mean is not subtracted: residuals of a fit have mean near 0, and the rest of it is part of the correlation. Each
+    lag is divided by its number of pairs. `most` defaults to a third of the shorter side.
     """
     height, width = residual.shape[-2:]
     most = max(1, min(height, width) // 3) if most is None else most
@@ -103,9 +105,9 @@ def _lagged_products(planes: np.ndarray, most: int) -> np.ndarray:
 def autocorrelation(
     covariance: _Covariance,
 ) -> Float64[np.ndarray, "rows columns"]:
-    """Correlation of residuals with their neighbours', of `covariances`: the mean over channels, 1 in the middle.
+    """Autocorrelation of residuals from `covariances`: the mean over channels, 1 in the middle.
 
-    Where there is no residual at all it is 0 but in the middle.
+    Residuals that are all 0 give 0 at all other lags.
     """
     same = np.einsum("ccyx->yx", covariance)
     most = len(same) // 2
@@ -117,7 +119,7 @@ def autocorrelation(
 
 
 def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, " lags"]:
-    """Mean correlation by distance, in whole pixels from 0 on, of what `autocorrelation` gives."""
+    """Mean of an `autocorrelation` by distance, in whole pixels from 0 on."""
     most = len(correlation) // 2
     lags = np.arange(-most, most + 1)
     distance = np.rint(np.hypot(lags[:, None], lags[None, :])).astype(int)
@@ -132,12 +134,12 @@ def correlated_reach(covariance: _Covariance) -> int:
     return int(below[0]) if below.size else len(correlation)
 
 
-def effective_share(covariance: _Covariance) -> float:
-    r"""Independent values per value, at most 1: 1 over the greatest sum of correlations that any colour has.
+def effective_fraction(covariance: _Covariance) -> float:
+    r"""Effective number of independent values per value, at most 1, by the sum of the residuals' autocorrelation.
 
-    With the residuals' `covariances`, summed over lags to a matrix over channels, it is the mean variance over the
-    matrix's greatest eigenvalue. Exact for what depends on the mean of many neighbouring residuals of that colour,
-    and cautious for what depends on details. The sum ends at `correlated_reach`.
+    The residuals' `covariances`, summed over lags up to `correlated_reach`, are a matrix over channels; the fraction is
+    the mean variance over its largest eigenvalue. Exact for statistics that depend on the mean of many neighboring
+    residuals of the leading color, and conservative for those that depend on details.
 
     **Source:** the variance of the mean of a stationary process; e.g. Priestley 1981, section 5.3.
     """
@@ -152,26 +154,26 @@ def effective_share(covariance: _Covariance) -> float:
     return min(1.0, 1.0 / inflation) if inflation > 0 else 1.0
 
 
-def score_share(
+def score_fraction(
     residual: Float[np.ndarray, "channels height width"],
     slope: Float[np.ndarray, "channels height width"],
     covariance: _Covariance,
 ) -> float:
-    r"""The share with which the likelihood of a time is as sure as its score is steady, at most 1.
+    r"""The fraction by which the likelihood of a time is tempered to match the sandwich variance, at most 1.
 
-    The score is the sum over pixels of r g, with the residual r and the slope g = dR/dt. The plain likelihood takes its
-    variance for J = scale^2 sum g^2. Here it is V, the greater of two estimates, and the share is J / V:
+    The score is the sum over pixels of r g, with the residual r and the slope g = dR/dt. For independent pixels its
+    variance is J = scale^2 sum g^2. Here it is V, the larger of two estimates, and the fraction is J / V:
 
     $$
     V_1 = \sum_{p, h} \rho(h)\, s_p g_p\, s_{p + h} g_{p + h},
     \qquad V_2 = \sum_{p, h} r_p g_p\, r_{p + h} g_{p + h}
     $$
 
-    summed over channels, too, over lags h up to twice the `correlated_reach` (in full up to half of it, then less and
-    less). The first, with the residual's size s around p and the correlations rho of `covariance`, best those of many
-    frames, is that of noise which knows nothing of the slope. The second is that of residuals as they are, which lie
-    along edges as slopes do; but at the best time they cancel over few pixels. A fit that has learned the noise
-    leaves less of both than noise is, and then this is too sure.
+    also summed over channels, with lags h up to twice the `correlated_reach`, tapered from half of that on. V_1 is the
+    variance for noise that is independent of the slope, with the local residual scale s and the correlations rho of
+    `covariance`, preferably the mean of many frames. V_2 uses the residuals themselves, which lie along edges as slopes
+    do, but cancel over few pixels at the best time. A fit that has learned part of the noise reduces both, and the
+    fraction is then too large.
 
     **Source:** the sandwich of Huber 1967; covariances over two dimensions as Conley 1999, with the flat-topped weights
     of Politis and Romano 1995.
@@ -189,14 +191,14 @@ def score_share(
     local = np.sqrt(scipy.ndimage.gaussian_filter((residual**2).mean(0), LOCAL))
     variance = float((weights * covariance[..., near, near] * _lagged_products(local * slope, reach)).sum() / power)
     variance = max(variance, _own_variance((residual * slope).sum(0), weights))
-    return min(1.0, plain / variance) if variance > 0 else effective_share(covariance)
+    return min(1.0, plain / variance) if variance > 0 else effective_fraction(covariance)
 
 
 def _own_variance(score: np.ndarray, weights: np.ndarray) -> float:
-    """Of a sum over pixels, by the pixels' own covariances about their mean; `weights` by lag."""
+    """Variance of a sum over pixels from the pixels' covariances about their mean; `weights` by lag."""
     reach, (height, width) = len(weights) // 2, score.shape
     lags = np.abs(np.arange(-reach, reach + 1))
     variance = float((weights * _lagged_products((score - score.mean())[None], reach)[0, 0]).sum())
-    # Taking off the mean makes all covariances together 0: what that takes from those that are summed.
+    # Subtracting the mean makes all covariances sum to 0: this corrects those that are summed.
     pairs = np.maximum(height - lags, 0)[:, None] * np.maximum(width - lags, 0)[None, :]
     return variance / max(1 - float((weights * pairs).sum()) / score.size**2, 0.1)

@@ -1,4 +1,4 @@
-"""Pictures of a model beside the frames of a video: squared errors and residuals."""
+"""Residuals of a video: its frames less the images that a model renders at given times."""
 
 import itertools
 from collections.abc import Iterable, Iterator
@@ -21,13 +21,13 @@ _f, _d = nb.float32, nb.float64
 _level = np.float32(1 / 255)
 _behind = np.asarray(BLACK, np.float32)
 BINS = 512
-TOGETHER = 8  # pictures drawn at once: fewer waits for threads
+BATCH = 8  # images rendered at once, for fewer synchronizations of threads
 
 
 def _batched(times: Iterable[float]) -> Iterator[tuple[float, ...]]:
     """`itertools.batched`, which Python 3.11 lacks."""
     times = iter(times)
-    while some := tuple(itertools.islice(times, TOGETHER)):
+    while some := tuple(itertools.islice(times, BATCH)):
         yield some
 
 
@@ -37,17 +37,17 @@ def check_model(model: VideoModel) -> None:
         return
     cure = ""
     if isinstance(model, EditedVideo):
-        cure = "Take the model that was edited, and the clip that it was fitted to; or fit one to what is now shown."
+        cure = "Give the model that was edited, and the clip that it was fitted to; or fit a model to the edited video."
     elif isinstance(model, SegmentedVideo):
         cure = f"{ONE_SEGMENT} Its clip is that segment's frames."
     raise invalid("model", expected="a VideoModel", got=short_repr(model), cure=cure)
 
 
-class Screen:
-    """A model and the frames it is compared with, both over black.
+class Residuals:
+    """A model and the frames it is compared with, both composited over black.
 
-    Pictures are drawn as the fit draws them: between two shots nothing is held, and no value is rounded or clipped.
-    `frames`: uint8 (num_frames, *model.size, 3), or with alpha (..., 4). Raises ValueError for anything else.
+    Images are rendered as in the fit: without holding frames between shots, rounding or clipping. `frames`: uint8
+    (num_frames, *model.size, 3), or with alpha (..., 4). Raises ValueError for anything else.
     """
 
     def __init__(self, model: VideoModel, frames: UInt8[np.ndarray, "num_frames height width channels"]):
@@ -66,51 +66,52 @@ class Screen:
                 f"uint8 (frames, {model.size[0]}, {model.size[1]}, 3), as the model was fitted to, or 4 with alpha"
             )
             fits = frames.ndim == 4 and frames.shape[1:3] == model.size
-            cure = "Make it 8-bit colour." if fits else "Read it at that size."
+            cure = "Convert it to 8-bit color." if fits else "Read it at that size."
             raise invalid("video", expected=expected, got=f"{frames.dtype} {frames.shape}", cure=cure)
         if frames.shape[3] == 4:
             frames = np.stack([composite(frame, np.zeros(3, np.float32)) for frame in frames])
         self.model, self.frames = model, np.ascontiguousarray(frames)
-        self.playback = VideoRenderer(model)
+        self.renderer = VideoRenderer(model)
 
     @property
     def num_values(self) -> int:
-        """Of a frame: pixels times channels."""
+        """Values per frame: pixels times channels."""
         return int(np.prod(self.frames.shape[1:]))
 
-    def picture(self, t: float) -> Float32[np.ndarray, "3 height width"]:
-        """What the model shows at time t, about [0, 1]."""
-        return next(self.pictures([t]))
+    def render(self, t: float) -> Float32[np.ndarray, "3 height width"]:
+        """The image of the model at time t in [0, 1]."""
+        return next(self.render_at([t]))
 
-    def pictures(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
-        """What the model shows at each of `times`, about [0, 1], one by one."""
-        drawn = {"compositing": self.model.compositing, "options": self.model.options}
+    def render_at(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
+        """The images of the model at each of `times` in [0, 1], one by one."""
         for some in _batched(times):
-            alive = [self.playback.splats(float(t)) for t in some]
+            alive = [self.renderer.splats(float(t)) for t in some]
             leaves = [(one.mean, one.factor, one.opacity, one.color, _behind) for one in alive]
-            for trace in cpu.forward_frames(leaves, self.model.size, **drawn):
+            for trace in cpu.forward_frames(
+                leaves, self.model.size, compositing=self.model.compositing, options=self.model.options
+            ):
                 yield trace.image
 
     def squared_errors(
-        self, picture: Float32[np.ndarray, "3 height width"], which: Iterable[int]
+        self, image: Float32[np.ndarray, "3 height width"], which: Iterable[int]
     ) -> Float64[np.ndarray, " which"]:
-        """Sums over pixels and channels of (frame - picture)^2, of the frames `which`."""
+        """Sums over pixels and channels of (frame - image)^2, for the frames `which`."""
         which = np.asarray(which)
         sums = np.empty(len(which))
 
         def compare(n: int) -> None:
-            sums[n] = _squared_error(picture, self.frames[which[n]])
+            sums[n] = _squared_error(image, self.frames[which[n]])
 
         run_tasks(compare, range(len(which)), serial=len(which) * self.num_values < 400_000)
         return sums
 
-    def residual(self, k: int, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, "3 height width"]:
-        """Frame k less the picture."""
-        return np.moveaxis(self.frames[k], -1, 0) * _level - picture
+    def residual(self, k: int, image: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, "3 height width"]:
+        """Frame k less the image."""
+        return np.moveaxis(self.frames[k], -1, 0) * _level - image
 
 
 class Sketches:
-    """Short vectors whose distances are those of pictures, to some 6%: values summed into bins with random signs.
+    """Random projections of images that keep distances to about 6%: values are summed into bins with random signs.
 
     **Source:** count sketch, Charikar, Chen and Farach-Colton 2002.
     """
@@ -120,9 +121,9 @@ class Sketches:
         self._bins = rng.integers(0, BINS, num_values, dtype=np.int16)
         self._signs = rng.choice(np.array([-1, 1], np.float32), num_values)
 
-    def of(self, picture: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, " bins"]:
+    def sketch(self, image: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, " bins"]:
         sketch = np.zeros(BINS)
-        _sum_into(sketch, picture.reshape(-1), self._bins, self._signs)
+        _sum_into(sketch, image.reshape(-1), self._bins, self._signs)
         return sketch.astype(np.float32)
 
 
@@ -133,14 +134,14 @@ def _sum_into(sketch, values, bins, signs):
 
 
 @kernel
-def _squared_error(picture, frame):
-    channels, height, width = picture.shape
+def _squared_error(image, frame):
+    channels, height, width = image.shape
     total = _d(0)
     for y in range(height):
         row = _f(0)
         for x in range(width):
             for c in range(channels):
-                miss = frame[y, x, c] * _level - picture[c, y, x]
+                miss = frame[y, x, c] * _level - image[c, y, x]
                 row += miss * miss
         total += row
     return total

@@ -1,4 +1,4 @@
-"""Coordinates of frame times in which all of them are free: log-ratios of increments, run by run."""
+"""Unconstrained coordinates of frame times: log-ratios of increments, run by run."""
 
 from collections.abc import Sequence
 
@@ -8,32 +8,32 @@ from scipy.special import gammaln
 
 from foldgauss._runtime.checks import invalid, is_within, short_repr
 
-#: Increments of less than this share of a run count as that: float64 has lost the smaller ones.
-LEAST_SHARE = 1e-16
+#: Increments below this fraction of a run are replaced by it: float64 does not resolve smaller ones.
+LEAST_FRACTION = 1e-16
 
 
 class Increments:
-    r"""Times of n frames, some of them free, as log-ratios of the increments between them.
+    r"""Times of n frames, some of them free, parametrized by log-ratios of the increments between them.
 
-    A *run* is a stretch of m free frames between two whose times are held; with its m + 1 increments p, as shares of
-    the time between those two, its coordinates are $z_i = \log p_i / p_m$. All times free but the first and the
-    last: one run, whose coordinates are the model's softmax weights less the last of them.
+    A *run* is a sequence of m free frames between two held ones; with its m + 1 increments p, as fractions of the time
+    between the held frames, its coordinates are $z_i = \log p_i / p_m$. If all times but the
+    first and the last are free, there is one run, and its coordinates are the model's softmax weights less the last.
 
-    **Shapes:** `held` (num_frames,) times of which those at `free` do not count; coordinates (*batch, num_free).
+    **Shapes:** `held` (num_frames,) times, ignored where `free`; coordinates (*batch, num_free).
     **Prior:** a symmetric Dirichlet on the increments of every run, of `concentration`; 1 is uniform over all ordered
-    times. A flat prior on the softmax weights would be improper: they do not notice a number added to all.
+    times. A flat prior on the softmax weights would be improper, since they are invariant to an added constant.
 
     **Source:** VeGaS eq:frame_fitting; additive log-ratios, Aitchison 1982.
-    **Raises:** ValueError for held times outside [0, 1] or not rising, free first or last frames, a concentration not
-    above 0.
+    **Raises:** ValueError for held times outside [0, 1] or not increasing, a free first or last frame, a concentration
+    that is not positive.
     """
 
     def __init__(
         self, held: Float[np.ndarray, "num_frames"], free: Bool[np.ndarray, "num_frames"], concentration: float = 1.0
     ):
-        self.held, self.free = _times(held), np.asarray(free, bool)
+        self.held, self.free = _as_times(held), np.asarray(free, bool)
         if not is_within(concentration, "(0, inf)"):
-            cure = "1 is uniform over all ordered times; more draws them towards equal spacing."
+            cure = "1 is uniform over all ordered times; larger values favor equal spacing."
             raise invalid("concentration", expected="a number > 0", got=short_repr(concentration), cure=cure)
         self.concentration = float(concentration)
         if self.held.ndim != 1 or self.free.shape != self.held.shape or len(self.held) < 3:
@@ -55,7 +55,7 @@ class Increments:
         self._check_held()
 
     def _check_held(self) -> None:
-        """What lies between held frames is their own; the times at free ones do not count."""
+        """Held times must lie in [0, 1] and increase; entries of free frames are ignored."""
         which = np.flatnonzero(~self.free)
         times = self.held[which]
         if not ((times >= 0) & (times <= 1)).all():
@@ -65,14 +65,14 @@ class Increments:
         if down.size:
             one, other = which[down[0] : down[0] + 2]
             got = f"{self.held[one]:.6g} of frame {one} and {self.held[other]:.6g} of frame {other}"
-            raise invalid("held", expected="rising times", got=got)
+            raise invalid("held", expected="increasing times", got=got)
 
     @classmethod
-    def among(
+    def with_free(
         cls, held: Float[np.ndarray, "num_frames"], frames: Sequence[int] | None = None, concentration: float = 1.0
     ) -> "Increments":
-        """With `frames` free, or all but the first and the last; ValueError for frames that are not between these."""
-        held = _times(held)
+        """With `frames` free (default: all but the first and the last); ValueError for other frames."""
+        held = _as_times(held)
         num_frames, free = held.size, np.zeros(held.size, bool)
         if frames is None:
             free[1:-1] = True
@@ -105,7 +105,7 @@ class Increments:
         return int(self.free.sum())
 
     def _slices(self):
-        """For each run: its coordinates, its first and last frame."""
+        """For each run: the slice of its coordinates, its first and last frame."""
         start = 0
         for first, last in self.runs:
             stop = start + last - first + 1
@@ -117,16 +117,17 @@ class Increments:
         coordinates = self._checked(coordinates)
         times = np.broadcast_to(self.held, (*coordinates.shape[:-1], self.num_frames)).copy()
         for part, first, last in self._slices():
-            shares = np.exp(_log_shares(coordinates[..., part]))
+            fractions = np.exp(_log_fractions(coordinates[..., part]))
             start, end = self.held[first - 1], self.held[last + 1]
-            found = start + (end - start) * np.cumsum(shares, axis=-1)[..., :-1]
-            times[..., first : last + 1] = np.minimum(found, end)  # what rounding adds
+            found = start + (end - start) * np.cumsum(fractions, axis=-1)[..., :-1]
+            times[..., first : last + 1] = np.minimum(found, end)  # rounding may exceed it
         return times
 
     def coordinates(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch num_free"]:
-        """The log-ratios of times that rise; the times of frames that are held are not looked at.
+        """The log-ratios of increasing times; the times of held frames are ignored.
 
-        Increments below `LEAST_SHARE` of a run, 0 included, count as that: draws of a low concentration have them.
+        Increments below `LEAST_FRACTION` of a run, 0 included, are replaced by it: draws of a low concentration have
+        them.
         """
         times = np.asarray(times, np.float64)
         if times.shape[-1:] != (self.num_frames,):
@@ -137,35 +138,37 @@ class Increments:
             steps = np.diff(np.concatenate([start, times[..., first : last + 1], end], axis=-1), axis=-1)
             if not (steps >= 0).all():
                 got = "NaN" if np.isnan(steps).any() else f"steps down to {steps.min():.3g}"
-                raise invalid("times", expected="times that rise", got=got)
-            logs = np.log(np.maximum(steps, LEAST_SHARE * (end - start)))
+                raise invalid("times", expected="increasing times", got=got)
+            logs = np.log(np.maximum(steps, LEAST_FRACTION * (end - start)))
             found[..., part] = logs[..., :-1] - logs[..., -1:]
         return found
 
     def log_prior(self, coordinates: Float[np.ndarray, "*batch num_free"]) -> Float64[np.ndarray, "*batch"]:
-        """Log-density of the coordinates: the Dirichlet's times the Jacobian, which is the product of the shares."""
+        """Log-density of the coordinates: the Dirichlet density times the Jacobian, the product of the fractions."""
         coordinates, alpha = self._checked(coordinates), self.concentration
         total = np.zeros(coordinates.shape[:-1])
         for part, first, last in self._slices():
             num = last - first + 2
-            total += alpha * _log_shares(coordinates[..., part]).sum(-1) + gammaln(alpha * num) - num * gammaln(alpha)
+            total += (
+                alpha * _log_fractions(coordinates[..., part]).sum(-1) + gammaln(alpha * num) - num * gammaln(alpha)
+            )
         return total
 
     def logits(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch intervals"]:
-        """The model's softmax weights w, centred: their mean is 0, as a number added to all changes nothing.
+        """The model's softmax weights w, centered to mean 0, since an added constant has no effect.
 
-        Of increments of at least `LEAST_SHARE`.
+        Increments below `LEAST_FRACTION` are replaced by it.
         """
-        logs = np.log(np.maximum(np.diff(np.asarray(times, np.float64), axis=-1), LEAST_SHARE))
+        logs = np.log(np.maximum(np.diff(np.asarray(times, np.float64), axis=-1), LEAST_FRACTION))
         return logs - logs.mean(-1, keepdims=True)
 
     def draw_prior(self, rng: np.random.Generator, num: int) -> Float64[np.ndarray, "num num_frames"]:
-        """Times from the prior."""
+        """Draw times from the prior."""
         times = np.broadcast_to(self.held, (num, self.num_frames)).copy()
         for first, last in self.runs:
-            shares = rng.dirichlet(np.full(last - first + 2, self.concentration), num)
+            fractions = rng.dirichlet(np.full(last - first + 2, self.concentration), num)
             start, end = self.held[first - 1], self.held[last + 1]
-            found = start + (end - start) * np.cumsum(shares, axis=1)[:, :-1]
+            found = start + (end - start) * np.cumsum(fractions, axis=1)[:, :-1]
             times[:, first : last + 1] = np.minimum(found, end)
         return times
 
@@ -176,15 +179,15 @@ class Increments:
         return coordinates
 
 
-def _times(held) -> np.ndarray:
+def _as_times(held) -> np.ndarray:
     try:
         return np.asarray(held, np.float64)
     except (TypeError, ValueError) as error:
         raise invalid("held", expected="times (num_frames,)", got=short_repr(held)) from error
 
 
-def _log_shares(coordinates: np.ndarray) -> np.ndarray:
-    """Logarithms of all increments of a run, as shares of it."""
+def _log_fractions(coordinates: np.ndarray) -> np.ndarray:
+    """Logarithms of all increments of a run, as fractions of it."""
     padded = np.concatenate([coordinates, np.zeros((*coordinates.shape[:-1], 1))], axis=-1)
     greatest = padded.max(-1, keepdims=True)
     return padded - greatest - np.log(np.exp(padded - greatest).sum(-1, keepdims=True))

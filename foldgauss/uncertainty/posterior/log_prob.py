@@ -1,4 +1,4 @@
-"""The log-posterior of frame times, as samplers ask for it."""
+"""The log-posterior density of frame times, as samplers call it."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -7,36 +7,36 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid, short_repr
-from foldgauss.uncertainty.likelihood.colors import evidence_without_colors
-from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, evidence
+from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_colors
+from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
-from foldgauss.uncertainty.likelihood.profiles import Profiles
-from foldgauss.uncertainty.likelihood.residuals import Screen, check_model
-from foldgauss.uncertainty.posterior.exact import exact_times
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
+from foldgauss.uncertainty.likelihood.residuals import Residuals, check_model
+from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.video.models.video_model import VideoModel
 
-#: What of the residuals counts, unless it is said.
+#: The default estimate of the noise.
 DEFAULT_NOISE = "score"
 
 
 class FrameTimeLogProb:
-    r"""Log-posterior density of the free frames' log-ratios, up to the evidence; batched, by compiled look-ups.
+    r"""Log-posterior density of the free frames' log-ratios up to a constant; batched and compiled.
 
     $$ \log p(z \mid y) = \sum_k \ell_k(t_k(z)) + \log \mathrm{Dirichlet}(p(z)) + \log |dp/dz| + \text{const} $$
 
-    Conditioned on: the splats (their places, folds and colours), the times of frames that are held, and the noise.
+    Conditioned on: the splats (positions, folds and colors), the times of held frames, and the noise.
 
     **Shapes:** called with coordinates (*batch, num_free), gives (*batch). **Units:** nats.
     **Example:** `log_prob(log_prob.increments.coordinates(times))`.
     **Source:** VeGaS eq:frame_fitting. **Raises:** ValueError where the density is NaN, and for other shapes.
     """
 
-    def __init__(self, profiles: Profiles, increments: Increments):
-        if profiles.num_frames != increments.num_frames:
-            got = f"{profiles.num_frames} profiles, {increments.num_frames} times"
+    def __init__(self, curves: ProfileCurves, increments: Increments):
+        if curves.num_frames != increments.num_frames:
+            got = f"{curves.num_frames} profiles, {increments.num_frames} times"
             raise invalid("profiles", expected="as many as there are times", got=got)
-        self.profiles, self.increments = profiles, increments
+        self.curves, self.increments = curves, increments
 
     @property
     def num_free(self) -> int:
@@ -44,107 +44,109 @@ class FrameTimeLogProb:
 
     def __call__(self, coordinates: Float[np.ndarray, "*batch num_free"]) -> Float64[np.ndarray, "*batch"]:
         times = self.increments.times(coordinates)
-        found = self.profiles(times).sum(-1) + self.increments.log_prior(coordinates)
+        found = self.curves(times).sum(-1) + self.increments.log_prior(coordinates)
         if np.isnan(found).any():
-            cure = "Look for NaN in profiles or coordinates."
-            raise invalid("coordinates", expected="numbers with a log-density", got="NaN", cure=cure)
+            cure = "Check curves and coordinates for NaN."
+            raise invalid("coordinates", expected="coordinates with a log-density", got="NaN", cure=cure)
         return found
 
     def log_likelihood(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch"]:
-        """Of all frames at these times, looked up; 0 is every frame at its best."""
-        return self.profiles(times).sum(-1)
+        """Joint log-likelihood of all frames at these times; 0 if every frame is at its mode."""
+        return self.curves(times).sum(-1)
 
 
-def drawn_log_likelihood(
+def rendered_log_likelihood(
     model: VideoModel,
     video: UInt8[np.ndarray, "num_frames height width channels"],
     times: Float[np.ndarray, " num_frames"],
     noise: FrameNoise,
 ) -> Float64[np.ndarray, " num_frames"]:
-    """The frames' log-likelihoods at `times`, drawn, without a look-up: what profiles are compared with.
+    """Log-likelihoods of the frames at `times` from rendered images, without interpolation.
 
-    A frame's profile is this less its value where it is greatest. Raises ValueError for a video of another size, times
-    that are not one a frame in [0, 1], and noise that is no FrameNoise.
+    A frame's profile is this less its maximum. Raises ValueError for a video of another size, times that are not one
+    per frame in [0, 1], and a noise that is not a FrameNoise.
     """
     if not isinstance(noise, FrameNoise):
-        cure = "`evidence(..).noise` is what it was drawn with."
+        cure = "For instance `likelihood_profiles(..).noise`."
         raise invalid("noise", expected="a FrameNoise", got=short_repr(noise), cure=cure)
-    screen = Screen(model, video)
-    num_frames, times = len(screen.frames), _numbers("times", times)
+    residuals = Residuals(model, video)
+    num_frames, times = len(residuals.frames), _as_array("times", times)
     if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
         got = f"shape {times.shape}" if times.shape != (num_frames,) else f"{times.min():.3g} to {times.max():.3g}"
-        raise invalid("times", expected=f"{num_frames} times in [0, 1], one a frame", got=got)
-    noise = noise.of(num_frames)
-    errors = [screen.squared_errors(picture, [k])[0] for k, picture in enumerate(screen.pictures(times))]
+        raise invalid("times", expected=f"{num_frames} times in [0, 1], one per frame", got=got)
+    noise = noise.for_frames(num_frames)
+    errors = [residuals.squared_errors(image, [k])[0] for k, image in enumerate(residuals.render_at(times))]
     return -noise.weight * np.array(errors)
 
 
-#: What frame times are conditioned on.
+#: What the posterior is conditioned on: all splats, or all but their colors.
 LEVELS = ("splats", "colors")
 
 
-def at_level(
+def condition_on_level(
     level: str,
     model: VideoModel,
     video: np.ndarray | None,
-    seen: LikelihoodProfiles,
+    profiles: LikelihoodProfiles,
     frames: Sequence[int] | None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> LikelihoodProfiles:
-    """What is seen given the splats, or with the colours of these integrated out."""
+    """The profiles given all splats, or with the colors integrated out."""
     check_level(level, video)
     if level == "splats":
-        return seen
-    profiles = evidence_without_colors(model, video, seen, frames=frames, on_frame=on_frame)
-    return dataclasses.replace(seen, profiles=profiles, level=level)
+        return profiles
+    curves = marginalize_colors(model, video, profiles, frames=frames, on_frame=on_frame)
+    return dataclasses.replace(profiles, curves=curves, level=level)
 
 
 def check_level(level: str, video: np.ndarray | None) -> None:
-    """ValueError for an unknown level, and for one that takes a video, without."""
+    """ValueError for an unknown level, or a missing video for one that requires it."""
     if level not in LEVELS:
-        cure = "Refitted splats are another thing: see refit_frame_times."
+        cure = "To refit the splats use refit_frame_times."
         raise invalid("level", expected=" or ".join(map(repr, LEVELS)), got=short_repr(level), cure=cure)
     if level == "colors" and video is None:
-        raise invalid("video", expected="frames, where colours are integrated out", got=None)
+        raise invalid("video", expected="frames to integrate out the colors", got=None)
 
 
-def check_seen(seen: LikelihoodProfiles, video: np.ndarray | None, noise: str | FrameNoise = DEFAULT_NOISE) -> int:
-    """The number of frames that were seen; ValueError where `video` or `noise` are not what was seen."""
-    if not isinstance(seen, LikelihoodProfiles):
-        raise invalid("seen", expected="what `evidence` gives", got=short_repr(seen))
-    num_frames = seen.profiles.num_frames
+def check_profiles(
+    profiles: LikelihoodProfiles, video: np.ndarray | None, noise: str | FrameNoise = DEFAULT_NOISE
+) -> int:
+    """The number of frames; ValueError if `video` or `noise` conflicts with the profiles."""
+    if not isinstance(profiles, LikelihoodProfiles):
+        raise invalid("profiles", expected="the result of `likelihood_profiles`", got=short_repr(profiles))
+    num_frames = profiles.curves.num_frames
     if video is not None and (shape := np.shape(video))[:1] != (num_frames,):
-        cure = "Give the video that was seen, or leave one of the two out."
-        raise invalid("video", expected=f"the {num_frames} frames that were `seen`", got=f"shape {shape}", cure=cure)
-    if noise is not seen.noise and not (isinstance(noise, str) and noise == DEFAULT_NOISE):
-        cure = "Noise is part of what was seen: give one to `evidence`, or scale the profiles."
-        raise invalid("noise", expected="none beside `seen`", got=short_repr(noise), cure=cure)
+        cure = "Give the video of these profiles, or leave one of the two out."
+        raise invalid("video", expected=f"the {num_frames} frames of `profiles`", got=f"shape {shape}", cure=cure)
+    if noise is not profiles.noise and not (isinstance(noise, str) and noise == DEFAULT_NOISE):
+        cure = "Profiles include their noise: give one to `likelihood_profiles`, or scale the curves."
+        raise invalid("noise", expected="none beside `profiles`", got=short_repr(noise), cure=cure)
     return num_frames
 
 
-def check_asked(
+def check_request(
     model: VideoModel,
     video: np.ndarray | None,
     noise: str | FrameNoise,
     level: str,
     frames: Sequence[int] | None,
     concentration: float,
-    seen: LikelihoodProfiles | None,
+    profiles: LikelihoodProfiles | None,
 ) -> Increments:
-    """All that can be known to be wrong before any picture is drawn; which frames are free."""
+    """Validate arguments before any image is rendered; returns the coordinates of the free frames."""
     check_model(model)
     check_level(level, video)
-    if seen is not None:
-        num_frames = check_seen(seen, video, noise)
+    if profiles is not None:
+        num_frames = check_profiles(profiles, video, noise)
     elif video is None:
-        raise invalid("video", expected="frames, or what was `seen`", got=None)
+        raise invalid("video", expected="frames, or `profiles`", got=None)
     else:
         if not isinstance(noise, FrameNoise):
             check_one_of("noise", noise if isinstance(noise, str) else short_repr(noise), NOISES)
         if (num_frames := len(video) if np.ndim(video) else 0) < 3:
-            cure = "The first frame is at time 0 and the last at 1: others are needed."
+            cure = "The first frame is at time 0 and the last at 1; others are needed."
             raise invalid("video", expected="at least 3 frames", got=f"shape {np.shape(video)}", cure=cure)
-    return Increments.among(np.linspace(0.0, 1.0, num_frames), frames, concentration)
+    return Increments.with_free(np.linspace(0.0, 1.0, num_frames), frames, concentration)
 
 
 def frame_time_log_prob(
@@ -156,39 +158,39 @@ def frame_time_log_prob(
     frames: Sequence[int] | None = None,
     concentration: float = 1.0,
     held: Float[np.ndarray, " num_frames"] | None = None,
-    seen: LikelihoodProfiles | None = None,
-    on_picture: Callable[[int, int], None] | None = None,
+    profiles: LikelihoodProfiles | None = None,
+    on_render: Callable[[int, int], None] | None = None,
 ) -> FrameTimeLogProb:
-    """The log-posterior of the times of `frames` (default: of all but the first and the last), given the splats.
+    """The log-posterior density of the times of `frames` (default: all but the first and the last) given the splats.
 
     `video`: uint8 (num_frames, height, width, 3 or 4) at the model's size; it may be another cut of the same scene,
-    with another number of frames. `noise`, `on_picture`: see `evidence`, whose result may be handed in as `seen`.
-    A `noise` beside `seen` is refused. `level`: what else is unknown: "splats" holds them all, "colors" integrates
-    their colours out (`evidence_without_colors`: minutes a frame for large models, so choose `frames`); refitting all
-    of them is another thing, `refit_frame_times`. `concentration`: of the Dirichlet prior on increments. `held`: the
-    times of all other frames (default: the posterior medians of all).
+    with another number of frames. `noise`, `on_render`: see `likelihood_profiles`, whose result may be given as
+    `profiles`, without a `noise`. `level`: "splats" conditions on all splats, "colors" integrates their colors out
+    (`marginalize_colors`: minutes per frame for large models, so choose `frames`); to refit all splats use
+    `refit_frame_times`. `concentration`: of the Dirichlet prior on increments. `held`: the times of all other frames
+    (default: their posterior medians when all are free).
 
-    Raises ValueError for a video of another size or scene, or not as long as what was seen; one that shows nothing of
-    its times, frames out of the model's order, and settings out of range or that contradict what was seen.
+    Raises ValueError for a video of another size, scene or number of frames than the profiles, one that does not
+    identify its times, frames out of the model's order, and settings out of range or in conflict with the profiles.
     """
-    free = check_asked(model, video, noise, level, frames, concentration, seen)
+    free = check_request(model, video, noise, level, frames, concentration, profiles)
     if held is not None:
-        held = _numbers("held", held)
+        held = _as_array("held", held)
         if held.shape != (free.num_frames,):
             raise invalid("held", expected=f"{free.num_frames} times", got=f"shape {held.shape}")
         free = Increments(held, free.free, concentration)
-    if seen is None:
-        seen = evidence(model, video, noise=noise, on_picture=on_picture)
-    seen = at_level(level, model, video, seen, frames)
+    if profiles is None:
+        profiles = likelihood_profiles(model, video, noise=noise, on_render=on_render)
+    profiles = condition_on_level(level, model, video, profiles, frames)
     if held is None and frames is not None:
-        everything = Increments.among(free.held, None, concentration)
-        held = _rising(exact_times(seen.profiles, everything).quantile(0.5))
+        everything = Increments.with_free(free.held, None, concentration)
+        held = _separate(exact_posterior(profiles.curves, everything).quantile(0.5))
         free = Increments(held, free.free, concentration)
-    return FrameTimeLogProb(seen.profiles, free)
+    return FrameTimeLogProb(profiles.curves, free)
 
 
-def _rising(times: Float64[np.ndarray, " num_frames"]) -> Float64[np.ndarray, " num_frames"]:
-    """Medians of frames that are all but one and the same may meet: apart by the least that float64 has."""
+def _separate(times: Float64[np.ndarray, " num_frames"]) -> Float64[np.ndarray, " num_frames"]:
+    """Make medians strictly increasing by the spacing of float64: those of nearly equal frames may coincide."""
     if (np.diff(times) > 0).all():
         return times
     times = np.maximum.accumulate(times)
@@ -197,7 +199,7 @@ def _rising(times: Float64[np.ndarray, " num_frames"]) -> Float64[np.ndarray, " 
     return np.minimum(np.maximum.accumulate(times - places) + places, 1.0 - places[::-1])
 
 
-def _numbers(name: str, values) -> np.ndarray:
+def _as_array(name: str, values) -> np.ndarray:
     try:
         return np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""A sweep of emcee moves over blocks of frames, for more frames than one move can take."""
+"""An emcee move that updates blocks of frames in turn, for more frames than one move can update."""
 
 from collections.abc import Iterator
 
@@ -8,33 +8,32 @@ from emcee.moves import Move
 from emcee.state import State
 
 from foldgauss._runtime.kernels import inline, kernel
-from foldgauss.uncertainty.likelihood.profiles import Profiles, piece_of, value_at
+from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves, piece_of, value_at
 from foldgauss.uncertainty.posterior.exact import profile_grid
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
+from foldgauss.uncertainty.posterior.settings import BLOCK
 
 _d = nb.float64
 
-#: Frames in a block. Walkers must be at least twice as many.
-BLOCK = 6
-#: Share of stretch moves; the others go along the difference of two walkers (differential evolution).
+#: Probability of stretch moves; the others are differential evolution moves.
 STRETCH = 0.3
-#: Share of the latter that go the whole difference: from one hill to another.
+#: Probability that the latter use the whole difference, which connects modes.
 WHOLE = 0.05
-#: Share of sweeps that go frame by frame.
+#: Probability of sweeps that update single frames.
 SINGLES = 0.5
-#: A frame stays where its likelihood between its neighbours is less than this share of all: float64 cannot tell.
+#: A frame is not updated if its likelihood between its neighbors is below this fraction of the whole (rounding).
 LEAST_MASS = 1e-9
-#: No two times are nearer than this share of all the time: below, float64 does not tell them apart.
+#: The least difference of two times: float64 does not resolve smaller ones.
 LEAST_GAP = 1e-14
 _stretch = 2.0  # a of Goodman and Weare
 
 
 class BlockSweep(Move):
-    r"""Gibbs sweeps: frames are cut into blocks between frames that stay, and every block moves, given these.
+    r"""Gibbs sweeps over blocks of frames, which are conditionally independent given the frames between them.
 
-    Half of the walkers move at a time, guided by the other half, as in emcee's own red-blue moves; but each block is
-    proposed and accepted by itself, since given the frames between them blocks are independent. The cuts are drawn anew
-    for every half sweep. In a block of m frames, in its log-ratios z, and with partners c, d of the other half:
+    Half of the walkers move at a time, with partners from the other half, as in emcee's red-blue moves; but each block
+    is proposed and accepted separately. The partition into blocks is drawn anew for every half sweep. For a block of m
+    frames with log-ratios z, and partners c, d of the other half:
 
     $$
     z' = z_c + \zeta (z - z_c), \quad g(\zeta) \propto \zeta^{-1/2} \text{ on } [1/2, 2]
@@ -43,9 +42,9 @@ class BlockSweep(Move):
 
     accepted by the density of z, times $\zeta^{m-1}$ for the first.
 
-    Half of the sweeps go frame by frame instead, first the even ones, then the odd ones: each time is proposed from its
-    own likelihood between its neighbours' times, on a grid, and accepted by what the grid misses. So a frame goes
-    from one hill of its likelihood to another, however far apart.
+    Half of the sweeps update single frames instead, first the even, then the odd ones: each time is proposed from its
+    own likelihood between its neighbors' times, approximated on a grid, and accepted by the ratio to the exact one.
+    So a frame moves between modes of its likelihood at any distance.
 
     **Source:** Goodman and Weare 2010; ter Braak 2006; emcee, Foreman-Mackey et al. 2013, algorithm 3.
     """
@@ -55,7 +54,7 @@ class BlockSweep(Move):
         self._grids = _proposals(log_prob)
 
     def propose(self, model, state: State) -> tuple[State, np.ndarray]:
-        """One sweep of all walkers; a walker's acceptance is the share of its blocks that moved."""
+        """One sweep of all walkers; a walker's acceptance is the fraction of its blocks that moved."""
         times = self.log_prob.increments.times(state.coords)
         sweep = self._singles if model.random.random_sample() < SINGLES else self._by_blocks
         moved = sweep(times, model.random)
@@ -64,10 +63,10 @@ class BlockSweep(Move):
         return State(coordinates, log_prob=values), moved
 
     def _singles(self, times: np.ndarray, random) -> np.ndarray:
-        """Move every frame of every walker by itself, in place; returns the share of its frames that each moved."""
+        """Update every frame of every walker separately, in place; returns the fraction of frames that moved."""
         moved = np.zeros(len(times))
         free = np.flatnonzero(self.log_prob.increments.free)
-        tables, alpha = _tables(self.log_prob.profiles), self.log_prob.increments.concentration
+        tables, alpha = _tables(self.log_prob.curves), self.log_prob.increments.concentration
         for parity in (0, 1):
             frames = free[free % 2 == parity]
             chance = random.random_sample((2, len(times), len(frames)))
@@ -75,7 +74,7 @@ class BlockSweep(Move):
         return moved / len(free)
 
     def _by_blocks(self, times: np.ndarray, random) -> np.ndarray:
-        """Move every block of every walker, in place; returns the share of its blocks that each moved."""
+        """Update every block of every walker, in place; returns the fraction of blocks that moved."""
         log_prob, num = self.log_prob, len(times)
         order = random.permutation(num)
         moved = np.zeros(num)
@@ -94,21 +93,21 @@ class BlockSweep(Move):
             threshold = np.log(random.random_sample(shape))
             moved[movers] += _sweep(
                 times, movers, others[first], others[second], stretched, factor, jitter, threshold, blocks,
-                log_prob.increments.concentration, *_tables(log_prob.profiles),
+                log_prob.increments.concentration, *_tables(log_prob.curves),
             )  # fmt: skip
         return moved
 
 
-def _tables(profiles: Profiles) -> tuple[np.ndarray, ...]:
-    return profiles.nodes, profiles.values, profiles.slopes, profiles.count
+def _tables(curves: ProfileCurves) -> tuple[np.ndarray, ...]:
+    return curves.nodes, curves.values, curves.slopes, curves.count
 
 
 def _proposals(log_prob: FrameTimeLogProb) -> tuple[np.ndarray, ...]:
-    """Grids of every frame, likelihoods there, and their integrals: (num_frames, most) each; and how many there are."""
+    """Grids of all frames, likelihoods there, and their integrals, (num_frames, most) each; and the grids' lengths."""
     found = []
-    for k in range(log_prob.profiles.num_frames):
-        grid = profile_grid(log_prob.profiles, k, 0.0, 1.0)
-        heights = log_prob.profiles[k](grid[:, None])[:, 0]
+    for k in range(log_prob.curves.num_frames):
+        grid = profile_grid(log_prob.curves, k, 0.0, 1.0)
+        heights = log_prob.curves[k](grid[:, None])[:, 0]
         likelihood = np.exp(heights - heights.max())
         masses = (likelihood[1:] + likelihood[:-1]) / 2 * np.diff(grid)
         found.append((grid, likelihood, np.concatenate([[0.0], np.cumsum(masses)])))
@@ -120,7 +119,7 @@ def _proposals(log_prob: FrameTimeLogProb) -> tuple[np.ndarray, ...]:
 
 
 def _blocks(runs: list[tuple[int, int]], block: int, random) -> Iterator[tuple[int, int]]:
-    """First and last frames of blocks, one frame left between two; runs that are no longer than a block are whole."""
+    """First and last frames of blocks with one frame between two; runs no longer than a block are one block."""
     for first, last in runs:
         if last - first < block:
             yield first, last
@@ -137,7 +136,7 @@ def _blocks(runs: list[tuple[int, int]], block: int, random) -> Iterator[tuple[i
 def _sweep(
     times, movers, first, second, stretched, factor, jitter, threshold, blocks, alpha, nodes, values, slopes, count
 ):
-    """Move the blocks of `movers`, in place; returns the share of its blocks that each moved."""
+    """Update the blocks of `movers`, in place; returns the fraction of its blocks that each moved."""
     moved = np.zeros(len(movers))
     most = jitter.shape[2]
     z, new, logs = np.empty(most), np.empty(most), np.empty(most + 1)
@@ -148,7 +147,7 @@ def _sweep(
             size = high - low + 1
             start, end = times[walker, low - 1], times[walker, high + 1]
             change = _d(0)
-            # Its own log-ratios, and what its density loses.
+            # The current log-ratios and log-density.
             closing = np.log(end - times[walker, high])
             before, summed = start, closing
             for m in range(size):
@@ -182,7 +181,7 @@ def _sweep(
             for m in range(size):
                 total += np.exp(new[m] - greatest)
             normal = greatest + np.log(total)
-            # Its density; in order as float64 shows it, or not at all.
+            # Its log-density; times must be in order in float64.
             change -= alpha * normal
             t = start
             ordered = True
@@ -233,7 +232,7 @@ def _time_of(mass, grid, likelihood, summed, last):
 
 @kernel
 def _single(times, frames, grids, likelihoods, summed, counts, chance, threshold, alpha, nodes, values, slopes, count):
-    """Propose each of `frames` of each walker between its neighbours; returns how many of each walker moved."""
+    """Propose each of `frames` of each walker between its neighbors; returns how many of each walker moved."""
     moved = np.zeros(len(times))
     for f in range(len(frames)):
         k = frames[f]

@@ -1,4 +1,4 @@
-"""What a change of each number of a model does to its pictures."""
+"""Sensitivity of the rendered images to each parameter of a model."""
 
 from collections.abc import Callable
 
@@ -6,63 +6,63 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss.render import cpu
-from foldgauss.video.compression.quantize import AXES, Described, path_matrix
+from foldgauss.video.compression.quantize import AXES, ExactColumns, path_matrix
 from foldgauss.video.models.conditioning import backpropagate
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.selection.contributions import Contributions
 
 _SEED = 0
-#: Levels of an 8-bit picture.
+#: Levels of an 8-bit image.
 LEVELS = 255.0
 
 
-def sensitivities(
-    lit: Contributions, described: Described, on_frame: Callable[[], None] = lambda: None
+def estimate_sensitivities(
+    contributions: Contributions, exact: ExactColumns, on_frame: Callable[[], None] = lambda: None
 ) -> tuple[dict[str, Float[np.ndarray, " num"]], Float[np.ndarray, " num"]]:
-    """Squared change of the pictures, in levels, summed over pixels, channels and frames, by the square of each number.
+    """Squared change of the images per squared change of each parameter, and contributions to the best frames.
 
-    That is the diagonal of J^T J with J the derivative of all pictures by the columns of `described`; and what each
-    Gaussian adds in its best frame, in pixels. Estimated without bias by (J^T z)^2 with random signs z in every pixel,
-    one draw a frame. Source: M. F. Hutchinson (1990), "A stochastic estimator of the trace".
+    The change is in levels, summed over pixels, channels and frames: the diagonal of J^T J with J the derivative of all
+    images with respect to the columns `exact`. It is estimated without bias by (J^T z)^2, with random signs z in every
+    pixel and one draw per frame. A contribution is in pixels: that of each Gaussian to the frame that shows most of it.
+    Source: M. F. Hutchinson (1990), "A stochastic estimator of the trace".
     """
-    rng, shape = np.random.default_rng(_SEED), (3, *lit.size)
-    degree, num = described.facts.degree, lit.num_gaussians
-    to_columns = _Columns(described)
+    rng, shape = np.random.default_rng(_SEED), (3, *contributions.size)
+    degree, num, prepared = exact.info.degree, contributions.num_gaussians, contributions.prepared
+    to_columns = _ColumnGradients(exact)
     total: dict[str, np.ndarray] = {name: np.zeros(num) for name in to_columns.names}
     best = np.zeros(num)
-    for k in range(len(lit.times)):
-        light = lit.frame(k)
-        if len(light.alive):
+    for k in range(len(contributions.times)):
+        frame = contributions.at_frame(k)
+        if len(frame.alive):
             signs = rng.integers(0, 2, shape, dtype=np.int8) * np.float32(2 * LEVELS) - np.float32(LEVELS)
             rows = np.zeros((num, 11 + 2 * degree), np.float32)
-            stage = lit.stage
-            backpropagate(stage.rows, light.splats, cpu.backward(light.trace, signs)[:4], stage.shape, rows)
-            for name, gradient in to_columns(rows[light.alive].astype(np.float64), light.alive).items():
-                total[name][light.alive] += gradient**2
-            best[light.alive] = np.maximum(best[light.alive], light.total)
+            backpropagate(prepared.rows, frame.splats, cpu.backward(frame.trace, signs)[:4], prepared.spec, rows)
+            for name, gradient in to_columns(rows[frame.alive].astype(np.float64), frame.alive).items():
+                total[name][frame.alive] += gradient**2
+            best[frame.alive] = np.maximum(best[frame.alive], frame.total)
         on_frame()
     return total, best
 
 
-class _Columns:
-    """Gradients of a model's rows to those of its columns."""
+class _ColumnGradients:
+    """Converts gradients with respect to packed rows to gradients with respect to columns."""
 
-    def __init__(self, described: Described):
-        v, facts = described.values, described.facts
-        self._described, self._at = described, columns(facts.degree)
-        self._matrix = path_matrix(v["time"], v["duration"], facts)
-        self._flip = np.where(described.swapped, -1.0, 1.0)
-        k = np.arange(1, facts.degree + 1)[:, None]
-        # A later m_t with the same path in time: see `shift_path`.
-        self._by_time = np.concatenate([k * described.place[:, 1:], np.zeros((len(self._flip), 1, 2))], 1)
-        path = [f"{axis}{j}" for j in range(facts.degree + 1) for axis in "xy"]
+    def __init__(self, exact: ExactColumns):
+        v, info = exact.values, exact.info
+        self._exact, self._at = exact, columns(info.degree)
+        self._matrix = path_matrix(v["time"], v["duration"], info)
+        self._flip = np.where(exact.swapped, -1.0, 1.0)
+        k = np.arange(1, info.degree + 1)[:, None]
+        # A later m_t with the same path in time, see `shift_path`.
+        self._by_time = np.concatenate([k * exact.place[:, 1:], np.zeros((len(self._flip), 1, 2))], 1)
+        path = [f"{axis}{j}" for j in range(info.degree + 1) for axis in "xy"]
         self.names = ["size", "stretch", "duration", "opacity", "time", "angle", "luma", "blue", "green", *path]
 
     def __call__(self, rows: Float[np.ndarray, "alive width"], alive: np.ndarray) -> dict[str, np.ndarray]:
-        at, v = self._at, self._described.values
+        at, v = self._at, self._exact.values
         scale = rows[:, at["log_scale"]]
         place = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2)
-        time, turn = v["time"][alive], self._described.turn[alive]
+        time, turn = v["time"][alive], self._exact.turn[alive]
         by_time = rows[:, at["time_loc_logit"].start] / np.maximum(time * (1 - time), 1e-12)
         made = {
             "size": scale[:, 0] + scale[:, 1],

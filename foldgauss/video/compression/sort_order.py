@@ -1,7 +1,8 @@
-"""Gaussians in an order that is cheap to tell: from cell to cell, wherever which of them covers which does not show.
+"""Reorders Gaussians by cell, which compresses well, where the compositing order hardly matters.
 
-Two that never overlap may change places without changing any picture. What changing places would cost is measured for
-all pairs, on a grid of pixels that moves from frame to frame; pairs that matter keep their order.
+Two Gaussians that never overlap may be swapped without changing any image. The error of a swap is measured for all
+overlapping pairs, on a grid of pixels that moves from frame to frame; pairs whose swap would be visible keep their
+order.
 """
 
 import heapq
@@ -15,34 +16,35 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.selection.contributions import Contributions
 
-#: Pixels of a frame that are looked at, about: those of a grid; the least distance between them.
+#: About how many pixels of a frame are sampled, on a grid, and its least spacing.
 _POINTS, _STRIDE = 4000, 2
-#: Layers of a pixel that are looked at, from the front; the least light that counts, since what many hide together
-#: would else be free to pass each of them; what two add to a pixel, below which they do not cover each other.
-_LAYERS, _HIDDEN, _FAINT = 256, 0.2, 0.004
+#: Layers of a pixel that are examined, from the front. Least transmittance that is assumed: a Gaussian hidden by many
+#: together could otherwise pass each of them for free. Product of alphas and transmittance below which two Gaussians do
+#: not overlap.
+_LAYERS, _MIN_TRANSMITTANCE, _FAINT = 256, 0.2, 0.004
 _EMPTY = -1
 
 
-#: Pairs of Gaussians that cover each other, the front ones and the back ones, and what changing places costs.
+#: Overlapping pairs of Gaussians: the front ones, the back ones, and the error of swapping them.
 Overlaps = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]
 
 
-def free_order(cell: Int32[np.ndarray, " num"], found: Overlaps, room: float) -> Int[np.ndarray, " num"]:
-    """The numbers of Gaussians in a new order, sweep after sweep through the cells; `found` is of `overlaps`.
+def sort_by_cell(cell: Int32[np.ndarray, " num"], overlaps: Overlaps, budget: float) -> Int[np.ndarray, " num"]:
+    """Indices of the Gaussians in a new order, in sweeps through the cells; `overlaps` is from `find_overlaps`.
 
-    `room`: what the pairs that are let go may add to the squared error, were all of them to change places; colours
-    about [0, 1], summed over frames, pixels and channels.
+    `budget`: the squared error allowed if all pairs whose order is given up were swapped; colours in [0, 1], summed
+    over frames, pixels and channels.
     """
-    front, back, cost = found
+    front, back, cost = overlaps
     cheapest = np.argsort(cost, kind="stable")
-    matters = cheapest[np.searchsorted(np.cumsum(cost[cheapest]), room, side="right") :]
-    return swept(cell, front[matters], back[matters])
+    matters = cheapest[np.searchsorted(np.cumsum(cost[cheapest]), budget, side="right") :]
+    return sort_constrained(cell, front[matters], back[matters])
 
 
-def swept(
+def sort_constrained(
     cell: Int32[np.ndarray, " num"], front: Int[np.ndarray, " pairs"], back: Int[np.ndarray, " pairs"]
 ) -> Int[np.ndarray, " num"]:
-    """An order in which every `front` comes before its `back`: of those that may come next the one in the next cell."""
+    """An order with every `front` before its `back`; among the Gaussians that may come next, that of the next cell."""
     num, order = len(cell), np.argsort(front, kind="stable")
     start = np.searchsorted(front[order], np.arange(num + 1)).tolist()
     behind, waits = back[order].tolist(), np.bincount(back, minlength=num).tolist()
@@ -65,37 +67,39 @@ def swept(
     return np.array(out)
 
 
-def overlaps(lit: Contributions) -> Overlaps:
-    """Pairs of Gaussians that cover each other, the front one first, and the squared change were they to change places.
+def find_overlaps(contributions: Contributions) -> Overlaps:
+    """Overlapping pairs of Gaussians, the front one first, and the squared error of swapping them.
 
-    Neighbours in the order at a pixel with opacities a, b and colours differing by d change by a b d times the light
-    that reaches them.
+    A pixel where two neighbours in the order have alphas a, b and colours that differ by d changes by a b d times the
+    transmittance in front of them.
     """
-    num, (height, width) = lit.num_gaussians, lit.size
+    num, (height, width) = contributions.num_gaussians, contributions.size
     stride = max(_STRIDE, round(math.sqrt(height * width / _POINTS)))
     rows = -(-height // stride), -(-width // stride)
     layers = np.empty((*rows, _LAYERS), np.int32), np.empty((*rows, _LAYERS, 2), np.float32)
-    color = np.maximum(0.5 + SH_C0 * np.asarray(lit.model.splats.color_dc, np.float64), 0)
+    color = np.maximum(0.5 + SH_C0 * np.asarray(contributions.model.splats.color_dc, np.float64), 0)
     keys, costs = np.full(1 << 20, _EMPTY, np.int64), np.zeros(1 << 20)
-    options, used = lit.model.options, 0
-    for k in range(len(lit.times)):
-        done, offset = lit.frame(k).splats, (k % stride, k // stride % stride)
-        light, count = np.ones(rows, np.float32), np.zeros(rows, np.int32)
+    options, used = contributions.model.options, 0
+    for k in range(len(contributions.times)):
+        done, offset = contributions.at_frame(k).splats, (k % stride, k // stride % stride)
+        transmittance, count = np.ones(rows, np.float32), np.zeros(rows, np.int32)
         seen = np.float32(options.low_pass), np.float32(options.alpha_cutoff)
-        _layered(done.mean, done.factor, done.opacity, done.alive, offset, stride, *seen, light, count, *layers)
-        begun = [0, 0]
-        while begun[0] < rows[0]:
+        _list_layers(
+            done.mean, done.factor, done.opacity, done.alive, offset, stride, *seen, transmittance, count, *layers
+        )
+        position = [0, 0]
+        while position[0] < rows[0]:
             if 2 * used > len(keys):
-                keys, costs = _grown(keys, costs)
-            *begun, used = _paired(count, *layers, color, num, keys, costs, begun[0], begun[1], used)
-    there = np.flatnonzero(keys != _EMPTY)
-    return keys[there] // num, keys[there] % num, costs[there] * stride**2
+                keys, costs = _enlarge(keys, costs)
+            *position, used = _add_costs(count, *layers, color, num, keys, costs, position[0], position[1], used)
+    used_slots = np.flatnonzero(keys != _EMPTY)
+    return keys[used_slots] // num, keys[used_slots] % num, costs[used_slots] * stride**2
 
 
-def _grown(keys: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    there = np.flatnonzero(keys != _EMPTY)
+def _enlarge(keys: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    used_slots = np.flatnonzero(keys != _EMPTY)
     more, own = np.full(4 * len(keys), _EMPTY, np.int64), np.zeros(4 * len(keys))
-    _moved(keys[there], costs[there], more, own)
+    _rehash(keys[used_slots], costs[used_slots], more, own)
     return more, own
 
 
@@ -108,15 +112,15 @@ def _slot(keys, key):
 
 
 @kernel
-def _moved(keys, costs, more, own):
+def _rehash(keys, costs, more, own):
     for k in range(len(keys)):
         place = _slot(more, keys[k])
         more[place], own[place] = keys[k], costs[k]
 
 
 @kernel
-def _layered(mean, factor, opacity, alive, offset, stride, low_pass, cutoff, light, count, who, what):
-    """The Gaussians at each pixel of the grid, front to back, with their opacities and the light that reaches them."""
+def _list_layers(mean, factor, opacity, alive, offset, stride, low_pass, cutoff, transmittance, count, index, layer):
+    """Append Gaussians to the layers of each pixel of the grid, front to back: indices, alphas, transmittances."""
     for k in range(len(alive)):
         a, b, c, d = factor[k, 0, 0], factor[k, 0, 1], factor[k, 1, 0], factor[k, 1, 1]
         xx, xy, yy = a * a + b * b + low_pass, a * c + b * d, c * c + d * d + low_pass
@@ -128,8 +132,8 @@ def _layered(mean, factor, opacity, alive, offset, stride, low_pass, cutoff, lig
         wide, high = reach * math.sqrt(xx) / stride, reach * math.sqrt(yy) / stride
         if not (abs(x) < 1e6 and abs(y) < 1e6):
             continue
-        first, last = max(math.ceil(x - wide), 0), min(math.floor(x + wide), light.shape[1] - 1)
-        top, bottom = max(math.ceil(y - high), 0), min(math.floor(y + high), light.shape[0] - 1)
+        first, last = max(math.ceil(x - wide), 0), min(math.floor(x + wide), transmittance.shape[1] - 1)
+        top, bottom = max(math.ceil(y - high), 0), min(math.floor(y + high), transmittance.shape[0] - 1)
         for r in range(top, bottom + 1):
             for q in range(first, last + 1):
                 if count[r, q] >= _LAYERS:
@@ -139,31 +143,30 @@ def _layered(mean, factor, opacity, alive, offset, stride, low_pass, cutoff, lig
                 if alpha < cutoff:
                     continue
                 place = count[r, q]
-                who[r, q, place] = alive[k]
-                what[r, q, place, 0], what[r, q, place, 1] = alpha, light[r, q]
+                index[r, q, place] = alive[k]
+                layer[r, q, place, 0], layer[r, q, place, 1] = alpha, transmittance[r, q]
                 count[r, q] = place + 1
-                light[r, q] *= 1 - alpha
+                transmittance[r, q] *= 1 - alpha
 
 
 @kernel
-def _paired(count, who, what, color, num, keys, costs, row, column, used):
-    """Adds what pairs cost, from a pixel on until the table is half full; where to go on, and how full it is."""
+def _add_costs(count, index, layer, color, num, keys, costs, row, column, used):
+    """Add the errors of pairs, pixel by pixel, until the table is half full; returns the next pixel and the fill."""
     for r in range(row, count.shape[0]):
         for q in range(column if r == row else 0, count.shape[1]):
             if 2 * used > len(keys):
                 return r, q, used
             for i in range(count[r, q]):
-                if what[r, q, i, 0] * what[r, q, i, 1] < _FAINT:
+                if layer[r, q, i, 0] * layer[r, q, i, 1] < _FAINT:
                     continue
                 for j in range(i + 1, count[r, q]):
-                    # The light that reaches the back one, were the other away; but what is hidden by many at once
-                    # must not come to light by one after another.
-                    light = max(what[r, q, j, 1], _HIDDEN) / max(1 - what[r, q, i, 0], np.float32(0.01))
-                    passed = min(light, what[r, q, i, 1])
-                    both = what[r, q, i, 0] * what[r, q, j, 0] * passed
+                    # The transmittance in front of the back one without the other, not below a minimum: see there.
+                    behind = max(layer[r, q, j, 1], _MIN_TRANSMITTANCE) / max(1 - layer[r, q, i, 0], np.float32(0.01))
+                    passed = min(behind, layer[r, q, i, 1])
+                    both = layer[r, q, i, 0] * layer[r, q, j, 0] * passed
                     if both < _FAINT:
                         continue
-                    a, b = who[r, q, i], who[r, q, j]
+                    a, b = index[r, q, i], index[r, q, j]
                     apart = 0.0
                     for c in range(3):
                         apart += (color[a, c] - color[b, c]) ** 2

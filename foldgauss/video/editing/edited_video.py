@@ -247,7 +247,7 @@ class PreparedEditedVideo:
         return jax.tree.map(lambda leaf: leaf[nearest_first], _together(moments))
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """One picture, see `foldgauss.video.models.renderer.Prepared`."""
+        """One picture, see `foldgauss.video.models.renderer.PreparedVideo`."""
         return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
     def _camera_at(self, t: float) -> Camera:
@@ -277,7 +277,7 @@ class _PreparedLayer:
 
     def at(self, t: float) -> "_ConditionedLayer":
         """The layer's Gaussians at the video's time t, edited."""
-        moment = _ConditionedLayer(*self._conditioned(t), self._stage.shape.size, self._stage.shape.aspect)
+        moment = _ConditionedLayer(*self._conditioned(t), self._stage.spec.size, self._stage.spec.aspect)
         for overlay, mask in zip(self._layer.overlays, self._masks, strict=True):
             progress = overlay.progress(t)
             if is_active(overlay, progress):

@@ -1,52 +1,82 @@
-"""Adam on the rows that took part in a step, and on no others (Kingma and Ba 2015).
+r"""Adam (Kingma and Ba 2015): its constants, its rule, and the implementations of it that fits use.
 
-Each row counts its own steps, so that its bias correction is right however seldom it is alive.
+With gradient $g$, moments $m, v$, learning rate $\eta$ and $n$ the number of steps taken:
+
+$$ m \gets \beta_1 m + (1 - \beta_1) g, \quad v \gets \beta_2 v + (1 - \beta_2) g^2, \quad
+   \theta \gets \theta - \eta\, \frac{m / (1 - \beta_1^n)}{\sqrt{v / (1 - \beta_2^n)} + \epsilon} $$
+
+`adam_step` states it in NumPy; `sparse_adam` (Numba), `masked_adam` (JAX) and `FRAME_TIME_ADAM` (optax) are its twins
+for the rows of Gaussians and for frame times, and tests compare them. Each row counts its own steps, so that its bias
+correction is right however seldom the Gaussian is alive.
 """
 
 import math
 
+import jax
+import jax.numpy as jnp
 import numba as nb
 import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
+from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 
-CHUNK = 2048  # rows per task
-#: The unit of time of Gaussians that last, whose sigma_t says nothing: the standard deviation of all times of a clip.
-LASTING_TIME = 0.29
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
+#: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
+#: for each row took a third of a step's optimizer.)
+BIAS_CORRECTIONS = np.ones((20_000, 2), np.float32)
+BIAS_CORRECTIONS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(BIAS_CORRECTIONS))[:, None])
+#: The unit of time of static Gaussians, which have no sigma_t: the standard deviation of all times of a clip.
+STATIC_TIME_SCALE = 0.29
+FRAME_TIME_ADAM = optax.scale_by_adam(BETA1, BETA2, EPSILON)
 
+_CHUNK = 2048  # rows per task
 _f, _u = nb.float32, nb.uint64
 
-#: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Powers taken anew
-#: for each row were a third of a step's optimiser.)
-UNBIAS = np.ones((20_000, 2), np.float32)
-UNBIAS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(UNBIAS))[:, None])
+
+def adam_step(
+    grad: Float[np.ndarray, "num width"],
+    first: Float[np.ndarray, "num width"],
+    second: Float[np.ndarray, "num width"],
+    counts: Int[np.ndarray, " num"],
+    rates: Float[np.ndarray, " width"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What to subtract from the parameters, and both moments after the step; `counts` includes this step."""
+    first = (BETA1 * first + (1 - BETA1) * grad).astype(first.dtype)
+    second = (BETA2 * second + (1 - BETA2) * grad**2).astype(second.dtype)
+    counts = counts[:, None]
+    mean, square = first / (1 - BETA1**counts), second / (1 - BETA2**counts)
+    return rates * mean / (np.sqrt(square) + EPSILON), first, second
+
+
+# ----------------------------------------------------------------------------------- rows of Gaussians, Numba
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, unit, at, unbias):
+def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, unit, at, corrections):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     width, own = _u(rows.shape[1]), rates.copy()
     spread, time, opacity, fold = at
-    lasting, solid, degrees = bits
+    static_bit, opaque_bit, degrees = bits
     for k in range(start, stop):
         i = touched[k]
         counts[i] += 1
-        taken = min(counts[i], len(unbias) - 1)
-        unbias1, unbias2 = unbias[taken, 0], unbias[taken, 1]
+        taken = min(counts[i], len(corrections) - 1)
+        correction1, correction2 = corrections[taken, 0], corrections[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
-        is_static, powers = kinds[i] & lasting, kinds[i] & degrees
-        if is_static:  # its times stay
+        static, powers = kinds[i] & static_bit, kinds[i] & degrees
+        if static:
             g[time], g[spread] = _f(0.0), _f(0.0)
-        if kinds[i] & solid:
+        if kinds[i] & opaque_bit:
             g[opacity] = _f(0.0)
         for c in range(fold + 2 * powers, width):
             g[c] = _f(0.0)
         if unit > _f(0.0):
-            wide = (_f(LASTING_TIME) if is_static else math.exp(row[spread])) / unit
+            wide = (_f(STATIC_TIME_SCALE) if static else math.exp(row[spread])) / unit
             own[time] = rates[time] * wide
             short, power = _f(1.0) / wide, _f(1.0)
             for c in range(fold, width, 2):
@@ -57,7 +87,7 @@ def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits
             g[c] = _f(0.0)
             m[c] = beta1 * m[c] + (_f(1.0) - beta1) * gradient
             v[c] = beta2 * v[c] + (_f(1.0) - beta2) * gradient * gradient
-            row[c] -= own[c] * m[c] * unbias1 / (math.sqrt(v[c] * unbias2) + _f(EPSILON))
+            row[c] -= own[c] * m[c] * correction1 / (math.sqrt(v[c] * correction2) + _f(EPSILON))
 
 
 def sparse_adam(
@@ -72,35 +102,78 @@ def sparse_adam(
     kinds: np.ndarray | None = None,
     unit_time: float = 0.0,
 ) -> None:
-    """One step on rows `touched`, in place; their gradients are set back to zero.
+    """One step on the rows `touched`, in place; their gradients are set to zero.
 
-    `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps each row
-    has taken; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which columns a row has, by
-    `sparse_storage.find_kinds` (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the
-    fold are those at sigma_t = `unit_time`, and others' as `config.LearningRates` says.
+    `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
+    row; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which parameters each Gaussian has
+    (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the fold are those at sigma_t =
+    `unit_time`, and scaled for other sigma_t as `config.LearningRates` documents.
     """
-    place = columns(0)  # the fold comes last, so its degree moves none of these
+    place = columns(0)  # the fold comes last, so its degree does not shift these
     at = tuple(place[name].start for name in ("log_time_scale", "time_loc_logit", "opacity_logit", "coefficients"))
     num = len(touched)
     if kinds is None:
         kinds = np.full(len(rows), (rows.shape[1] - at[-1]) // 2, np.uint8)
+    moments, bits, unit = (first, second, counts), (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK), np.float32(unit_time)
 
     def work(start: int) -> None:
-        _update(
-            start,
-            min(start + CHUNK, num),
-            touched,
-            rows,
-            grad,
-            first,
-            second,
-            counts,
-            kinds,
-            (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK),
-            rates,
-            np.float32(unit_time),
-            at,
-            UNBIAS,
-        )
+        stop = min(start + _CHUNK, num)
+        _update(start, stop, touched, rows, grad, *moments, kinds, bits, rates, unit, at, BIAS_CORRECTIONS)
 
-    run_tasks(work, range(0, num, CHUNK))
+    run_tasks(work, range(0, num, _CHUNK))
+
+
+# ------------------------------------------------------------------------------------- rows of Gaussians, JAX
+
+
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, unit_time: float):
+    """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
+    degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
+    grad = jnp.where(_has_parameter(kinds, degree), grad, jnp.zeros_like(grad))
+    counts = counts + touched.astype(counts.dtype)
+    corrections = jnp.asarray(BIAS_CORRECTIONS)[jnp.minimum(counts, len(BIAS_CORRECTIONS) - 1)]
+    beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
+    mean = beta1 * first + (one - beta1) * grad
+    square = beta2 * second + (one - beta2) * grad * grad
+    own = rates[None, :] * _rate_factors(rows, kinds, degree, unit_time)
+    moved = rows - own * mean * corrections[:, :1] / (jnp.sqrt(square * corrections[:, 1:]) + np.float32(EPSILON))
+    chosen = touched[:, None]
+    return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts
+
+
+def _has_parameter(kinds: UInt8[Array, " num"], degree: int) -> Bool[Array, "num width"]:
+    """Which parameters each Gaussian has."""
+    place = columns(degree)
+    kinds = kinds.astype(jnp.int32)[:, None]
+    column = np.arange(place["coefficients"].stop, dtype=np.int32)[None, :]
+    of_time = (column == place["time_loc_logit"].start) | (column == place["log_time_scale"].start)
+    absent = of_time & ((kinds & STATIC_BIT) > 0)
+    absent |= (column == place["opacity_logit"].start) & ((kinds & OPAQUE_BIT) > 0)
+    return ~(absent | (column >= place["coefficients"].start + 2 * (kinds & DEGREE_MASK)))
+
+
+def _rate_factors(rows, kinds, degree: int, unit_time: float) -> Float[Array, "num width"]:
+    """The factors by which each Gaussian's duration scales its learning rates, see `config.LearningRates`."""
+    factors, place = jnp.ones_like(rows), columns(degree)
+    if unit_time == 0:
+        return factors
+    static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
+    spread = jnp.exp(rows[:, place["log_time_scale"].start])
+    wide = jnp.where(static, np.float32(STATIC_TIME_SCALE), spread) / np.float32(unit_time)
+    factors, power = factors.at[:, place["time_loc_logit"].start].set(wide), jnp.ones_like(wide)
+    for column in range(place["coefficients"].start, place["coefficients"].stop, 2):
+        power = power * (1 / wide)
+        factors = factors.at[:, column : column + 2].set(power[:, None])
+    return factors
+
+
+# ------------------------------------------------------------------------------------------------ frame times
+
+
+@jax.jit
+def update_frame_times(logits, moments, by_time, rate):
+    """The softmax weights of the frame times and their moments after a step, given dL/dt_k."""
+    _, pull = jax.vjp(lambda weights: FrameTimes(weights).times(), logits)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
+        update, moments = FRAME_TIME_ADAM.update(pull(by_time)[0], moments)
+    return logits - rate * update, moments

@@ -1,7 +1,6 @@
-"""Numbers that many Gaussians share: colours, and pairs of standard deviations. Stored once, with an index each."""
+"""Codebooks: values that Gaussians share (colors, pairs of standard deviations), stored once with an index each."""
 
 import dataclasses
-import functools
 import math
 
 import jax
@@ -9,21 +8,21 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Float32, Int, Int32
 
-from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON
+from foldgauss.video.fitting.adam import adam_step
 
-#: Rounds of Lloyd's algorithm, and sizes of palettes tried.
-_LLOYD, _PALETTES = 12, tuple(2**k for k in range(3, 17))
-#: Of the error that sharing adds, what is left once the others have made up for it; and the share of the plan that they
-#: need for that.
-_LEFT, _MENDED_IN = 0.3, 0.1
+#: Rounds of Lloyd's algorithm, and the sizes of codebooks that are tried.
+_LLOYD_ROUNDS, _SIZES = 12, tuple(2**k for k in range(3, 17))
+#: Of the squared error that sharing adds, the fraction that remains after the other parameters have adapted; and the
+#: fraction of the plan that they need for it.
+_REMAINING_ERROR, _ADAPTATION = 0.3, 0.1
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=["index", "first", "second", "counts"], meta_fields=[])
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass
 class Codebook:
-    """Rows of numbers that many Gaussians share, and Adam's moments of each: what is shared learns as one.
+    """Which Gaussians share the values of a leaf, and Adam's moments of each shared value, which is learned as one.
 
-    `index` is the number of each Gaussian's row; of length 0 where none is shared. The rows are the Gaussians' own.
+    `index` is the entry of each Gaussian; of length 0 where nothing is shared. The values are in the Gaussians' rows.
     """
 
     index: Int32[np.ndarray, " num"]
@@ -32,14 +31,14 @@ class Codebook:
     counts: Int32[np.ndarray, " entries"]
 
     @classmethod
-    def of(cls, index: Int[np.ndarray, " num"] | None, width: int) -> "Codebook":
-        """One that has not learned yet; None: nothing is shared."""
+    def create(cls, index: Int[np.ndarray, " num"] | None, width: int) -> "Codebook":
+        """A codebook whose moments are zero; `index` None: nothing is shared."""
         index = np.zeros(0, np.int32) if index is None else index.astype(np.int32)
         moments = np.zeros((int(index.max(initial=-1)) + 1, width), np.float32)
         return cls(index, moments, moments.copy(), np.zeros(len(moments), np.int32))
 
-    def kept(self, stay: Int[np.ndarray, " left"]) -> "Codebook":
-        """That of the Gaussians that stay."""
+    def keep(self, stay: Int[np.ndarray, " left"]) -> "Codebook":
+        """The codebook of the Gaussians `stay`."""
         return dataclasses.replace(self, index=self.index[stay]) if len(self.index) else self
 
     def step(
@@ -47,9 +46,9 @@ class Codebook:
         values: Float32[np.ndarray, "num width"],
         grad: Float32[np.ndarray, "num width"],
         touched: Int[np.ndarray, " touched"],
-        rate: Float32[np.ndarray, " width"],
+        rates: Float32[np.ndarray, " width"],
     ) -> None:
-        """One of Adam's, by the sums of gradients, on the rows that took part: `values` change in place.
+        """A step of Adam on the entries of the Gaussians `touched`, by the sums of their gradients; in place.
 
         Gradients are set to zero.
         """
@@ -59,65 +58,64 @@ class Codebook:
         total = np.stack([np.bincount(index, column, num) for column in grad[touched].T], 1)
         there = np.flatnonzero(np.bincount(index, minlength=num))
         self.counts[there] += 1
-        taken, total = self.counts[there, None], total[there]
-        self.first[there] = BETA1 * self.first[there] + (1 - BETA1) * total
-        self.second[there] = BETA2 * self.second[there] + (1 - BETA2) * total**2
-        mean, square = self.first[there] / (1 - BETA1**taken), self.second[there] / (1 - BETA2**taken)
         moved = np.zeros_like(self.first)
-        moved[there] = rate * mean / (np.sqrt(square) + EPSILON)
+        moved[there], self.first[there], self.second[there] = adam_step(
+            total[there], self.first[there], self.second[there], self.counts[there], rates
+        )
         values -= moved[self.index]
         grad[touched] = 0
 
 
-def shared(
+def find_clusters(
     values: Float32[np.ndarray, "num width"],
     weight: Float[np.ndarray, "num width"],
     price: float,
     seed: int,
     *,
     progress: float = 0.0,
-    most: float = math.inf,
+    max_error: float = math.inf,
 ) -> Int[np.ndarray, " num"] | None:
-    """Which rows share their values: the number of each one's in a palette; None where sharing does not pay.
+    """The cluster of each row, whose members are to share their values; None where sharing does not pay.
 
-    `weight` is what the square of an error of a value adds to the squared error, `price` what a stored number has to
-    save, `progress` the share of the fit that is done: what is left of it mends part of the error, which is
-    `most` at most before. Clusters by Lloyd's algorithm (1982), weighted by the mean of a row's weights, for palettes
-    of several sizes.
+    `weight` is what the square of an error of a value adds to the squared error of the fit, `price` the squared error
+    that a stored parameter has to save, `progress` the fraction of the fit that is done: the rest of it compensates
+    part of the error, which is at most `max_error` before. Lloyd's algorithm (1982), weighted by the mean of each
+    row's weights, for codebooks of several sizes.
     """
     num, width = values.shape
-    left = 1 - (1 - _LEFT) * min((1 - progress) / _MENDED_IN, 1.0)
-    best, least = None, width * num * price
-    for size in (size for size in _PALETTES if size < num):
-        index = _clustered(values.astype(float), weight.mean(1), size, seed)
-        error = float((weight * (values - averaged(values, index)) ** 2).sum())
-        if error > most:
+    remaining = 1 - (1 - _REMAINING_ERROR) * min((1 - progress) / _ADAPTATION, 1.0)
+    best, lowest = None, width * num * price
+    for size in (size for size in _SIZES if size < num):
+        index = _cluster(values.astype(float), weight.mean(1), size, seed)
+        error = float((weight * (values - average_clusters(values, index)) ** 2).sum())
+        if error > max_error:
             continue
         stored = len(np.unique(index)) * width + num * (1 if size <= 256 else 2) / 4
-        cost = left * error + stored * price
-        if cost < least:
-            best, least = index, cost
-        elif best is not None and size != 512:  # indices are longer from there on
+        cost = remaining * error + stored * price
+        if cost < lowest:
+            best, lowest = index, cost
+        elif best is not None and size != 512:  # from there on indices are longer
             break
     return best
 
 
-def averaged(
+def average_clusters(
     values: Float32[np.ndarray, "num width"], index: Int[np.ndarray, " num"]
 ) -> Float32[np.ndarray, "num width"]:
-    """Each row's mean with those of its number: of equal bits for equal numbers."""
+    """Each row replaced by the mean of its cluster, of equal bits within a cluster."""
     count = np.maximum(np.bincount(index), 1)
     sums = np.stack([np.bincount(index, column) for column in values.T], 1)
     return (sums / count[:, None]).astype(np.float32)[index]
 
 
-def _clustered(values: np.ndarray, weight: np.ndarray, size: int, seed: int) -> np.ndarray:
+def _cluster(values: np.ndarray, weight: np.ndarray, size: int, seed: int) -> np.ndarray:
+    """Weighted k-means: the cluster of each value."""
     rng = np.random.default_rng([seed, 5])
     chance = np.maximum(weight, 1e-9 * weight.max() + 1e-300)
-    centre = values[rng.choice(len(values), size, replace=False, p=chance / chance.sum())]
-    for _ in range(_LLOYD):
-        index = scipy.spatial.cKDTree(centre).query(values)[1]
+    center = values[rng.choice(len(values), size, replace=False, p=chance / chance.sum())]
+    for _ in range(_LLOYD_ROUNDS):
+        index = scipy.spatial.cKDTree(center).query(values)[1]
         total = np.bincount(index, chance, size)
         sums = np.stack([np.bincount(index, chance * column, size) for column in values.T], 1)
-        centre = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], centre)
-    return scipy.spatial.cKDTree(centre).query(values)[1]
+        center = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], center)
+    return scipy.spatial.cKDTree(center).query(values)[1]

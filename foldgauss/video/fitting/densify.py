@@ -1,54 +1,124 @@
-"""Births, deaths and resets between the steps of a fit, on the arrays of its state: what `growth` decides is done."""
+"""Densification as in 3D Gaussian Splatting: Gaussians are cloned, split, pruned and reset, by their gradients.
+
+VeGaS takes this over (Kerbl et al. 2023, section 5.2) and adds a criterion of its own, the gradient of m_t. Only the
+positions of split halves are random, drawn by the seed and the step, so a resumed fit continues to the same bits.
+"""
+
+import math
 
 import numpy as np
 
 from foldgauss.render import pixels_per_unit
-from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig, most_gaussians
-from foldgauss.video.fitting.growth import GradientStatistics, Growth, dim, grown
+from foldgauss.video.fitting.growth import GradientStatistics, Growth
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import find_kinds
 
-
-def changes_at(growth: Growth, step: int) -> bool:
-    """Whether any row is born, dropped or dimmed after this step of a plan that `growth` is scaled to."""
-    return growth.grows_at(step) or growth.resets_at(step)
+#: The published code renders, and so measures, a splat within this many standard deviations.
+_RADIUS = 3.0
 
 
 def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
-    """Births, deaths and resets that are due now that the plan is known; after the last, statistics end.
+    """Carry out the densification and the reset that are due at the state's step; after the last, statistics end.
 
-    `size`: (height, width) of the frames. Returns whether there are other Gaussians now.
+    `size`: (height, width) of the frames. Returns whether the number of Gaussians may have changed.
     """
     growth = config.growth.for_plan(state.plan)
     grows = growth.grows_at(state.step)
     if grows:
-        _replace(state, config, growth, size)
+        stay, born = densify(
+            state.rows,
+            state.statistics,
+            growth,
+            degree=config.degree,
+            pixels=pixels_per_unit(size),
+            max_num=most_gaussians(config, len(state.frame_errors)),
+            step=state.step,
+            seed=config.seed,
+        )
+        state.keep(stay)
+        state.extend(rows=born, kinds=find_kinds(born, config.degree))
     if growth.resets_at(state.step):
-        dim(state.rows, state.first, state.second, growth, config.degree)
+        reset_opacities(state.rows, state.first, state.second, growth, config.degree)
     if state.step + 1 >= growth.until_step:
         state.statistics = None
     return grows
 
 
-def _replace(state: FitState, config: FitConfig, growth: Growth, size: tuple[int, int]) -> None:
-    """Births and deaths: moments of those that stay are theirs, those of the new ones are zero."""
-    stay, born = grown(
-        state.rows,
-        state.statistics,
-        growth,
-        degree=config.degree,
-        pixels=pixels_per_unit(size),
-        most=most_gaussians(config, len(state.frame_errors)),
-        step=state.step,
-        seed=config.seed,
+def densify(
+    rows: np.ndarray,
+    statistics: GradientStatistics,
+    growth: Growth,
+    *,
+    degree: int,
+    pixels: float,
+    max_num: int,
+    step: int,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The result of densification and pruning after `step`: indices of the rows that stay, in order, and the new rows.
+
+    `rows` is float32 (num, width), see `row_layout`; `pixels` is the number of pixels along one unit of model space.
+    Births do not exceed `max_num` rows: where there is no room for all, those come first whose gradients exceed their
+    thresholds by most. At least one row stays. New rows belong at the end of the array: behind all others.
+    Source: Kerbl et al. 2023, section 5.2.
+    """
+    place, num = columns(degree), len(rows)
+    chosen = _choose_parents(statistics, growth, max_num - num)
+    small = np.exp(rows[chosen, place["log_scale"]].max(axis=1)) <= growth.clone_below
+    clones, parents = rows[chosen[small]], chosen[~small]
+    rng = np.random.default_rng([seed, 2, step])
+    halves = [_draw_half(rows[parents], rng, growth.shrinking, place) for _ in range(2)]
+    stays = np.ones(num, bool)
+    stays[parents] = False
+    born = np.concatenate([clones, *halves])
+    good, good_born = (_survives(part, growth, place, pixels, step) for part in (rows, born))
+    stays &= good
+    if not (stays.any() or good_born.any()):
+        stays[np.argmax(rows[:, place["opacity_logit"]])] = True
+    return np.flatnonzero(stays), born[good_born]
+
+
+def reset_opacities(rows: np.ndarray, first: np.ndarray, second: np.ndarray, growth: Growth, degree: int) -> None:
+    """Lower opacities to `reset_opacity`, in place; their moments `first` and `second` become zero."""
+    place = columns(degree)["opacity_logit"]
+    rows[:, place] = np.minimum(rows[:, place], _logit(growth.reset_opacity))
+    first[:, place] = 0
+    second[:, place] = 0
+
+
+def _choose_parents(statistics: GradientStatistics, growth: Growth, room: int) -> np.ndarray:
+    """Indices, in order, of at most `room` Gaussians whose mean gradients reach a threshold."""
+    steps = np.maximum(statistics.seen, 1).astype(np.float32)
+    excess = np.maximum(
+        statistics.screen / (steps * np.float32(growth.screen_gradient)),
+        statistics.time / (steps * np.float32(growth.time_gradient)),
     )
-    state.rows = np.concatenate([state.rows[stay], born])
-    state.first, state.second = (
-        np.concatenate([part[stay], np.zeros_like(born)]) for part in (state.first, state.second)
-    )
-    state.counts = np.concatenate([state.counts[stay], np.zeros(len(born), np.int32)])
-    state.kinds = np.concatenate([state.kinds[stay], find_kinds(born, config.degree)])
-    state.young = np.concatenate([state.young[stay], np.zeros(len(born), bool)])
-    state.colors, state.shapes = Codebook.of(None, 3), Codebook.of(None, 2)  # those born have their own
-    state.statistics = GradientStatistics.zeros(len(state.rows))
+    wanted = np.flatnonzero(excess >= 1)
+    first = np.argsort(-excess[wanted], kind="stable")[: max(room, 0)]
+    return np.sort(wanted[first])
+
+
+def _draw_half(parents: np.ndarray, rng: np.random.Generator, shrinking: float, place: dict[str, slice]) -> np.ndarray:
+    """A smaller Gaussian for each parent, at a position drawn from it; all else is copied from the parent."""
+    rows = parents.copy()
+    along = np.exp(parents[:, place["log_scale"]]) * rng.standard_normal((len(parents), 2), np.float32)
+    angle = np.float32(2 * np.pi) / (1 + np.exp(-parents[:, place["angle_logit"]][:, 0]))
+    cos, sin = np.cos(angle), np.sin(angle)
+    rows[:, place["loc"]] += np.stack([cos * along[:, 0] - sin * along[:, 1], sin * along[:, 0] + cos * along[:, 1]], 1)
+    rows[:, place["log_scale"]] -= np.float32(np.log(shrinking))
+    return rows
+
+
+def _survives(rows: np.ndarray, growth: Growth, place: dict[str, slice], pixels: float, step: int) -> np.ndarray:
+    """Which rows are neither too faint nor, after `big_from`, too big."""
+    lives = rows[:, place["opacity_logit"]][:, 0] >= _logit(growth.prune_opacity)
+    if step > growth.big_from:
+        widest = min(growth.prune_scale, growth.prune_radius / (_RADIUS * pixels))
+        lives &= rows[:, place["log_scale"]].max(axis=1) <= np.float32(np.log(widest))
+    return lives
+
+
+def _logit(p: float) -> np.float32:
+    return np.float32(math.log(p) - math.log1p(-p))

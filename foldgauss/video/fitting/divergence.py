@@ -1,196 +1,184 @@
-"""A fit that comes apart is seen, named and taken back to where it was still sound.
+"""Divergence: detected while a fit runs, named in a warning, and undone by a return to the last finite state.
 
-Two signs: numbers that are none, and pictures that become much worse than they have been. Either comes of rates that
-are too high for the clip, or of a state that was broken before.
+The signs are parameters that are not finite, and errors that become much larger than they were. Either comes of
+learning rates too high for the clip, or of a state that was broken before.
 """
 
-import copy
-import dataclasses
 import math
 import warnings
 
-import jax
 import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.state import ARRAYS, FitState
+from foldgauss.video.fitting.schedule import BACKOFF_FACTOR
+from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.row_layout import columns
 
-#: Steps from one sound state that is remembered to the next. (A copy of 40,000 Gaussians takes 4 ms.)
-REMEMBERED = 50
-#: A mean squared error of so many times the best one known is no chance: 6 dB.
+#: Steps between the states that are kept to return to. (A copy of 40,000 Gaussians takes 4 ms.)
+KEEP_EVERY = 50
+#: A mean squared error of so many times the lowest one known is no chance: 6 dB.
 MUCH_WORSE = 4.0
-#: Above 35 dB nothing has come apart.
-FINE = 3e-4
-#: A fit that after so many passes is worse than its start by this, 1 dB, gets nowhere.
-NO_BETTER, LOST_PASSES = 1.25, 6
-#: Each time a fit is taken back its rates are divided by this, as often as `MOST_BACKOFFS`: down to 1/4096.
-LOWERED, MOST_BACKOFFS = 4.0, 6
-#: How far a frame time's logit may come from its last sound value, one of some `REMEMBERED` steps ago: by then its
-#: interval is e^15 times as long or short by the others, and float32 tells neighbours no longer apart.
-FARTHEST_TIME = 15.0
-#: The least unit that a leaf's moves are judged in: where all start alike, as opacities do, their own spread is none.
-LEAST_UNIT = {"loc": 0.3}  # of the frame; 1 for logits, logarithms, colours and folds
+#: Above 35 dB a fit has not diverged.
+GOOD_ERROR = 3e-4
+#: A fit that after so many passes is worse than its start by this factor, 1 dB, does not converge.
+NOT_BETTER, START_PASSES = 1.25, 6
+#: How often a fit backs off, each time by `BACKOFF_FACTOR`: down to 1/4096 of its rates.
+MAX_BACKOFFS = 6
+#: How far a frame time's logit may move from that of the state kept, some `KEEP_EVERY` steps ago: its interval is then
+#: e^15 times as long or short compared with the others, and float32 can no longer tell neighbors apart.
+MAX_TIME_MOVE = 15.0
+#: The least scale that a leaf's moves are measured in: where all start alike, as opacities do, their own spread is 0.
+MIN_SCALE = {"loc": 0.3}  # of the frame; 1 for logits, logarithms, colors and folds
 #: All frames must have been seen at a size before their errors are compared.
-PASSES, LEAST_STEPS = 2, 20
+PASSES, MIN_STEPS = 2, 20
 
 
 class DivergenceWarning(RuntimeWarning):
-    """A fit came apart and goes on from a sound state, at lower rates."""
+    """A fit diverged; it continues from the last finite state with lower learning rates."""
 
 
 class FitDiverged(ArithmeticError):
-    """A fit came apart and stopped; `state` is the last sound one, None if there was none."""
+    """A fit diverged and stopped; `state` is the last finite one, None if there was none."""
 
     def __init__(self, message: str, state: FitState | None):
         super().__init__(message)
         self.state = state
 
 
-def _copied(state: FitState) -> FitState:
-    """As it is now, arrays and all, but for the sound state before; on the device that holds it."""
-    if state.held is None:
-        return jax.tree.map(np.array, dataclasses.replace(state, sound=None))
-    other = copy.copy(state)
-    other.sound, other.held = None, state.held.copied()
-    return other
-
-
-def _put_back(state: FitState) -> None:
-    """The arrays of its last sound state are handed over as copies: a state owns what it updates in place."""
-    state.held = None
-    for name in ARRAYS:
-        setattr(state, name, jax.tree.map(np.array, getattr(state.sound, name)))
-
-
 class Guard:
-    """Watches the steps of a fit. What it goes by is kept in the state, so that it knows as much after a stop.
+    """Watches the steps of a fit. All that it decides by is in the state, so that resuming changes nothing.
 
-    Errors are those of the same frames at the same size, each as it was last seen: a frame alone that is much harder
-    than the others raises no alarm. Where they may rise for other reasons, only numbers are looked at: where Gaussians
-    are born and dropped, and over the random backgrounds of frames with alpha.
+    Errors are those of the same frames at the same size, each as it was last seen: a single frame much harder than the
+    others raises no alarm. Where errors may rise for other reasons, only finiteness is tested: where Gaussians are
+    added and pruned, and over the random backgrounds of frames with alpha.
     """
 
     def __init__(self, state: FitState, config: FitConfig, steps_per_pass: int, *, alpha: bool):
         self.config, self.steps_per_pass = config, steps_per_pass
         self.comparable = config.growth is None and config.economy is None and not alpha
-        fault = _broken(state, config)
+        fault = _find_nonfinite(state, config)
         if fault:
-            cure = "Start anew, without the kept state."
-            raise FitDiverged(f"state: expected finite numbers, got {fault} at step {state.step}. {cure}", None)
-        if state.sound is None:
+            cure = "Start a new fit instead of resuming this state."
+            raise FitDiverged(f"state: expected finite parameters, got {fault} at step {state.step}. {cure}", None)
+        if state.last_finite is None:
             self.restart(state)
-            state.sound = _copied(state)
+            state.last_finite = state.copy()
 
     def restart(self, state: FitState) -> None:
-        """From this step on errors are those of other pictures."""
-        state.settled = state.step + max(PASSES * self.steps_per_pass, LEAST_STEPS)
-        state.should_be_better = state.step + LOST_PASSES * self.steps_per_pass
+        """From this step on, errors are not comparable with those before."""
+        state.compare_from = state.step + max(PASSES * self.steps_per_pass, MIN_STEPS)
+        state.improve_by = state.step + START_PASSES * self.steps_per_pass
 
-    def fault(self, state: FitState, loss: float) -> str:
-        """What is wrong after a step, in words; empty if nothing is."""
-        if not (math.isfinite(loss) and state.finite("rows") and state.finite("time_logits")):
-            return _broken(state, self.config) or f"a loss of {loss}"
-        if state.backoffs >= MOST_BACKOFFS:
-            return ""  # where no tries are left, bad pictures are better than none
-        if self._times_moved(state) > FARTHEST_TIME:
-            return f"frame times moved by e^{self._times_moved(state):.0f} since step {state.sound.step}"
-        if not self.comparable or state.step < state.settled:
+    def find_fault(self, state: FitState, loss: float) -> str:
+        """A description of what is wrong after a step; empty if nothing is."""
+        if not (math.isfinite(loss) and state.is_finite("rows") and state.is_finite("time_logits")):
+            return _find_nonfinite(state, self.config) or f"a loss of {loss}"
+        if state.backoffs >= MAX_BACKOFFS:
+            return ""  # no back-off is left, and a bad fit is better than none
+        if _time_move(state) > MAX_TIME_MOVE:
+            return f"frame times moved by e^{_time_move(state):.0f} since step {state.last_finite.step}"
+        if not self.comparable or state.step < state.compare_from:
             return ""
-        worse = self._times_worse(state)
+        worse = self._error_ratio(state)
         if worse > MUCH_WORSE:
             decibels, moved = 10 * math.log10(worse), self._most_moved(state)
-            return f"pictures {decibels:.0f} dB worse than they were, {moved} having moved most"
-        if state.step >= state.should_be_better and self._times_start(state) > NO_BETTER:
+            return f"frames are {decibels:.0f} dB worse than they were; {moved} moved most"
+        if state.step >= state.improve_by and self._start_ratio(state) > NOT_BETTER:
             moved = self._most_moved(state)
-            return f"pictures are worse than at the start after {LOST_PASSES} passes, {moved} having moved most"
+            return f"frames are worse than at the start after {START_PASSES} passes; {moved} moved most"
         error = float(state.frame_errors.mean())
         state.best_error = min(error, state.best_error or error)
         return ""
 
-    def _times_worse(self, state: FitState) -> float:
-        """The error by the best one known."""
-        error = float(state.frame_errors.mean())
-        of_all = error / state.best_error if state.best_error > 0 and error > FINE else 0.0
-        return max(of_all, self._times_start(state))
+    def keep_good(self, state: FitState) -> None:
+        """Keep a copy of the state, every `KEEP_EVERY` steps, unless its moments overflow or its frames look bad."""
+        due = state.step - state.last_finite.step >= KEEP_EVERY
+        if state.backoffs and state.step < state.compare_from:
+            return  # not all frames have been seen since the back-off
+        bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > NOT_BETTER)
+        if due and not bad and state.is_finite("second"):
+            state.last_finite = state.copy()
 
-    def _times_start(self, state: FitState) -> float:
-        """The error by that of the start, both of the frames of which that is known."""
+    def finish(self, state: FitState) -> None:
+        """At the end of a fit with no back-off left: if its frames are worse than they were, restore the last state."""
+        if not self.comparable or state.backoffs < MAX_BACKOFFS:
+            return
+        worse = self._error_ratio(state)
+        if worse > MUCH_WORSE or self._start_ratio(state) > NOT_BETTER:
+            moved, kept = self._most_moved(state), state.last_finite
+            state.restore()
+            state.error = kept.error or float(np.mean([error for _, error in state.start_errors] or [0.0]))
+            warnings.warn(
+                f"the fit ended at step {state.step} with frames {10 * math.log10(worse):.0f} dB worse than they were; "
+                f"{moved} moved most. The result is that of step {kept.step}: lower these learning rates.",
+                DivergenceWarning,
+                stacklevel=3,
+            )
+
+    def back_off(self, state: FitState, fault: str, error_before: float) -> None:
+        """Restore the arrays of the last finite state and lower the learning rates. The count of steps goes on.
+
+        Raises FitDiverged if the fit is to stop, or has backed off `MAX_BACKOFFS` times. Its state is then that before
+        the step, whose running error was `error_before`, but for the arrays.
+        """
+        step, kept = state.step, state.last_finite
+        state.restore()
+        message = f"the fit diverged at step {step}: {fault}."
+        exhausted = state.backoffs >= MAX_BACKOFFS
+        if self.config.on_divergence == "stop" or exhausted:
+            state.step, state.error = step - 1, error_before
+            cure = "Lower the learning rates, or give on_divergence='back-off', which finds them."
+            if exhausted:
+                lowest = f"{BACKOFF_FACTOR**-MAX_BACKOFFS:.1g} of those given"
+                cure = f"It did so even with learning rates {lowest}: lower these, or check the frames."
+            raise FitDiverged(f"{message} The state is that of step {kept.step}. {cure}", state)
+        state.backoffs += 1
+        state.error = kept.error
+        self.restart(state)
+        rates = f"1/{BACKOFF_FACTOR**state.backoffs:.0f} of those given"
+        warnings.warn(
+            f"{message} It continues from step {kept.step} with learning rates {rates}.",
+            DivergenceWarning,
+            stacklevel=3,
+        )
+
+    def _error_ratio(self, state: FitState) -> float:
+        """The error divided by the lowest one known."""
+        error = float(state.frame_errors.mean())
+        of_all = error / state.best_error if state.best_error > 0 and error > GOOD_ERROR else 0.0
+        return max(of_all, self._start_ratio(state))
+
+    def _start_ratio(self, state: FitState) -> float:
+        """The error divided by that at the start, both over the frames for which that is known."""
         if not state.start_errors:
             return 0.0
         frames, errors = zip(*state.start_errors, strict=True)
         before, now = float(np.mean(errors)), float(np.mean(state.frame_errors[list(frames)]))
-        return now / before if before > 0 and now > FINE else 0.0
-
-    def remember(self, state: FitState) -> None:
-        """Now and then, of a state in which nothing is wrong. One whose moments overflow is not sound, nor one whose
-        pictures look bad, be it by too few of them to say so."""
-        due = state.step - state.sound.step >= REMEMBERED
-        if state.backoffs and state.step < state.settled:
-            return  # what the errors were, and are now, is not known of all frames
-        bad = self.comparable and (self._times_worse(state) > MUCH_WORSE or self._times_start(state) > NO_BETTER)
-        if due and not bad and state.finite("second"):
-            state.sound = _copied(state)
-
-    def finish(self, state: FitState) -> None:
-        """At the end: where no tries were left and pictures came out worse than they were, they are those of before."""
-        if not self.comparable or state.backoffs < MOST_BACKOFFS:
-            return
-        worse = max(self._times_worse(state), self._times_start(state))
-        if worse > MUCH_WORSE or self._times_start(state) > NO_BETTER:
-            decibels = 10 * math.log10(worse)
-            told = f"the fit ended at step {state.step} with pictures {decibels:.0f} dB worse than they were"
-            moved, start = self._most_moved(state), state.sound.step
-            _put_back(state)
-            state.error = state.sound.error or float(np.mean([error for _, error in state.start_errors] or [0.0]))
-            cure = f"What is kept is of step {start}: lower these rates."
-            warnings.warn(f"{told}, {moved} having moved most. {cure}", DivergenceWarning, stacklevel=3)
-
-    def back_off(self, state: FitState, fault: str, error_before: float) -> None:
-        """Take the arrays of `state` back, and lower its rates. Steps go on counting: so a fit ends when it should.
-
-        Raises FitDiverged if the fit is to stop, or has been taken back `MOST_BACKOFFS` times. Its state is then that
-        before the step, whose running error was `error_before`, but for the arrays.
-        """
-        step, start = state.step, state.sound.step
-        _put_back(state)
-        told = f"the fit came apart at step {step}: {fault}."
-        lowest = state.backoffs >= MOST_BACKOFFS
-        if self.config.on_divergence == "stop" or lowest:
-            state.step, state.error = step - 1, error_before
-            cure = "Give lower rates, or 'back-off', which finds them."
-            if lowest:
-                lowest_rates = f"{LOWERED**-MOST_BACKOFFS:.1g} of those asked for"
-                cure = f"So it did with rates {lowest_rates}: lower these, or look at the frames."
-            raise FitDiverged(f"{told} What is kept is of step {start}. {cure}", state)
-        state.backoffs += 1
-        state.error = state.sound.error
-        self.restart(state)
-        rates = f"{LOWERED**state.backoffs:.0f}th"
-        warnings.warn(f"{told} It goes on from step {start}, with rates a {rates}.", DivergenceWarning, stacklevel=3)
+        return now / before if before > 0 and now > GOOD_ERROR else 0.0
 
     def _most_moved(self, state: FitState) -> str:
-        """The leaf that is farthest from where it was when all was sound, by its own spread then."""
-        before, rows = state.sound.rows, state.rows
+        """The leaf that moved farthest from the last finite state, in units of its spread there."""
+        before, rows = state.last_finite.rows, state.rows
         if before.shape != rows.shape:
             return "some leaves"
         with np.errstate(over="ignore", invalid="ignore"):
             moved = {
                 name: float(np.median(np.abs(rows[:, at] - before[:, at])))
-                / max(float(before[:, at].std()), LEAST_UNIT.get(name, 1.0))
+                / max(float(before[:, at].std()), MIN_SCALE.get(name, 1.0))
                 for name, at in columns(self.config.degree).items()
                 if at.stop > at.start
             }
-        moved["frame times"] = self._times_moved(state)
+        moved["frame times"] = _time_move(state)
         return max(moved, key=moved.get)
 
-    def _times_moved(self, state: FitState) -> float:
-        """The farthest that a frame time's logit is from where it was when all was sound."""
-        return float(np.abs(np.asarray(state.time_logits) - state.sound.time_logits).max(initial=0.0))
+
+def _time_move(state: FitState) -> float:
+    """The largest distance of a frame time's logit from the last finite state."""
+    return float(np.abs(np.asarray(state.time_logits) - state.last_finite.time_logits).max(initial=0.0))
 
 
-def _broken(state: FitState, config: FitConfig) -> str:
-    """The leaves with numbers that are none, and how many Gaussians have them; empty if there are none."""
+def _find_nonfinite(state: FitState, config: FitConfig) -> str:
+    """The leaves with NaN or infinities, and how many Gaussians have them; empty if there are none."""
     found = []
     rows = state.rows
     for name, at in columns(config.degree).items():

@@ -1,4 +1,4 @@
-"""Where the Gaussians start: drawn from the clip's own detail, with its own colours; or uniformly, as published."""
+"""The initial Gaussians of a fit: drawn from the detail and the colors of the clip; or uniformly, as published."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,42 +10,43 @@ import scipy
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
-from foldgauss.video.fitting.optical_flow import Motion, fitted_folds
+from foldgauss.video.fitting.optical_flow import Motion, fit_folds
 from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 
-#: Share of the starts that is spread evenly, so that flat parts are covered too.
-EVEN_SHARE = 0.15
-#: Starting standard deviation in units of the distance to the neighbours alive at the same time.
+#: Fraction of the starts that is spread evenly, so that flat regions are covered too.
+EVEN_FRACTION = 0.15
+#: Initial standard deviation in units of the distance to the neighbors alive at the same time.
 SCALE_FACTOR = 1.3
 START_OPACITY = 0.3
-#: Where contributions are added up, so that those of the neighbours come to 1.
+#: With compositing "sum": neighboring contributions then add up to 1.
 SUMMED_OPACITY = 1 / (2 * np.pi * SCALE_FACTOR**2)
-#: sigma_t of a start that stands still is drawn log-uniformly between these, in units of the clip's duration.
+#: sigma_t of a start at rest is drawn log-uniformly between these, in units of the clip's duration.
 TIME_SCALES = (0.02, 0.4)
-#: sigma_t of a start that follows its track, in units of half the track; and in frames at the least.
-TRACK_SHARES, LEAST_FRAMES = (0.25, 1.2), 0.6
-#: That of a start whose pixel neither neighbour shows, in frames: with an envelope of power 1 it is then a quarter as
-#: wide there. (Two pictures in turn, 120 steps: 19.5 dB with 0.6, 22.3 with this; bikes, 80x160: 31.65 and 31.70.)
-ALONE_FRAMES = 0.42
-#: Where the fold misses the track by more than this many pixels, sigma_t is shortened by this, some times.
+#: sigma_t of a start that follows its track, in units of half the track; and at least, in frames.
+TRACK_FRACTIONS, MIN_FRAMES = (0.25, 1.2), 0.6
+#: sigma_t, in frames, of a start that cannot be tracked to either neighbor: with an envelope of power 1 it is then a
+#: quarter as wide there. (Two alternating images, 120 steps: 19.5 dB with 0.6, 22.3 with this; bikes, 80x160: 31.65 and
+#: 31.70.)
+UNTRACKED_FRAMES = 0.42
+#: Where the fold misses the track by more than this many pixels, sigma_t is multiplied by this, so often at most.
 MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
-#: A pixel is steady whose colour changes by less than this (of 1, root mean square over the channels) in any of so many
-#: frames.
-STEADY, STEADY_FRAMES = 0.03, 64
+#: A pixel is constant whose color changes by less than this (of 1, root mean square over the channels) in any of so
+#: many frames.
+CONSTANT, CONSTANT_FRAMES = 0.03, 64
 CHUNK = 12_000  # tracks held at once: some 3 kB each on the way
-#: Starts per frame that are tried, to see how long they will be seen; that is so many sigma_t to either side. Of a long
-#: clip as many in all as `MOST_PILOTS`, or they take longer than the fit.
-PILOT, CORE, ROUNDS, MOST_PILOTS = 32, 1.5, 50, 40_000
-#: With fewer starts than this for each frame, homes are drawn at even distances.
+#: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
+#: at most `MAX_PILOTS` in all, since they would take longer than the fit.
+PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
+#: With fewer starts than this per frame, their frames are drawn at even distances.
 FEW_STARTS = 16
-#: Share of the starts that is spread so that all frames, however short the tracks there, are covered alike. With more,
-#: the worst frames get better and the mean worse.
+#: Fraction of the starts that is spread so that all frames are covered equally, however short the tracks there. With
+#: more, the worst frames get better and the mean worse.
 EVEN_FRAMES = 0.2
 #: Uniform starts. VeGaS: sigma_t and fold coefficients lie between these (the latter in published units), opacity is
-#: 0.1, colours are below one step of 8 bits. 3DGS: scales are the mean distance to so many neighbours.
-UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBOURS = (0.01, 1.0), 1.0, 0.1, 1 / 255, 3
-#: Their box is the frame, larger by this. How large the published "bounding box" is, the paper does not say; folds
-#: carry Gaussians into the frame and out of it anyway.
+#: 0.1, colors are below one step of 8 bits. 3DGS: scales are the mean distance to so many neighbors.
+UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 1 / 255, 3
+#: Their box is the frame, larger by this factor. The paper does not give the size of its "bounding box"; folds move
+#: Gaussians into the frame and out of it anyway.
 UNIFORM_BOX = 1.1
 
 
@@ -59,37 +60,37 @@ def initialize(
     times: np.ndarray | None = None,
     motion: Motion | None = None,
     opacity: float = START_OPACITY,
-    lasting: bool = False,
+    with_static: bool = False,
 ) -> FoldedSplats:
-    """Starting splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
+    """Initial splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
-    Positions are drawn by image gradient within each frame, m_t at that frame, sizes by the local density of starts,
-    colours from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a share of the time
-    for which that works; without, folds are at rest and sigma_t is log-uniform. With `lasting`, starts whose pixel
-    never changes are there throughout the clip, behind the others.
+    Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
+    density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
+    fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. With `with_static`,
+    starts whose pixel never changes are static Gaussians, behind the others.
     """
     rng = np.random.default_rng([seed, 0])
     num_frames = len(frames)
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
-    share_of = lambda k: detail(frames[k])  # noqa: E731
-    make = lambda home, position: born(  # noqa: E731
+    density_of = lambda k: measure_detail(frames[k])  # noqa: E731
+    make = lambda home, position: make_splats(  # noqa: E731
         frames, home, position, times, degree, envelope, motion, rng, opacity
     )
-    pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MOST_PILOTS // num_frames), 1))
-    _, spread = make(pilot, drawn(pilot, share_of, rng)[0])
+    pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MAX_PILOTS // num_frames), 1))
+    _, spread = make(pilot, draw_positions(pilot, density_of, rng)[0])
     chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
-    if num_gaussians < FEW_STARTS * num_frames:  # where chance would leave out whole stretches: at even distances
+    if num_gaussians < FEW_STARTS * num_frames:  # random frames would leave out whole intervals
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
         home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
-    position, density = drawn(home, share_of, rng)
+    position, density = draw_positions(home, density_of, rng)
     splats, spread = make(home, position)
-    still = steady(frames, home, position) if lasting else np.zeros(num_gaussians, bool)
-    splats, spread = without_end(splats, still), np.where(still, np.exp(STATIC_LOG_TIME_SCALE), spread)
-    alive = num_alive(times[home], spread, times)[home]
+    static = find_constant(frames, home, position) if with_static else np.zeros(num_gaussians, bool)
+    splats, spread = make_static(splats, static), np.where(static, np.exp(STATIC_LOG_TIME_SCALE), spread)
+    alive = count_alive(times[home], spread, times)[home]
     scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     order = rng.permutation(num_gaussians)  # depth has nothing to do with time
-    order = order[np.argsort(still[order], kind="stable")]  # but what never changes is behind
+    order = order[np.argsort(static[order], kind="stable")]  # except that static Gaussians are behind
     splats = dataclasses.replace(splats, log_scale=np.log(np.stack([scale, scale], -1), dtype=np.float32))
     return jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, splats)
 
@@ -97,25 +98,25 @@ def initialize(
 def initialize_uniform(
     num_gaussians: int, size: tuple[int, int], *, degree: int, envelope: TimeLikelihood, seed: int
 ) -> FoldedSplats:
-    """The published starts for frames of `size` (height, width): uniform, whatever the clip shows.
+    """The published initial splats for frames of `size` (height, width): uniform, whatever the clip shows.
 
     Positions lie in a box `UNIFORM_BOX` times the frame, m_t in (0, 1), sigma_t, folds and angles likewise uniformly;
-    Gaussians are round, as wide as the mean distance to their `NEIGHBOURS` nearest, faint and almost black.
+    Gaussians are round, as wide as the mean distance to their `NEIGHBORS` nearest, faint and almost black.
     Source: VeGaS, "Implementation Details", and constants of its published code.
     """
     rng = np.random.default_rng([seed, 0])
     frame = np.array(size[::-1]) / max(size)
     loc = rng.uniform(-0.5, 0.5, (num_gaussians, 2)) * UNIFORM_BOX * frame
-    near = min(NEIGHBOURS, num_gaussians - 1)
-    # The nearest is the point itself; one that is alone is as wide as the frame.
+    near = min(NEIGHBORS, num_gaussians - 1)
+    # The nearest is the point itself; a single one is as wide as the frame.
     scale = scipy.spatial.cKDTree(loc).query(loc, near + 1)[0][:, 1:].mean(axis=1) if near else np.ones(1)
     limit = UNIFORM_FOLD * PUBLISHED_UNIT
-    share = lambda: rng.uniform(1e-6, 1 - 1e-6, num_gaussians)  # noqa: E731
+    unit = lambda: rng.uniform(1e-6, 1 - 1e-6, num_gaussians)  # noqa: E731
     leaves = {
         "loc": loc,
         "log_scale": np.log(np.stack([scale, scale], -1)),
-        "angle_logit": _logit(share()),
-        "time_loc_logit": _logit(share()),
+        "angle_logit": _logit(unit()),
+        "time_loc_logit": _logit(unit()),
         "log_time_scale": np.log(rng.uniform(*UNIFORM_TIME_SCALES, num_gaussians)),
         "coefficients": rng.uniform(-limit, limit, (num_gaussians, degree, 2)),
         "opacity_logit": _logit(np.full(num_gaussians, UNIFORM_OPACITY)),
@@ -124,23 +125,23 @@ def initialize_uniform(
     return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope)
 
 
-def drawn(
-    home: np.ndarray, share_of: Callable[[int], np.ndarray], rng: np.random.Generator
+def draw_positions(
+    home: np.ndarray, density_of: Callable[[int], np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (num, 2) in pixels, one for each of the frames `home`, and their density, per pixel, there.
+    """Positions (num, 2) in pixels, one for each of the frames `home`, and the density, per pixel, there.
 
-    `share_of(k)` is the density over the pixels of frame k, (height, width), summing to 1.
+    `density_of(k)` is the density over the pixels of frame k, (height, width), summing to 1.
     """
     position, density = np.empty((len(home), 2)), np.empty(len(home))
     for k in np.unique(home):
-        here, share = np.flatnonzero(home == k), share_of(k)
-        pixel = _draw(share.ravel(), rng.random(len(here)))
-        density[here] = share.ravel()[pixel]
-        position[here] = np.stack(np.divmod(pixel, share.shape[1])[::-1], -1)
+        here, own = np.flatnonzero(home == k), density_of(k)
+        pixel = _draw(own.ravel(), rng.random(len(here)))
+        density[here] = own.ravel()[pixel]
+        position[here] = np.stack(np.divmod(pixel, own.shape[1])[::-1], -1)
     return position + rng.random(position.shape), density
 
 
-def born(
+def make_splats(
     frames: np.ndarray,
     home: np.ndarray,
     position: np.ndarray,
@@ -151,9 +152,9 @@ def born(
     rng: np.random.Generator,
     opacity: float,
 ) -> tuple[FoldedSplats, np.ndarray]:
-    """Splats at `position` in frames `home`, one pixel wide, with the frames' own colours; and their sigma_t."""
+    """Splats at `position` in frames `home`, one pixel wide, with the colors of the frames; and their sigma_t."""
     num, (height, width) = len(home), frames.shape[1:3]
-    interval = np.diff(times).min(initial=1.0)  # one frame alone has all the time
+    interval = np.diff(times).min(initial=1.0)  # a single frame lasts the whole clip
     if motion is None:
         time = times[home] + rng.uniform(-0.5, 0.5, num) * interval
         coefficients = np.zeros((num, degree, 2), np.float32)
@@ -161,7 +162,7 @@ def born(
         spread = np.exp(rng.uniform(np.log(shortest), np.log(max(TIME_SCALES[1], shortest)), num))
     else:
         time = times[home]
-        coefficients, spread = along_tracks(motion, home, position, degree, rng)
+        coefficients, spread = follow_tracks(motion, home, position, degree, rng)
         coefficients /= np.float32(interval) ** np.arange(1, degree + 1)[:, None]
         spread = spread * interval
     column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
@@ -179,19 +180,19 @@ def born(
     return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope), spread
 
 
-def steady(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Whether a pixel's colour is the same in all frames, but for noise: bool (num,); many frames are sampled."""
+def find_constant(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Whether the color of a pixel is the same in all frames (or a sample of them), up to noise: bool (num,)."""
     height, width = frames.shape[1:3]
     column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
-    own, most = frames[home, row, column].astype(np.float32), np.zeros(len(home), np.float32)
-    for k in np.unique(np.linspace(0, len(frames) - 1, STEADY_FRAMES).round().astype(int)):
+    own, largest = frames[home, row, column].astype(np.float32), np.zeros(len(home), np.float32)
+    for k in np.unique(np.linspace(0, len(frames) - 1, CONSTANT_FRAMES).round().astype(int)):
         change = frames[k, row, column] - own
-        most = np.maximum(most, (change * change).mean(1))
-    return most < (255 * STEADY) ** 2
+        largest = np.maximum(largest, (change * change).mean(1))
+    return largest < (255 * CONSTANT) ** 2
 
 
-def without_end(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
-    """Those of the splats made to last, at rest."""
+def make_static(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
+    """The splats with those of `which` made static: at rest throughout the clip."""
     return dataclasses.replace(
         splats,
         time_loc_logit=np.where(which, np.float32(0), splats.time_loc_logit),
@@ -200,7 +201,7 @@ def without_end(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
     )
 
 
-def along_tracks(
+def follow_tracks(
     motion: Motion, home: np.ndarray, position: np.ndarray, degree: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`."""
@@ -208,37 +209,37 @@ def along_tracks(
     for start in range(0, len(home), CHUNK):
         part = slice(start, start + CHUNK)
         tracks = motion.follow(home[part], position[part].astype(np.float32))
-        shares = np.exp(rng.uniform(*np.log(TRACK_SHARES), len(tracks.known)))
-        wide = np.maximum(shares * tracks.reach / 2, LEAST_FRAMES)
-        wide[tracks.reach == 0] = ALONE_FRAMES
-        folds, miss = fitted_folds(tracks, wide, degree)
+        fractions = np.exp(rng.uniform(*np.log(TRACK_FRACTIONS), len(tracks.known)))
+        wide = np.maximum(fractions * tracks.reach / 2, MIN_FRAMES)
+        wide[tracks.reach == 0] = UNTRACKED_FRAMES
+        folds, miss = fit_folds(tracks, wide, degree)
         for _ in range(SHORTENINGS):
-            off = np.flatnonzero((miss > MISS) & (wide > LEAST_FRAMES))
+            off = np.flatnonzero((miss > MISS) & (wide > MIN_FRAMES))
             if not len(off):
                 break
-            wide[off] = np.maximum(wide[off] * SHORTENING, LEAST_FRAMES)
-            folds[off], miss[off] = fitted_folds(tracks[off], wide[off], degree)
+            wide[off] = np.maximum(wide[off] * SHORTENING, MIN_FRAMES)
+            folds[off], miss[off] = fit_folds(tracks[off], wide[off], degree)
         coefficients[part], spread[part] = folds, wide
     return coefficients, spread
 
 
-def detail(frame: np.ndarray) -> np.ndarray:
-    """Density of starts over one frame's pixels (height, width), summing to 1: gradient, and an even share."""
-    grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-    slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).astype(np.float64)
+def measure_detail(frame: np.ndarray) -> np.ndarray:
+    """Density of starts over the pixels of a frame (height, width), summing to 1: by gradient, and partly even."""
+    gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)).astype(np.float64)
     slope = cv2.GaussianBlur(slope, (0, 0), 1.0)
     even = np.full(slope.shape, 1 / slope.size)
     total = slope.sum()
-    return EVEN_SHARE * even + (1 - EVEN_SHARE) * (slope / total if total > 0 else even)
+    return EVEN_FRACTION * even + (1 - EVEN_FRACTION) * (slope / total if total > 0 else even)
 
 
-def _draw(share: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """Indices distributed as `share`, by inversion."""
-    summed = np.cumsum(share)
-    return np.minimum(np.searchsorted(summed, uniform * summed[-1], side="right"), len(share) - 1)
+def _draw(density: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Indices distributed as `density`, by inversion."""
+    summed = np.cumsum(density)
+    return np.minimum(np.searchsorted(summed, uniform * summed[-1], side="right"), len(density) - 1)
 
 
-def num_alive(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
+def count_alive(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Gaussians alive at each of the frames."""
     first = np.searchsorted(times, time - TAU_MAX * spread)
     last = np.searchsorted(times, time + TAU_MAX * spread, side="right")
@@ -247,9 +248,9 @@ def num_alive(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.nda
 
 
 def _even_chance(home: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """How often to start in each frame, so that all are covered alike by windows of `CORE` sigma_t.
+    """The probability of starting in each frame with which windows of `CORE` sigma_t cover all frames equally.
 
-    `home` and `spread` are of starts tried, as many in every frame. Source: Richardson 1972, Lucy 1974.
+    `home` and `spread` are those of trial starts, as many in every frame. Source: Richardson 1972, Lucy 1974.
     """
     num = len(times)
     first = np.searchsorted(times, times[home] - CORE * spread)

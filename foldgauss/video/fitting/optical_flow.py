@@ -1,10 +1,12 @@
-"""Where points of a clip go: optical flow from frame to frame, and where it breaks off: cuts.
+"""Optical flow of a clip: tracks of points, folds fitted to them, cuts between shots, and images between frames.
 
-Starts that stand still fail where the camera moves over texture; folds fitted to tracks were worth 3 dB and more there.
+Where the camera moves over texture, folds that start along tracks were worth 3 dB and more over starts at rest.
 """
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -12,37 +14,36 @@ from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
 from foldgauss._runtime.threads import run_tasks
 
-#: Frames followed to either side at most.
+#: Tracks have at most so many frames to either side.
 LONGEST = 36
-#: A track ends where the colour has moved by more than this (of 1, root mean square over the channels): it is another
-#: object, or the point is hidden.
+#: A track ends where the color has changed by more than this (of 1, root mean square over the channels): it is another
+#: object, or the point is occluded.
 COLOR_CHANGE = 0.06
-#: It ends, too, where the way forth and back again misses the start by more than this many pixels of the picture that
-#: the flow was read off, and this share of the way: the flow does not know.
-MISS, MISS_SHARE = 0.5, 0.2
-#: The longer side, in pixels, of the pictures that flow is read off, and of the maps that are kept: motion is smoother
-#: than pictures.
+#: It also ends where forward and backward flow disagree by more than this many pixels of the image that the flow was
+#: computed on, and this fraction of the distance.
+MISS, MISS_FRACTION = 0.5, 0.2
+#: The longer side, in pixels, of the images that flow is computed on, and of the flow maps: motion is smoother than
+#: images.
 FLOW_SIDE, KEPT_SIDE = 640, 320
-#: Flow in between is looked up in the frames so often, at the places it leads from.
-LOOKS = 2
-#: A long clip's maps are smaller, so that they take no more bytes than this, or than this share of the frames' own.
-MAP_BYTES, MAP_SHARE, BYTES_PER_CELL = 256e6, 0.25, 11
-#: With fewer points than this in each frame, the mean over frames, they are looked up all at once.
-FEW = 16
-#: Between two frames is a cut where the flow knows the way of less than this share of the points.
-CUT_SHARE = 0.15
-#: Two frames are no cut, for sure, where a quick flow between pictures with a longer side of so many pixels knows the
-#: way of this share. (At 183 cuts in and between three clips, some of them made fast, dark or noisy, it knew 0.27 at
-#: most.)
-SCREEN_SIDE, SURE_SHARE = 160, 0.5
+#: Fixed-point iterations of the flow at a time between two frames.
+FLOW_ITERATIONS = 2
+#: The maps of long clips are smaller, so that they take no more bytes than this, or than this fraction of the frames.
+MAP_BYTES, MAP_FRACTION, BYTES_PER_CELL = 256e6, 0.25, 11
+#: With fewer points than this per frame on average, the points of all frames are sampled at once.
+FEW_POINTS = 16
+#: There is a cut between two frames where less than this fraction of the points can be tracked.
+CUT_FRACTION = 0.15
+#: There certainly is none where this fraction can be tracked by a fast flow between images with a longer side of so
+#: many pixels. (At 183 cuts in and between three clips, some of them made fast, dark or noisy, it was 0.27 at most.)
+FAST_SIDE, SURE_FRACTION = 160, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
 class Tracks:
-    """Tracks of points, relative to where they start.
+    """Tracks of points, relative to their starts.
 
-    Shapes: `shift` (num, 2 LONGEST + 1, 2) in pixels, x right and y down, 0 at the middle column, which is the point's
-    own frame; `known` (num, 2 LONGEST + 1), true where the track goes: one stretch, with the middle.
+    Shapes: `shift` (num, 2 LONGEST + 1, 2) in pixels, x right and y down, 0 at the middle column, which is the frame of
+    the start; `known` (num, 2 LONGEST + 1), true along the track: one interval around the middle.
     """
 
     shift: Float32[np.ndarray, "num steps 2"]
@@ -50,7 +51,7 @@ class Tracks:
 
     @property
     def reach(self) -> Int[np.ndarray, " num"]:
-        """Frames from the first to the last one known."""
+        """Frames from the first to the last one of each track."""
         return self.known.sum(1) - 1
 
     def __getitem__(self, which) -> "Tracks":
@@ -59,64 +60,64 @@ class Tracks:
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """The flow between a clip's neighbouring frames, forth and back, on reduced maps.
+    """The optical flow between neighboring frames, forward and backward, on reduced maps.
 
     Source: Kroeger et al. 2016, Fast Optical Flow using Dense Inverse Search (OpenCV's DIS).
     """
 
-    size: tuple[int, int]  # of the frames, whose pixels are the unit of everything
+    size: tuple[int, int]  # of the frames, whose pixels are the unit of all lengths
     small: UInt8[np.ndarray, "frames rows columns 3"]
     there: Float16[np.ndarray, "intervals rows columns 2"]
     back: Float16[np.ndarray, "intervals rows columns 2"]
-    miss: float  # of forth and back, in pixels of the frames
+    miss: float  # allowed between forward and backward flow, in pixels of the frames
 
     @classmethod
-    def of(
+    def from_frames(
         cls, frames: UInt8[np.ndarray, "frames height width 3"], preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
     ) -> "Motion":
         num, height, width, _ = frames.shape
-        flow_size = _at_most(_flow_side(height, width), height, width)
-        cells = max(MAP_BYTES, MAP_SHARE * frames.size) / (BYTES_PER_CELL * num)
-        kept = _at_most(min(KEPT_SIDE, math.sqrt(cells * max(height, width) / min(height, width))), height, width)
+        flow_size = _fit_size(_flow_side(height, width), height, width)
+        cells = max(MAP_BYTES, MAP_FRACTION * frames.size) / (BYTES_PER_CELL * num)
+        kept = _fit_size(min(KEPT_SIDE, math.sqrt(cells * max(height, width) / min(height, width))), height, width)
         small = np.empty((num, *kept[::-1], 3), np.uint8)
         flows = np.empty((2, num - 1, *kept[::-1], 2), np.float16)
         unit = np.float32([width / flow_size[0], height / flow_size[1]])
 
-        def grey(k: int) -> np.ndarray:
+        def gray(k: int) -> np.ndarray:
             return cv2.resize(cv2.cvtColor(frames[k], cv2.COLOR_RGB2GRAY), flow_size, interpolation=cv2.INTER_AREA)
 
         def shrink(k: int) -> None:
             small[k] = cv2.resize(cv2.GaussianBlur(frames[k], (0, 0), 1.0), kept, interpolation=cv2.INTER_AREA)
 
         def match(k: int) -> None:
-            for way, flow in enumerate(_forth_and_back(grey(k), grey(k + 1), preset)):
+            for way, flow in enumerate(_match_both_ways(gray(k), gray(k + 1), preset)):
                 flows[way, k] = cv2.resize(flow * unit, kept, interpolation=cv2.INTER_AREA)
 
         run_tasks(shrink, range(num))
         run_tasks(match, range(num - 1))
         return cls((height, width), small, flows[0], flows[1], MISS * float(unit.max()))
 
-    def cuts(self) -> list[int]:
-        """The frames, in order, that begin another shot."""
-        return [k + 1 for k, share in enumerate(self.known_shares()) if share < CUT_SHARE]
+    def find_cuts(self) -> list[int]:
+        """The frames, in order, that begin a new shot."""
+        return [k + 1 for k, known in enumerate(self.measure_tracked()) if known < CUT_FRACTION]
 
-    def known_shares(self) -> list[float]:
-        """Between each two neighbouring frames: of which share of the points, on a grid, the flow knows the way."""
+    def measure_tracked(self) -> list[float]:
+        """The fraction of points on a grid that can be tracked from each frame to the next."""
         rows, columns = self.small.shape[1:3]
         y, x = np.meshgrid(np.arange(4, rows, 8), np.arange(4, columns, 8), indexing="ij")
         unit = np.float32([self.size[1] / columns, self.size[0] / rows])
         grid = ((np.stack([x.ravel(), y.ravel()], -1) + 0.5) * unit).astype(np.float32)
-        shares = []
+        fractions = []
         for k in range(len(self.there)):
             home = np.full(len(grid), k)
             _, known = self._step(home, grid, 1, self._color(home, grid))
-            shares.append(float(known.mean()))
-        return shares
+            fractions.append(float(known.mean()))
+        return fractions
 
     def follow(
         self, home: Int[np.ndarray, " num"], position: Float32[np.ndarray, "num 2"], *, longest: int = LONGEST
     ) -> Tracks:
-        """Follow points, at `position` (x, y in pixels, centres at +0.5) in frame `home`, forth and back in time."""
+        """Track points, at `position` (x, y in pixels, centers at +0.5) in frame `home`, forward and backward."""
         num, position = len(home), position.astype(np.float32)
         shift = np.zeros((num, 2 * longest + 1, 2), np.float32)
         known = np.zeros((num, 2 * longest + 1), bool)
@@ -137,124 +138,140 @@ class Motion:
                 shift[on, column] = here - position[on]
         return Tracks(shift, known)
 
-    def between(
-        self, frames: UInt8[np.ndarray, "frames height width 3"], k: int, share: float, size: tuple[int, int]
+    def interpolate(
+        self, frames: UInt8[np.ndarray, "frames height width 3"], k: int, fraction: float, size: tuple[int, int]
     ) -> Float32[np.ndarray, "rows columns 3"]:
-        """What is seen `share` of the way from frame k to k + 1, as far as the flow knows; about [0, 255].
+        """The image at a `fraction` of the way from frame k to k + 1, of `size` (height, width); values about [0, 255].
 
-        Both frames are moved along the flow and their mean is taken, weighted by how near they are, in pictures of
-        `size` (height, width). What comes from outside one of them is taken from the other.
+        Both frames are warped along the flow and averaged, weighted by how near in time they are. Pixels from outside
+        one of them are taken from the other.
         """
         rows, columns = size
         pair = [
             frame if frame.shape[:2] == size else cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_AREA)
             for frame in frames[k : k + 2]
         ]
-        flow, grid, edge = self._flow_between(pair, k, share), _grid(rows, columns), np.float32([columns, rows]) - 0.5
-        origins = grid - np.float32(share) * flow, grid + np.float32(1 - share) * flow
-        moved = [_warped(picture, origin).astype(np.float32) for picture, origin in zip(pair, origins, strict=True)]
+        flow, grid, edge = (
+            self._interpolate_flow(pair, k, fraction),
+            _grid(rows, columns),
+            np.float32([columns, rows]) - 0.5,
+        )
+        origins = grid - np.float32(fraction) * flow, grid + np.float32(1 - fraction) * flow
+        moved = [_warp(image, origin).astype(np.float32) for image, origin in zip(pair, origins, strict=True)]
         inside = [((origin >= -0.5) & (origin < edge)).all(-1) for origin in origins]
-        weight = np.where(inside[0] == inside[1], share, inside[1]).astype(np.float32)[..., None]
+        weight = np.where(inside[0] == inside[1], fraction, inside[1]).astype(np.float32)[..., None]
         return (1 - weight) * moved[0] + weight * moved[1]
 
-    def _flow_between(self, pair: list[np.ndarray], k: int, share: float) -> Float32[np.ndarray, "rows columns 2"]:
-        """The flow from one picture to the other, in their pixels, of what is seen at each pixel in between.
+    def _interpolate_flow(
+        self, pair: list[np.ndarray], k: int, fraction: float
+    ) -> Float32[np.ndarray, "rows columns 2"]:
+        """The flow from one image to the other, in their pixels, at each pixel of the image between them.
 
-        First that of the places in either frame which it leads here from; moved along that the pictures nearly meet,
-        and the flow that is left between them is added.
+        First it is looked up at the positions in either image that it leads here from; then the images are warped
+        along it, and the remaining flow between them is added.
         """
         height, width = pair[0].shape[:2]
-        columns, rows = _at_most(_flow_side(height, width), height, width)
-        small = [cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA) for picture in pair]
+        columns, rows = _fit_size(_flow_side(height, width), height, width)
+        small = [cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA) for image in pair]
         unit = np.float32([columns / self.size[1], rows / self.size[0]])
         there, back = (cv2.resize(own[k].astype(np.float32), (columns, rows)) * unit for own in (self.there, self.back))
-        grid, past, ahead = _grid(rows, columns), np.float32(share), np.float32(1 - share)
+        grid, past, ahead = _grid(rows, columns), np.float32(fraction), np.float32(1 - fraction)
         flow = ahead * there - past * back
-        for _ in range(LOOKS):
-            from_there = _warped(there, grid - past * flow, cv2.INTER_LINEAR)
-            from_back = _warped(back, grid + ahead * flow, cv2.INTER_LINEAR)
+        for _ in range(FLOW_ITERATIONS):
+            from_there = _warp(there, grid - past * flow, cv2.INTER_LINEAR)
+            from_back = _warp(back, grid + ahead * flow, cv2.INTER_LINEAR)
             flow = ahead * from_there - past * from_back
-        met = _warped(small[0], grid - past * flow), _warped(small[1], grid + ahead * flow)
-        there, back = _forth_and_back(*(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in met))
+        met = _warp(small[0], grid - past * flow), _warp(small[1], grid + ahead * flow)
+        there, back = _match_both_ways(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in met))
         flow += ahead * there - past * back
         return cv2.resize(flow, (width, height)) * np.float32([width / columns, height / rows])
 
     def _step(self, at, here, direction: int, color) -> tuple[np.ndarray, np.ndarray]:
-        """Where points of frames `at` are in the next frame (or the one before), and of which that is known."""
+        """The positions of points of frames `at` in the next frame (or the one before), and which are reliable."""
         flows, opposite = (self.there, self.back) if direction > 0 else (self.back, self.there)
         between = at if direction > 0 else at - 1  # flow k lies between frames k and k + 1
-        move = _sampled(flows, between, here, self.size)
+        move = _sample(flows, between, here, self.size)
         there = here + move
-        miss = move + _sampled(opposite, between, there, self.size)
+        miss = move + _sample(opposite, between, there, self.size)
         inside = ((there >= 0) & (there < [self.size[1], self.size[0]])).all(1)
         change = self._color(at + direction, there) - color
         same = np.sqrt((change * change).mean(1)) < 255 * COLOR_CHANGE
-        return there, inside & same & (np.hypot(*miss.T) < self.miss + MISS_SHARE * np.hypot(*move.T))
+        return there, inside & same & (np.hypot(*miss.T) < self.miss + MISS_FRACTION * np.hypot(*move.T))
 
     def _color(self, at, position) -> np.ndarray:
-        return _sampled(self.small, at, position, self.size)
+        return _sample(self.small, at, position, self.size)
 
 
 class CutFinder:
-    """What `Motion.cuts` finds, of a clip that comes frame by frame; two frames are held.
+    """`Motion.find_cuts` for a clip that is given frame by frame; two frames are kept.
 
-    Most pairs are known for no cut by small pictures. Any other is judged as a clip of its own, on maps as large as
-    those of a short clip; those of a long one, in which `Motion` saves memory, may be smaller.
+    For most pairs a fast flow between small images rules out a cut. Any other pair is tested as a clip of its own, on
+    maps as large as those of a short clip; those of a long one, for which `Motion` saves memory, may be smaller.
     """
 
     def __init__(self):
-        self.found: list[int] = []  # the frames, in order, that begin another shot
+        self.found: list[int] = []  # the frames, in order, that begin a new shot
         self._num, self._before = 0, None
 
     def add(self, frame: UInt8[np.ndarray, "height width 3"]) -> None:
-        """The next frame. It is held until the one after it, so it must not change."""
-        size = _at_most(SCREEN_SIDE, *frame.shape[:2])
+        """Add the next frame. It is kept until the one after it, so it must not change."""
+        size = _fit_size(FAST_SIDE, *frame.shape[:2])
         now = frame, cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
         if self._before is not None:
             large, small = zip(self._before, now, strict=True)
-            (share,) = Motion.of(np.stack(small), cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).known_shares()
-            if share < SURE_SHARE and Motion.of(np.stack(large)).cuts():
+            (known,) = Motion.from_frames(np.stack(small), cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).measure_tracked()
+            if known < SURE_FRACTION and Motion.from_frames(np.stack(large)).find_cuts():
                 self.found.append(self._num)
         self._before, self._num = now, self._num + 1
 
 
-def _at_most(side: float, height: int, width: int) -> tuple[int, int]:
+def motion_finder(frames: np.ndarray, motion: Motion | None = None) -> Callable[[], Motion]:
+    """A function that computes the optical flow of `frames` (alpha is ignored) when first called; or gives `motion`."""
+
+    @functools.cache
+    def find_motion() -> Motion:
+        return Motion.from_frames(np.ascontiguousarray(frames[..., :3])) if motion is None else motion
+
+    return find_motion
+
+
+def _fit_size(side: float, height: int, width: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `side`, and none below 16: the flow needs a patch."""
-    share = min(1.0, side / max(height, width))
-    return max(16, round(width * share)), max(16, round(height * share))
+    scale = min(1.0, side / max(height, width))
+    return max(16, round(width * scale)), max(16, round(height * scale))
 
 
 def _flow_side(height: int, width: int) -> int:
-    """The longer side of what flow is read off."""
+    """The longer side of the images that flow is computed on."""
     return FLOW_SIDE if max(height, width) > FLOW_SIDE else FLOW_SIDE // 2
 
 
-def _forth_and_back(
+def _match_both_ways(
     one: np.ndarray, other: np.ndarray, preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
 ) -> tuple[np.ndarray, np.ndarray]:
-    """DIS flow between two grey pictures (rows, columns): (rows, columns, 2) each, in pixels."""
+    """DIS flow between two gray images (rows, columns): (rows, columns, 2) each, in pixels."""
     search = cv2.DISOpticalFlow.create(preset)
     return search.calc(one, other, None), search.calc(other, one, None)
 
 
 def _grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]:
-    """(x, y) of every pixel, centres at whole numbers, as OpenCV has them."""
+    """(x, y) of every pixel, centers at whole numbers, as in OpenCV."""
     return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
 
 
-def _warped(picture, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:
-    """The picture with pixels from `origin`, beyond its border that of the border."""
-    return cv2.remap(picture, origin, None, order, borderMode=cv2.BORDER_REPLICATE)
+def _warp(image, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:
+    """The image sampled at `origin`; beyond the border, the nearest pixel of it."""
+    return cv2.remap(image, origin, None, order, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _sampled(stack, index, position, size) -> np.ndarray:
+def _sample(stack, index, position, size) -> np.ndarray:
     """Bilinear samples of `stack[index]`, maps over frames of `size` (height, width) pixels, at positions in pixels."""
     _, rows, columns, channels = stack.shape
     scaled = position * np.float32([columns / size[1], rows / size[0]]) - np.float32(0.5)
     order = np.argsort(index, kind="stable")
     frames, starts = np.unique(index[order], return_index=True)
-    if len(index) < FEW * len(frames):
-        return _gathered(stack, index, scaled)
+    if len(index) < FEW_POINTS * len(frames):
+        return _gather(stack, index, scaled)
     samples = np.empty((len(index), channels), np.float32)
     stops = np.append(starts[1:], len(order))
 
@@ -270,8 +287,8 @@ def _sampled(stack, index, position, size) -> np.ndarray:
     return samples
 
 
-def _gathered(stack, index, scaled) -> np.ndarray:
-    """As `_sampled`, at positions in pixels of the maps, all frames at once: no map is read but where it is asked."""
+def _gather(stack, index, scaled) -> np.ndarray:
+    """As `_sample`, at positions in pixels of the maps, for all frames at once: reads only the samples' own pixels."""
     _, rows, columns, _ = stack.shape
     inside = np.clip(scaled, 0, np.float32([columns - 1, rows - 1]))
     left, top = np.minimum(inside.astype(np.int64), [columns - 2, rows - 2]).T
@@ -285,42 +302,40 @@ def _gathered(stack, index, scaled) -> np.ndarray:
     return above + low * (below - above)
 
 
-#: Ridge on the coefficients, in frames at the window's edge.
+#: Ridge on the coefficients, in frames at the edge of the window.
 RIDGE = 0.03
-#: Width of the window in which a fold has to follow its track, in units of sigma_t: where the Gaussian is seen.
+#: Width of the window in which a fold has to follow its track, in units of sigma_t: where the Gaussian is visible.
 WINDOW = 1.2
-
-
-#: A power is there only if the fold without it misses by more than this many pixels, and with it by less than so much
-#: of that: beyond its track a cubic leaves the picture. (Bunny, 80x160, 15,000 Gaussians, 2,000 steps: always cubic
-#: 35.6 dB, as needed 35.9; bikes 29.25 and 29.26, always linear 28.8.)
+#: A power is used only if the fold without it misses by more than this many pixels, and with it by less than this
+#: fraction of that: beyond its track a cubic leaves the frame. (Bunny, 80x160, 15,000 Gaussians, 2,000 steps: always
+#: cubic 35.6 dB, as needed 35.9; bikes 29.25 and 29.26, always linear 28.8.)
 NEEDED, GAINED = 0.3, 0.8
 
 
-def fitted_folds(
+def fit_folds(
     tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int
 ) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
-    """Polynomials in u = own time - t along the tracks, seen through windows of width `spread` (num,), in frames.
+    """Fit polynomials in u = own time - t to the tracks, within windows of width `spread` (num,), in frames.
 
     Returns coefficients (num, degree, 2), in pixels per frame^k, and the root mean square distance (num,) in pixels
     from the track. Least squares without a constant, with as many powers as the track needs; those above the third
-    stay 0, as tracks do not determine them.
+    are 0, since tracks do not determine them.
     """
-    coefficients, miss = _fitted(tracks, spread, degree, min(degree, 1))
+    coefficients, miss = _fit_powers(tracks, spread, degree, min(degree, 1))
     for used in range(2, min(degree, 3) + 1):
         off = np.flatnonzero(miss > NEEDED)
         if not len(off):
             break
-        bent, left = _fitted(tracks[off], spread[off], degree, used)
+        bent, left = _fit_powers(tracks[off], spread[off], degree, used)
         better = left < GAINED * miss[off]
         coefficients[off[better]], miss[off[better]] = bent[better], left[better]
     return coefficients, miss
 
 
-def _fitted(
+def _fit_powers(
     tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int, used: int
 ) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
-    """`fitted_folds` with the first `used` powers."""
+    """`fit_folds` with the first `used` powers."""
     num, steps, _ = tracks.shift.shape
     longest = steps // 2
     coefficients = np.zeros((num, degree, 2), np.float32)
@@ -331,7 +346,7 @@ def _fitted(
         powers = u[:, None] ** np.arange(1, used + 1)
         products = np.einsum("sj,sk->sjk", powers, powers).reshape(steps, -1)
         normal = (weight @ products).reshape(num, used, used)
-        # A little belief in standing still, and more in not bending, in units of the window: short tracks show neither.
+        # A weak prior for rest, a stronger one against curvature, in units of the window: short tracks show neither.
         window = np.minimum(WINDOW * spread / longest, 1.0)[:, None] ** (2 * np.arange(1, used + 1))
         normal += (RIDGE * np.array([1.0, 4.0, 16.0])[:used] * window)[:, :, None] * np.eye(used)
         right = np.einsum("ns,nsc,sj->njc", weight, shift, powers, optimize=True)

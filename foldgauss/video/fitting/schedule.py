@@ -1,4 +1,4 @@
-"""What each step of a fit uses: its views of the clip, the resolution level of its frames, and its learning rates."""
+"""What each step of a fit uses: its views of the clip, the resolution of its frames, and its learning rates."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,17 @@ import cv2
 import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.divergence import LOWERED
 from foldgauss.video.models.row_layout import columns
 
-#: Frames that tell how good the start is.
-LOOKED_AT = 16
+#: Frames whose errors tell how good the start is.
+NUM_START_FRAMES = 16
+#: Frames are not made smaller than this many pixels along their shorter side: less shows too little detail to learn.
+MIN_SIDE = 120
+#: Learning rates are divided by this whenever a diverged fit backs off.
+BACKOFF_FACTOR = 4.0
+
+
+# ------------------------------------------------------------------------------------------------------ views
 
 
 def num_views(config: FitConfig, num_frames: int) -> int:
@@ -22,27 +28,30 @@ def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     return -(-num_views(config, num_frames) // config.batch_size)
 
 
-def views_of(config: FitConfig, num_frames: int, step: int) -> np.ndarray:
-    """Views of a step: every pass visits all once, in an order that depends on seed and pass only.
+def choose_views(config: FitConfig, num_frames: int, step: int) -> np.ndarray:
+    """The views of a step: every pass visits all once, in an order that depends on the seed and the pass only.
 
     View k is frame k; from the number of frames on, frame k - num_frames, mirrored.
     """
     first, num = step * config.batch_size, num_views(config, num_frames)
     positions = np.arange(first, first + config.batch_size)
-    return np.array([_order(config, num, p // num)[p % num] for p in positions])
+    return np.array([_shuffle(config, num, p // num)[p % num] for p in positions])
 
 
-def _order(config: FitConfig, num: int, epoch: int) -> np.ndarray:
+def _shuffle(config: FitConfig, num: int, epoch: int) -> np.ndarray:
     return np.random.default_rng([config.seed, 1, epoch]).permutation(num)
 
 
-def looked_at(num_frames: int) -> np.ndarray:
-    """Frames that tell how good the start is: evenly spaced, from the first to the last."""
-    return np.unique(np.linspace(0, num_frames - 1, LOOKED_AT).round().astype(int))
+def choose_start_frames(num_frames: int) -> np.ndarray:
+    """The frames whose errors tell how good the start is: evenly spaced, from the first to the last."""
+    return np.unique(np.linspace(0, num_frames - 1, NUM_START_FRAMES).round().astype(int))
 
 
-class Rates:
-    """Adam's rates by column of a row, and that of the frame times, as they fall."""
+# ------------------------------------------------------------------------------------------ learning rates
+
+
+class RateSchedule:
+    """Adam's learning rates by column of a row, and that of the frame times, as they decay."""
 
     def __init__(self, config: FitConfig):
         width = columns(config.degree)["coefficients"].stop
@@ -53,67 +62,78 @@ class Rates:
             self.decayed[place] = config.decayed in ("all", name)
 
     def at(self, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32]:
-        """Those of rows, float32 (width,), and that of frame times, at a share of the plan and after back-offs."""
+        """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
         config = self.config
         decay = config.final_rate**progress if config.final_rate > 0 else max(1 - progress, 0.0)
-        slower = LOWERED**-backoffs
+        slower = BACKOFF_FACTOR**-backoffs
         rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
         times = config.rates.frame_times * (decay if config.decayed == "all" else 1.0) * slower
         return rows, np.float32(times)
 
 
-# --------------------------------------------------------------------------------- resolution levels
-
-#: Frames are not made smaller than this many pixels along their shorter side: what is left there teaches nothing.
-LEAST_SIDE = 120
+# ------------------------------------------------------------------------------------------ coarse to fine
 
 
 class Level(NamedTuple):
-    """A part of the plan and the size it sees frames at."""
+    """A part of the plan, and the resolution of the frames in it.
 
-    share: float  # of the plan
+    Coarse levels come first: a step there costs a fraction, and large structures place the Gaussians that are far off.
+    """
+
+    fraction: float  # of the plan
     size: tuple[int, int]  # height, width
 
 
-def levels(config: FitConfig, size: tuple[int, int]) -> list[Level]:
+def plan_levels(config: FitConfig, size: tuple[int, int]) -> list[Level]:
     """The levels of a fit to frames of `size`, coarse to fine; the last is `size` itself.
 
-    A level too small for its frames (`LEAST_SIDE`) gives its share to the next finer one. With `target_psnr` there is
-    but one: what is reached at a smaller size says nothing about the clip's own, and the fit must be able to end.
+    A level too small for its frames (`MIN_SIDE`) gives its fraction to the next finer one. With `target_psnr` there is
+    only one: a PSNR at a smaller size says nothing about the clip's own, and the fit must be able to end.
     """
     if config.target_psnr is not None:
         return [Level(1.0, tuple(size))]
-    made, pending = [], 0.0
-    for factor, share in ((4, config.quarter_fraction), (2, config.half_fraction)):
-        pending += share
+    levels, pending = [], 0.0
+    for factor, fraction in ((4, config.quarter_fraction), (2, config.half_fraction)):
+        pending += fraction
         small = tuple(max(round(length / factor), 1) for length in size)
-        if pending and min(small) >= LEAST_SIDE:
-            made.append(Level(pending, small))
+        if pending and min(small) >= MIN_SIDE:
+            levels.append(Level(pending, small))
             pending = 0.0
-    return [*made, Level(1.0 - sum(level.share for level in made), tuple(size))]
+    return [*levels, Level(1.0 - sum(level.fraction for level in levels), tuple(size))]
 
 
-def level_at(made: list[Level], progress: float) -> int:
-    """Which level a step belongs to, by the share of the plan that is done."""
+def find_level(levels: list[Level], progress: float) -> int:
+    """The index of the level that a step belongs to, by the fraction of the plan that is done."""
     end = 0.0
-    for index, level in enumerate(made[:-1]):
-        end += level.share
+    for index, level in enumerate(levels[:-1]):
+        end += level.fraction
         if progress < end:
             return index
-    return len(made) - 1
+    return len(levels) - 1
 
 
-def work_done(made: list[Level], progress: float) -> float:
-    """Share of the fit's time that is over at `progress`, a step's time being as its frame's area."""
+def work_fraction(levels: list[Level], progress: float) -> float:
+    """The fraction of the fit's time that is over at `progress`, where a step's time is as its frame's area."""
     end, done, total = 0.0, 0.0, 0.0
-    for level in made:
+    for level in levels:
         area = level.size[0] * level.size[1]
-        done += area * min(max(progress - end, 0.0), level.share)
-        total += area * level.share
-        end += level.share
+        done += area * min(max(progress - end, 0.0), level.fraction)
+        total += area * level.fraction
+        end += level.fraction
     return min(done / total, 1.0)
 
 
-def shrunk(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def shrink_frame(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A frame, uint8 (height, width, channels), at a level's size: the mean over each pixel's area."""
     return frame if frame.shape[:2] == size else cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
+
+
+def to_planes(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """A frame of bytes as float planes (3, height, width), as the kernels take it; with alpha, over `background`."""
+    out = np.empty((3, *frame.shape[:2]), np.float32)
+    *colors, last = cv2.split(frame)
+    for plane, own in zip(out, colors if frame.shape[2] == 4 else (*colors, last), strict=True):
+        np.multiply(own, np.float32(1 / 255), out=plane)
+    if frame.shape[2] == 4:
+        out += background[:, None, None] * (1 - last * np.float32(1 / 255))
+    return out

@@ -1,108 +1,233 @@
-"""The arrays of a running fit, and what they amount to."""
+"""`FitState`: the arrays and counters of a running fit; and the model, the error and the PSNR that follow from them.
 
+A new array is one line in `FitState`. Its metadata, a `StateArray`, says how it is built, cut, extended and described;
+starting, pruning, densification, copies, checkpoints and devices all go by it.
+"""
+
+import abc
+import collections
+import copy
 import dataclasses
-import functools
 import math
-from typing import Any, ClassVar, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import field
+from typing import Any, ClassVar, NamedTuple, Protocol
 
-import cv2
 import jax
 import numpy as np
 import optax
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.metrics import psnr
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import unpack
+from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.video_model import VideoModel
 
-TIME_ADAM = optax.scale_by_adam(eps=1e-15)
+# ------------------------------------------------------------------------------------------------ metadata
+
+
+class Sizes(NamedTuple):
+    """The sizes from which the shapes of all arrays of a `FitState` follow."""
+
+    num_gaussians: int
+    width: int  # of a row
+    num_frames: int
+    growing: bool = False  # whether there are gradient statistics
+    colors: int = 0  # entries of the codebooks
+    shapes: int = 0
+
+
+class StateArray(abc.ABC):
+    """The metadata of a field of arrays. `on_device` tells whether a fit on a device keeps it there."""
+
+    per_gaussian: ClassVar[bool] = False  #: whether every leaf has one row for each Gaussian
+    on_device: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def spec(self, sizes: Sizes) -> Any:
+        """Shapes and types: a pytree of `jax.ShapeDtypeStruct`."""
+
+    def build(self, sizes: Sizes) -> Any:
+        """The value that a fit starts with."""
+        return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), self.spec(sizes))
+
+    def keep(self, value: Any, index: np.ndarray) -> Any:
+        """The value where only the Gaussians `index` are left."""
+        return value
+
+    def extend(self, value: Any, sizes: Sizes) -> Any:
+        """The value where as many Gaussians as `sizes` has are added."""
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class PerGaussian(StateArray):
+    """An array with an entry of `shape` for each Gaussian, `fill` for a new one; strings in `shape` name `Sizes`."""
+
+    dtype: type
+    shape: tuple[int | str, ...] = ()
+    fill: float = 0
+    per_gaussian: ClassVar[bool] = True
+
+    def spec(self, sizes: Sizes) -> jax.ShapeDtypeStruct:
+        shape = (getattr(sizes, length) if isinstance(length, str) else length for length in self.shape)
+        return jax.ShapeDtypeStruct((sizes.num_gaussians, *shape), self.dtype)
+
+    def build(self, sizes: Sizes) -> np.ndarray:
+        return np.full(self.spec(sizes).shape, self.fill, self.dtype)
+
+    def keep(self, value: np.ndarray, index: np.ndarray) -> np.ndarray:
+        return value[index]
+
+    def extend(self, value: np.ndarray, sizes: Sizes) -> np.ndarray:
+        return np.concatenate([value, self.build(sizes)])
+
+
+class OfGrowth(StateArray):
+    """`GradientStatistics`, which begin anew whenever the number of Gaussians changes; None where nothing grows."""
+
+    per_gaussian: ClassVar[bool] = True
+
+    def spec(self, sizes: Sizes) -> GradientStatistics | None:
+        floats, counts = (jax.ShapeDtypeStruct((sizes.num_gaussians,), dtype) for dtype in (np.float32, np.int32))
+        return GradientStatistics(floats, floats, counts) if sizes.growing else None
+
+    def keep(self, value: GradientStatistics | None, index: np.ndarray) -> GradientStatistics | None:
+        return jax.tree.map(lambda leaf: np.zeros_like(leaf[index]), value)
+
+    def extend(self, value: GradientStatistics | None, sizes: Sizes) -> GradientStatistics | None:
+        return jax.tree.map(lambda leaf: np.zeros(len(leaf) + sizes.num_gaussians, leaf.dtype), value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shared(StateArray):
+    """A `Codebook` of values of `width` numbers, whose entries `Sizes` has under `name`; new Gaussians end sharing."""
+
+    name: str
+    width: int
+    on_device: ClassVar[bool] = False
+
+    def spec(self, sizes: Sizes) -> Codebook:
+        entries = getattr(sizes, self.name)
+        index, counts = (
+            jax.ShapeDtypeStruct((num,), np.int32) for num in (sizes.num_gaussians if entries else 0, entries)
+        )
+        moments = jax.ShapeDtypeStruct((entries, self.width), np.float32)
+        return Codebook(index, moments, moments, counts)
+
+    def keep(self, value: Codebook, index: np.ndarray) -> Codebook:
+        return value.keep(index)
+
+    def extend(self, value: Codebook, sizes: Sizes) -> Codebook:
+        return Codebook.create(None, self.width)
+
+
+@dataclasses.dataclass(frozen=True)
+class PerFrame(StateArray):
+    """One number for each frame, or for each interval between two frames; with Adam's moments of these, if asked."""
+
+    intervals: bool = False
+    moments: bool = False
+
+    def spec(self, sizes: Sizes) -> Any:
+        values = jax.ShapeDtypeStruct((sizes.num_frames - self.intervals,), np.float32)
+        return jax.eval_shape(FRAME_TIME_ADAM.init, values) if self.moments else values
+
+
+def _stored(kind: StateArray) -> dict[str, Any]:
+    return {"arrays": kind}
+
+
+def _decode_errors(pairs: Any) -> tuple[tuple[int, float], ...]:
+    return tuple((int(frame), float(error)) for frame, error in pairs)
+
+
+#: The metadata of fields that are no arrays: `decode` restores them from JSON.
+_COUNT, _NUMBER = ({"static": True, "decode": kind} for kind in (int, float))
+_ERRORS = {"static": True, "decode": _decode_errors}
+_ROW = PerGaussian(np.float32, ("width",))
+
+
+# --------------------------------------------------------------------------------------------------- state
 
 
 class Held(Protocol):
-    """Arrays of a fit that are elsewhere, on a device: fetched only where somebody asks for them."""
+    """The arrays of a fit that are on a device, fetched only where they are read."""
 
     num: int  #: Gaussians
-    growing: bool  #: whether statistics of growth are kept
+    growing: bool  #: whether there are gradient statistics
 
     def fetch(self, name: str) -> Any:
-        """A field of `FitState`, as an array of NumPy's, a copy."""
+        """A field of `FitState` as NumPy arrays, a copy."""
 
-    def finite(self, name: str) -> bool:
-        """Whether all numbers of a field are, by a look on the device."""
+    def is_finite(self, name: str) -> bool:
+        """Whether all values of a field are finite, as computed on the device."""
 
-    def copied(self) -> "Held":
-        """A copy that later steps leave as it is, on the device as well."""
+    def copy(self) -> "Held":
+        """A copy on the device, which later steps do not change."""
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "rows",
-        "first",
-        "second",
-        "counts",
-        "kinds",
-        "young",
-        "colors",
-        "shapes",
-        "frame_errors",
-        "time_logits",
-        "time_moments",
-        "statistics",
-        "sound",
-    ],
-    meta_fields=[
-        "step",
-        "plan",
-        "seconds",
-        "error",
-        "best_error",
-        "backoffs",
-        "settled",
-        "should_be_better",
-        "start_errors",
-    ],
-)
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass
 class FitState:
-    """The arrays of a running fit. A step consumes its state: as with donated buffers, arrays are updated in place.
+    """The arrays and counters of a running fit. A step consumes its state: arrays are updated in place.
 
-    Those of a fit on a device are `held` there, and fetched anew, as copies, whenever they are read; who sets one has
-    it taken over by the next step.
+    The arrays of a fit on a device are `held` there, and fetched, as copies, whenever they are read; an array that is
+    assigned is used from the next step on.
     """
 
-    rows: np.ndarray  # float32 (num, width): see `packing`
-    first: np.ndarray  # Adam's moments, likewise
-    second: np.ndarray
-    counts: np.ndarray  # int32 (num,): steps each Gaussian has taken
-    kinds: np.ndarray  # uint8 (num,): which numbers each Gaussian has, see `sparse_storage.find_kinds`
-    young: np.ndarray  # bool (num,): born the last time that stock was taken
-    colors: Codebook  # which colours are one and the same
-    shapes: Codebook  # likewise of the two standard deviations
-    frame_errors: np.ndarray  # float32 (num_frames,): mean squared error when last seen, 0 before
-    time_logits: np.ndarray  # float32 (num_frames - 1,)
-    time_moments: optax.OptState
-    statistics: GradientStatistics | None  # what growth is decided by; None where Gaussians do not grow, or no longer
-    step: int
-    plan: int  # steps of the whole fit; 0 until the pace is known that minutes are planned by
-    seconds: float
-    error: float  # running mean of the squared error
-    best_error: float = 0.0  # the least one that a later one is compared with, see `guard`; 0: none known
-    backoffs: int = 0  # how often the fit was taken back, and its rates lowered
-    # What else `guard` goes by; kept, so that a fit that was stopped comes apart, and back, as if it had not been.
-    sound: "FitState | None" = None  # the last sound state, which has none of its own; None: none known
-    settled: int = 0  # steps from which on errors are compared with the best one, and with those of the start
-    should_be_better: int = 0
-    start_errors: tuple[tuple[int, float], ...] = ()  # frames, and their mean squared errors before the first step
+    rows: np.ndarray = field(metadata=_stored(_ROW))  # parameters, see `row_layout`
+    first: np.ndarray = field(metadata=_stored(_ROW))  # Adam's moments
+    second: np.ndarray = field(metadata=_stored(_ROW))
+    counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
+    kinds: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # its parameters, see `sparse_storage`
+    newborn: np.ndarray = field(metadata=_stored(PerGaussian(np.bool_)))  # born in the last round of pruning
+    colors: Codebook = field(metadata=_stored(Shared("colors", 3)))
+    shapes: Codebook = field(metadata=_stored(Shared("shapes", 2)))  # of the two standard deviations
+    frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
+    time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
+    time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
+    statistics: GradientStatistics | None = field(metadata=_stored(OfGrowth()))  # None without densification to come
+    step: int = field(default=0, metadata=_COUNT)
+    plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
+    seconds: float = field(default=0.0, metadata=_NUMBER)
+    error: float = field(default=0.0, metadata=_NUMBER)  # running mean of the squared error
+    # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
+    best_error: float = field(default=0.0, metadata=_NUMBER)  # the lowest one that others are compared with; 0: none
+    backoffs: int = field(default=0, metadata=_COUNT)  # how often the fit returned to `last_finite`, with lower rates
+    compare_from: int = field(default=0, metadata=_COUNT)  # the step from which on errors are compared with the best,
+    improve_by: int = field(default=0, metadata=_COUNT)  # and with those of the start
+    start_errors: tuple[tuple[int, float], ...] = field(default=(), metadata=_ERRORS)  # (frame, error) at the start
+    last_finite: "FitState | None" = None  # the last state known to be good, which has none of its own
     held: ClassVar[Held | None] = None  # of a fit on a device, an attribute of the instance
 
+    @classmethod
+    def array_fields(cls) -> Mapping[str, StateArray]:
+        """The metadata of the fields that are arrays, by name."""
+        return {one.name: one.metadata["arrays"] for one in dataclasses.fields(cls) if "arrays" in one.metadata}
+
+    @classmethod
+    def counter_fields(cls) -> Mapping[str, Callable]:
+        """The functions that restore the other fields from JSON, by name."""
+        return {one.name: one.metadata["decode"] for one in dataclasses.fields(cls) if "decode" in one.metadata}
+
+    @classmethod
+    def create(
+        cls, rows: np.ndarray, kinds: np.ndarray, time_logits: np.ndarray, *, growing: bool = False, **fields: Any
+    ) -> "FitState":
+        """A state with these Gaussians and frame times; all other arrays as a fit starts with, but for `fields`."""
+        sizes = Sizes(*rows.shape, len(time_logits) + 1, growing)
+        fields |= {"rows": rows, "kinds": kinds, "time_logits": time_logits}
+        arrays = {name: kind.build(sizes) for name, kind in cls.array_fields().items() if name not in fields}
+        return cls(**arrays, **fields)
+
     def __getattr__(self, name: str) -> Any:
-        """An array that is not here is fetched."""
+        """An array that is held elsewhere is fetched."""
         held = self.__dict__.get("held")
         if held is None or name not in ARRAYS:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
@@ -114,15 +239,51 @@ class FitState:
 
     @property
     def growing(self) -> bool:
-        """Whether births and deaths are still to come."""
+        """Whether densification is still to come."""
         return self.statistics is not None if self.held is None else self.held.growing
 
-    def finite(self, name: str) -> bool:
-        """Whether all numbers of an array are, by their sum: a third of the time of looking at each."""
+    @property
+    def sizes(self) -> Sizes:
+        entries = len(self.colors.counts), len(self.shapes.counts)
+        return Sizes(*self.rows.shape, len(self.frame_errors), self.growing, *entries)
+
+    def is_finite(self, name: str) -> bool:
+        """Whether all values of an array are finite, by their sum: a third of the time of testing each."""
         if self.held is not None:
-            return self.held.finite(name)
+            return self.held.is_finite(name)
         with np.errstate(invalid="ignore", over="ignore"):
             return bool(np.isfinite(getattr(self, name).sum()))
+
+    # ---------------------------------------------------------------------------------- which Gaussians there are
+
+    def keep(self, index: np.ndarray, **changed: Any) -> None:
+        """Drop all Gaussians but those of `index`, or reorder them; `changed` fields are already cut."""
+        for name, kind in self.array_fields().items():
+            setattr(self, name, changed[name] if name in changed else kind.keep(getattr(self, name), index))
+
+    def extend(self, rows: np.ndarray, kinds: np.ndarray, **born: np.ndarray) -> None:
+        """Add Gaussians at the end: their rows, kinds and fields `born`; in all other fields they are as at a start."""
+        sizes, born = Sizes(*rows.shape, len(self.frame_errors)), born | {"rows": rows, "kinds": kinds}
+        for name, kind in self.array_fields().items():
+            value = getattr(self, name)
+            new = np.concatenate([value, born[name]]) if name in born else kind.extend(value, sizes)
+            setattr(self, name, new)
+
+    # --------------------------------------------------------------------------------------- copies, and devices
+
+    def copy(self) -> "FitState":
+        """A copy of all but `last_finite`; on the device where arrays are held there."""
+        if self.held is None:
+            return jax.tree.map(np.array, dataclasses.replace(self, last_finite=None))
+        other = copy.copy(self)
+        other.last_finite, other.held = None, self.held.copy()
+        return other
+
+    def restore(self) -> None:
+        """Take the arrays of `last_finite` back, as copies."""
+        self.held = None
+        for name in self.array_fields():
+            setattr(self, name, jax.tree.map(np.array, getattr(self.last_finite, name)))
 
     def hold(self, held: Held) -> None:
         """From now on all arrays are those of `held`."""
@@ -131,7 +292,7 @@ class FitState:
         self.held = held
 
     def land(self) -> None:
-        """Fetch all arrays, but for those that were set since; nothing is held any more."""
+        """Fetch all arrays that were not assigned meanwhile, and hold none any more."""
         if self.held is not None:
             arrays = {name: getattr(self, name) for name in ARRAYS}
             self.held = None
@@ -139,13 +300,18 @@ class FitState:
 
     @property
     def changed(self) -> bool:
-        """Whether an array was set since arrays are held."""
+        """Whether an array was assigned since arrays are held."""
         return self.held is not None and not self.__dict__.keys().isdisjoint(ARRAYS)
 
 
-#: The fields of a `FitState` that are arrays, or trees of them.
-_OTHERS = ("step", "plan", "seconds", "error", "best_error", "backoffs", "sound", "settled", "should_be_better")
-ARRAYS = tuple(field.name for field in dataclasses.fields(FitState) if field.name not in (*_OTHERS, "start_errors"))
+#: The names of the arrays of a `FitState`; those that a device keeps, as a pytree.
+ARRAYS = tuple(FitState.array_fields())
+DeviceArrays = collections.namedtuple(
+    "DeviceArrays", [name for name, kind in FitState.array_fields().items() if kind.on_device]
+)
+
+
+# ------------------------------------------------------------------------------------ what follows from a state
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
@@ -160,15 +326,29 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
     )
 
 
+def update_rows(
+    state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, degree: int, unit_time: float
+) -> None:
+    """A step of Adam on the rows `touched` and on the values that they share, in place; `grad` becomes zero there.
+
+    `grad` is float32 (num, width), `rates` and `unit_time` are those of `sparse_adam`.
+    """
+    for name, codebook in (("color_dc", state.colors), ("log_scale", state.shapes)):
+        at = columns(degree)[name]
+        codebook.step(state.rows[:, at], grad[:, at], touched, rates[at])
+    moments = state.first, state.second, state.counts
+    sparse_adam(state.rows, grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit_time)
+
+
 def running_psnr(state: FitState) -> float:
-    """dB, by the running mean of the squared error; at most 100, as of pictures that are equal (`psnr`)."""
+    """dB, by the running mean of the squared error; at most 100, as `psnr` has for equal images."""
     return -10 * math.log10(max(state.error, 1e-10))
 
 
 def mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
-    """dB, mean over all frames as they are shown, over black."""
-    playback = VideoRenderer(to_model(state, config, frames.shape[1:3], 1.0))
-    return float(np.mean([psnr(frame[..., :3], shown) for frame, shown in zip(frames, playback.frames(), strict=True)]))
+    """dB, mean over all frames, rendered over black."""
+    renderer = VideoRenderer(to_model(state, config, frames.shape[1:3], 1.0))
+    return float(np.mean([psnr(frame[..., :3], image) for frame, image in zip(frames, renderer.frames(), strict=True)]))
 
 
 def envelope_of(config: FitConfig) -> TimeLikelihood:
@@ -177,24 +357,5 @@ def envelope_of(config: FitConfig) -> TimeLikelihood:
 
 @jax.jit
 def frame_times(logits):
+    """The times t_k of softmax weights `logits`."""
     return FrameTimes(logits).times()
-
-
-@jax.jit
-def update_times(logits, moments, by_time, rate):
-    """Adam on the softmax weights, given dL/dt_k."""
-    _, pull = jax.vjp(lambda w: FrameTimes(w).times(), logits)
-    with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
-        update, moments = TIME_ADAM.update(pull(by_time)[0], moments)
-    return logits - rate * update, moments
-
-
-def planar(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Bytes (height, width, 3) as floats (3, height, width), as the kernels want them; with alpha over `background`."""
-    out = np.empty((3, *frame.shape[:2]), np.float32)
-    *colors, last = cv2.split(frame)
-    for plane, own in zip(out, colors if frame.shape[2] == 4 else (*colors, last), strict=True):
-        np.multiply(own, np.float32(1 / 255), out=plane)
-    if frame.shape[2] == 4:
-        out += background[:, None, None] * (1 - last * np.float32(1 / 255))
-    return out

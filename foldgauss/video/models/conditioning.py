@@ -1,8 +1,8 @@
-"""Fused Numba twin of `FoldedSplats.at`, with its gradient, on packed rows of the Gaussians alive at one time.
+"""Fused Numba version of `FoldedSplats.at` and its gradient, on packed rows of the Gaussians alive at one time.
 
-The fold equation's home is `FoldedGaussian.condition_time`; this is the one exception that the profile bought: it
-touches only the Gaussians alive, whose number changes with every frame, which compiled XLA shapes cannot follow. A test
-holds both to the same values and gradients. Only the polynomial fold and the time-likelihood envelope exist here.
+The fold equation is defined by `FoldedGaussian.condition_time` and repeated here for speed: these kernels touch only
+the Gaussians alive, whose number changes with every frame, unlike XLA's fixed shapes. A test checks that values and
+gradients agree. Only the polynomial fold and the time-likelihood envelope are supported.
 """
 
 import dataclasses
@@ -22,12 +22,12 @@ from foldgauss.video.models.splats import SH_C0, TAU_MAX
 CHUNK = 4096  # Gaussians per task
 
 _f, _u = nb.float32, nb.uint64
-#: Numbers that conditioning gives for each Gaussian: mean 2, factor 4, opacity, colour 3, kept 3.
+#: Outputs of conditioning for each Gaussian: mean 2, factor 4, opacity, colour 3, kept 3.
 _NUM_OUT = 13
 
 
 class _Layout(NamedTuple):
-    """Columns of a row and constants of the model, handed to the kernels as arguments: see `_kernels.kernel`."""
+    """Columns of a row and constants of the model, passed to the kernels as arguments: see `kernels.kernel`."""
 
     loc: int
     scale: int
@@ -63,7 +63,7 @@ def _sigmoid(x):
 
 @kernel
 def _windows(at, start, stop, indices, rows, window):
-    """The span of time in which each of the named Gaussians is drawn."""
+    """The time windows in which these Gaussians are rendered."""
     for k in range(start, stop):
         i = indices[k]
         centre, reach = _sigmoid(rows[i, at.time]), at.tau_max * math.exp(rows[i, at.spread])
@@ -91,7 +91,7 @@ def _condition(
     color,
     kept,
 ):
-    """Sixteen Gaussians at a time: their rows become columns, vectors, and the results rows again."""
+    """Sixteen Gaussians at a time: rows are transposed to vectors, and the results back to rows."""
     width = rows.shape[1]
     columns, out = np.zeros(width * LANES, np.float32), np.empty(_NUM_OUT * LANES, np.float32)
     for begin in range(start, stop, LANES):
@@ -128,7 +128,7 @@ def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
     store(out, _u(0), (_column(columns, at.loc) + x) * scale + broadcast(cx))
     store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + broadcast(cy))
     tau = u / spread
-    exponent = broadcast(_f(-0.25) * power) * tau * tau  # of sqrt(a), but for the floor
+    exponent = broadcast(_f(-0.25) * power) * tau * tau  # of sqrt(a) without the floor
     if floor == _f(0.0):
         first = exp(_column(columns, at.scale) + exponent) * scale
         second = exp(_column(columns, at.scale + 1) + exponent) * scale
@@ -217,7 +217,7 @@ def _pull_back(
 
 @dataclasses.dataclass(frozen=True)
 class ConditionedSplats:
-    """Splats of one time in pixels, of the Gaussians `alive` (indices, in array order)."""
+    """Splats of one time, in pixels, of the Gaussians `alive` (indices, in array order)."""
 
     alive: np.ndarray
     t: np.float32
@@ -226,14 +226,14 @@ class ConditionedSplats:
     factor: np.ndarray
     opacity: np.ndarray
     color: np.ndarray
-    kept: np.ndarray  # (num, 3), for the way back: m_t, sigma_t and the angle in turns
+    kept: np.ndarray  # (num, 3), for the gradient: m_t, sigma_t and the angle in turns
 
 
 @dataclasses.dataclass(frozen=True)
 class ConditioningSpec:
-    """What conditioning needs beside the rows: the fold's degree, the envelope's power and floor, the picture's size.
+    """Constants of conditioning: the fold's degree, the envelope's power and floor, and the image's size.
 
-    `aspect` is the model frame's height / width (default: the picture's own), see `Splats2D.to_pixels`.
+    `aspect` is the model frame's height / width (default: the image's own), see `Splats2D.to_pixels`.
     """
 
     degree: int
@@ -244,27 +244,27 @@ class ConditioningSpec:
 
 
 def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
-    """Write the spans of time of the named rows into `window` (num, 2)."""
+    """Write the time windows of the rows `indices` into `window` (num, 2)."""
     num = len(indices)
     run_tasks(
         lambda start: _windows(_LAYOUT, start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK)
     )
 
 
-def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, shape: ConditioningSpec, scale_cutoff: float) -> None:
-    """Leave out of the spans in `window` (num, 2) when a standard deviation is not above `scale_cutoff`, model units.
+def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, spec: ConditioningSpec, scale_cutoff: float) -> None:
+    """Narrow `window` (num, 2) to the times when both standard deviations exceed `scale_cutoff`, in model units.
 
     With s the smaller one: s^2 a > cutoff^2, that is (1 - floor) exp(-power tau^2 / 2) > (cutoff / s)^2 - floor.
     """
     if scale_cutoff <= 0:
         return
-    places = columns(shape.degree)
+    places = columns(spec.degree)
     centre, spread = (rows[:, places[name].start].astype(float) for name in ("time_loc_logit", "log_time_scale"))
     smaller = rows[:, places["log_scale"]].min(axis=1).astype(float)
-    needed = np.exp(2 * (math.log(scale_cutoff) - smaller)) - shape.floor
+    needed = np.exp(2 * (math.log(scale_cutoff) - smaller)) - spec.floor
     with np.errstate(divide="ignore", invalid="ignore"):
-        square = 2 * (math.log1p(-shape.floor) - np.log(needed)) / shape.power  # tau^2 where both sides are equal
-    never, always = needed >= 1 - shape.floor, needed <= 0
+        square = 2 * (math.log1p(-spec.floor) - np.log(needed)) / spec.power  # tau^2 where both sides are equal
+    never, always = needed >= 1 - spec.floor, needed <= 0
     reach = np.where(always, np.inf, np.sqrt(np.where(never | always, 0, square)))
     reach = np.minimum(reach, TAU_MAX) * np.exp(spread)
     middle = 1 / (1 + np.exp(-centre))
@@ -272,22 +272,22 @@ def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, shape: Conditioning
 
 
 def condition(
-    rows: np.ndarray, window: np.ndarray, t: float, shape: ConditioningSpec, members: np.ndarray | None = None
+    rows: np.ndarray, window: np.ndarray, t: float, spec: ConditioningSpec, members: np.ndarray | None = None
 ) -> ConditionedSplats:
     """The Gaussians whose window holds t, of those with `members` (num,) if given, conditioned on t, in pixels."""
     t = np.float32(t)
     near = (window[:, 0] < t) & (t < window[:, 1])
     alive = np.flatnonzero(near if members is None else near & members)
-    num, (height, width) = len(alive), shape.size
-    unit = np.float32(pixels_per_unit(shape.size, aspect=shape.aspect))
+    num, (height, width) = len(alive), spec.size
+    unit = np.float32(pixels_per_unit(spec.size, aspect=spec.aspect))
     mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
     opacity, (color, kept) = np.empty(num, np.float32), np.empty((2, num, 3), np.float32)
-    constants = np.float32([width / 2, height / 2, shape.power, shape.floor])
+    constants = np.float32([width / 2, height / 2, spec.power, spec.floor])
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
         splats = (mean, factor, opacity, color, kept)
-        _condition(_LAYOUT, start, stop, alive, rows, shape.degree, t, unit, *constants, *splats)
+        _condition(_LAYOUT, start, stop, alive, rows, spec.degree, t, unit, *constants, *splats)
 
     run_tasks(work, range(0, num, CHUNK))
     return ConditionedSplats(alive, t, unit, mean, factor, opacity, color, kept)
@@ -297,13 +297,13 @@ def backpropagate(
     rows: np.ndarray,
     done: ConditionedSplats,
     gradients: tuple[np.ndarray, ...],
-    shape: ConditioningSpec,
+    spec: ConditioningSpec,
     grad: np.ndarray,
 ) -> float:
     """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt."""
     num = len(done.alive)
     by_time = np.zeros(-(-num // CHUNK))
-    power, floor = np.float32(shape.power), np.float32(shape.floor)
+    power, floor = np.float32(spec.power), np.float32(spec.floor)
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
@@ -313,7 +313,7 @@ def backpropagate(
             stop,
             done.alive,
             rows,
-            shape.degree,
+            spec.degree,
             done.t,
             done.unit,
             power,

@@ -1,4 +1,4 @@
-"""Quality of pictures, by scikit-image."""
+"""Image quality: PSNR and SSIM of frames, by scikit-image."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,31 +11,31 @@ from foldgauss.video.models.background import BLACK, check_background, composite
 from foldgauss.video.models.renderer import RenderableVideo
 
 
-def psnr(target: np.ndarray, picture: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of two uint8 pictures; equal pictures give 100 dB, not infinity.
+def psnr(target: np.ndarray, image: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of two uint8 images; equal images give 100 dB, not infinity.
 
-    Shapes: both (height, width, channels), or any that are equal. Raises ValueError where they differ.
+    Shapes: any, but equal. Raises ValueError where they differ.
     Example: `psnr(clip.frames[0], next(model.frames()))`. Source: scikit-image.
     """
-    if np.array_equal(target, picture):
+    if np.array_equal(target, image):
         return 100.0
-    return float(skimage.metrics.peak_signal_noise_ratio(target, picture, data_range=255))
+    return float(skimage.metrics.peak_signal_noise_ratio(target, image, data_range=255))
 
 
-#: Pixels along a side of the window of SSIM, and from its middle to its edge.
+#: Side of SSIM's window in pixels, and the distance from its centre to its edge.
 SSIM_WINDOW, SSIM_REACH = 11, 5
 
 
-def ssim(target: np.ndarray, picture: np.ndarray) -> float:
-    """Mean SSIM of two uint8 pictures (height, width, 3), with the weights of Wang et al. 2004.
+def ssim(target: np.ndarray, image: np.ndarray) -> float:
+    """Mean SSIM of two uint8 images (height, width, 3), with the weights of Wang et al. 2004.
 
     1 is equal. Example: `ssim(clip.frames[0], next(model.frames()))`. Raises ValueError where sizes differ.
 
-    The mean is over the pixels whose window of 11 px lies within the picture; along a side shorter than that, over all,
-    the picture being mirrored at its border.
+    The mean is over the pixels whose window of 11 px lies inside the image. A side shorter than that is padded by
+    mirroring the image.
     """
     short = [(SSIM_REACH, SSIM_REACH) if length < SSIM_WINDOW else (0, 0) for length in target.shape[:2]]
-    pair = (np.pad(one, [*short, (0, 0)], mode="symmetric") for one in (target, picture))
+    pair = (np.pad(one, [*short, (0, 0)], mode="symmetric") for one in (target, image))
     return float(
         skimage.metrics.structural_similarity(
             *pair,
@@ -73,23 +73,27 @@ def evaluate(
 ) -> Evaluation:
     """Compare `model` at its frame times with `frames`, uint8 (num_frames, *model.size, 3), or with alpha (..., 4).
 
-    Both stand over `background`: black says whether what is seen is right, white besides whether nothing else is.
-    Pictures are rounded to 8 bits first, as anyone who watches them gets them. `on_frame` is called with each picture.
-    `model` is any video, also one in segments. Frames are asked for one by one, in order, so `frames` may be anything
-    with `shape`, `dtype`, `ndim` and `[k]`, as `foldgauss.io.LazyFrames` of a clip that is larger than memory.
-    Raises ValueError if number or size of the frames differ from the model's.
+    Both are composited over `background`: errors in alpha do not show over black, but over white. Images are rounded to
+    8 bits first. `on_frame` is called with each image. `model` is any video, also one in segments. Frames are read one
+    by one, in order: `frames` may be anything with `shape`, `dtype`, `ndim` and `[k]`, as `foldgauss.io.LazyFrames` of
+    a clip larger than memory. Raises ValueError if the number or size of the frames differs from the model's.
 
     Example: `evaluate(model, clip.frames).mean_psnr`.
     """
+    check_frames(model, frames)
+    scores = []
+    for k, image in enumerate(model.frames(background=background)):
+        target = np.asarray(frames[k])
+        target = target if target.shape[-1] == 3 else composite(target, check_background(background))
+        scores.append((psnr(target, image), ssim(target, image)))
+        if on_frame is not None:
+            on_frame(image)
+    return Evaluation(*map(tuple, zip(*scores, strict=True)))
+
+
+def check_frames(model: RenderableVideo, frames: np.ndarray) -> None:
+    """Raise unless `frames` are uint8 frames of the model's number and size, with or without alpha."""
     expected = (model.num_frames, *model.size)
     if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4) or frames.dtype != np.uint8:
         wanted = f"uint8 {(*expected, 3)}, or 4 with alpha"
         raise invalid("frames", expected=wanted, got=f"{frames.dtype} {frames.shape}")
-    scores = []
-    for k, picture in enumerate(model.frames(background=background)):
-        target = np.asarray(frames[k])
-        target = target if target.shape[-1] == 3 else composite(target, check_background(background))
-        scores.append((psnr(target, picture), ssim(target, picture)))
-        if on_frame is not None:
-            on_frame(picture)
-    return Evaluation(*map(tuple, zip(*scores, strict=True)))

@@ -1,4 +1,4 @@
-"""A model made ready to be conditioned many times, for pictures of one size."""
+"""A model prepared for conditioning on many times, for images of one size: packed rows and their time windows."""
 
 from typing import Protocol
 
@@ -21,7 +21,7 @@ from foldgauss.video.models.splats import FoldedSplats
 
 
 class _Model(Protocol):
-    """What is read of a `VideoModel`, which is built upon this module."""
+    """The attributes needed of a `VideoModel`, which imports this module."""
 
     splats: FoldedSplats
     frame_times: FrameTimes
@@ -30,14 +30,14 @@ class _Model(Protocol):
 
 
 class PreparedModel:
-    """The Gaussians of a model by time, in pixels of a picture of `size`: rows packed, spans of time known.
+    """The Gaussians of a model, ready to be conditioned on any time, in pixels of an image of `size`.
 
-    `aspect` is the height / width of the frame that covers the picture (default: the model's).
+    `aspect` is the height / width of the frame that covers the image (default: the model's).
 
     **Example:** `PreparedModel(model, (160, 320)).splats(0.5)`.
 
-    **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for a size that is none, and for a model
-    with NaN or infinities in it (its pictures would have holes) or with several envelopes.
+    **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for an invalid size, and for a model with NaN or
+    infinities or with several envelopes.
     """
 
     def __init__(self, model: _Model, size: tuple[int, int], *, aspect: float | None = None):
@@ -45,15 +45,15 @@ class PreparedModel:
         height, width = model.size
         self.rows = pack(model.splats)
         _check_finite(self.rows)
-        self.shape = _shape_of(model.splats, tuple(size), height / width if aspect is None else aspect)
+        self.spec = _make_spec(model.splats, tuple(size), height / width if aspect is None else aspect)
         self.window = np.empty((len(self.rows), 2), np.float32)
         update_windows(self.rows, np.arange(len(self.rows)), self.window)
-        apply_scale_cutoff(self.rows, self.window, self.shape, model.scale_cutoff)
+        apply_scale_cutoff(self.rows, self.window, self.spec, model.scale_cutoff)
         self._times = np.asarray(model.frame_times.times())
 
     def at(self, t: float, members: np.ndarray | None = None) -> ConditionedSplats:
-        """The Gaussians alive at time t, any number; of `members`, bool (num_gaussians,), if given."""
-        return condition(self.rows, self.window, t, self.shape, members)
+        """The Gaussians alive at time t, also outside [0, 1]; of `members`, bool (num_gaussians,), if given."""
+        return condition(self.rows, self.window, t, self.spec, members)
 
     def splats(self, t: float) -> Splats2D:
         """The splats of the Gaussians alive at time t, front to back; NumPy leaves."""
@@ -61,27 +61,29 @@ class PreparedModel:
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """One picture, see `foldgauss.video.models.renderer.Prepared`."""
+        """A single image, see `foldgauss.video.models.renderer.PreparedVideo`."""
         return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
 
 def _check_finite(rows: np.ndarray) -> None:
     broken = int((~np.isfinite(rows)).any(-1).sum())
     if broken:
-        got, cure = f"{broken:,} Gaussians that have none", "The fit diverged, or the model was edited: fit again."
+        got, cure = (
+            f"others in {broken:,} Gaussians",
+            "The fit diverged, or the model was edited: fit again.",
+        )
         raise invalid("model", expected="finite numbers", got=got, cure=cure)
 
 
-def _shape_of(splats: FoldedSplats, size: tuple[int, int], aspect: float) -> ConditioningSpec:
-    power, floor = (_the_one(splats.envelope, name) for name in ("power", "floor"))
+def _make_spec(splats: FoldedSplats, size: tuple[int, int], aspect: float) -> ConditioningSpec:
+    power, floor = (_common_value(splats.envelope, name) for name in ("power", "floor"))
     return ConditioningSpec(splats.degree, power, floor, size, aspect=aspect)
 
 
-def _the_one(envelope: TimeLikelihood, name: str) -> float:
-    """The number that all Gaussians share."""
+def _common_value(envelope: TimeLikelihood, name: str) -> float:
+    """The value that all Gaussians have in common."""
     values = np.unique(np.asarray(getattr(envelope, name)))
     if values.size != 1:
-        got = f"{values.size} different ones"
-        cure = "Use VideoModel.render, which knows an envelope of each Gaussian's own."
+        got, cure = f"{values.size} different ones", "Use VideoModel.render, which supports one envelope per Gaussian."
         raise invalid(f"model.splats.envelope.{name}", expected="one number for all Gaussians", got=got, cure=cure)
     return float(values[0])

@@ -1,7 +1,7 @@
-"""Pictures of a fitted video one after another, as fast as the CPU gives them.
+"""Rendering of a video's frames on the CPU: 8-bit images at any times.
 
-Conditioning by the fused twin (`stage`, `conditioning`), blending by the CPU engine, 8-bit pictures in one more pass:
-no XLA, and no work for Gaussians that are not alive.
+Conditioning uses the fused kernels (`conditioning`) and blending the CPU engine: no XLA, and no work for Gaussians that
+are not alive.
 """
 
 from collections.abc import Iterator
@@ -23,21 +23,21 @@ ROWS = 64  # of pixels per task
 _f, _byte = nb.float32, nb.uint8
 
 
-class Prepared(Protocol):
-    """A video made ready for pictures of one size, as its `prepare(size)` gives it."""
+class PreparedVideo(Protocol):
+    """A video prepared for images of one size, by its `prepare(size)`."""
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """The pictures whose weighted sum is seen at time t, each as weight and splats; the weights sum to 1.
+        """The splats of the images whose weighted sum is the frame at time t, with the weights, which sum to 1.
 
-        Between two shots they are the nearer one's.
+        In the gap of a cut they are those of the nearer shot.
         """
 
 
 class RenderableVideo(Protocol):
-    """What all videos have: `VideoModel`, `EditedVideo`, `SegmentedVideo`."""
+    """The interface of all videos: `VideoModel`, `EditedVideo`, `SegmentedVideo`."""
 
     size: tuple[int, int]
     fps: float
@@ -45,21 +45,21 @@ class RenderableVideo(Protocol):
     compositing: str
     num_frames: int
 
-    def prepare(self, size: tuple[int, int]) -> Prepared:
-        """Made ready to be conditioned many times, for pictures of `size`."""
+    def prepare(self, size: tuple[int, int]) -> PreparedVideo:
+        """Prepared for conditioning on many times, for images of `size`."""
 
 
 class VideoRenderer:
-    """A video made ready to be drawn many times, at one size: a model, an edited one, or one of segments.
+    """Renders a video at one size and many times: a model, an edited video, or one in segments.
 
-    **Shapes:** pictures are uint8 (height, width, 3). **Units:** times are those of the model, in [0, 1].
+    **Shapes:** images are uint8 (height, width, 3). **Units:** times are those of the model, in [0, 1].
 
-    `background`: red, green and blue in [0, 1] behind all splats; black as the fit had it, where frames have no alpha.
+    `background`: red, green and blue in [0, 1] behind all splats; black, as in a fit of frames without alpha.
 
-    **Example:** `for picture in Playback(model).frames(): ...`
+    **Example:** `for image in VideoRenderer(model).frames(): ...`
 
-    **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for a size that is none, and for a model
-    with NaN or infinities in it (its pictures would have holes) or with several envelopes.
+    **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for an invalid size, and for a model with NaN or
+    infinities or with several envelopes.
     """
 
     def __init__(
@@ -77,55 +77,57 @@ class VideoRenderer:
         self._background = check_background(background, model.compositing)
 
     def splats(self, t: float) -> Splats2D:
-        """The splats of the Gaussians alive at time t, in pixels of a picture of `size`; NumPy leaves."""
+        """The splats of the Gaussians alive at time t, in pixels of an image of `size`; NumPy leaves."""
         return self._prepared.splats(t)
 
     def dominant_splats(self, t: float) -> Splats2D:
-        """As `splats`, of what is seen: between two shots the nearer one; in a fade, what is seen more of."""
+        """As `splats`, but of the nearer shot in the gap of a cut, and of the heavier image in a fade."""
         return max(self._prepared.weighted_splats(t), key=lambda part: part[0])[1]
 
     def frame(self, t: float) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture at time t; between two shots the nearer one's."""
+        """The image at time t; in the gap of a cut the nearer shot's."""
         return to_bytes(self.image(t))
 
     def frames(self, times: Float[np.ndarray, "frames"] | None = None) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        """The pictures at `times` (default: the model's frame times), one by one."""
-        shown = np.asarray(self.model.frame_times.times() if times is None else times)
-        close = 1e-6  # sums of steps miss the ends by their rounding
-        if shown.ndim != 1 or shown.dtype.kind not in "fiu" or not ((shown >= -close) & (shown <= 1 + close)).all():
+        """The images at `times` (default: the model's frame times), one by one."""
+        chosen = np.asarray(self.model.frame_times.times() if times is None else times)
+        close = 1e-6  # rounding of summed steps
+        if chosen.ndim != 1 or chosen.dtype.kind not in "fiu" or not ((chosen >= -close) & (chosen <= 1 + close)).all():
             cure = "Frame k is at frame_times.times()[k]."
             raise invalid("times", expected="a list of times in [0, 1]", got=short_repr(times), cure=cure)
-        for t in shown:
+        for t in chosen:
             yield self.frame(t)
 
     def image(self, t: float) -> Float[np.ndarray, "3 height width"]:
-        """The picture at time t before it is rounded to 8 bits: planar float32, about [0, 1]."""
+        """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""
         (first, splats), *others = self._prepared.weighted_splats(t)
-        image = self._drawn(splats)
+        image = self._render(splats)
         if others:
             image = np.float32(first) * image
             for weight, splats in others:
-                image += np.float32(weight) * self._drawn(splats)
+                image += np.float32(weight) * self._render(splats)
         return image
 
-    def _drawn(self, splats: Splats2D) -> Float[np.ndarray, "3 height width"]:
+    def _render(self, splats: Splats2D) -> Float[np.ndarray, "3 height width"]:
         leaves = splats.mean, splats.factor, splats.opacity, splats.color
-        drawn = {"compositing": self.model.compositing, "options": self.model.options}
-        return cpu.forward(*leaves, self._background, self.size, **drawn).image
+        model = self.model
+        return cpu.forward(
+            *leaves, self._background, self.size, compositing=model.compositing, options=model.options
+        ).image
 
 
 def to_bytes(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "height width 3"]:
     """Planar float32 about [0, 1] to interleaved uint8, rounded and clipped; NaN is 0."""
     _, height, width = image.shape
-    picture = np.empty((height, width, 3), np.uint8)
-    run_tasks(lambda top: _to_bytes(image, picture, top, min(top + ROWS, height)), range(0, height, ROWS))
-    return picture
+    out = np.empty((height, width, 3), np.uint8)
+    run_tasks(lambda top: _to_bytes(image, out, top, min(top + ROWS, height)), range(0, height, ROWS))
+    return out
 
 
 @kernel
-def _to_bytes(image, picture, top, bottom):
+def _to_bytes(image, out, top, bottom):
     for y in range(top, bottom):
         for x in range(image.shape[2]):
             for c in range(3):
                 level = image[c, y, x] * _f(255) + _f(0.5)
-                picture[y, x, c] = _byte(nb.int32(min(max(level, _f(0)), _f(255))))
+                out[y, x, c] = _byte(nb.int32(min(max(level, _f(0)), _f(255))))

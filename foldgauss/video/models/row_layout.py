@@ -1,7 +1,7 @@
-"""One row of numbers per Gaussian: the layout the optimiser works on.
+"""Packed rows: all parameters of a Gaussian in one row, the layout that the optimizer works on.
 
-A Gaussian's parameters, moments and gradients each lie in one cache line or two, so that a step which touches
-only the Gaussians alive reads only them.
+A Gaussian's parameters, moments and gradients each fit in one or two cache lines, so that a step reads only the
+Gaussians alive.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ def _leaf_names() -> list[str]:
 
 
 def columns(degree: int) -> dict[str, slice]:
-    """Where each leaf of `FoldedSplats` stands in a row."""
+    """The columns of each leaf of `FoldedSplats` in a row."""
     widths = {"loc": 2, "log_scale": 2, "color_dc": 3, "coefficients": 2 * degree}
     place, start = {}, 0
     for name in _leaf_names():
@@ -47,7 +47,7 @@ def unpack(rows: np.ndarray, degree: int, envelope: TimeLikelihood) -> FoldedSpl
 def shift_path(
     place: Float[np.ndarray, "num degree+1 2"], shift: Float[np.ndarray, " num"]
 ) -> Float[np.ndarray, "num degree+1 2"]:
-    """The same path in powers of u + shift: its Gaussian's m_t is later by `shift`."""
+    """Coefficients of the same path in powers of u + shift, for an m_t later by `shift`."""
     place, degree = place.copy(), place.shape[1] - 1
     for j in range(degree):
         for k in range(degree - 1, j - 1, -1):

@@ -1,4 +1,4 @@
-"""The fitted video: folded splats, frame times and what rendering them depends on."""
+"""The fitted video: folded splats, frame times and rendering options."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -22,12 +22,12 @@ from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.splats import FoldedSplats
 
-#: The cure where a video in segments is given and one model is wanted.
+#: Advice in errors where a segmented video was given and one model is needed.
 ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 
 def check_time(t: float) -> None:
-    """Raise unless t is a time of a video, where that is known."""
+    """Raise unless t is a time in [0, 1], if its value is known."""
     check_not_forked()
     try:
         value = concrete_value(jnp.asarray(t))
@@ -42,7 +42,7 @@ def check_model(model: object) -> None:
     """Raise unless it is a `VideoModel`."""
     if not isinstance(model, VideoModel):
         cures = {
-            "EditedVideo": "Take each layer's own model, before layers and edits are put together.",
+            "EditedVideo": "Use each layer's own model, before layers and edits are combined.",
             "Edit": "End the chain with .video().",
             "SegmentedVideo": ONE_SEGMENT,
         }
@@ -51,11 +51,11 @@ def check_model(model: object) -> None:
 
 
 class VideoModel(eqx.Module):
-    """A fitted video: what is stored in a model file.
+    """A fitted video, as stored in a model file.
 
-    `size` is (height, width) of the frames it was fitted to, `fps` their rate, `options` the constants and
-    `compositing` the blend ("over" or "sum") it was fitted with and must be drawn with. `scale_cutoff`: a Gaussian is
-    drawn only where its standard deviations exceed it, in model units; 0 but for imported VeGaS videos.
+    `size` is (height, width) of the frames it was fitted to, `fps` their rate; `options` and `compositing` ("over" or
+    "sum") are those of the fit, and must be rendered with. `scale_cutoff`: a Gaussian is rendered only where its
+    standard deviations exceed it, in model units; 0 except for imported VeGaS videos.
 
     Units: time is [0, 1], frame k at `frame_times.times()[k]`; lengths are in model space, see `FoldedSplats`.
     Example: `fit(frames).model.render(0.5)`. Source: VeGaS, section 4.
@@ -84,20 +84,20 @@ class VideoModel(eqx.Module):
 
     @property
     def num_parameters(self) -> int:
-        """Numbers stored: of each Gaussian what it has, see `StoredSplats`. Four bytes of kinds or indices are one."""
+        """The parameters that a file stores, see `StoredSplats`; four bytes of kinds or indices count as one."""
         leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
         return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
 
     def with_options(self, options: RenderOptions) -> "VideoModel":
-        """The same, drawn with other constants."""
+        """The same model, rendered with other options."""
         return dataclasses.replace(self, options=options)
 
     def prepare(self, size: tuple[int, int]) -> PreparedModel:
-        """Made ready to be conditioned many times, for pictures of `size`."""
+        """The model prepared for conditioning on many times, for images of `size`."""
         return PreparedModel(self, size)
 
     def at(self, t: Float[Array, ""], size: tuple[int, int] | None = None) -> Splats2D:
-        """The splats of time t, in pixels of a picture of `size` (default: the fitted one)."""
+        """The splats of time t, in pixels of an image of `size` (default: the fitted one)."""
         height, width = self.size
         return self.splats.at(t, scale_cutoff=self.scale_cutoff).to_pixels(
             self.size if size is None else size, aspect=height / width
@@ -111,9 +111,9 @@ class VideoModel(eqx.Module):
         engine: str = "auto",
         background: tuple[float, float, float] = BLACK,
     ) -> Float[Array, "height width 3"]:
-        """The picture at any time t in [0, 1], values about [0, 1], over `background`; see `foldgauss.render.render`.
+        """The image at any time t in [0, 1], values about [0, 1], over `background`; see `foldgauss.render.render`.
 
-        Between two shots it is the nearer shot's. Frame k is at `frame_times.times()[k]`.
+        In the gap of a cut it is the nearer shot's. Frame k is at `frame_times.times()[k]`.
         """
         size = self.size if size is None else size
         check_size(size)
@@ -121,8 +121,9 @@ class VideoModel(eqx.Module):
         t = snap_to_shots(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
         behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)
-        drawn = {"compositing": self.compositing, "options": self.options}
-        return render(splats, size, background=behind, engine=engine, **drawn)
+        return render(
+            splats, size, background=behind, engine=engine, compositing=self.compositing, options=self.options
+        )
 
     def frames(
         self,
@@ -131,11 +132,11 @@ class VideoModel(eqx.Module):
         *,
         background: tuple[float, float, float] = BLACK,
     ) -> Iterator[np.ndarray]:
-        """Pictures at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
+        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
         yield from VideoRenderer(self, size, background=background).frames(times)
 
     def _repr_html_(self) -> str | None:
-        """The player, in a notebook: see docs/player.md. None where its page would be too large."""
+        """The player, in a notebook: see docs/player.md. None if its page would be too large."""
         return notebook_hooks.show("video", self)
 
 

@@ -23,8 +23,8 @@ from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
-from foldgauss.video.selection.contributions import Contributions, drawn_share
-from foldgauss.video.selection.regions import box_region, chosen_frames, mask_region, polygon_region
+from foldgauss.video.selection.contributions import Contributions, render_matte
+from foldgauss.video.selection.regions import region_from_box, region_from_mask, region_from_polygon, resolve_frames
 from foldgauss.video.selection.selectors import (
     THRESHOLD,
     Selection,
@@ -34,7 +34,7 @@ from foldgauss.video.selection.selectors import (
     by_mask,
     by_polygon,
     by_time,
-    questions,
+    list_criteria,
     select,
 )
 
@@ -219,7 +219,7 @@ class SegmentedEdit:
             raise invalid("layer", expected="a whole number >= 0", got=layer)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
-            return self._chosen(self._answer(questions(**criteria), layer))
+            return self._chosen(self._answer(list_criteria(**criteria), layer))
         if selection is None:
             return self._selecting(lambda one, number: one.select(layer=layer), None)
         if callable(selection):
@@ -329,7 +329,7 @@ class SegmentedEdit:
     def _answer(
         self, asked: list[tuple[Callable[..., Selection], dict[str, Any]]], layer: int | None
     ) -> SegmentedSelection:
-        """The answers to all questions, intersected: those by place first, so that the others need ask fewer models."""
+        """The answers to all criteria, intersected: those by place first, so that the others need ask fewer models."""
         found: SegmentedSelection | None = None
         for function, named in sorted(asked, key=lambda question: question[0] in (by_color, by_time)):
             if function in (by_color, by_time):
@@ -365,7 +365,7 @@ class SegmentedEdit:
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
         """First and last frame position, of times, or the range of frames."""
         if times is None:
-            return chosen_frames(_model(self._stand_in), frame, frames)
+            return resolve_frames(_model(self._stand_in), frame, frames)
         pair = np.asarray(times)
         if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
             raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
@@ -401,12 +401,12 @@ class _RegionQuery:
         stand_in = _model(edits._stand_in)
         where = {"frame": named["frame"], "frames": named.get("frames")}
         if function is by_click:
-            self._frames = tuple(chosen_frames(stand_in, **where))
+            self._frames = tuple(resolve_frames(stand_in, **where))
         else:
             regions = {
-                by_mask: (mask_region, "mask"),
-                by_box: (box_region, "box"),
-                by_polygon: (polygon_region, "polygon"),
+                by_mask: (region_from_mask, "mask"),
+                by_box: (region_from_box, "box"),
+                by_polygon: (region_from_polygon, "polygon"),
             }
             make, name = regions[function]
             self._region = make(stand_in, named[name], **where)
@@ -466,7 +466,7 @@ class _RegionQuery:
                 if lit is None:
                     pictures[k] = np.zeros(layer.model.size, bool)
                 else:
-                    pictures[k] = drawn_share(lit, mask, float(one._window.times[k - here.first])) >= _SHOWN
+                    pictures[k] = render_matte(lit, mask, float(one._window.times[k - here.first])) >= _SHOWN
 
     def _from_neighbours(self, one: Edit, number: int) -> Selection:
         first, shown = self._segments[number].first, self._shown[number]

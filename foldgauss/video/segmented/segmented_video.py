@@ -15,7 +15,7 @@ from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.frame_times import check_frame_before, times_at
-from foldgauss.video.models.renderer import Prepared, VideoRenderer
+from foldgauss.video.models.renderer import PreparedVideo, VideoRenderer
 from foldgauss.video.models.video_model import VideoModel, check_time
 
 #: Models that are held ready at once; more only where more are seen: half way from the last frame of one fade to the
@@ -251,7 +251,7 @@ class PreparedSegmentedVideo:
 
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):
         self._video, self._size = video, tuple(size)
-        self._ready: OrderedDict[int, tuple[Prepared, np.ndarray]] = OrderedDict()
+        self._ready: OrderedDict[int, tuple[PreparedVideo, np.ndarray]] = OrderedDict()
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, of the segment that is seen most; NumPy leaves."""
@@ -261,7 +261,7 @@ class PreparedSegmentedVideo:
         return stage.splats(time)
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """The pictures of the segments that are seen at time t, see `foldgauss.video.models.renderer.Prepared`."""
+        """The pictures of the segments that are seen at time t, see `foldgauss.video.models.renderer.PreparedVideo`."""
         position, parts = self._video.position(t), []
         weights = self._video.weights(position)
         for number, weight in weights:
@@ -269,12 +269,12 @@ class PreparedSegmentedVideo:
             parts += [(weight * own, splats) for own, splats in stage.weighted_splats(time)]
         return parts
 
-    def _at(self, number: int, position: float, most: int) -> tuple[Prepared, np.ndarray]:
+    def _at(self, number: int, position: float, most: int) -> tuple[PreparedVideo, np.ndarray]:
         """A segment made ready, one of at `most` so many, and its own time at a position in the whole clip."""
         stage, times = self._prepared(number, most)
         return stage, times_at(times, position - self._video.segments[number].first)
 
-    def _prepared(self, number: int, most: int) -> tuple[Prepared, np.ndarray]:
+    def _prepared(self, number: int, most: int) -> tuple[PreparedVideo, np.ndarray]:
         if number not in self._ready:
             while len(self._ready) >= most:
                 self._ready.popitem(last=False)  # before the next is loaded, so that there is room for it

@@ -1,8 +1,8 @@
-"""Who adds what to the picture: the weights w_i(p) = alpha_i(p) times the light that reaches Gaussian i at pixel p.
+"""Contribution of each Gaussian to a rendered image: the weights w_i(p) = alpha_i(p) times the transmittance at i.
 
-A picture is A c: linear in the colours, with A the weights. So the renderer's two passes give both ways through A:
-forward, what any three numbers of each Gaussian look like; backward, the sums over pixels of any picture times the
-weights. Three channels always, since the kernels for three are those that the fit and playback have compiled.
+An image is A c: linear in the colours, with A the weights. The renderer's two passes therefore apply A and its
+transpose: the forward pass renders any three values per Gaussian, the backward pass sums any image times the weights
+over pixels. There are always three channels, the number for which the fit has compiled its kernels.
 """
 
 import dataclasses
@@ -21,19 +21,19 @@ from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.selection.regions import Region
 
-_DARK = np.zeros(3, np.float32)
+_BLACK = np.zeros(3, np.float32)
 
 
 class Contributions:
-    """A model ready to be asked, at any time and its own size, what its Gaussians add to the picture.
+    """A model prepared to compute, at any time and at its own size, what each Gaussian adds to the image.
 
-    **Raises:** ValueError for what is no `VideoModel`, for numbers that are not finite, and for several envelopes.
+    **Raises:** ValueError for anything but a `VideoModel`, for NaN or infinities, and for several envelopes.
     """
 
     def __init__(self, model: VideoModel):
         check_model(model)
         self.model, self.size = model, model.size
-        self.stage = PreparedModel(model, model.size)
+        self.prepared = PreparedModel(model, model.size)
         self.times = np.asarray(model.frame_times.times())
 
     @property
@@ -42,24 +42,23 @@ class Contributions:
 
     @property
     def window(self) -> Float32[np.ndarray, "num_gaussians 2"]:
-        """First and last time at which each Gaussian is drawn."""
-        return self.stage.window
+        """First and last time at which each Gaussian is rendered."""
+        return self.prepared.window
 
-    def frame(self, k: int) -> "Light":
-        """The light of frame k."""
+    def at_frame(self, k: int) -> "FrameContributions":
         return self.at(float(self.times[k]))
 
-    def at(self, t: float) -> "Light":
-        """The light at time t; between two shots the nearer one's, as pictures are drawn."""
-        return Light(self, self.stage.at(float(snap_to_shots(t, self.times))))
+    def at(self, t: float) -> "FrameContributions":
+        """The contributions at time t; in the gap of a cut those at the nearer frame, as in rendering."""
+        return FrameContributions(self, self.prepared.at(float(snap_to_shots(t, self.times))))
 
-    def position(self, indices: Int[np.ndarray, " num"], t: float) -> Float32[np.ndarray, "num 2"]:
-        """Centres of the named Gaussians, in pixels, at any time, alive or not."""
-        ever = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
-        return condition(self.stage.rows[indices], ever, t, self.stage.shape).mean
+    def centers_at(self, indices: Int[np.ndarray, " num"], t: float) -> Float32[np.ndarray, "num 2"]:
+        """Centres of these Gaussians at time t, in pixels, alive or not."""
+        always = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
+        return condition(self.prepared.rows[indices], always, t, self.prepared.spec).mean
 
-    def own_place(self, indices: Int[np.ndarray, " num"]) -> Float[np.ndarray, "num 2"]:
-        """Centres of the named Gaussians at their own times, in pixels: there the fold is 0."""
+    def own_centers(self, indices: Int[np.ndarray, " num"]) -> Float[np.ndarray, "num 2"]:
+        """Centres of these Gaussians at their own m_t, where the fold is 0, in pixels."""
         height, width = self.size
         return np.asarray(self.model.splats.loc, np.float64)[indices] * max(self.size) + [width / 2, height / 2]
 
@@ -69,20 +68,20 @@ class Contributions:
         return expit(np.asarray(self.model.splats.time_loc_logit, np.float64))
 
     def nearest_frame(self, indices: Int[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
-        """The frame next to each named Gaussian's own time."""
+        """The frame nearest to the m_t of each of these Gaussians."""
         return np.searchsorted((self.times[1:] + self.times[:-1]) / 2, self.own_times[indices])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Light:
-    """One time of a model: the Gaussians alive, and the weights by which they make the picture."""
+class FrameContributions:
+    """The Gaussians alive at one time, and their weights in the image."""
 
-    lit: Contributions
+    source: Contributions
     splats: ConditionedSplats
 
     @property
     def alive(self) -> Int[np.ndarray, " num_alive"]:
-        """Numbers of the Gaussians alive, in array order."""
+        """Indices of the Gaussians alive, in array order."""
         return self.splats.alive
 
     @functools.cached_property
@@ -90,107 +89,110 @@ class Light:
         return self._forward(self.splats.color)
 
     @property
-    def picture(self) -> Float32[np.ndarray, "3 height width"]:
-        """What is seen, over black."""
+    def image(self) -> Float32[np.ndarray, "3 height width"]:
+        """The rendered image over black."""
         return self.trace.image
 
     @functools.cached_property
     def total(self) -> Float32[np.ndarray, " num_alive"]:
-        """Sum over pixels of the weights, in pixels."""
-        return self.gathered(np.ones((1, *self.lit.size), np.float32))[:, 0]
+        """Sum of each Gaussian's weights over pixels, in pixels."""
+        return self.gather(np.ones((1, *self.source.size), np.float32))[:, 0]
 
-    def drawn(self, values: Float[np.ndarray, "num_alive channels"]) -> Float32[np.ndarray, "channels height width"]:
-        """A v: the picture of up to three numbers per Gaussian, as if they were its colours."""
-        return self._forward(_three(values, 1)).image[: values.shape[1]]
+    def render(self, values: Float[np.ndarray, "num_alive channels"]) -> Float32[np.ndarray, "channels height width"]:
+        """A v: the image of up to three values per Gaussian in place of its colour."""
+        return self._forward(_pad_to_three(values, 1)).image[: values.shape[1]]
 
-    def gathered(self, planes: Float[np.ndarray, "channels height width"]) -> Float32[np.ndarray, "num_alive channels"]:
-        """A^T y: sums over pixels of up to three pictures times the weights."""
-        return cpu.backward(self.trace, _three(planes, 0))[3][:, : len(planes)]
+    def gather(self, images: Float[np.ndarray, "channels height width"]) -> Float32[np.ndarray, "num_alive channels"]:
+        """A^T y: up to three images times the weights, summed over pixels."""
+        return cpu.backward(self.trace, _pad_to_three(images, 0))[3][:, : len(images)]
 
     def _forward(self, color: Float32[np.ndarray, "num_alive 3"]) -> cpu.Trace:
-        splats, model = self.splats, self.lit.model
-        leaves = splats.mean, splats.factor, splats.opacity, color, _DARK
-        return cpu.forward(*leaves, self.lit.size, compositing=model.compositing, options=model.options)
+        splats, model = self.splats, self.source.model
+        leaves = splats.mean, splats.factor, splats.opacity, color, _BLACK
+        return cpu.forward(*leaves, self.source.size, compositing=model.compositing, options=model.options)
 
 
-def _three(values: np.ndarray, axis: int) -> np.ndarray:
-    """float32, filled up with zeros to three along the axis."""
+def _pad_to_three(values: np.ndarray, axis: int) -> np.ndarray:
+    """As float32, with zeros up to three along the axis."""
     pad = [(0, 0)] * values.ndim
     pad[axis] = (0, 3 - values.shape[axis])
     return np.ascontiguousarray(np.pad(values.astype(np.float32), pad))
 
 
-def contributions(
-    lit: Contributions, region: Region
+def sum_contributions(
+    contributions: Contributions, region: Region
 ) -> tuple[
     Float[np.ndarray, " num_gaussians"], Float[np.ndarray, " num_gaussians"], Float[np.ndarray, " num_gaussians"]
 ]:
-    """What each Gaussian adds over the frames of a region: inside it, in all, and in its best frame; px, float64."""
-    inside, total, best = np.zeros((3, lit.num_gaussians))
-    everywhere = np.ones(lit.size, np.float32)
+    """Each Gaussian's weights over a region's frames: summed inside it, in all, and in its best frame; px, float64."""
+    inside, total, best = np.zeros((3, contributions.num_gaussians))
+    everywhere = np.ones(contributions.size, np.float32)
     for k in region.frames:
-        light = lit.frame(k)
-        own_inside, own = light.gathered(np.stack([region.at(k), everywhere])).T
-        inside[light.alive] += own_inside
-        total[light.alive] += own
-        best[light.alive] = np.maximum(best[light.alive], own)
+        frame = contributions.at_frame(k)
+        own_inside, own = frame.gather(np.stack([region.at(k), everywhere])).T
+        inside[frame.alive] += own_inside
+        total[frame.alive] += own
+        best[frame.alive] = np.maximum(best[frame.alive], own)
     return inside, total, best
 
 
-def best_frames(
-    lit: Contributions, frames: Iterable[int], best: Float[np.ndarray, " num_gaussians"]
+def update_best(
+    contributions: Contributions, frames: Iterable[int], best: Float[np.ndarray, " num_gaussians"]
 ) -> Float[np.ndarray, " num_gaussians"]:
-    """What each Gaussian adds in its best frame, of `frames` too, if that is more than `best`."""
+    """Each Gaussian's contribution to its best frame: the maximum of `best` and those to `frames`."""
     best = best.copy()
     for k in frames:
-        light = lit.frame(k)
-        best[light.alive] = np.maximum(best[light.alive], light.total)
+        frame = contributions.at_frame(k)
+        best[frame.alive] = np.maximum(best[frame.alive], frame.total)
     return best
 
 
-def seen_colors(
-    lit: Contributions,
+def average_seen_colors(
+    contributions: Contributions,
 ) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, " num_gaussians"]]:
-    """The picture's colour where each Gaussian is seen, the mean over all frames; and which are seen at all."""
+    """The rendered colour where each Gaussian is visible, averaged over all frames; and which are visible at all."""
 
-    def parts():
-        for k in range(len(lit.times)):
-            light = lit.frame(k)
-            seen = light.total > 0
-            total = light.total[seen]
-            yield light.alive[seen], light.gathered(light.picture)[seen] / total[:, None], total
+    def observations():
+        for k in range(len(contributions.times)):
+            frame = contributions.at_frame(k)
+            seen = frame.total > 0
+            total = frame.total[seen]
+            yield frame.alive[seen], frame.gather(frame.image)[seen] / total[:, None], total
 
-    return weighted_mean(lit.num_gaussians, parts())
+    return weighted_mean(contributions.num_gaussians, observations())
 
 
 def weighted_mean(
-    num: int, parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    num: int, observations: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> tuple[Float[np.ndarray, "num 3"], Bool[np.ndarray, " num"]]:
-    """Means of (index, value, weight) of several frames; and which of `num` there were any of."""
+    """Means of (index, value, weight) over frames; and which of the `num` indices occur."""
     value, total = np.zeros((num, 3)), np.zeros((num, 1))
-    for index, own, weight in parts:
+    for index, own, weight in observations:
         value[index] += weight[:, None] * own
         total[index] += weight[:, None]
-    there = total[:, 0] > 0
-    return np.divide(value, total, out=value, where=there[:, None]), there
+    found = total[:, 0] > 0
+    return np.divide(value, total, out=value, where=found[:, None]), found
 
 
-def drawn_share(
-    lit: Contributions, mask: Bool[np.ndarray, " num_gaussians"], t: float
+def render_matte(
+    contributions: Contributions, mask: Bool[np.ndarray, " num_gaussians"], t: float
 ) -> Float32[np.ndarray, "height width"]:
-    """The share of a set of Gaussians in each pixel at time t: sum of their weights over that of all; 0 where none."""
-    light = lit.at(t)
-    chosen = mask[light.alive]
-    own, everyone = light.drawn(np.stack([chosen, np.ones_like(chosen)], 1))
+    """The fraction of each pixel's weights at time t that belongs to the Gaussians of `mask`; 0 without any."""
+    frame = contributions.at(t)
+    chosen = mask[frame.alive]
+    own, everyone = frame.render(np.stack([chosen, np.ones_like(chosen)], 1))
     return np.divide(own, everyone, out=np.zeros_like(own), where=everyone > 0)
 
 
-def reached(lit: Contributions, mask: Bool[np.ndarray, " num_gaussians"], t: float) -> Bool[np.ndarray, "height width"]:
-    """The pixels at time t that a set of Gaussians reaches: where the alpha of one is not cut off, seen or hidden."""
-    splats = lit.at(t).splats
+def find_influence(
+    contributions: Contributions, mask: Bool[np.ndarray, " num_gaussians"], t: float
+) -> Bool[np.ndarray, "height width"]:
+    """The pixels at time t where a Gaussian of `mask` has an alpha above the cutoff, visible or occluded."""
+    splats = contributions.at(t).splats
     chosen = mask[splats.alive]
     leaves = splats.mean[chosen], splats.factor[chosen], splats.opacity[chosen]
-    bright = np.ones((int(chosen.sum()), 3), np.float32)
-    # Added up: nothing hides behind anything then.
-    drawn = cpu.forward(*leaves, bright, _DARK, lit.size, compositing="sum", options=lit.model.options)
-    return drawn.image[0] > 0
+    white = np.ones((int(chosen.sum()), 3), np.float32)
+    # In a sum nothing is occluded.
+    options = contributions.model.options
+    trace = cpu.forward(*leaves, white, _BLACK, contributions.size, compositing="sum", options=options)
+    return trace.image[0] > 0

@@ -1,4 +1,4 @@
-"""Where on which frames: masks, boxes and polygons as one thing, at the model's own size."""
+"""Image regions: masks, boxes and polygons on some frames, as one type, at the model's own size."""
 
 import dataclasses
 import math
@@ -17,144 +17,142 @@ from foldgauss.video.models.video_model import VideoModel, check_model
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
 Masks = Mask | Bool[np.ndarray, "num_frames height width"] | Mapping[int, Mask]
 
-#: A mask's sides may be off the model's aspect by so many of the model's pixels: sizes are rounded.
+#: A mask's aspect may differ from the model's by this many of the model's pixels: sizes are rounded.
 ROUNDING = 1.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Region:
-    """Pixels of some frames: `at(k)` is float32 (height, width) in [0, 1], the share of each pixel that is inside."""
+    """Pixels of some frames: `at(k)` is float32 (height, width) in [0, 1], the fraction of each pixel inside."""
 
     frames: tuple[int, ...]
     at: Callable[[int], Float32[np.ndarray, "height width"]]
 
 
-def mask_region(model: VideoModel, mask: Masks, frame: int | None, frames: tuple[int, int] | None) -> Region:
-    """A mask of one frame or several alike, one mask for each of a range of frames, or {frame: mask}."""
+def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: tuple[int, int] | None) -> Region:
+    """From one mask for one frame or several, one mask for each of several frames, or {frame: mask}."""
     check_model(model)
     if isinstance(mask, Mapping):
         if frame is not None or frames is not None:
-            raise invalid("mask", expected="its frames named once", got="{frame: mask} and frame or frames as well")
-        found = {_checked_frame(model, k): _checked_mask(model, one, ndim=2) for k, one in mask.items()}
+            raise invalid("mask", expected="its frames given once", got="{frame: mask}, and frame or frames as well")
+        found = {_check_frame(model, k): _check_mask(model, one, ndim=2) for k, one in mask.items()}
     elif isinstance(mask, str | os.PathLike):
         cure = "Read it: mask=foldgauss.io.read_masks(path)."
         raise invalid("mask", expected="bool (height, width)", got=f"the path {str(mask)!r}", cure=cure)
     else:
         mask = np.asarray(mask)
         if mask.ndim == 2 and frame is None and frames is None:
-            cure = "Say which frame it is of: frame=k."
+            cure = "Name its frame: frame=k."
             raise invalid("mask", expected=f"({model.num_frames}, height, width)", got=f"{mask.shape}", cure=cure)
-        numbers = chosen_frames(model, frame, frames)
+        numbers = resolve_frames(model, frame, frames)
         if mask.ndim not in (2, 3) or (mask.ndim == 3 and len(mask) != len(numbers)):
             expected = f"one of shape (height, width), or {len(numbers)} of them"
             cure = "Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}."
             raise invalid("mask", expected=expected, got=f"shape {mask.shape}", cure=cure)
-        _checked_mask(model, mask, mask.ndim)
+        _check_mask(model, mask, mask.ndim)
         found = dict(zip(numbers, mask, strict=True)) if mask.ndim == 3 else dict.fromkeys(numbers, mask)
     if not any(one.any() for one in found.values()):
-        raise invalid("mask", expected="a mask with something in it", got="an empty one")
-    return Region(tuple(sorted(found)), lambda k: _resized(found[k], model.size))
+        raise invalid("mask", expected="a mask that is not empty", got="an empty one")
+    return Region(tuple(sorted(found)), lambda k: _resize(found[k], model.size))
 
 
-def box_region(
+def region_from_box(
     model: VideoModel, box: tuple[float, float, float, float], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
     """The pixels whose centres lie in x0 <= x < x1, y0 <= y < y1."""
     check_model(model)
-    edges = _as_numbers(box)
+    edges = _as_array(box)
     if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
-        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=_shown(box))
+        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=_short_repr(box))
     if not (edges[0] < edges[2] and edges[1] < edges[3]):
         raise invalid("box", expected="x0 < x1 and y0 < y1", got=box, cure="x is right, y is down.")
     (height, width), (x0, y0, x1, y1) = model.size, edges
     x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    return _still("box", model, (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1), frame, frames)
+    return _constant_region("box", model, (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1), frame, frames)
 
 
-def polygon_region(
+def region_from_polygon(
     model: VideoModel, polygon: Float[ArrayLike, "corners 2"], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
     """The pixels whose centres lie in a polygon of corners (x, y), even-odd."""
     check_model(model)
-    corners = _as_numbers(polygon)
+    corners = _as_array(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
     if bad or not np.isfinite(corners).all():
-        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=_shown(polygon))
-    # There a pixel's centre is a whole number, and rows come first.
-    return _still("polygon", model, skimage.draw.polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames)
+        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=_short_repr(polygon))
+    # scikit-image has pixel centres at integers, and rows first.
+    return _constant_region(
+        "polygon", model, skimage.draw.polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames
+    )
 
 
-def _as_numbers(given: object) -> np.ndarray:
-    """As an array; an empty one for rows of unlike length."""
+def _as_array(given: object) -> np.ndarray:
+    """As an array; an empty one for rows of different lengths."""
     try:
         return np.asarray(given)
     except ValueError:
         return np.zeros(0)
 
 
-def _shown(given: object) -> str:
-    """In an error of one line: a model is told by its type."""
+def _short_repr(given: object) -> str:
+    """For an error message of one line: the value if it is short, else its type."""
     return repr(given) if isinstance(given, list | tuple | np.ndarray | str | float | int) else type(given).__name__
 
 
-def chosen_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:
-    """One frame, the frames first <= k < stop, or all."""
+def resolve_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:
+    """The frame `frame`, the frames first <= k < stop, or all."""
     check_model(model)
     if frame is not None and frames is not None:
         raise invalid("frame, frames", expected="one of the two", got="both")
     if frame is not None:
-        k = _checked_frame(model, frame)
+        k = _check_frame(model, frame)
         return range(k, k + 1)
-    first, stop = (0, model.num_frames) if frames is None else _checked_frames(model, frames)
+    first, stop = (0, model.num_frames) if frames is None else _check_range(model, frames)
     return range(first, stop)
 
 
-def checked_share(name: str, value: object, bounds: str = "(0, 1]") -> float:
+def check_number(name: str, value: object, bounds: str) -> float:
     """As float. Raises ValueError unless it is a number within the bounds."""
     if not is_within(value, bounds):
         raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
     return float(value)
 
 
-def _still(name, model, inside: Bool[np.ndarray, "height width"], frame, frames) -> Region:
-    """The same pixels in all the frames."""
+def _constant_region(name, model, inside: Bool[np.ndarray, "height width"], frame, frames) -> Region:
+    """The same pixels in all of the frames."""
     if not inside.any():
         height, width = model.size
-        cure = "x is right, y is down; the model's own size counts."
+        cure = "x is right, y is down, in pixels of the model's own size."
         raise invalid(name, expected=f"pixels of a {height}x{width} frame in it", got="none", cure=cure)
-    share = inside.astype(np.float32)
-    return Region(tuple(chosen_frames(model, frame, frames)), lambda k: share)
+    fraction = inside.astype(np.float32)
+    return Region(tuple(resolve_frames(model, frame, frames)), lambda k: fraction)
 
 
-def _checked_frame(model: VideoModel, k: object) -> int:
+def _check_frame(model: VideoModel, k: object) -> int:
     if not isinstance(k, Integral) or isinstance(k, bool) or not 0 <= k < model.num_frames:
         raise invalid("frame", expected=f"a frame's number in [0, {model.num_frames})", got=repr(k))
     return int(k)
 
 
-def _checked_frames(model: VideoModel, frames: object) -> tuple[int, int]:
+def _check_range(model: VideoModel, frames: object) -> tuple[int, int]:
     pair = tuple(frames) if isinstance(frames, tuple | list | np.ndarray) else ()
     if len(pair) == 2:
         pair = tuple(end if given is None else given for given, end in zip(pair, (0, model.num_frames), strict=True))
     if not (len(pair) == 2 and all(is_integer(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames):
         expected = f"(first, stop) with 0 <= first < stop <= {model.num_frames}"
-        raise invalid(
-            "frames",
-            expected=expected,
-            got=repr(frames),
-            cure="None is the clip's own end; for one frame give frame=k.",
-        )
+        cure = "None is the clip's own end; for one frame give frame=k."
+        raise invalid("frames", expected=expected, got=repr(frames), cure=cure)
     return int(pair[0]), int(pair[1])
 
 
-def _checked_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
-    """One mask or a stack of them, of the model's aspect; bool, or numbers in [0, 1]."""
+def _check_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
+    """A mask or a stack of masks of the model's aspect; bool, or float in [0, 1]."""
     mask = np.asarray(mask)
     if mask.ndim != ndim or mask.size == 0 or mask.dtype.kind not in "bf":
-        cure = "Of labels take those of one object: mask=(labels == 1); of grey levels, mask=(levels > 127)."
+        cure = "From labels take those of one object: mask=(labels == 1); from grey levels, mask=(levels > 127)."
         raise invalid("mask", expected="bool (height, width)", got=f"{mask.dtype} {mask.shape}", cure=cure)
     if mask.dtype.kind == "f" and not ((mask >= 0) & (mask <= 1)).all():
-        raise invalid("mask", expected="bool, or shares in [0, 1]", got="other numbers")
+        raise invalid("mask", expected="bool, or fractions in [0, 1]", got="other values")
     (height, width), (rows, columns) = model.size, mask.shape[-2:]
     off = min(abs(columns * height / rows - width), abs(rows * width / columns - height))
     if off > ROUNDING:
@@ -163,10 +161,10 @@ def _checked_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
     return mask
 
 
-def _resized(mask: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
-    """By area where it shrinks: a pixel at the border is inside by its share."""
-    share = np.ascontiguousarray(mask, np.float32)
-    if share.shape == size:
-        return share
-    shrinks = math.prod(share.shape) > math.prod(size)
-    return cv2.resize(share, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+def _resize(mask: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    """By area averaging where it shrinks, so that border pixels are partly inside."""
+    fraction = np.ascontiguousarray(mask, np.float32)
+    if fraction.shape == size:
+        return fraction
+    shrinks = math.prod(fraction.shape) > math.prod(size)
+    return cv2.resize(fraction, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

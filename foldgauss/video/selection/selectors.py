@@ -1,4 +1,4 @@
-"""Which Gaussians: sets of them, and the ways to point at what is seen."""
+"""Selections: sets of Gaussians, and functions that select them by region, colour, time or a click."""
 
 import dataclasses
 import functools
@@ -13,26 +13,36 @@ from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model, check_time
 from foldgauss.video.selection.contributions import (
     Contributions,
-    best_frames,
-    contributions,
-    drawn_share,
-    reached,
-    seen_colors,
+    average_seen_colors,
+    find_influence,
+    render_matte,
+    sum_contributions,
+    update_best,
 )
 from foldgauss.video.selection.regions import (
     Masks,
     Region,
-    box_region,
-    checked_share,
-    chosen_frames,
-    mask_region,
-    polygon_region,
+    check_number,
+    region_from_box,
+    region_from_mask,
+    region_from_polygon,
+    resolve_frames,
 )
-from foldgauss.video.selection.tracking import CLEAR, IN, OUT, UNKNOWN, difference, followed, grown, lab, settled
+from foldgauss.video.selection.tracking import (
+    CLEAR,
+    IN,
+    OUT,
+    UNKNOWN,
+    color_difference,
+    grow_from_pixel,
+    propagate_labels,
+    settle_labels,
+    to_lab,
+)
 
-#: Share of what a Gaussian adds that has to lie inside a mask.
+#: Fraction of a Gaussian's contribution that must lie inside a mask.
 THRESHOLD = 0.5
-#: Delta E: a shade for all of the clip; and, where a chain of neighbours holds it together, more.
+#: Defaults in Delta E: a shade; and more for clicks, where links between neighbours limit the set, too.
 COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 15.0
 
 
@@ -52,14 +62,14 @@ class Selection:
     def __post_init__(self) -> None:
         mask = np.array(self.mask)
         if mask.ndim != 1 or mask.dtype != bool:
-            cure = "For numbers of Gaussians use Selection.of(model, indices)."
+            cure = "For indices of Gaussians use Selection.of(model, indices)."
             raise invalid("mask", expected="bool (num_gaussians,)", got=f"{mask.dtype} {mask.shape}", cure=cure)
         mask.setflags(write=False)
         object.__setattr__(self, "mask", mask)
 
     @classmethod
     def of(cls, model: VideoModel, indices: Int[np.ndarray, " num"]) -> "Selection":
-        """The Gaussians of these numbers. Raises ValueError for numbers that the model has not."""
+        """The Gaussians with these indices. Raises ValueError for indices that the model does not have."""
         check_model(model)
         indices, num = np.asarray(indices), model.splats.num_gaussians
         if indices.size == 0:
@@ -84,12 +94,12 @@ class Selection:
 
     @property
     def indices(self) -> Int[np.ndarray, " num_selected"]:
-        """Numbers of the selected Gaussians, in array order."""
+        """Indices of the selected Gaussians, in array order."""
         return np.flatnonzero(self.mask)
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians of the model, selected or not."""
+        """The number of Gaussians of the model, selected or not."""
         return len(self.mask)
 
     def __len__(self) -> int:
@@ -124,9 +134,8 @@ class Selection:
             raise TypeError(f"expected a Selection, got {type(other).__name__}. Selection(mask) makes one of a mask.")
         if other.num_gaussians != self.num_gaussians:
             expected = f"a selection of {self.num_gaussians:,} Gaussians"
-            raise invalid(
-                "selection", expected=expected, got=f"one of {other.num_gaussians:,}", cure="Is it another model's?"
-            )
+            got, cure = f"one of {other.num_gaussians:,}", "Is it another model's?"
+            raise invalid("selection", expected=expected, got=got, cure=cure)
         return other.mask
 
 
@@ -149,24 +158,24 @@ def select(
     """The Gaussians that meet every criterion given: those of `by_mask`, `by_box`, `by_polygon`, `by_color`,
     `by_click` and `by_time`, intersected.
 
-    - `frame`, or `frames` = (first, stop), half-open: those on which mask, box, polygon and click are looked at, and
-      *not* a limit in time. With none of these they are one: `by_time`, as `times` always is.
-    - `tolerance`: of `color` and `click`, in Delta E; None: their own.
+    - `frame`, or `frames` = (first, stop), half-open: the frames of mask, box, polygon and click, *not* a limit in
+      time. Without any of these, they are a criterion of their own: `by_time`. `times` always is one.
+    - `tolerance`: of `color` and `click`, in Delta E; None: their defaults.
     - `alive`: of `by_time`. `threshold`, `follow`: of mask, box and polygon.
 
     **Units:** pixels of the model's own size, x right, y down; times in [0, 1]; colours in [0, 1].
 
     **Example:** `select(model, box=(200, 80, 420, 260), frame=0, color=(0.8, 0.1, 0.1), tolerance=25)`.
 
-    **Raises:** ValueError without any criterion, for options of a criterion that is not there, and as the functions.
+    **Raises:** ValueError without any criterion, for options of a criterion not given, and as the functions.
     """
     given = {"mask": mask, "box": box, "polygon": polygon, "color": color, "click": click, "times": times}
     where = {"frame": frame, "frames": frames, "tolerance": tolerance}
-    asked = questions(**given, **where, alive=alive, threshold=threshold, follow=follow)
-    return functools.reduce(Selection.__and__, [function(model, **named) for function, named in asked])
+    criteria = list_criteria(**given, **where, alive=alive, threshold=threshold, follow=follow)
+    return functools.reduce(Selection.__and__, [function(model, **options) for function, options in criteria])
 
 
-def questions(
+def list_criteria(
     *,
     mask: Masks | None = None,
     box: tuple[float, float, float, float] | None = None,
@@ -181,9 +190,9 @@ def questions(
     threshold: float = THRESHOLD,
     follow: bool = True,
 ) -> list[tuple[Callable[..., Selection], dict[str, Any]]]:
-    """What `select` asks a model, whose answers are intersected: functions such as `by_mask`, and their arguments.
+    """The criteria of `select`: functions such as `by_mask`, each with its arguments except the model.
 
-    Raises ValueError as `select` for what needs no model to be told.
+    Raises ValueError as `select`, where that does not depend on the model.
     """
     where = {"frame": frame, "frames": frames}
     own_tolerance = {} if tolerance is None else {"tolerance": tolerance}
@@ -191,15 +200,16 @@ def questions(
     for name, value, function in (("mask", mask, by_mask), ("box", box, by_box), ("polygon", polygon, by_polygon)):
         if value is not None:
             found.append((function, {name: value, **where, "threshold": threshold, "follow": follow}))
-    placed = bool(found) or click is not None
-    regional, timed = bool(found), times is not None or not (placed or (frame is None and frames is None))
-    for name, given, wanted in (
+    regional = bool(found)
+    placed = regional or click is not None
+    timed = times is not None or not (placed or (frame is None and frames is None))
+    for name, misplaced, wanted in (
         ("threshold", threshold != THRESHOLD and not regional, "a mask, box or polygon with it"),
         ("follow", not follow and not regional, "a mask, box or polygon with it"),
         ("alive", alive and not timed, "times or frames with it"),
         ("frames", click is not None and frames is not None, "frame, the one that was clicked in"),
     ):
-        if given:
+        if misplaced:
             raise invalid(name, expected=wanted, got="none")
     if tolerance is not None and color is None and click is None:
         raise invalid("tolerance", expected="color or click with it", got="neither")
@@ -222,7 +232,7 @@ def questions(
 def contribution(
     model: VideoModel, mask: Masks, *, frame: int | None = None, frames: tuple[int, int] | None = None
 ) -> tuple[Float[np.ndarray, " num_gaussians"], Float[np.ndarray, " num_gaussians"]]:
-    r"""What each Gaussian adds to the picture inside a mask, and everywhere.
+    r"""Each Gaussian's contribution to the image inside a mask, and everywhere.
 
     $$
     \sum_k \sum_p m_k(p)\, w_{ik}(p), \qquad \sum_k \sum_p w_{ik}(p),
@@ -233,9 +243,9 @@ def contribution(
 
     **Shapes:** two arrays (num_gaussians,), float64. **Units:** pixels of the model's own size, summed over frames.
 
-    **Raises:** ValueError as `by_mask`. **Source:** the weights of eq:colorblending, as gradients of the colours.
+    **Raises:** ValueError as `by_mask`. **Source:** the weights of eq:colorblending.
     """
-    return contributions(Contributions(model), mask_region(model, mask, frame, frames))[:2]
+    return sum_contributions(Contributions(model), region_from_mask(model, mask, frame, frames))[:2]
 
 
 def by_mask(
@@ -247,24 +257,23 @@ def by_mask(
     threshold: float = THRESHOLD,
     follow: bool = True,
 ) -> Selection:
-    """The Gaussians of what a mask shows, by their *rendered contribution*: those that add at least `threshold` of all
-    they add to the masked frames inside the mask.
+    """The Gaussians whose *rendered contribution* to the masked frames lies inside the mask, to at least `threshold`.
 
     - `mask`: bool (height, width) for `frame`, or for each of `frames`; (num_frames, height, width), one for each of
-      `frames` (default: all); or {frame: mask}. Of any size of the model's aspect; numbers in [0, 1] are shares.
-    - `follow`: Gaussians that show too little of themselves on the masked frames (not alive yet, or hidden) are decided
-      where they are seen: frame by frame outwards from the masked ones, within the shot, they join the known ones
-      around them that move alike and look alike. False: nobody is selected that the masked frames do not show.
-    - Those seen in no frame at all, as they stand behind others or live between two frames, go by their place at their
-      own time, in the frame next to it: by its mask, or with `follow` by the known ones around.
+      `frames` (default: all); or {frame: mask}. Any size of the model's aspect; values in [0, 1] are fractions.
+    - `follow`: Gaussians that the masked frames hardly show (not alive yet, or occluded) are decided where they are
+      visible: frame by frame outwards from the masked ones, within the shot, they join the decided ones around them
+      with similar motion and colour. False: only Gaussians visible in the masked frames are selected.
+    - Gaussians visible in no frame, as they are occluded or live between two frames, are decided by their position at
+      their own m_t in the nearest frame: by its mask, or with `follow` by the decided ones around.
 
-    So a whole object comes with one mask, better with a few, best with one on each frame.
+    One mask selects a whole object; a few masks are better, and one for each frame is best.
 
     **Units:** pixels of the masks' own size. **Raises:** ValueError for empty masks, other aspects, dtypes, frames.
 
     **Example:** `by_mask(model, clip.masks == 1)`, with `clip = datasets.davis(...)`.
     """
-    return _inside(model, mask_region(model, mask, frame, frames), threshold, follow)
+    return _select_region(model, region_from_mask(model, mask, frame, frames), threshold, follow)
 
 
 def by_box(
@@ -276,13 +285,13 @@ def by_box(
     threshold: float = THRESHOLD,
     follow: bool = True,
 ) -> Selection:
-    """What stands in the box (x0, y0, x1, y1) of `frame`, or all along `frames` (default: all): see `by_mask`.
+    """The Gaussians inside the box (x0, y0, x1, y1) of `frame`, or of each of `frames` (default: all): see `by_mask`.
 
     **Units:** pixels of the model's own size, x right, y down; a pixel is inside if its centre (at +0.5) is.
 
     **Example:** `by_box(model, (200, 80, 420, 260), frame=0)`. **Raises:** ValueError for a box without pixels.
     """
-    return _inside(model, box_region(model, box, frame, frames), threshold, follow)
+    return _select_region(model, region_from_box(model, box, frame, frames), threshold, follow)
 
 
 def by_polygon(
@@ -294,37 +303,37 @@ def by_polygon(
     threshold: float = THRESHOLD,
     follow: bool = True,
 ) -> Selection:
-    """What stands in the polygon of corners (x, y), closed by itself; else as `by_box`.
+    """The Gaussians inside the polygon of corners (x, y), closed automatically; otherwise as `by_box`.
 
     **Shapes:** `polygon` (corners, 2), 3 corners at least. **Units:** pixels of the model's own size.
 
     **Example:** `by_polygon(model, [(10, 10), (60, 12), (30, 50)], frame=0)`. **Raises:** ValueError as `by_box`.
     """
-    return _inside(model, polygon_region(model, polygon, frame, frames), threshold, follow)
+    return _select_region(model, region_from_polygon(model, polygon, frame, frames), threshold, follow)
 
 
 def by_color(
     model: VideoModel, color: tuple[float, float, float], *, tolerance: float = COLOR_TOLERANCE, seen: bool = True
 ) -> Selection:
-    """What looks like `color`, red, green and blue in [0, 1], to within `tolerance`.
+    """The Gaussians that look like `color`, red, green and blue in [0, 1], to within `tolerance`.
 
-    With `seen` a Gaussian's colour is the picture's where it is seen, averaged over frames by its weights: where many
-    overlap, single ones have any colour. Without, and for those that are never seen, its own.
+    With `seen`, a Gaussian's colour is the image's where it is visible, averaged over frames by its weights: where many
+    overlap, its own colour may be anything. Its own is used without `seen`, and for Gaussians that are never visible.
 
     **Units:** tolerance in CIELAB Delta E (CIEDE2000): 1 is just noticeable, 10 a shade, 30 another colour.
 
-    **Example:** `by_color(model, (0.9, 0.2, 0.1), tolerance=25)`. **Raises:** ValueError for what is no colour.
+    **Example:** `by_color(model, (0.9, 0.2, 0.1), tolerance=25)`. **Raises:** ValueError for an invalid colour.
     """
     wanted = np.asarray(color)
     if wanted.shape != (3,) or wanted.dtype.kind not in "fiu" or not ((wanted >= 0) & (wanted <= 1)).all():
         raise invalid("color", expected="red, green and blue in [0, 1]", got=color)
-    tolerance = checked_share("tolerance", tolerance, "[0, inf)")
-    lit = Contributions(model)
+    tolerance = check_number("tolerance", tolerance, "[0, inf)")
+    contributions = Contributions(model)
     own = np.maximum(0.5 + SH_C0 * np.asarray(model.splats.color_dc), 0)
     if seen:
-        looks, shown = seen_colors(lit)
-        own[shown] = looks[shown]
-    return Selection(difference(lab(own), lab(wanted[None])[0]) <= tolerance)
+        color, visible = average_seen_colors(contributions)
+        own[visible] = color[visible]
+    return Selection(color_difference(to_lab(own), to_lab(wanted[None])[0]) <= tolerance)
 
 
 def by_time(
@@ -335,134 +344,134 @@ def by_time(
     frames: tuple[int, int] | None = None,
     alive: bool = False,
 ) -> Selection:
-    """The Gaussians whose own time m_t lies in `times`, both ends included; or with `alive` those drawn at any time
-    of it, which is up to 3.03 sigma_t from m_t.
+    """The Gaussians whose m_t lies in `times`, both ends included; with `alive` those rendered at any time in it,
+    which reach up to 3.03 sigma_t from m_t.
 
-    Instead of `times`, `frames` = (first, stop) or `frame`: half a frame more to either side; with `alive`, exactly
-    from the first one's time to the last one's.
+    Instead of `times`, `frames` = (first, stop) or `frame`: half a frame more on either side; with `alive`, exactly
+    from the time of the first to that of the last.
 
     **Units:** times in [0, 1]. **Example:** `by_time(model, frames=(0, 24))`.
 
-    **Raises:** ValueError unless one span is given, and for one that is none.
+    **Raises:** ValueError unless exactly one valid span is given.
     """
     if (times is not None) + (frame is not None) + (frames is not None) != 1:
         raise invalid("times, frames, frame", expected="one of them", got="several or none")
-    lit = Contributions(model)
-    start, stop = _span(lit, times, frame, frames, widened=not alive)
+    contributions = Contributions(model)
+    start, stop = _resolve_span(contributions, times, frame, frames, widen=not alive)
     if alive:
-        return Selection((lit.window[:, 0] < stop) & (start < lit.window[:, 1]))
-    own = lit.own_times
+        return Selection((contributions.window[:, 0] < stop) & (start < contributions.window[:, 1]))
+    own = contributions.own_times
     return Selection((start <= own) & (own <= stop))
 
 
 def by_click(
     model: VideoModel, click: tuple[float, float], *, frame: int, tolerance: float = CLICK_TOLERANCE
 ) -> Selection:
-    """What a click points at: grown from the greatest contributor at the pixel (x, y) of `frame`, along its motion.
+    """The object at a click: grown from the greatest contributor at the pixel (x, y) of `frame`, along its motion.
 
-    A Gaussian is in if it *looks* like the pixel, to within `tolerance`, and a chain of such neighbours leads to it
-    that touch and move alike in most of the frames in which they touch. So the set goes on through time, up to the cuts
-    of the shot, and ends where another colour or another motion begins: what is of one colour and at rest all over the
-    frame is told apart by neither, so intersect it with a box. Gaussians that are seen in none of the frames looked at
-    (48 at most) are left out.
+    A Gaussian is included if it *looks* like the pixel, to within `tolerance`, and is linked to it by a chain of such
+    neighbours, which touch and move alike in most of the frames in which they touch. The set extends through time up to
+    the cuts of the shot, and ends where the colour or the motion changes; a static background of one colour has neither
+    boundary, so intersect with a box. Gaussians visible in none of the frames examined (at most 48) are left out.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 
     **Example:** `by_click(model, (320, 140), frame=0, tolerance=25)`.
 
-    **Raises:** ValueError for a click beyond the frame, or where nothing is drawn.
+    **Raises:** ValueError for a click outside the frame, or where nothing is rendered.
     """
     point, (height, width) = np.asarray(click), model.size
     if point.shape != (2,) or point.dtype.kind not in "fiu" or not ((point >= 0) & (point < [width, height])).all():
         raise invalid("click", expected=f"(x, y) in pixels of a {height}x{width} frame", got=click)
-    tolerance = checked_share("tolerance", tolerance, "[0, inf)")
-    k = chosen_frames(model, frame, None)[0]
-    found = grown(Contributions(model), (int(point[1]), int(point[0])), k, tolerance)
+    tolerance = check_number("tolerance", tolerance, "[0, inf)")
+    k = resolve_frames(model, frame, None)[0]
+    found = grow_from_pixel(Contributions(model), (int(point[1]), int(point[0])), k, tolerance)
     if found is None:
-        raise invalid("click", expected="a place where something is drawn", got=f"{click} of frame {k}")
+        raise invalid("click", expected="a pixel where something is rendered", got=f"{click} of frame {k}")
     return Selection(found)
 
 
 def matte(model: VideoModel, selection: Selection, t: float) -> Float32[np.ndarray, "height width"]:
-    """The selection's share in each pixel at time t: its weights over those of all Gaussians; 0 where nothing is.
+    """The selection's fraction of each pixel at time t: its weights over those of all Gaussians; 0 without any.
 
     **Units:** t in [0, 1]: frame k is at `model.frame_times.times()[k]`. **Shapes:** (height, width), in [0, 1].
 
     **Example:** `matte(model, selection, 0.5) > 0.5`. **Raises:** ValueError for a selection of another model.
     """
-    lit, mask = _known(model, selection)
+    contributions, mask = _prepare(model, selection)
     check_time(t)
-    return drawn_share(lit, mask, t)
+    return render_matte(contributions, mask, t)
 
 
 def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndarray, "height width"]:
-    """The pixels that the selection reaches at time t, seen or hidden: without it all others are the same.
+    """The pixels that the selection can change at time t: removing it leaves all others the same.
 
-    Reached is where a Gaussian's alpha is not cut off (`RenderOptions.alpha_cutoff`). Shapes, units and errors as
-    `matte`'s. Example: `influence(model, ball, 0.5).sum()`  pixels.
+    They are those where a Gaussian of it, visible or occluded, has an alpha above `RenderOptions.alpha_cutoff`.
+    Shapes, units and errors as `matte`'s. Example: `influence(model, ball, 0.5).sum()`  pixels.
     """
-    lit, mask = _known(model, selection)
+    contributions, mask = _prepare(model, selection)
     check_time(t)
-    return reached(lit, mask, t)
+    return find_influence(contributions, mask, t)
 
 
-def _known(model: VideoModel, selection: Selection) -> tuple[Contributions, Bool[np.ndarray, " num_gaussians"]]:
-    """The model, ready to be asked, and the mask of a selection that fits it."""
-    lit = Contributions(model)
+def _prepare(model: VideoModel, selection: Selection) -> tuple[Contributions, Bool[np.ndarray, " num_gaussians"]]:
+    """The model's contributions, and the mask of a selection checked to fit the model."""
+    contributions = Contributions(model)
     if not isinstance(selection, Selection):
         cure = "The order is (model, selection, t); Selection(mask) makes one of a mask."
         raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
-    return lit, (Selection.none(model) | selection).mask
+    return contributions, (Selection.none(model) | selection).mask
 
 
-def _inside(model: VideoModel, region: Region, threshold: float, follow: bool) -> Selection:
-    """Those with at least `threshold` of what they add to the region's frames in it; see `by_mask`."""
-    threshold, lit = checked_share("threshold", threshold), Contributions(model)
-    inside, total, best = contributions(lit, region)
-    by_share = np.where(inside >= threshold * total, IN, OUT).astype(np.int8)
-    by_share[total == 0] = UNKNOWN
-    label = by_share
+def _select_region(model: VideoModel, region: Region, threshold: float, follow: bool) -> Selection:
+    """The Gaussians with at least `threshold` of their contribution to the region's frames inside it, see `by_mask`."""
+    threshold, contributions = check_number("threshold", threshold, "(0, 1]"), Contributions(model)
+    inside, total, best = sum_contributions(contributions, region)
+    direct = np.where(inside >= threshold * total, IN, OUT).astype(np.int8)
+    direct[total == 0] = UNKNOWN
+    label = direct
     if follow:
-        overall = best_frames(lit, set(range(model.num_frames)) - set(region.frames), best)
-        label = followed(lit, np.where(best >= CLEAR * overall, by_share, UNKNOWN), region.frames, overall)
-        label = np.where(label == UNKNOWN, by_share, label)
-    label = _by_place(lit, region, label)
+        overall = update_best(contributions, set(range(model.num_frames)) - set(region.frames), best)
+        clear = np.where(best >= CLEAR * overall, direct, UNKNOWN)
+        label = propagate_labels(contributions, clear, region.frames, overall)
+        label = np.where(label == UNKNOWN, direct, label)
+    label = _label_by_position(contributions, region, label)
     if follow:
-        label = settled(lit, label, region.frames)
+        label = settle_labels(contributions, label, region.frames)
     return Selection(label == IN)
 
 
-def _by_place(
-    lit: Contributions, region: Region, label: Int8[np.ndarray, " num_gaussians"]
+def _label_by_position(
+    contributions: Contributions, region: Region, label: Int8[np.ndarray, " num_gaussians"]
 ) -> Int8[np.ndarray, " num_gaussians"]:
-    """Decide the unknown by their centres at their own time, where the frame next to it has a mask."""
+    """Decide the unknown by their centres at their own m_t, if the nearest frame has a mask."""
     label, unknown = label.copy(), np.flatnonzero(label == UNKNOWN)
-    home = lit.nearest_frame(unknown)
-    for k in set(region.frames) & set(home.tolist()):
-        own = unknown[home == k]
-        column, row = np.floor(lit.own_place(own)).astype(np.int64).T
-        height, width = lit.size
-        there = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        share = region.at(k)[row.clip(0, height - 1), column.clip(0, width - 1)]
-        label[own] = np.where(there & (share >= 0.5), IN, OUT)
+    nearest = contributions.nearest_frame(unknown)
+    for k in set(region.frames) & set(nearest.tolist()):
+        own = unknown[nearest == k]
+        column, row = np.floor(contributions.own_centers(own)).astype(np.int64).T
+        height, width = contributions.size
+        visible = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        fraction = region.at(k)[row.clip(0, height - 1), column.clip(0, width - 1)]
+        label[own] = np.where(visible & (fraction >= 0.5), IN, OUT)
     return label
 
 
-def _span(
-    lit: Contributions,
+def _resolve_span(
+    contributions: Contributions,
     times: tuple[float, float] | None,
     frame: int | None,
     frames: tuple[int, int] | None,
     *,
-    widened: bool,
+    widen: bool,
 ) -> tuple[float, float]:
-    """The span of time that is meant, from first to last; frames `widened` by half a frame to either side."""
+    """The span of time from first to last; of frames, half a frame wider on either side if `widen`."""
     if times is None:
-        chosen = chosen_frames(lit.model, frame, frames)
-        if widened and len(lit.times) == 1:
-            return 0.0, 1.0  # one frame alone lasts all the time
-        ends = np.array([chosen[0], chosen[-1]]) + (np.array([-0.5, 0.5]) if widened else 0)
-        return tuple(np.interp(ends, np.arange(len(lit.times)), lit.times))
+        chosen, num_frames = resolve_frames(contributions.model, frame, frames), len(contributions.times)
+        if widen and num_frames == 1:
+            return 0.0, 1.0  # a single frame covers all times
+        ends = np.array([chosen[0], chosen[-1]]) + (np.array([-0.5, 0.5]) if widen else 0)
+        return tuple(np.interp(ends, np.arange(num_frames), contributions.times))
     pair = np.asarray(times)
     if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
         raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)

@@ -1,4 +1,4 @@
-"""Taking stock in a running fit: what does not pay goes, what does is born, and what serves many is shared."""
+"""`Pruner`: the rounds of pruning of a fit with an `Economy`, in which Gaussians are pruned, born and share values."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,177 +7,192 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from foldgauss.render import cpu, pixels_per_unit
-from foldgauss.video.fitting.codebook import Codebook, averaged, shared
+from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.initialize import START_OPACITY
 from foldgauss.video.fitting.optical_flow import Motion
-from foldgauss.video.fitting.pruning.births import among, newborns
-from foldgauss.video.fitting.pruning.description_length import Cut, allowed_error, count_births, cut, frame_weights
-from foldgauss.video.fitting.pruning.scores import PruningScores, measured
-from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr, planar
+from foldgauss.video.fitting.pruning.births import make_newborns, shuffle_into
+from foldgauss.video.fitting.pruning.description_length import (
+    PrunedRows,
+    allowed_error,
+    count_births,
+    prune_rows,
+    weigh_frames,
+)
+from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
+from foldgauss.video.fitting.schedule import to_planes
+from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import clear_absent_moments, count_parameters, find_initial_kinds
 
-#: Gaussians born in all are so many times those at the start at most.
-MOST_BORN = 4
-#: Times that a fit is trimmed at its end, and the share of its numbers that is worth another time.
-TRIMS, LEAST_TRIM = 8, 0.002
-#: Rounds that are left when colours and shapes are shared and opacities left out, in plans with enough: they see what
-#: that costs.
-LATE = 1
-#: Of the squared error, what sharing colours, and sharing shapes, may add before it is mended.
-MOST_BY_SHARING = 0.25
+#: At most so many Gaussians are born in all, in units of those at the start.
+MAX_BORN = 4
+#: How often a fit is trimmed at its end, and the fraction of its parameters that is worth another time.
+MAX_TRIMS, MIN_TRIM = 8, 0.002
+#: Colors and shapes are shared, and opacities left out, only so many rounds before the last, in plans that have them:
+#: these correct for it.
+LATE_ROUNDS = 1
+#: What sharing colors, and sharing shapes, may add at first, as a fraction of the squared error.
+MAX_SHARING_ERROR = 0.25
 
 
 class Pruner:
-    """What a fit with an economy does between its steps. All of it changes the state in place."""
+    """Prunes between the steps of a fit; all methods change the state in place."""
 
     def __init__(
         self,
         frames: np.ndarray,
         config: FitConfig,
-        shape: ConditioningSpec,
+        spec: ConditioningSpec,
         coarse: float,
-        motion: Callable[[], Motion],
+        find_motion: Callable[[], Motion],
     ):
-        """`shape` is that of whole frames, `coarse` the share of the plan with smaller ones."""
-        self._frames, self._config, self._shape, self._coarse, self._motion = frames, config, shape, coarse, motion
+        """`spec` is that of whole frames, `coarse` the fraction of the plan with smaller ones."""
+        self._frames, self._config, self._spec, self._coarse = frames, config, spec, coarse
+        self._find_motion = find_motion
 
-    def take(self, state: FitState) -> bool:
-        """Take stock where that is due: drop what does not pay, bear where it does, share. Whether it was due."""
+    def prune(self, state: FitState) -> bool:
+        """A round of pruning, births and sharing, each where it pays, if one is due; returns whether one was."""
         config, economy = self._config, self._config.economy
-        steps = self._rounds(state.plan)
+        steps = self._plan_rounds(state.plan)
         if state.step not in steps:
             return False
         growing = state.step in steps[: len(steps) // 2]
-        ledger, progress = self._ledger(state), state.step / state.plan
-        psnr = self._psnr(state, ledger)
-        room, late = allowed_error(economy, ledger, psnr, progress), steps[max(len(steps) // 2, len(steps) - 1 - LATE)]
-        made = self._cut(state, ledger, room, solid=state.step >= late)
-        survived = state.young[made.stay].sum() / max(state.young.sum(), 1) if state.step > steps[0] else 1.0
-        _keep(state, made, config.degree)
-        if state.step == late and not growing and state.statistics is None:  # those to be born have their own
-            self._share(state, ledger, made)
+        scores, progress = self._measure(state), state.step / state.plan
+        psnr = self._psnr(state, scores)
+        room = allowed_error(economy, scores, psnr, progress)
+        late = steps[max(len(steps) // 2, len(steps) - 1 - LATE_ROUNDS)]
+        pruned = self._prune_rows(state, scores, room, allow_opaque=state.step >= late)
+        survived = state.newborn[pruned.stay].sum() / max(state.newborn.sum(), 1) if state.step > steps[0] else 1.0
+        _keep(state, pruned, config.degree)
+        if state.step == late and not growing and state.statistics is None:  # newborn Gaussians share nothing
+            self._share(state, scores, pruned)
         num = 0
         if growing:
             at_start = chosen_num_gaussians(config, *self._frames.shape[:3])
-            most = min(most_gaussians(config, len(self._frames)), MOST_BORN * at_start)
-            num = min(count_births(economy, ledger, psnr, progress, len(state.rows), survived), most - len(state.rows))
-        state.young = np.zeros(len(state.rows), bool)
+            most = min(most_gaussians(config, len(self._frames)), MAX_BORN * at_start)
+            births = count_births(economy, scores, psnr, progress, len(state.rows), survived)
+            num = min(births, most - len(state.rows))
+        state.newborn = np.zeros(len(state.rows), bool)
         if num > 0:
-            self._bear(state, ledger, num)
-        if state.statistics is not None:
-            state.statistics = GradientStatistics.zeros(len(state.rows))
+            self._add_newborns(state, scores, num)
         return True
 
     def trim(self, state: FitState) -> None:
-        """At the end: leave out what the PSNR asked for has no need of, each try measured, until none succeeds."""
-        for _ in range(TRIMS):
-            if not self._trimmed(state):
+        """At the end, drop what the target PSNR does not need, measured at each attempt, until none succeeds."""
+        for _ in range(MAX_TRIMS):
+            if not self._trim_once(state):
                 break
 
-    def _rounds(self, plan: int) -> np.ndarray:
-        """The steps after which stock is taken."""
+    def _plan_rounds(self, plan: int) -> np.ndarray:
+        """The steps after which there is a round."""
         coarse, config = self._coarse, self._config
         if config.growth is not None:
             coarse = max(coarse, config.growth.for_plan(plan).until_step / plan)
         return config.economy.steps(plan, passes=plan * config.batch_size / len(self._frames), coarse=coarse)
 
-    def _trimmed(self, state: FitState) -> bool:
-        config, ledger = self._config, self._ledger(state)
+    def _trim_once(self, state: FitState) -> bool:
+        config, scores = self._config, self._measure(state)
         wanted, size = config.economy.psnr, count_parameters(state.kinds)
-        room = ledger.squared_error * (10 ** (max(self._psnr(state, ledger) - wanted, 0.0) / 10) - 1)
-        for share in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
-            tried = dataclasses.replace(state)
-            _keep(tried, self._cut(tried, ledger, share * room), config.degree)
-            fewer = count_parameters(tried.kinds) < (1 - LEAST_TRIM) * size
-            if fewer and mean_psnr(tried, config, self._frames) >= wanted:
+        room = scores.squared_error * (10 ** (max(self._psnr(state, scores) - wanted, 0.0) / 10) - 1)
+        for fraction in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
+            trial = dataclasses.replace(state)
+            _keep(trial, self._prune_rows(trial, scores, fraction * room), config.degree)
+            fewer = count_parameters(trial.kinds) < (1 - MIN_TRIM) * size
+            if fewer and mean_psnr(trial, config, self._frames) >= wanted:
                 for field in dataclasses.fields(state):
-                    setattr(state, field.name, getattr(tried, field.name))
+                    setattr(state, field.name, getattr(trial, field.name))
                 return True
         return False
 
-    def _cut(self, state: FitState, ledger: PruningScores, room: float | None, *, solid: bool = True) -> Cut:
-        how = {"degree": self._config.degree, "pixels": pixels_per_unit(self._shape.size), "room": room}
-        how |= {"progress": min(state.step / state.plan, 1.0), "sized": len(state.shapes.index) > 0}
-        # Growth dims; and whom no light comes through early hides for good what others might become.
-        how |= {"solid": solid and state.statistics is None}
-        return cut(state.rows, state.kinds, ledger, self._config.economy, **how)
+    def _prune_rows(
+        self, state: FitState, scores: PruningScores, room: float | None, *, allow_opaque: bool = True
+    ) -> PrunedRows:
+        return prune_rows(
+            state.rows,
+            state.kinds,
+            scores,
+            self._config.economy,
+            degree=self._config.degree,
+            pixels=pixels_per_unit(self._spec.size),
+            room=room,
+            progress=min(state.step / state.plan, 1.0),
+            shares_sizes=len(state.shapes.index) > 0,
+            # Resets of opacity make none; and what is opaque early hides for good what others could become.
+            allow_opaque=allow_opaque and state.statistics is None,
+        )
 
     # ------------------------------------------------------------------------------------------ births
 
-    def _bear(self, state: FitState, ledger: PruningScores, num: int) -> None:
-        """Gaussians where the error is, in depth anywhere between the others."""
+    def _add_newborns(self, state: FitState, scores: PruningScores, num: int) -> None:
+        """Gaussians where errors are large, in depth anywhere between the others."""
         config, times = self._config, np.asarray(frame_times(state.time_logits))
         window = _windows(state.rows)
-        new = newborns(
+        new = make_newborns(
             num,
             np.ascontiguousarray(self._frames[..., :3]),
             times,
-            ledger.errors,
-            lambda k: self._squares(state.rows, window, k, times[k]),
+            scores.errors,
+            lambda k: self._measure_squares(state.rows, window, k, times[k]),
             float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times])),
             degree=config.degree,
             envelope=envelope_of(config),
-            motion=self._motion() if config.follow_motion else None,
+            motion=self._find_motion() if config.follow_motion else None,
             opacity=START_OPACITY,
             seed=(config.seed, 3, state.step),
         )
-        order = among(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
-        state.rows = np.concatenate([state.rows, new])[order]
-        for name in ("first", "second"):
-            setattr(state, name, np.concatenate([getattr(state, name), np.zeros_like(new)])[order])
-        state.counts = np.concatenate([state.counts, np.zeros(num, np.int32)])[order]
-        state.young = np.concatenate([state.young, np.ones(num, bool)])[order]
-        state.kinds = np.concatenate([state.kinds, find_initial_kinds(new, config.degree)])[order]
+        order = shuffle_into(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
+        state.extend(new, find_initial_kinds(new, config.degree), newborn=np.ones(num, bool))
+        state.keep(order)
 
-    def _squares(self, rows: np.ndarray, window: np.ndarray, k: int, t: float) -> Float32[np.ndarray, "height width"]:
-        """Squared errors of frame k, summed over the channels."""
-        target, behind = self._target(k)
-        done = condition(rows, window, t, self._shape)
-        leaves = done.mean, done.factor, done.opacity, done.color, behind
-        return ((cpu.forward(*leaves, self._shape.size, **self._drawn()).image - target) ** 2).sum(0)
+    def _measure_squares(
+        self, rows: np.ndarray, window: np.ndarray, k: int, t: float
+    ) -> Float32[np.ndarray, "height width"]:
+        """Squared errors of the pixels of frame k, summed over the channels."""
+        target, background = self._target(k)
+        done = condition(rows, window, t, self._spec)
+        leaves = done.mean, done.factor, done.opacity, done.color, background
+        return ((cpu.forward(*leaves, self._spec.size, **self._render_options()).image - target) ** 2).sum(0)
 
-    # ------------------------------------------------------------------------------------------ what is shared
+    # ------------------------------------------------------------------------------------------ sharing
 
-    def _share(self, state: FitState, ledger: PruningScores, made: Cut) -> None:
-        """Colours and shapes of those that stayed, each where that pays."""
-        degree, stay = self._config.degree, made.stay
+    def _share(self, state: FitState, scores: PruningScores, pruned: PrunedRows) -> None:
+        """Let the Gaussians that stayed share colors and shapes, each where that pays."""
+        degree, stay = self._config.degree, pruned.stay
         turned = _long_axis_first(state, degree)
-        of_axes = np.where(turned[:, None], ledger.by_axes[stay, ::-1], ledger.by_axes[stay])
-        of_colors = np.repeat(ledger.by_color[stay, None], 3, axis=1)
+        of_axes = np.where(turned[:, None], scores.by_axes[stay, ::-1], scores.by_axes[stay])
+        of_colors = np.repeat(scores.by_color[stay, None], 3, axis=1)
+        progress, max_error = min(state.step / state.plan, 1.0), MAX_SHARING_ERROR * scores.squared_error
         for leaf, name, weight in (("color_dc", "colors", of_colors), ("log_scale", "shapes", of_axes)):
-            at, progress = columns(degree)[leaf], min(state.step / state.plan, 1.0)
-            how = {"progress": progress, "most": MOST_BY_SHARING * ledger.squared_error}
-            index = shared(state.rows[:, at], weight, made.price, self._config.seed, **how)
-            setattr(state, name, Codebook.of(index, weight.shape[1]))
+            at, seed = columns(degree)[leaf], self._config.seed
+            index = find_clusters(state.rows[:, at], weight, pruned.price, seed, progress=progress, max_error=max_error)
+            setattr(state, name, Codebook.create(index, weight.shape[1]))
             if index is not None:
-                state.rows[:, at] = averaged(state.rows[:, at], index)
+                state.rows[:, at] = average_clusters(state.rows[:, at], index)
                 state.first[:, at] = state.second[:, at] = 0
 
-    # ------------------------------------------------------------------------------------------ what is measured
+    # ------------------------------------------------------------------------------------------ measurements
 
-    def _ledger(self, state: FitState) -> PruningScores:
+    def _measure(self, state: FitState) -> PruningScores:
         times = np.asarray(frame_times(state.time_logits))
-        weights = None if self._config.economy.psnr is None else frame_weights(state.frame_errors)
-        how = self._drawn() | {"seed": state.step, "weights": weights}
-        return measured(state.rows, _windows(state.rows), times, self._shape, self._target, **how)
+        weights = None if self._config.economy.psnr is None else weigh_frames(state.frame_errors)
+        options = self._render_options() | {"seed": state.step, "weights": weights}
+        return measure_scores(state.rows, _windows(state.rows), times, self._spec, self._target, **options)
 
-    def _psnr(self, state: FitState, ledger: PruningScores) -> float:
-        """dB, as the fit is held to it: frames with alpha are shown over black, and measured over other colours."""
+    def _psnr(self, state: FitState, scores: PruningScores) -> float:
+        """The mean PSNR in dB, over black; scores of frames with alpha are measured over other colors."""
         alpha = self._frames.shape[3] == 4 and self._config.economy.psnr is not None
-        return mean_psnr(state, self._config, self._frames) if alpha else ledger.psnr
+        return mean_psnr(state, self._config, self._frames) if alpha else scores.psnr
 
     def _target(self, k: int) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
-        """Frame k, whole; with alpha over one colour for good, which is told too."""
+        """Frame k and the background: with alpha, a random color that is always the same for the frame."""
         alpha = self._frames.shape[3] == 4
-        behind = random_background(self._config.seed, k) if alpha else np.zeros(3, np.float32)
-        return planar(self._frames[k], behind), behind
+        background = random_background(self._config.seed, k) if alpha else np.zeros(3, np.float32)
+        return to_planes(self._frames[k], background), background
 
-    def _drawn(self) -> dict:
+    def _render_options(self) -> dict:
         return {"compositing": self._config.compositing, "options": self._config.options}
 
 
@@ -187,17 +202,17 @@ def _windows(rows: np.ndarray) -> Float32[np.ndarray, "num 2"]:
     return window
 
 
-def _keep(state: FitState, made: Cut, degree: int) -> None:
-    """The state with what is left."""
-    state.rows, state.kinds = made.rows, made.kinds
-    for name in ("first", "second", "counts", "young"):
-        setattr(state, name, getattr(state, name)[made.stay])
-    state.colors, state.shapes = state.colors.kept(made.stay), state.shapes.kept(made.stay)
+def _keep(state: FitState, pruned: PrunedRows, degree: int) -> None:
+    """Reduce the state to what stays after pruning."""
+    state.keep(pruned.stay, rows=pruned.rows, kinds=pruned.kinds)
     clear_absent_moments(state.first, state.second, state.kinds, degree)
 
 
 def _long_axis_first(state: FitState, degree: int) -> np.ndarray:
-    """Turn Gaussians by a quarter where the second axis is longer: alike are then alike in numbers. Returns where."""
+    """Turn Gaussians by a quarter where the second axis is longer, so that equal shapes have equal parameters.
+
+    Returns where it turned them, bool (num,).
+    """
     at = columns(degree)
     first, second = at["log_scale"].start, at["log_scale"].start + 1
     turned = state.rows[:, first] < state.rows[:, second]

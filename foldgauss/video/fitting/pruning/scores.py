@@ -1,6 +1,6 @@
-"""What each Gaussian, each power of its path and its end in time do to the pictures, in squared error.
+"""Pruning scores: how much squared error it adds to remove or simplify each Gaussian, all others unchanged.
 
-One pass over the frames. To second order: the change of the squared error when a part is left out, all else staying.
+Estimated to second order, in one pass over the frames.
 """
 
 import dataclasses
@@ -17,27 +17,27 @@ from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
 #: Squared error of rounding to 8 bits.
 ROUNDING = 1 / (12 * 255.0**2)
-#: Draws of random signs: so many a frame, and in all for short clips. With few, estimates scatter, and what is unlucky
-#: in one of several rounds is dropped.
-DRAWS, LEAST_DRAWS = 3, 96
-#: Of the trace, on the diagonal of the paths' equations: a Gaussian seen in few frames leaves some of them open.
+#: Samples of random signs per frame, and in all for short clips. With few, estimates scatter, and Gaussians with an
+#: unlucky estimate in one of several rounds are pruned.
+SAMPLES, MIN_SAMPLES = 3, 96
+#: Ridge on the equations of paths, as a fraction of the trace: a Gaussian seen in few frames leaves some undetermined.
 _RIDGE = 1e-6
 
-#: Planes (3, height, width) of frame k, and the colour (3,) behind it.
+#: Planes (3, height, width) of frame k, and the background color (3,).
 Target = Callable[[int], tuple[Float32[np.ndarray, "3 height width"], Float32[np.ndarray, "3"]]]
 
 
 @dataclasses.dataclass(frozen=True)
 class PruningScores:
-    """Sums over all frames, pixels and channels; colours are about [0, 1], lengths pixels, float64.
+    """Sums over all frames, pixels and channels, float64; colors are about [0, 1], lengths in pixels.
 
-    * `errors` (num_frames,): squared error of each frame; `num_samples`: numbers that the pictures have; `weights`
-      (num_frames,): how much a frame's errors count in all that follows, 1 on the average.
-    * `alike` (3,): correlation of the errors of neighbours in time, along columns and along rows.
-    * `slope` (num,): its change by leaving a Gaussian out, to first order; `own` (num,): to second, which is what the
-      Gaussian adds to the pictures, squared.
+    * `errors` (num_frames,): squared error of each frame; `num_samples`: values in all frames; `weights` (num_frames,):
+      the weights of the frames in all that follows, 1 on average.
+    * `correlation` (3,): of the errors of neighbors in time, along columns and along rows.
+    * `first_order` (num,): the change of the squared error by removing a Gaussian, to first order; `second_order`
+      (num,): the term of second order, the square of what the Gaussian adds to the frames.
     * `by_path` (num, 2 degree + 1, 3): sum over frames of (u / span)^m M, M the second derivatives (xx, xy, yy) by the
-      Gaussian's place, halved; `span` (num,): a length of time to measure u = m_t - t by.
+      Gaussian's position, halved; `span` (num,): the unit of u = m_t - t.
     * `by_color` (num,): half the second derivative by any of a Gaussian's `color_dc`; `by_axes` (num, 2): by the
       logarithms of its standard deviations.
     * `by_size` (num, 3): sums of S, S l and S l^2, S the second derivative by the logarithm of the Gaussian's size,
@@ -48,9 +48,9 @@ class PruningScores:
     weights: Float[np.ndarray, " num_frames"]
     num_samples: int
     size: tuple[int, int]
-    alike: Float[np.ndarray, "3"]
-    slope: Float[np.ndarray, " num"]
-    own: Float[np.ndarray, " num"]
+    correlation: Float[np.ndarray, "3"]
+    first_order: Float[np.ndarray, " num"]
+    second_order: Float[np.ndarray, " num"]
     by_path: Float[np.ndarray, "num moments 3"]
     span: Float[np.ndarray, " num"]
     by_color: Float[np.ndarray, " num"]
@@ -60,7 +60,7 @@ class PruningScores:
 
     @property
     def squared_error(self) -> float:
-        """Weighted by frames."""
+        """Of all frames, weighted."""
         return float(self.weights @ self.errors)
 
     @property
@@ -71,15 +71,15 @@ class PruningScores:
 
     @property
     def effective_samples(self) -> float:
-        """Of how many numbers the error costs bits, beyond those of rounding to 8 bits.
+        """The number of values whose error costs bits, beyond those of rounding to 8 bits.
 
-        Errors are coded given their neighbours in time and in the picture, as a first-order autoregression: what is
-        new in each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are
-        log2(1 + (v / q)^2) / 4, q the variance of rounding: none where pictures are rounded to the same, and
-        log2(v / q) / 2 beyond. So a number counts v^2 / (v^2 + q^2), and a picture that stands still is paid for once.
+        Errors are coded given their neighbors in time and in the frame, as a first-order autoregression: the innovation
+        of each has the variance v = e (1 - r^2) (1 - ..) .., e their mean square. Its bits are log2(1 + (v / q)^2) / 4,
+        q the variance of rounding: none where rounding gives equal frames, and log2(v / q) / 2 beyond. So a value
+        counts v^2 / (v^2 + q^2), and a static image counts once.
         """
         mean = float(self.errors.sum()) / self.num_samples
-        in_time, *in_space = 1 - np.clip(self.alike, 0, 1) ** 2
+        in_time, *in_space = 1 - np.clip(self.correlation, 0, 1) ** 2
         once = mean * float(np.prod(in_space))
         each = once * float(in_time)
         own, first = (v**2 / (v**2 + ROUNDING**2) for v in (each, once))
@@ -87,14 +87,14 @@ class PruningScores:
         return max(self.num_samples * (first + (frames - 1) * own) / frames, 1.0)
 
     @property
-    def removed(self) -> Float[np.ndarray, " num"]:
-        """Squared error that leaving a Gaussian out adds."""
-        return self.slope + self.own
+    def added_by_removal(self) -> Float[np.ndarray, " num"]:
+        """The squared error that removing a Gaussian adds."""
+        return self.first_order + self.second_order
 
-    def lower(
+    def lower_degree(
         self, place: Float[np.ndarray, "num degree+1 2"], degree: int, which: np.ndarray
     ) -> tuple[Float[np.ndarray, " some"], Float[np.ndarray, "some degree+1 2"]]:
-        """The squared error that a path of lower degree adds to the Gaussians `which`; and that path, the best there.
+        """The squared error that a path of lower degree adds for the Gaussians `which`; and the best such path.
 
         `place`: m_s and c_k in pixels.
         """
@@ -107,34 +107,34 @@ class PruningScores:
         )
         own = path[:, high].reshape(len(path), -1, 1)
         size = np.trace(within, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
-        wanted = across @ own
-        moved = np.linalg.solve(within + _RIDGE * size * np.eye(within.shape[1]), wanted)
-        added = (own * (above @ own)).sum((1, 2)) - (wanted * moved).sum((1, 2))
+        target = across @ own
+        moved = np.linalg.solve(within + _RIDGE * size * np.eye(within.shape[1]), target)
+        added = (own * (above @ own)).sum((1, 2)) - (target * moved).sum((1, 2))
         path[:, low] += moved.reshape(len(path), -1, 2)
         path[:, high] = 0
         return np.maximum(added, 0), path / scale
 
-    def lasting(self, grown: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
-        """Squared error that an end to waxing and waning adds, where the logarithm of a Gaussian's size is `grown`.
+    def added_by_static(self, log_growth: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
+        """The squared error that making a Gaussian static adds, where its log size changes by `log_growth`.
 
-        Least by `mean_log_envelope`. Infinite where it is not alive at every frame, where there is another picture
-        behind it.
+        Lowest for `mean_log_envelope`. Infinite where the Gaussian is not alive at every frame: what it would hide
+        there is not known.
         """
         total, first, second = self.by_size.T
-        added = second - 2 * grown * first + grown**2 * total
+        added = second - 2 * log_growth * first + log_growth**2 * total
         return np.where(self.misses > 0, np.inf, np.maximum(added, 0))
 
-    def solid(self, opacity: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
-        """Squared error that Gaussians of this `opacity` add where no light comes through them any more.
+    def added_by_opaque(self, opacity: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
+        """The squared error that making Gaussians of this `opacity` opaque adds.
 
-        Pictures are linear in one opacity, so this is exact for each alone.
+        Frames are linear in one opacity, so this is exact for each alone.
         """
         more = 1 / np.maximum(opacity, np.finfo(float).tiny) - 1
-        return np.maximum(more * (more * self.own - self.slope), 0)
+        return np.maximum(more * (more * self.second_order - self.first_order), 0)
 
     @property
     def mean_log_envelope(self) -> Float[np.ndarray, " num"]:
-        """The mean of log a(t) / 2 where it is seen: what the logarithm of a lasting one's size should change by."""
+        """The mean of log a(t) / 2 where it is visible: the best change of the log size of a Gaussian made static."""
         total, first, _ = self.by_size.T
         return first / np.maximum(total, np.finfo(float).tiny)
 
@@ -146,7 +146,7 @@ def _normal(moments: np.ndarray, rows: np.ndarray, others: np.ndarray) -> np.nda
     return blocks.transpose(0, 1, 3, 2, 4).reshape(len(moments), 2 * len(rows), 2 * len(others))
 
 
-def measured(
+def measure_scores(
     rows: Float32[np.ndarray, "num width"],
     window: Float32[np.ndarray, "num 2"],
     times: Float[np.ndarray, " num_frames"],
@@ -159,27 +159,27 @@ def measured(
     seed: int = 0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> PruningScores:
-    """The ledger of packed rows against frames, whose errors count by `weights`; None: all the same.
+    """The scores of packed rows against frames with `weights`; None: all 1.
 
-    Squares of the pictures' derivatives are estimated without bias by random signs, as in `sensitivities`.
+    Squares of the frames' derivatives are estimated without bias by random signs, as in `compression.sensitivity`.
     """
     num, place, rng = len(rows), columns(shape.degree), np.random.default_rng([seed, 4])
-    centre = 1 / (1 + np.exp(-rows[:, place["time_loc_logit"]][:, 0].astype(float)))
+    center = 1 / (1 + np.exp(-rows[:, place["time_loc_logit"]][:, 0].astype(float)))
     spread = np.exp(rows[:, place["log_time_scale"]][:, 0].astype(float))
     span = np.minimum(TAU_MAX * spread, 1.0)
-    slope, own, misses, by_color = np.zeros((4, num))
+    first_order, second_order, misses, by_color = np.zeros((4, num))
     by_path, by_size, by_axes = np.zeros((num, 2 * shape.degree + 1, 3)), np.zeros((num, 3)), np.zeros((num, 2))
     weights = np.ones(len(times)) if weights is None else weights
-    draws = max(DRAWS, -(-LEAST_DRAWS // len(times)))
+    samples = max(SAMPLES, -(-MIN_SAMPLES // len(times)))
     errors, products, before = np.zeros(len(times)), np.zeros(3), None
     signs_shape = (3, *shape.size)
     for k, t in enumerate(times):
-        wanted, behind = target(k)
+        wanted, background = target(k)
         done = condition(rows, window, t, shape)
         alive = done.alive
         misses += 1
         misses[alive] -= 1
-        leaves = done.mean, done.factor, done.opacity, done.color, behind
+        leaves = done.mean, done.factor, done.opacity, done.color, background
         trace = cpu.forward(*leaves, shape.size, compositing=compositing, options=options)
         residual = trace.image - wanted
         errors[k] = np.vdot(residual, residual)
@@ -188,27 +188,28 @@ def measured(
         on_frame()
         if not len(alive):
             continue
-        slope[alive] -= 2 * weights[k] * done.opacity * cpu.backward(trace, residual)[2]
-        u = centre[alive] - t
+        first_order[alive] -= 2 * weights[k] * done.opacity * cpu.backward(trace, residual)[2]
+        u = center[alive] - t
         powers = (u / span[alive])[:, None] ** np.arange(2 * shape.degree + 1)
         narrowed = _log_envelope(u / spread[alive], shape) / 2
-        # By the logarithm of its size, at the size that it would have: that grows as its square.
+        # The second derivative by the log size is proportional to the squared size that the Gaussian would have.
         by_narrowed = np.exp(-2 * narrowed)[:, None] * np.stack([np.ones_like(narrowed), narrowed, narrowed**2], 1)
-        share = weights[k] / draws
-        for _ in range(draws):
+        weight = weights[k] / samples
+        for _ in range(samples):
             signs = rng.integers(0, 2, signs_shape, dtype=np.int8) * np.float32(2) - np.float32(1)
             d_mean, d_factor, d_opacity, d_color, _ = cpu.backward(trace, signs)
-            own[alive] += share * (done.opacity * d_opacity).astype(float) ** 2
-            by_path[alive] += share * powers[:, :, None] * _outer(d_mean.astype(float))[:, None]
+            second_order[alive] += weight * (done.opacity * d_opacity).astype(float) ** 2
+            by_path[alive] += weight * powers[:, :, None] * _outer(d_mean.astype(float))[:, None]
             by_scale = (done.factor * d_factor).sum(1).astype(float)  # by the logarithms
-            by_size[alive] += share * by_narrowed * by_scale.sum(1, keepdims=True) ** 2
-            by_axes[alive] += share * by_scale**2
-            by_color[alive] += share * SH_C0**2 * (d_color.astype(float) ** 2).mean(1)
+            by_size[alive] += weight * by_narrowed * by_scale.sum(1, keepdims=True) ** 2
+            by_axes[alive] += weight * by_scale**2
+            by_color[alive] += weight * SH_C0**2 * (d_color.astype(float) ** 2).mean(1)
     num_samples = len(times) * 3 * math.prod(shape.size)
     lines = np.array([len(times), *shape.size])
-    alike = products * lines / np.maximum(lines - 1, 1) / max(errors.sum(), np.finfo(float).tiny)
-    facts = errors, weights, num_samples, shape.size, alike
-    return PruningScores(*facts, slope, own, by_path, span, by_color, by_axes, by_size, misses)
+    correlation = products * lines / np.maximum(lines - 1, 1) / max(errors.sum(), np.finfo(float).tiny)
+    of_frames = errors, weights, num_samples, shape.size, correlation
+    orders = first_order, second_order
+    return PruningScores(*of_frames, *orders, by_path, span, by_color, by_axes, by_size, misses)
 
 
 def _products(residual: np.ndarray, before: np.ndarray | None) -> list[float]:
@@ -225,7 +226,7 @@ def _log_envelope(tau: np.ndarray, shape: ConditioningSpec) -> np.ndarray:
 
 
 def _outer(vectors: Float[np.ndarray, "num 2"]) -> Float[np.ndarray, "num 3"]:
-    """v v^T as (xx, xy, yy), half of it made round: a mean over few frames would call some direction free."""
+    """v v^T as (xx, xy, yy), half of it made isotropic: a mean over few frames would leave a direction undetermined."""
     x, y = vectors.T
     round_part = 0.25 * (x * x + y * y)
     return np.stack([0.5 * x * x + round_part, 0.5 * x * y, 0.5 * y * y + round_part], 1)

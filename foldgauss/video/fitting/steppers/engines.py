@@ -1,4 +1,6 @@
-"""The choice of the engine that computes the steps of a fit."""
+"""The engines of a fit: which one computes it, and the stepper that belongs to it."""
+
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -6,35 +8,48 @@ import numpy as np
 from foldgauss._runtime.checks import invalid
 from foldgauss.render import pallas
 from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
+from foldgauss.video.fitting.steppers.jax_stepper import JaxStepper
+from foldgauss.video.fitting.steppers.protocol import Stepper
 
 
 def choose_engine(frames: np.ndarray, config: FitConfig, state: FitState | None = None) -> str:
-    """ "cpu", "xla" or "pallas": what computes a fit to `frames`, on from `state`.
+    """The engine of a fit to `frames`, resumed from `state`: "cpu", "xla" or "pallas".
 
-    Raises ValueError where an engine is asked for that does not know a setting.
+    Raises ValueError for an engine that does not support one of the settings.
     """
     if config.engine == "cpu" or (config.engine == "auto" and jax.default_backend() == "cpu"):
         return "cpu"
-    unknown = _unknown(frames, config, state)
+    unsupported = _find_unsupported(frames, config, state)
     if config.engine == "auto":
-        return "cpu" if unknown else "xla"
-    if unknown:
-        cure = "Give engine='cpu', which knows all settings."
-        raise invalid("engine", expected=f"'cpu' with {unknown}", got=repr(config.engine), cure=cure)
+        return "cpu" if unsupported else "xla"
+    if unsupported:
+        cure = "Give engine='cpu', which supports all settings."
+        raise invalid("engine", expected=f"'cpu' with {unsupported}", got=repr(config.engine), cure=cure)
     if config.engine == "pallas":
         pallas.check_options(config.options)
     return config.engine
 
 
+def make_stepper(
+    engine: str, frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion]
+) -> Stepper:
+    """The stepper of an engine; it takes over the arrays of `state`."""
+    if engine == "cpu":
+        return CpuStepper(frames, config, state, find_motion)
+    return JaxStepper(frames, config, state, engine)
+
+
 def describe_device() -> str:
-    """The device that steps are computed on where they are not on the CPU's kernels, as "NVIDIA H200"."""
+    """The name of the device that JAX engines compute on, as "NVIDIA H200"."""
     first, *others = jax.local_devices()
     return f"{len(others) + 1} times {first.device_kind}" if others else first.device_kind
 
 
-def _unknown(frames: np.ndarray, config: FitConfig, state: FitState | None) -> str:
-    """What steps on a device do not know, in words; empty where there is nothing."""
+def _find_unsupported(frames: np.ndarray, config: FitConfig, state: FitState | None) -> str:
+    """A setting that the JAX engines do not support, in words; empty where there is none."""
     if config.economy is not None:
         return "an economy"
     if config.interpolation_fraction > 0:
@@ -42,5 +57,5 @@ def _unknown(frames: np.ndarray, config: FitConfig, state: FitState | None) -> s
     if frames.shape[3] == 4:
         return "frames that have alpha"
     if state is not None and (len(state.colors.index) or len(state.shapes.index)):
-        return "a state whose Gaussians share numbers"
+        return "a state whose Gaussians share values"
     return ""

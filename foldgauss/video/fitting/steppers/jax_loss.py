@@ -1,4 +1,4 @@
-"""The losses of `loss` in JAX, for fits whose steps stay on a device: a test holds both to the same values."""
+"""The losses of `loss` in JAX, for fits on a device; a test compares both."""
 
 import jax
 import jax.numpy as jnp
@@ -9,45 +9,45 @@ from foldgauss.video.fitting.steppers.loss import C1, C2, RADIUS, SQUARE_WEIGHT,
 
 
 @jax.custom_vjp
-def blurred(x: Float[Array, "*batch height width channels"]) -> Float[Array, "*batch height width channels"]:
+def blur(x: Float[Array, "*batch height width channels"]) -> Float[Array, "*batch height width channels"]:
     """The 11 taps down the columns and along the rows, zeros around. It is its own transpose."""
-    # Between the two passes a barrier: fused into one they would take 121 products where 22 do.
+    # A barrier between the two passes: fused they would take 121 products instead of 22.
     return _along(jax.lax.optimization_barrier(_along(x, -3)), -2)
 
 
-blurred.defvjp(lambda x: (blurred(x), None), lambda _, grad: (blurred(grad),))
+blur.defvjp(lambda x: (blur(x), None), lambda _, grad: (blur(grad),))
 
 
 def _along(x: Array, axis: int) -> Array:
     axis, length = axis + x.ndim, x.shape[axis]
     padded = jnp.pad(x, [(RADIUS, RADIUS) if k == axis else (0, 0) for k in range(x.ndim)])
 
-    def moved(k: int) -> Array:
+    def shift(k: int) -> Array:
         return jax.lax.slice_in_dim(padded, RADIUS + k, RADIUS + k + length, axis=axis)
 
     out = TAPS[0] * x
     for k in range(1, RADIUS + 1):
-        out = out + TAPS[k] * (moved(-k) + moved(k))
+        out = out + TAPS[k] * (shift(-k) + shift(k))
     return out
 
 
-def similarity(
+def ssim(
     x: Float[Array, "*batch height width channels"], y: Float[Array, "*batch height width channels"]
 ) -> Float[Array, "*batch height width channels"]:
     """SSIM at every pixel, as `loss.ssim_map`."""
-    mean_x, mean_y, xx, yy, xy = blurred(jnp.stack([x, y, x * x, y * y, x * y]))
+    mean_x, mean_y, xx, yy, xy = blur(jnp.stack([x, y, x * x, y * y, x * y]))
     var_x, var_y, cov = xx - mean_x * mean_x, yy - mean_y * mean_y, xy - mean_x * mean_y
     top = (2 * mean_x * mean_y + C1) * (2 * cov + C2)
     return top / ((mean_x * mean_x + mean_y * mean_y + C1) * (var_x + var_y + C2))
 
 
-def losses(
+def compute_losses(
     rendered: Float[Array, "batch height width channels"],
     target: Float[Array, "batch height width channels"],
     squared: Bool[Array, ""],
     ssim_fraction: float,
 ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    """Of each picture its loss, `squared_loss` or `image_loss`, and its mean squared error.
+    """The loss of each image, as `squared_loss` or `image_loss`, and its mean squared error.
 
     Source: Kerbl et al. 2023, eq. 7, with D-SSIM as 1 - SSIM; Wang et al. 2004.
     """
@@ -57,11 +57,11 @@ def losses(
     def structural() -> Float[Array, " batch"]:
         # Not `abs`, whose slope in JAX is 1 where both are equal: there it is 0.
         value = (1 - ssim_fraction) * _mean(difference * jax.lax.stop_gradient(jnp.sign(difference)))
-        return value if ssim_fraction == 0 else value + ssim_fraction * (1 - _mean(similarity(rendered, target)))
+        return value if ssim_fraction == 0 else value + ssim_fraction * (1 - _mean(ssim(rendered, target)))
 
     return jax.lax.cond(squared, lambda: np.float32(SQUARE_WEIGHT) * errors, structural), errors
 
 
 def _mean(x: Float[Array, "batch height width channels"]) -> Float[Array, " batch"]:
-    """By rows first: float32 sums of millions of pixels one by one would lose digits."""
+    """Mean over rows first: float32 sums of millions of pixels one by one would lose digits."""
     return jnp.mean(jnp.mean(x, axis=2), axis=(1, 2))

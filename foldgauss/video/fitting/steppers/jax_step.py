@@ -1,8 +1,8 @@
-"""One step of a fit as a function of arrays, in pure JAX: what `fit._Stepper` does on the CPU, for any device.
+"""One step of a fit as a function of arrays, in pure JAX: the twin of `CpuStepper.step` for any device.
 
-Arrays are as long as the most Gaussians that there may be; rows behind the first `num` are in nobody's way: they draw
-nothing and do not learn. A step is one program, whose state is donated to it; nothing in it asks the host. Frames of a
-batch are shared out over the devices of a mesh, each of which keeps the whole state.
+Arrays have rows for the largest number of Gaussians that there may be; rows after the first `num` are unused: they
+render nothing and do not learn. A step is one program, to which the arrays are donated; nothing in it calls the host.
+The frames of a batch are divided over the devices of a mesh, each of which has all arrays.
 """
 
 import dataclasses
@@ -12,51 +12,35 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
-from foldgauss.render.tiles import on_screen
-from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, LASTING_TIME, UNBIAS
+from foldgauss.render.tiles import find_visible
+from foldgauss.video.fitting.adam import masked_adam, update_frame_times
 from foldgauss.video.fitting.growth import GradientStatistics
-from foldgauss.video.fitting.state import TIME_ADAM, frame_times, update_times
-from foldgauss.video.fitting.steppers.jax_loss import losses
+from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.models.row_layout import columns, unpack
-from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 from foldgauss.video.models.splats import TAU_MAX
 
-#: The axis of the mesh that views are shared out over.
+#: The axis of the mesh that views are divided over.
 VIEWS = "views"
 
 
-class Arrays(NamedTuple):
-    """What a step consumes and gives anew; rows are those of `FitState`, and unused ones."""
-
-    rows: Float[Array, "capacity width"]
-    first: Float[Array, "capacity width"]
-    second: Float[Array, "capacity width"]
-    counts: Int[Array, " capacity"]
-    kinds: UInt8[Array, " capacity"]
-    frame_errors: Float[Array, " num_frames"]
-    time_logits: Float[Array, " intervals"]
-    time_moments: optax.OptState
-    statistics: GradientStatistics | None  # (capacity,) each; None where Gaussians never grow
-
-
 class Control(NamedTuple):
-    """What a step is told."""
+    """What differs between steps."""
 
-    views: Int[Array, " batch"]  # of `schedule.views_of`
+    views: Int[Array, " batch"]  # of `schedule.choose_views`
     num: Int[Array, ""]  # rows in use
     squared: Bool[Array, ""]  # which loss
     rates: Float[Array, " width"]
-    rate_of_times: Float[Array, ""]
+    time_rate: Float[Array, ""]
 
 
-class Figures(NamedTuple):
-    """What a step tells, all that is fetched after each."""
+class Report(NamedTuple):
+    """What is fetched after each step."""
 
     loss: Float[Array, ""]
     error: Float[Array, ""]  # mean squared
@@ -68,12 +52,12 @@ class Figures(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class Program:
     """All that a step is compiled for."""
 
     capacity: int
     num_frames: int
-    size: tuple[int, int]  # of the pictures
+    size: tuple[int, int]  # of the images
     aspect: float  # of the frames: height / width
     degree: int
     power: float
@@ -95,94 +79,84 @@ class Plan:
         return columns(self.degree)["coefficients"].stop
 
 
-def mesh_of(plan: Plan) -> Mesh | None:
-    """The devices that views are shared out over; None where there is but one."""
-    if plan.num_devices == 1:
+def make_mesh(program: Program) -> Mesh | None:
+    """The devices that views are divided over; None where there is only one."""
+    if program.num_devices == 1:
         return None
-    return Mesh(np.array(jax.local_devices()[: plan.num_devices]), (VIEWS,))
+    return Mesh(np.array(jax.local_devices()[: program.num_devices]), (VIEWS,))
 
 
-def everywhere(plan: Plan) -> NamedSharding | None:
-    """The place of arrays that every device has."""
-    mesh = mesh_of(plan)
+def replicated(program: Program) -> NamedSharding | None:
+    """The sharding of arrays that every device has whole."""
+    mesh = make_mesh(program)
     return None if mesh is None else NamedSharding(mesh, PartitionSpec())
 
 
 @functools.lru_cache(maxsize=8)
-def program(plan: Plan) -> jax.stages.Compiled:
-    """The step of a plan, compiled: `program(plan)(arrays, frames, control)` gives `(arrays, figures)`.
+def compile_step(program: Program) -> jax.stages.Compiled:
+    """The compiled step: called with `(arrays, frames, control)` it returns `(arrays, report)`.
 
-    `arrays` are donated: they are no more after the call. `frames` is uint8 (num_frames, *plan.size, 3).
+    `arrays` are donated: they cannot be used after the call. `frames` is uint8 (num_frames, *program.size, 3).
     """
-    return lowered(plan).compile()
+    return lower_step(program).compile()
 
 
-def lowered(plan: Plan, platforms: tuple[str, ...] | None = None) -> jax.stages.Lowered:
-    """The program of a step before it is compiled; for `platforms`, by default those that are here."""
-    place = everywhere(plan)
-    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), _shapes(plan))
-    how = {} if place is None else {"out_shardings": place}
-    traced = jax.jit(functools.partial(step, plan), donate_argnums=0, **how).trace(*shapes)
+def lower_step(program: Program, platforms: tuple[str, ...] | None = None) -> jax.stages.Lowered:
+    """The step before it is compiled; for `platforms`, by default those of this machine."""
+    place = replicated(program)
+    specs = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), _specs(program))
+    options = {} if place is None else {"out_shardings": place}
+    traced = jax.jit(functools.partial(step, program), donate_argnums=0, **options).trace(*specs)
     return traced.lower(lowering_platforms=platforms)
 
 
-def _shapes(plan: Plan) -> tuple[Arrays, jax.ShapeDtypeStruct, Control]:
-    def of(*shape: int, dtype=np.float32) -> jax.ShapeDtypeStruct:
+def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Control]:
+    def spec(*shape: int, dtype=np.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, dtype)
 
-    num, rows, logits = plan.capacity, of(plan.capacity, plan.width), of(plan.num_frames - 1)
-    counts = of(num, dtype=np.int32)
-    arrays = Arrays(
-        rows=rows,
-        first=rows,
-        second=rows,
-        counts=counts,
-        kinds=of(num, dtype=np.uint8),
-        frame_errors=of(plan.num_frames),
-        time_logits=logits,
-        time_moments=jax.eval_shape(TIME_ADAM.init, logits),
-        statistics=GradientStatistics(of(num), of(num), counts) if plan.grows else None,
-    )
-    views, one = of(plan.batch_size, dtype=np.int32), of(dtype=np.int32)
-    control = Control(views, one, of(dtype=np.bool_), of(plan.width), of())
-    return arrays, of(plan.num_frames, *plan.size, 3, dtype=np.uint8), control
+    sizes, kinds = Sizes(program.capacity, program.width, program.num_frames, program.grows), FitState.array_fields()
+    arrays = DeviceArrays(*(kinds[name].spec(sizes) for name in DeviceArrays._fields))
+    views, num = spec(program.batch_size, dtype=np.int32), spec(dtype=np.int32)
+    control = Control(views, num, spec(dtype=np.bool_), spec(program.width), spec())
+    return arrays, spec(program.num_frames, *program.size, 3, dtype=np.uint8), control
 
 
 # --------------------------------------------------------------------------------------------- the step
 
 
-def step(plan: Plan, arrays: Arrays, frames: UInt8[Array, "frames height width 3"], control: Control):
-    """The arrays after a step, and its `Figures`."""
+def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames height width 3"], control: Control):
+    """The arrays after a step, and its `Report`."""
     times = frame_times(arrays.time_logits)
-    seen = _shared_out(plan)(arrays.rows, times, frames, control)
+    seen = _distribute(program)(arrays.rows, times, frames, control)
     statistics = arrays.statistics
     if statistics is not None:
-        by_time = seen.by_rows[:, columns(plan.degree)["time_loc_logit"].start]
-        statistics = _counted(statistics, seen.screen, by_time)
-    used = jnp.arange(plan.capacity, dtype=jnp.int32) < control.num
-    touched = seen.alive if plan.sparse_updates else used
+        by_time = seen.by_rows[:, columns(program.degree)["time_loc_logit"].start]
+        statistics = _add(statistics, seen.screen, by_time)
+    used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
+    touched = seen.alive if program.sparse_updates else used
     moments = arrays.first, arrays.second, arrays.counts
-    rows, *moments = adam(
-        arrays.rows, seen.by_rows, *moments, touched, control.rates, kinds=arrays.kinds, unit_time=plan.unit_time
+    rows, first, second, counts = masked_adam(
+        arrays.rows, seen.by_rows, *moments, touched, control.rates, kinds=arrays.kinds, unit_time=program.unit_time
     )
     logits, time_moments = arrays.time_logits, arrays.time_moments
-    if plan.learns_times:
-        logits, time_moments = update_times(logits, time_moments, seen.by_times, control.rate_of_times)
+    if program.learns_times:
+        logits, time_moments = update_frame_times(logits, time_moments, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
-    figures = Figures(
+    report = Report(
         loss=seen.loss,
         error=seen.error,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
         finite_rows=jnp.all(jnp.isfinite(rows)),
-        finite_second=jnp.all(jnp.isfinite(moments[1])),
+        finite_second=jnp.all(jnp.isfinite(second)),
         frame_errors=errors,
         time_logits=logits,
     )
-    return Arrays(rows, *moments, arrays.kinds, errors, logits, time_moments, statistics), figures
+    arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, statistics=statistics)
+    return arrays._replace(frame_errors=errors, time_logits=logits, time_moments=time_moments), report
 
 
-class Seen(NamedTuple):
-    """What the views of a batch come to."""
+class Gradients(NamedTuple):
+    """The loss of a batch, its gradients, and which Gaussians it shows."""
 
     loss: Float[Array, ""]  # means over the batch
     error: Float[Array, ""]
@@ -193,9 +167,9 @@ class Seen(NamedTuple):
     screen: Float[Array, " capacity"]  # largest screen gradient; -1 of Gaussians that no view shows
 
 
-def _shared_out(plan: Plan):
-    """`_look`, on one device or on all of them, each with its views."""
-    mesh, here = mesh_of(plan), functools.partial(_look, plan)
+def _distribute(program: Program):
+    """`_differentiate`, on one device or on all of them, each with its views."""
+    mesh, here = make_mesh(program), functools.partial(_differentiate, program)
     if mesh is None:
         return here
     whole, views = PartitionSpec(), PartitionSpec(VIEWS)
@@ -204,93 +178,93 @@ def _shared_out(plan: Plan):
         own = here(rows, times, frames, control)
         total = functools.partial(jax.lax.psum, axis_name=VIEWS)
         largest = functools.partial(jax.lax.pmax, axis_name=VIEWS)
-        return Seen(
+        return Gradients(
             *map(total, (own.loss, own.error, own.by_rows, own.by_times)),
             largest(own.errors),
             largest(own.alive.astype(jnp.int32)) > 0,
             largest(own.screen),
         )
 
-    own = Control(views=views, num=whole, squared=whole, rates=whole, rate_of_times=whole)
-    # Its loops make arrays of their own, which the check of what is equal everywhere cannot follow.
+    own = Control(views=views, num=whole, squared=whole, rates=whole, time_rate=whole)
+    # The replication check does not support the loops inside.
     return jax.shard_map(on_each, mesh=mesh, in_specs=(whole, whole, whole, own), out_specs=whole, check_vma=False)
 
 
-def _look(plan: Plan, rows, times, frames, control: Control) -> Seen:
-    """Draw the views, and carry their losses' gradients back to rows and times; sums of a share of the batch."""
-    k, mirrored = control.views % plan.num_frames, control.views >= plan.num_frames
-    alive = _over(len(k), lambda t: alive_at(plan, rows, control.num, t), times[k])
+def _differentiate(program: Program, rows, times, frames, control: Control) -> Gradients:
+    """Render the views and differentiate their losses by rows and times; sums over this device's part of the batch."""
+    k, mirrored = control.views % program.num_frames, control.views >= program.num_frames
+    alive = _map_views(len(k), lambda t: find_alive(program, rows, control.num, t), times[k])
     target = frames[k].astype(jnp.float32) * np.float32(1 / 255)
     target = jnp.where(mirrored[:, None, None, None], target[:, :, ::-1], target)
 
-    def conditioned(rows, t):
-        return _over(len(k), functools.partial(_splats, plan, rows), t, alive, mirrored)
+    def condition(rows, t):
+        return _map_views(len(k), functools.partial(_splats, program, rows), t, alive, mirrored)
 
-    splats, to_rows = jax.vjp(conditioned, rows, times[k])
-    pictures, to_splats = jax.vjp(functools.partial(_over, len(k), functools.partial(_drawn, plan)), splats)
+    splats, to_rows = jax.vjp(condition, rows, times[k])
+    images, to_splats = jax.vjp(functools.partial(_map_views, len(k), functools.partial(_render, program)), splats)
 
-    def mean_loss(pictures):
-        own, errors = losses(pictures, target, control.squared, plan.ssim_fraction)
-        return jnp.sum(own) / plan.batch_size, errors
+    def mean_loss(images):
+        own, errors = compute_losses(images, target, control.squared, program.ssim_fraction)
+        return jnp.sum(own) / program.batch_size, errors
 
-    (loss, errors), by_pictures = jax.value_and_grad(mean_loss, has_aux=True)(pictures)
-    (by_splats,) = to_splats(by_pictures)
+    (loss, errors), by_images = jax.value_and_grad(mean_loss, has_aux=True)(images)
+    (by_splats,) = to_splats(by_images)
     by_rows, by_t = to_rows(by_splats)
-    return Seen(
+    return Gradients(
         loss,
-        jnp.sum(errors) / plan.batch_size,
+        jnp.sum(errors) / program.batch_size,
         by_rows,
         jnp.zeros_like(times).at[k].add(by_t),  # a batch may hold a frame twice
         jnp.full_like(times, -1.0).at[k].set(errors),
         jnp.any(alive, axis=0),
-        _screen_gradient(plan, splats, by_splats, alive) if plan.grows else jnp.zeros_like(rows[:, 0]),
+        _screen_gradient(program, splats, by_splats, alive) if program.grows else jnp.zeros_like(rows[:, 0]),
     )
 
 
-def _over(num: int, function, *batches):
-    """`function` of each of `num` views; of one alone without `vmap`, which would compute both sides of branches."""
+def _map_views(num: int, function, *batches):
+    """`function` of each of `num` views; of a single one without `vmap`, which would compute both sides of branches."""
     if num == 1:
         out = function(*jax.tree.map(lambda leaf: leaf[0], batches))
         return jax.tree.map(lambda leaf: leaf[None], out)
     return jax.vmap(function)(*batches)
 
 
-def alive_at(plan: Plan, rows, num, t) -> Bool[Array, " capacity"]:
-    """Which Gaussians take part at t: rows in use, whose window holds t, as `conditioning.update_windows` has it."""
-    place = columns(plan.degree)
-    centre = jax.nn.sigmoid(rows[:, place["time_loc_logit"].start])
+def find_alive(program: Program, rows, num, t) -> Bool[Array, " capacity"]:
+    """Which Gaussians are alive at t: rows in use whose window contains t, see `conditioning.update_windows`."""
+    place = columns(program.degree)
+    center = jax.nn.sigmoid(rows[:, place["time_loc_logit"].start])
     reach = np.float32(TAU_MAX) * jnp.exp(rows[:, place["log_time_scale"].start])
-    used = jnp.arange(plan.capacity, dtype=jnp.int32) < num
-    return used & (centre - reach < t) & (t < centre + reach)
+    used = jnp.arange(program.capacity, dtype=jnp.int32) < num
+    return used & (center - reach < t) & (t < center + reach)
 
 
-def _splats(plan: Plan, rows, t, alive, mirrored) -> Splats2D:
-    """The Gaussians of time t in pixels, of opacity 0 but for those alive: `FoldedSplats.at`, home of the equation."""
-    # Rows of others are replaced, so that what underflows far away in time is in no gradient.
+def _splats(program: Program, rows, t, alive, mirrored) -> Splats2D:
+    """The Gaussians at time t in pixels, by `FoldedSplats.at`; those not alive have opacity 0."""
+    # The rows of those are replaced, so that their underflow far away in time is in no gradient.
     rows = jnp.where(alive[:, None], rows, jnp.zeros_like(rows))
-    envelope = TimeLikelihood(power=np.float32(plan.power), floor=np.float32(plan.floor))
-    splats = unpack(rows, plan.degree, envelope).at(t).to_pixels(plan.size, aspect=plan.aspect)
-    # The camera opposite sees left for right.
+    envelope = TimeLikelihood(power=np.float32(program.power), floor=np.float32(program.floor))
+    splats = unpack(rows, program.degree, envelope).at(t).to_pixels(program.size, aspect=program.aspect)
+    # The opposite camera sees left for right.
     sign = jnp.where(mirrored, jnp.float32([-1, 1]), jnp.float32([1, 1]))
-    offset = jnp.where(mirrored, jnp.float32([plan.size[1], 0]), jnp.float32([0, 0]))
+    offset = jnp.where(mirrored, jnp.float32([program.size[1], 0]), jnp.float32([0, 0]))
     mean, factor = splats.mean * sign[None, :] + offset[None, :], splats.factor * sign[None, :, None]
     return Splats2D(mean, factor, jnp.where(alive, splats.opacity, jnp.zeros_like(splats.opacity)), splats.color)
 
 
-def _drawn(plan: Plan, splats: Splats2D) -> Float[Array, "height width 3"]:
-    return render(splats, plan.size, compositing=plan.compositing, engine=plan.engine, options=plan.options)
+def _render(program: Program, splats: Splats2D) -> Float[Array, "height width 3"]:
+    return render(splats, program.size, compositing=program.compositing, engine=program.engine, options=program.options)
 
 
-def _screen_gradient(plan: Plan, splats: Splats2D, by_splats: Splats2D, alive) -> Float[Array, " capacity"]:
-    """Of `GradientStatistics.add`: the largest over the views; -1 where none shows a Gaussian."""
-    half = np.float32(plan.size[::-1]) / 2
+def _screen_gradient(program: Program, splats: Splats2D, by_splats: Splats2D, alive) -> Float[Array, " capacity"]:
+    """The largest screen gradient over the views, see `GradientStatistics`; -1 where no view shows the Gaussian."""
+    half = np.float32(program.size[::-1]) / 2
     size = jnp.hypot(by_splats.mean[..., 0] * half[0], by_splats.mean[..., 1] * half[1])
-    shows = jax.vmap(lambda own: on_screen(own.mean, own.factor, own.opacity, plan.size, plan.options))(splats)
+    shows = jax.vmap(lambda own: find_visible(own.mean, own.factor, own.opacity, program.size, program.options))(splats)
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
 
 
-def _counted(statistics: GradientStatistics, screen, by_time) -> GradientStatistics:
-    """As `GradientStatistics.add`."""
+def _add(statistics: GradientStatistics, screen, by_time) -> GradientStatistics:
+    """The twin of `GradientStatistics.add`."""
     seen = screen >= 0
     return GradientStatistics(
         statistics.screen + jnp.where(seen, screen, jnp.zeros_like(screen)),
@@ -299,66 +273,21 @@ def _counted(statistics: GradientStatistics, screen, by_time) -> GradientStatist
     )
 
 
-def adam(rows, grad, first, second, counts, touched, rates, *, kinds, unit_time: float):
-    """`sparse_adam` in JAX: rows, moments and counts after a step on the rows `touched`, (num,) bool.
-
-    `rows`, `grad`, `first`, `second`: float32 (num, width); `counts`: int32 (num,); `rates`: float32 (width,); `kinds`:
-    uint8 (num,).
-    """
-    degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
-    grad = jnp.where(_learns(kinds, degree), grad, jnp.zeros_like(grad))
-    counts = counts + touched.astype(counts.dtype)
-    unbias = jnp.asarray(UNBIAS)[jnp.minimum(counts, len(UNBIAS) - 1)]
-    beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
-    mean = beta1 * first + (one - beta1) * grad
-    square = beta2 * second + (one - beta2) * grad * grad
-    own = rates[None, :] * _in_own_time(rows, kinds, degree, unit_time)
-    moved = rows - own * mean * unbias[:, :1] / (jnp.sqrt(square * unbias[:, 1:]) + np.float32(EPSILON))
-    chosen = touched[:, None]
-    return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts
-
-
-def _learns(kinds: UInt8[Array, " num"], degree: int) -> Bool[Array, "num width"]:
-    """Which numbers each row has."""
-    place = columns(degree)
-    kinds = kinds.astype(jnp.int32)[:, None]
-    column = np.arange(place["coefficients"].stop, dtype=np.int32)[None, :]
-    of_time = (column == place["time_loc_logit"].start) | (column == place["log_time_scale"].start)
-    gone = of_time & ((kinds & STATIC_BIT) > 0)
-    gone |= (column == place["opacity_logit"].start) & ((kinds & OPAQUE_BIT) > 0)
-    return ~(gone | (column >= place["coefficients"].start + 2 * (kinds & DEGREE_MASK)))
-
-
-def _in_own_time(rows, kinds, degree: int, unit_time: float) -> Float[Array, "num width"]:
-    """What rates are multiplied by: see `config.LearningRates`."""
-    factors, place = jnp.ones_like(rows), columns(degree)
-    if unit_time == 0:
-        return factors
-    is_static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
-    spread = jnp.exp(rows[:, place["log_time_scale"].start])
-    wide = jnp.where(is_static, np.float32(LASTING_TIME), spread) / np.float32(unit_time)
-    factors, power = factors.at[:, place["time_loc_logit"].start].set(wide), jnp.ones_like(wide)
-    for column in range(place["coefficients"].start, place["coefficients"].stop, 2):
-        power = power * (1 / wide)
-        factors = factors.at[:, column : column + 2].set(power[:, None])
-    return factors
-
-
-# ---------------------------------------------------------------------------------------------- looking
+# -------------------------------------------------------------------------------------------------- errors
 
 
 @functools.lru_cache(maxsize=8)
-def look(plan: Plan) -> jax.stages.Compiled:
-    """`look(plan)(rows, num, t, frame)`: the mean squared error of the picture of time t against a frame, compiled."""
-    place = everywhere(plan)
-    shapes = (plan.capacity, plan.width), (), (), (*plan.size, 3)
+def compile_error(program: Program) -> jax.stages.Compiled:
+    """Compiled: called with `(rows, num, t, frame)`, the mean squared error of the image at time t against a frame."""
+    place = replicated(program)
+    shapes = (program.capacity, program.width), (), (), (*program.size, 3)
     dtypes = np.float32, np.int32, np.float32, np.uint8
-    given = (jax.ShapeDtypeStruct(*own, sharding=place) for own in zip(shapes, dtypes, strict=True))
-    return jax.jit(functools.partial(_error, plan)).lower(*given).compile()
+    specs = (jax.ShapeDtypeStruct(*spec, sharding=place) for spec in zip(shapes, dtypes, strict=True))
+    return jax.jit(functools.partial(_measure_error, program)).lower(*specs).compile()
 
 
-def _error(plan: Plan, rows, num, t, frame: UInt8[Array, "height width 3"]) -> Float[Array, ""]:
-    alive = alive_at(plan, rows, num, t)
-    picture = _drawn(plan, _splats(plan, rows, t, alive, jnp.bool_(False)))
-    difference = picture - frame.astype(jnp.float32) * np.float32(1 / 255)
+def _measure_error(program: Program, rows, num, t, frame: UInt8[Array, "height width 3"]) -> Float[Array, ""]:
+    alive = find_alive(program, rows, num, t)
+    image = _render(program, _splats(program, rows, t, alive, jnp.bool_(False)))
+    difference = image - frame.astype(jnp.float32) * np.float32(1 / 255)
     return jnp.mean(jnp.mean(difference * difference, axis=1))

@@ -1,127 +1,174 @@
-"""Fits whose steps stay on a JAX device: which engine computes a fit, and the stepper that holds arrays and frames.
+"""`JaxStepper`: the steps of a fit on JAX's default devices, where arrays and frames stay between steps.
 
-Between two steps only `device_step.Figures` are fetched, some hundred numbers. All arrays are fetched where somebody
-reads them of the state, and where Gaussians are born and die, which `population` does on the host.
+After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays are fetched where they are read from the
+state, and for densification, which runs on the host.
 """
 
 import time
+from typing import Any
 
 import jax
 import numpy as np
 
-from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.densify import changes_at, grow
-from foldgauss.video.fitting.growth import GradientStatistics
-from foldgauss.video.fitting.schedule import Rates, levels, looked_at, shrunk, steps_per_pass, views_of
-from foldgauss.video.fitting.state import FitState, frame_times
-from foldgauss.video.fitting.steppers.jax_step import Arrays, Control, Figures, Plan, everywhere, look, program
+from foldgauss.video.fitting.densify import grow
+from foldgauss.video.fitting.schedule import (
+    RateSchedule,
+    choose_start_frames,
+    choose_views,
+    plan_levels,
+    shrink_frame,
+    steps_per_pass,
+)
+from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.steppers.jax_step import (
+    Control,
+    Program,
+    Report,
+    compile_error,
+    compile_step,
+    replicated,
+)
+from foldgauss.video.fitting.steppers.protocol import StepResult
 
-#: Of a fit that grows without a bound that it could reach: room for so many times the Gaussians of its start, and
-#: twice as much whenever that is not enough, for which steps are compiled anew.
-ROOM = 4
+#: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
+#: that is not enough it doubles, and steps are compiled anew.
+CAPACITY_FACTOR = 4
+_FIELDS = FitState.array_fields()
 
 
-def _seen_at(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Frames at a level's size."""
-    return frames if frames.shape[1:3] == size else np.stack([shrunk(frame, size) for frame in frames])
+class HeldArrays:
+    """The arrays of a `FitState` on a device, a `state.Held`. The next step consumes them."""
 
+    def __init__(self, arrays: DeviceArrays, num: int, growing: bool, report: Report | None):
+        self.arrays, self.num, self.growing, self.report = arrays, num, growing, report
+        self._fetched: dict[str, Any] = {}  # arrays that are small, and read after every step
 
-class OnDevice:
-    """What a `FitState` holds on a device: `state.Held`. The next step consumes it."""
+    def fetch(self, name: str) -> Any:
+        kind = _FIELDS[name]
+        if not kind.on_device or (name == "statistics" and not self.growing):
+            return kind.build(Sizes(self.num, 0, 0))
+        if self.report is not None and name in Report._fields:
+            return np.array(getattr(self.report, name))
+        if kind.per_gaussian:
+            return jax.tree.map(lambda leaf: np.array(leaf)[: self.num].copy(), getattr(self.arrays, name))
+        if name not in self._fetched:
+            self._fetched[name] = jax.tree.map(np.array, getattr(self.arrays, name))
+        return jax.tree.map(np.array, self._fetched[name])
 
-    def __init__(self, arrays: Arrays, num: int, growing: bool, figures: Figures | None):
-        self.arrays, self.num, self.growing, self.figures = arrays, num, growing, figures
-        self._here: dict[str, object] = {}  # what is small, and asked for in every step
-
-    def fetch(self, name: str) -> object:
-        if name == "young":
-            return np.zeros(self.num, bool)
-        if name in ("colors", "shapes"):
-            return Codebook.of(None, 3 if name == "colors" else 2)
-        if name == "statistics" and not self.growing:
-            return None
-        if self.figures is not None and name in Figures._fields:
-            return np.array(getattr(self.figures, name))
-        if name in ("time_logits", "time_moments", "frame_errors"):
-            if name not in self._here:
-                self._here[name] = jax.tree.map(np.array, getattr(self.arrays, name))
-            return jax.tree.map(np.array, self._here[name])
-        return jax.tree.map(lambda leaf: np.array(leaf)[: self.num].copy(), getattr(self.arrays, name))
-
-    def finite(self, name: str) -> bool:
-        if self.figures is not None and name in ("rows", "second"):
-            return bool(getattr(self.figures, f"finite_{name}"))
+    def is_finite(self, name: str) -> bool:
+        if self.report is not None and name in ("rows", "second"):
+            return bool(getattr(self.report, f"finite_{name}"))
         return bool(np.isfinite(self.fetch(name)).all())
 
-    def copied(self) -> "OnDevice":
+    def copy(self) -> "HeldArrays":
         arrays = jax.tree.map(lambda leaf: leaf.copy(), self.arrays)
-        return OnDevice(arrays, self.num, self.growing, self.figures)
+        return HeldArrays(arrays, self.num, self.growing, self.report)
 
 
-class DeviceStepper:
-    """Steps of a fit on JAX's default device, or on several where the batch can be shared out evenly.
+class JaxStepper:
+    """A `Stepper` on JAX's default device, or on several where the batch can be divided evenly.
 
-    As `fit._Stepper`, of a state whose arrays it takes over: programs for all levels are compiled at once, before any
-    clock runs, and frames are held on the device at the sizes of all levels, as bytes.
+    The programs of all levels are compiled when it is made, before any clock runs, and the frames are kept on the
+    device at the sizes of all levels, as bytes.
     """
 
     def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState, engine: str):
         self.frames, self.config, self.engine = frames, config, engine
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
-        self.levels, self.rates = levels(config, self.size), Rates(config)
+        self.levels, self.rates = plan_levels(config, self.size), RateSchedule(config)
+        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.capacity = 0
-        self._adopt(state)
-        place = everywhere(self.plans[-1])
-        self.pictures = [jax.device_put(_seen_at(frames, level.size), place) for level in self.levels]
+        self.adopt(state)
+        place = replicated(self.programs[-1])
+        self.images = [jax.device_put(_shrink_clip(frames, level.size), place) for level in self.levels]
 
-    def _adopt(self, state: FitState) -> None:
-        """Take a state's arrays over, with room for as many Gaussians as there may be."""
-        growing, num = state.growing, len(state.rows)
-        capacity = self._room(num)
+    def adopt(self, state: FitState) -> None:
+        """Move a state's arrays to the device, padded to the capacity."""
+        growing, num, width = state.growing, *state.rows.shape
+        capacity = self._choose_capacity(num)
         if capacity != self.capacity:
             self.capacity = capacity
-            self.plans = [self._plan(level.size) for level in self.levels]
-            for plan in self.plans:
-                program(plan)  # compiled here, or known
+            self.programs = [self._program(level.size) for level in self.levels]
+            for program in self.programs:
+                compile_step(program)
+        # Where growth has ended there are statistics nevertheless: without, steps would be compiled anew.
+        sizes = Sizes(num, width, self.num_frames, growing=self.config.growth is not None)
 
-        def padded(array: np.ndarray) -> np.ndarray:
-            out = np.zeros((capacity, *array.shape[1:]), array.dtype)
-            out[:num] = array
-            return out
+        def padded(name: str) -> Any:
+            kind = _FIELDS[name]
+            value = kind.build(sizes) if name == "statistics" and not growing else getattr(state, name)
+            if not kind.per_gaussian:
+                return jax.tree.map(np.array, value)
+            return jax.tree.map(lambda leaf: _pad(leaf, capacity), value)
 
-        statistics = None
-        if self.config.growth is not None:  # also after the last births: else steps were to be compiled anew
-            statistics = state.statistics if growing else GradientStatistics.zeros(num)
-        arrays = Arrays(
-            *(padded(getattr(state, name)) for name in ("rows", "first", "second", "counts", "kinds")),
-            np.array(state.frame_errors),
-            np.array(state.time_logits),
-            jax.tree.map(np.array, state.time_moments),
-            jax.tree.map(padded, statistics),
-        )
+        arrays = DeviceArrays(*map(padded, DeviceArrays._fields))
         # Copied, since arrays that are donated must be the device's own.
-        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, everywhere(self.plans[-1])))
-        state.hold(OnDevice(arrays, num, growing, None))
+        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.programs[-1])))
+        state.hold(HeldArrays(arrays, num, growing, None))
 
-    def _room(self, num: int) -> int:
-        """Rows of the arrays: a function of the number of Gaussians, so that a fit that goes on has the same."""
-        if self.config.growth is None:
-            return num
+    def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
+        if state.changed:  # by an observer of the fit
+            state.land()
+            self.adopt(state)
+        held, config = state.held, self.config
+        rates, time_rate = self.rates.at(progress, state.backoffs)
+        control = Control(
+            views=choose_views(config, self.num_frames, state.step).astype(np.int32),
+            num=np.int32(held.num),
+            squared=np.bool_(progress >= 1 - config.l2_fraction),
+            rates=rates,
+            time_rate=time_rate,
+        )
+        arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
+        report = jax.device_get(report)
+        state.hold(HeldArrays(arrays, held.num, held.growing, report))
+        return StepResult(float(report.loss), float(report.error), int(report.num_alive))
+
+    def grow(self, state: FitState) -> None:
+        """Densification on the host, where any is due."""
+        growth = self.config.growth.for_plan(state.plan)
+        if growth.changes_at(state.step):
+            state.land()
+            grow(state, self.config, self.size)
+            self.adopt(state)
+        elif state.step + 1 >= growth.until_step:
+            state.held.growing = False
+
+    def prune(self, state: FitState) -> None:
+        """Nothing: fits with an economy run on the CPU, see `engines.choose_engine`."""
+
+    def trim(self, state: FitState) -> None:
+        """Nothing, as `prune`."""
+
+    def measure_start(self, state: FitState) -> dict[int, float]:
+        arrays, num = state.held.arrays, np.int32(state.held.num)
+        times = np.asarray(frame_times(state.time_logits))
+        error = compile_error(self.programs[-1])  # before the clock runs
+        begun = time.perf_counter()
+        chosen = choose_start_frames(self.num_frames)
+        errors = {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in chosen}
+        state.seconds += time.perf_counter() - begun
+        return errors
+
+    def _choose_capacity(self, num: int) -> int:
+        """Rows of the arrays: a function of the number of Gaussians, so that a resumed fit has the same."""
         config = self.config
+        if config.growth is None:
+            return num
         most = max(most_gaussians(config, self.num_frames), num)
         if config.max_gaussians is not None or config.max_size_mb is not None:
             return most
-        room = ROOM * chosen_num_gaussians(config, self.num_frames, *self.size)
-        while room < num:
-            room *= 2
-        return min(room, most)
+        capacity = CAPACITY_FACTOR * chosen_num_gaussians(config, self.num_frames, *self.size)
+        while capacity < num:
+            capacity *= 2
+        return min(capacity, most)
 
-    def _plan(self, size: tuple[int, int]) -> Plan:
+    def _program(self, size: tuple[int, int]) -> Program:
         config, devices = self.config, len(jax.local_devices())
-        shares = [n for n in range(1, min(devices, config.batch_size) + 1) if config.batch_size % n == 0]
-        return Plan(
+        divisors = [n for n in range(1, min(devices, config.batch_size) + 1) if config.batch_size % n == 0]
+        return Program(
             capacity=self.capacity,
             num_frames=self.num_frames,
             size=size,
@@ -138,53 +185,17 @@ class DeviceStepper:
             unit_time=UNIT_TIME if config.scale_rates_by_duration else 0.0,
             learns_times=config.learn_frame_times and self.num_frames > 2,
             grows=config.growth is not None,
-            num_devices=max(shares),
+            num_devices=max(divisors),
         )
 
-    def __call__(self, state: FitState, progress: float, level: int = -1) -> tuple[float, float, int]:
-        """Advance `state`, whose arrays are consumed; returns loss, mean squared error and how many took part."""
-        if state.changed:  # by who watches the fit
-            state.land()
-            self._adopt(state)
-        held, config = state.held, self.config
-        rates, rate_of_times = self.rates.at(progress, state.backoffs)
-        control = Control(
-            views=views_of(config, self.num_frames, state.step).astype(np.int32),
-            num=np.int32(held.num),
-            squared=np.bool_(progress >= 1 - config.l2_fraction),
-            rates=rates,
-            rate_of_times=rate_of_times,
-        )
-        arrays, figures = program(self.plans[level])(held.arrays, self.pictures[level], control)
-        figures = jax.device_get(figures)
-        state.hold(OnDevice(arrays, held.num, held.growing, figures))
-        return float(figures.loss), float(figures.error), int(figures.num_alive)
 
-    @property
-    def steps_per_pass(self) -> int:
-        return steps_per_pass(self.config, self.num_frames)
+def _pad(array: np.ndarray, capacity: int) -> np.ndarray:
+    """The array with zero rows up to the capacity."""
+    out = np.zeros((capacity, *array.shape[1:]), array.dtype)
+    out[: len(array)] = array
+    return out
 
-    def anew(self, state: FitState) -> "DeviceStepper":
-        """For a state whose arrays are others now, and not on the device."""
-        self._adopt(state)
-        return self
 
-    def grow(self, state: FitState) -> None:
-        """Births, deaths and resets that are due: on the host, with the room on the device as it was."""
-        growth = self.config.growth.for_plan(state.plan)
-        if changes_at(growth, state.step):
-            state.land()
-            grow(state, self.config, self.size)
-            self._adopt(state)
-        elif state.step + 1 >= growth.until_step:
-            state.held.growing = False
-
-    def errors_at_start(self, state: FitState) -> dict[int, float]:
-        """As `fit._Stepper.errors_at_start`."""
-        plan, arrays = self.plans[-1], state.held.arrays
-        times, num = np.asarray(frame_times(state.time_logits)), np.int32(state.held.num)
-        error = look(plan)  # compiled, before the clock runs
-        begun = time.perf_counter()
-        errors = {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in looked_at(self.num_frames)}
-        state.seconds += time.perf_counter() - begun
-        return errors
+def _shrink_clip(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """All frames at a level's size."""
+    return frames if frames.shape[1:3] == size else np.stack([shrink_frame(frame, size) for frame in frames])

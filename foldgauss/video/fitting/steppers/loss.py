@@ -1,9 +1,9 @@
-r"""The loss of 3DGS and VeGaS with its gradient, in one pass over the picture.
+r"""The loss of 3DGS and VeGaS with its gradient, in one pass over the image.
 
 $$ L = (1 - \lambda)\,\mathrm{mean}|x - y| + \lambda\,(1 - \mathrm{mean}\,\mathrm{SSIM}(x, y)) $$
 
 SSIM: Wang et al. 2004, with the published rasterisers' choices: 11 Gaussian taps of sigma 1.5, zero padding, population
-covariance, data range 1. In XLA this loss costs more than the splats; here strips of rows go through the cache once.
+covariance, data range 1. In XLA this loss costs more than the splats; here strips of rows pass through the cache once.
 """
 
 import math
@@ -31,12 +31,12 @@ _f, _u = nb.float32, nb.uint64
 
 
 class ImageLoss(NamedTuple):
-    """Value and gradient of the loss of one picture, and the figures read off on the way."""
+    """Value and gradient of the loss of one image, and the metrics computed along with it."""
 
     value: float
     gradient: np.ndarray  # (3, height, width), dL/d rendered
     mean_squared_error: float
-    ssim: float | None  # None where its share in the loss is zero: it was not computed
+    ssim: float | None  # None where its fraction of the loss is 0: not computed
 
 
 @inline
@@ -122,7 +122,7 @@ def _blur_row(padded, out):
 
 @kernel
 def _finish_row(x, y, row, top, blurred, scratch, scale_l1, scale_ssim, gradient):
-    """Blur the derivatives down the columns and put the gradient of one row together."""
+    """Blur the derivatives down the columns and combine the gradient of one row."""
     height, width = x.shape
     s_mean, s_square, s_product = scratch[0], scratch[1], scratch[2]
     scratch[:] = 0.0
@@ -190,7 +190,7 @@ def _strip_l1(x, y, start, stop, scale, gradient):
 
 
 def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float = 0.2) -> ImageLoss:
-    """(1 - share) L1 + share (1 - SSIM) of one picture, with its gradient.
+    """(1 - fraction) L1 + fraction (1 - SSIM) of one image, with its gradient.
 
     `rendered`, `target`: float32, planar (channels, height, width), values about [0, 1].
     `ssim_fraction` in [0, 1] is the lambda of 3DGS (Kerbl et al. 2023, eq. 7). Raises ValueError on other shapes.
@@ -236,13 +236,13 @@ def ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return out
 
 
-#: Weight of the squared error: about the slope of the absolute one where pictures are some 30 dB close, so that Adam's
-#: moments stay of one size when the loss changes.
+#: Weight of the squared error: about the slope of the absolute one at some 30 dB, so that Adam's moments keep their
+#: scale when the loss changes.
 SQUARE_WEIGHT = 20.0
 
 
 def squared_loss(rendered: np.ndarray, target: np.ndarray) -> ImageLoss:
-    """`SQUARE_WEIGHT` times the mean squared error of planar float32 pictures, with its gradient."""
+    """`SQUARE_WEIGHT` times the mean squared error of planar float32 images, with its gradient."""
     difference = rendered - target
     error = float(np.vdot(difference, difference)) / difference.size
     difference *= np.float32(2 * SQUARE_WEIGHT / difference.size)

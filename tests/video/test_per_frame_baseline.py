@@ -1,4 +1,4 @@
-"""The control of folds: every frame its own Gaussians, counted as they would be stored."""
+"""The per-frame baseline: every frame has its own Gaussians, and parameters are counted as stored."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from clips import moving_blobs
 
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, Growth, evaluate, fit, independent_frames, psnr
-from foldgauss.video.fitting.per_frame_baseline import FLOATS, _Allowance
+from foldgauss.video.fitting.per_frame_baseline import PARAMETERS, _StepBudget
 
 FRAMES = moving_blobs(5, 24, 40)
 QUICK = FitConfig(steps=60)
@@ -17,14 +17,14 @@ QUICK = FitConfig(steps=60)
 
 @pytest.fixture(scope="module")
 def made():
-    return independent_frames(FRAMES, 5 * FLOATS * 40 + FLOATS * 2 + 5, QUICK, fps=12.0)
+    return independent_frames(FRAMES, 5 * PARAMETERS * 40 + PARAMETERS * 2 + 5, QUICK, fps=12.0)
 
 
-def test_numbers_are_counted_one_by_one(made):
+def test_parameters_are_counted_as_stored(made):
     """What a Gaussian has that is not what it would have anyway, by the leaves; the budget is used up to a rest."""
     leaves = ("loc", "log_scale", "angle_logit", "opacity_logit", "color_dc")
     counted = sum(np.size(getattr(model.splats, name)) for model in made.models for name in leaves)
-    assert made.num_parameters == counted == 5 * FLOATS * 40 + FLOATS * 2
+    assert made.num_parameters == counted == 5 * PARAMETERS * 40 + PARAMETERS * 2
     assert [model.num_gaussians for model in made.models] == [41, 41, 40, 40, 40]
     for model in made.models:
         assert model.splats.static.all()
@@ -33,7 +33,7 @@ def test_numbers_are_counted_one_by_one(made):
         assert model.num_parameters - 9 * model.num_gaussians <= model.num_gaussians / 4 + 3
 
 
-def test_results_are_as_a_video_models(made):
+def test_result_evaluates_like_a_video_model(made):
     scores = evaluate(made, FRAMES)
     by_hand = [psnr(frame, next(model.frames())) for frame, model in zip(FRAMES, made.models, strict=True)]
     assert scores.psnr == tuple(by_hand)
@@ -76,18 +76,18 @@ def test_alpha():
     assert evaluate(made, clear, background=(1.0, 1.0, 1.0)).mean_psnr > 18  # over black it would be 5 to the right
 
 
-def test_minutes_are_divided_by_the_last_pace():
-    allowance = _Allowance(FitConfig(minutes=1), 3)
-    allowance.take(30, 3.0)  # the pilot: 0.1 s a step
-    assert allowance.steps(0) == 190
-    allowance.take(190, 38.0)  # twice as slow: 19 s are left for two frames
-    assert allowance.steps(1) == 47
-    allowance.take(47, 30.0)
-    assert allowance.steps(2) == 1  # nothing is left, but every frame has a model
-    assert _Allowance(FitConfig(), 3).steps(1) == 500
-    both = _Allowance(FitConfig(minutes=1, steps=20), 3)
-    both.take(30, 3.0)
-    assert both.steps(0) == 20
+def test_minutes_are_divided_by_the_last_speed():
+    budget = _StepBudget(FitConfig(minutes=1), 3)
+    budget.record(30, 3.0)  # the pilot: 0.1 s a step
+    assert budget.plan(0) == 190
+    budget.record(190, 38.0)  # twice as slow: 19 s are left for two frames
+    assert budget.plan(1) == 47
+    budget.record(47, 30.0)
+    assert budget.plan(2) == 1  # nothing is left, but every frame has a model
+    assert _StepBudget(FitConfig(), 3).plan(1) == 500
+    both = _StepBudget(FitConfig(minutes=1, steps=20), 3)
+    both.record(30, 3.0)
+    assert both.plan(0) == 20
 
 
 def test_minutes_end_the_fits():
@@ -116,12 +116,12 @@ def test_settings_without_meaning_are_refused(change, named):
 
 
 @pytest.mark.parametrize("num", [44, 0, -9, 100.5, "900"])
-def test_too_few_numbers(num):
+def test_too_few_parameters(num):
     with pytest.raises(ValueError, match="num_parameters: expected a whole number >= 45, one Gaussian in each frame"):
         independent_frames(FRAMES, num, QUICK)
 
 
-def test_frames_that_are_none():
+def test_bad_frames():
     with pytest.raises(ValueError, match="frames: expected a uint8 array"):
         independent_frames(FRAMES[0], 9000, QUICK)
 

@@ -1,7 +1,7 @@
-"""PLY files as tables of numbers: the container, not what its columns mean.
+"""PLY files as tables of numbers: the container format, independent of the meaning of its columns.
 
-Read by hand with NumPy: a header of text, then rows. Files may come from strangers, so every count is held against the
-bytes that are there before anything is allocated, and nothing but `FormatError` is raised for what a file says.
+Files are not trusted: every count is checked against the size of the file before anything is allocated, and invalid
+content raises only `FormatError`.
 
 Source of the layout: G. Turk, "The PLY Polygon File Format" (1994).
 """
@@ -23,23 +23,23 @@ _SIZES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-#: A header names each frame of a VeGaS video in 30 bytes or so: room for some 100,000 of them.
+#: Bytes; a header names each frame of a VeGaS video in about 30, so this allows some 100,000 frames.
 MAX_HEADER = 4 << 20
-#: No number takes more characters than that.
+#: Characters of the longest accepted number.
 LONGEST_WORD = 64
 
 
 class FormatError(ValueError):
-    """A file of another program's format cannot be read or written; the message is one line: expected, got, cure."""
+    """A file of another program's format cannot be read or written; the message is one line."""
 
 
 def format_error(path: object, *, expected: str, got: str, cure: str = "") -> FormatError:
-    """The error about a file: `path` is its name, or the name and the place within."""
+    """The error for a file; `path` is its name, optionally with the position in it."""
     return FormatError(str(invalid(str(path), expected=expected, got=got, cure=cure)))
 
 
 def facts_error(path: object, error: Exception) -> FormatError:
-    """The error about facts that something else has refused: in its words, where those are ours."""
+    """The error for invalid metadata, with the text of `error` where it is one of our messages."""
     text = " ".join(str(error).split())[:300]
     if ": expected " in text:
         return FormatError(f"{path}: {text}")
@@ -101,12 +101,12 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
     """Read the `wanted` elements of a PLY file, those of them that it has: text or binary, of either byte order.
 
     Other elements, lists among them, are skipped. Raises `FileNotFoundError` for a missing path and `FormatError` for
-    a file that is not PLY, breaks off, promises more rows than it holds, or has lists in a wanted element.
+    a file that is not PLY, breaks off, declares more rows than it holds, or has lists in a wanted element.
     """
     path = Path(path)
-    data = _bytes_of(path)
-    header, start = _header_lines(path, data)
-    order, elements, comments = _parsed_header(path, header)
+    data = _read_bytes(path)
+    header, start = _split_header(path, data)
+    order, elements, comments = _parse_header(path, header)
     wanted = set(wanted)
     body = _TextBody(path, data[start:]) if order == "" else _BinaryBody(path, data, start, order)
     found = {}
@@ -125,7 +125,7 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
     return Ply(path, found, comments)
 
 
-def _bytes_of(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -137,7 +137,7 @@ def _bytes_of(path: Path) -> bytes:
         raise format_error(path, expected=expected, got=got, cure="Give the path of a file.") from error
 
 
-def _header_lines(path: Path, data: bytes) -> tuple[list[str], int]:
+def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
     """The lines between "ply" and "end_header", and where the rows start."""
     if data[:4] not in (b"ply\n", b"ply\r"):
         got = "an empty file" if not data else f"one that starts with {data[:8]!r}"
@@ -156,7 +156,7 @@ def _header_lines(path: Path, data: bytes) -> tuple[list[str], int]:
         lines.append(line)
 
 
-def _parsed_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
+def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
     """(byte order, elements, comments); see `_ORDERS`."""
     order, comments = None, []
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
@@ -174,7 +174,7 @@ def _parsed_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], t
                 raise format_error(where, expected="elements of different names", got=f"{rest[0]!r} twice")
             elements.append((rest[0], int(rest[1]), []))
         elif word == "property" and elements:
-            elements[-1][2].append(_parsed_property(where, rest))
+            elements[-1][2].append(_parse_property(where, rest))
         else:
             expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
             raise format_error(where, expected=expected, got=repr(line[:80]), cure="The header is damaged.")
@@ -188,7 +188,7 @@ def _parsed_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], t
     return order, [_Element(name, count, tuple(properties)) for name, count, properties in elements], tuple(comments)
 
 
-def _parsed_property(where: str, words: list[str]) -> tuple[str, str]:
+def _parse_property(where: str, words: list[str]) -> tuple[str, str]:
     """(name, type code) of what follows "property"."""
     if len(words) == 2 and words[0] in _SIZES:
         return words[1], _SIZES[words[0]]
@@ -316,11 +316,11 @@ def write_ply(
     """
     path = Path(path)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_encoded(elements, comments))
+        file.writelines(_encode(elements, comments))
     return path
 
 
-def _encoded(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence[str]) -> Iterator[bytes]:
+def _encode(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence[str]) -> Iterator[bytes]:
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     for name, columns in elements.items():
         lines.append(f"element {name} {len(next(iter(columns.values())))}")
@@ -328,3 +328,25 @@ def _encoded(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequenc
     yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
     for columns in elements.values():
         yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()
+
+
+# ---------------------------------------------------------------------------------------------- layouts
+
+
+def is_vegas(ply: Ply) -> bool:
+    """Whether a PLY file is a published VeGaS video, by the columns that only those have."""
+    return {"m_0", "sigma_0", "rot_0"} <= set(ply.names("vertex"))
+
+
+def is_3dgs(ply: Ply) -> bool:
+    """Whether a PLY file is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
+    return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(ply.names("vertex"))
+
+
+def to_float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:
+    """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
+    with np.errstate(over="ignore"):
+        leaf = np.ascontiguousarray(leaf, np.float32)
+    if not np.isfinite(leaf).all():
+        raise format_error(ply.path, expected=f"a {name} that float32 holds in model space", got="a larger one")
+    return leaf

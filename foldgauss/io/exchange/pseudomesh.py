@@ -1,6 +1,6 @@
-"""Frames as triangles for mesh tools, and back: GaMeS pseudomeshes, an `.obj` and a `.ply` of each frame.
+"""GaMeS pseudomeshes: frames as triangles for mesh tools, in one `.obj` and one `.ply` file per frame.
 
-The `.obj` holds the shape, a triangle for each Gaussian; the `.ply`, an ordinary 3DGS file, opacity and colour.
+The `.obj` contains the shape, one triangle per Gaussian; the `.ply`, an ordinary 3DGS file, opacity and color.
 """
 
 import dataclasses
@@ -18,20 +18,21 @@ from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import atomic_folder, check_replaceable
-from foldgauss.io.exchange.ply import checked_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
-from foldgauss.io.exchange.ply_format import facts_error, format_error
-from foldgauss.io.media.video_file import DEFAULT_FPS, natural_order
+from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
+from foldgauss.io.exchange.ply_file import facts_error, format_error
+from foldgauss.io.media.frame_rate import DEFAULT_FPS
+from foldgauss.io.media.image_files import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
 from foldgauss.video.models.background import BLACK, check_background
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer, to_bytes
 
-#: What is not in an `.obj`: times of the frames, size and rate of the video, how it is drawn.
+#: Frame times, size and rate of the video, and render options, which an `.obj` cannot hold.
 NOTES = "pseudomesh.json"
 _FILES = r"frame_[0-9]{4,}\.(obj|ply)|pseudomesh\.json"
 #: Model space (x right, y down, z away) to the axes of mesh tools (x right, y up, z towards the viewer), and back.
-_TURN = np.array([1.0, -1.0, -1.0])
+_AXES_TURN = np.array([1.0, -1.0, -1.0])
 #: No sine of the angle between two edges is smaller than that in a face that float32 tells from a line.
 _COLLINEAR = COLLINEAR * float(np.finfo(np.float32).eps)
 _LARGEST = 1e38  # of a coordinate: float32 holds the difference of two such
@@ -45,7 +46,7 @@ class Pseudomesh:
     **Shapes:** `triangles` one `Triangles` (NumPy leaves, front first) for each frame, of its own number of faces;
     `times` (num_frames,), those of the frames in [0, 1]. **Units:** model space.
 
-    `size` is (height, width), `fps` the rate; `options` and `compositing` say how it is drawn.
+    `size` is (height, width), `fps` the rate; `options` and `compositing` are the render options.
     """
 
     triangles: tuple[Triangles, ...]
@@ -65,9 +66,9 @@ class Pseudomesh:
         return np.concatenate([faces.origin[:, None], faces.origin[:, None] + faces.edges], axis=1)
 
     def splats(self, number: int, size: tuple[int, int] | None = None) -> Splats2D:
-        """The conditioned Gaussians of a frame, in pixels of a picture of `size` (default: the video's own).
+        """The conditioned Gaussians of a frame, in pixels of an image of `size` (default: the video's own).
 
-        A frame whose vertices all lie in the plane is seen as it is, others by the front camera, in array order.
+        Frames whose vertices lie in the plane are rendered directly, others through the front camera, in array order.
         Source: VeGaS eq:gaussrecons1, eq:gaussrecons2.
         """
         size = self.size if size is None else size
@@ -87,7 +88,7 @@ class Pseudomesh:
         *,
         background: tuple[float, float, float] = BLACK,
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture of a frame over `background`. Raises ValueError for a size or a background that is none."""
+        """The image of a frame over `background`. Raises ValueError for an invalid size or background."""
         size = self.size if size is None else tuple(size)
         splats, behind = self.splats(number, size), check_background(background, self.compositing)
         leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
@@ -97,7 +98,7 @@ class Pseudomesh:
     def frames(
         self, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        """The pictures of all frames one by one."""
+        """The images of all frames one by one."""
         for number in range(self.num_frames):
             yield self.frame(number, size, background=background)
 
@@ -138,13 +139,13 @@ def write_pseudomesh(
 
     **Source:** VeGaS eq:traingle_face; Waczyńska et al. 2024, GaMeS (pseudomesh).
     """
-    folder, times = Path(folder), checked_times(model, times)
+    folder, times = Path(folder), check_times(model, times)
     check = partial(check_replaceable, folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
     check()
     with atomic_folder(folder, check=check) as temporary:
-        playback = VideoRenderer(model)
+        renderer = VideoRenderer(model)
         for number, t in enumerate(times):
-            gaussians = frame_gaussians(playback, t, depth_step=0.0)
+            gaussians = frame_gaussians(renderer, t, depth_step=0.0)
             write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, sh_degree=0)
             (temporary / f"frame_{number:04d}.obj").write_text(_obj_text(gaussians, t), encoding="ascii")
             on_frame()
@@ -162,7 +163,7 @@ def write_pseudomesh(
 def _obj_text(gaussians: Gaussians3D, t: float) -> str:
     mean = gaussians.mean.astype(np.float64)
     edges = np.pad(_axes(gaussians.factor[:, :2, :2].astype(np.float64)), [(0, 0), (0, 0), (0, 1)])
-    vertices = np.concatenate([mean[:, None], mean[:, None] + edges], axis=1) * _TURN
+    vertices = np.concatenate([mean[:, None], mean[:, None] + edges], axis=1) * _AXES_TURN
     colors = np.repeat(np.clip(gaussians.color, 0, 1), 3, axis=0)
     rows = np.concatenate([vertices.reshape(-1, 3), colors], axis=1) + 0.0  # no -0
     lines = ["# foldgauss pseudomesh: a face for each Gaussian, front first; keep the order of vertices and faces"]
@@ -213,19 +214,19 @@ def read_pseudomesh(
         raise FileNotFoundError(
             f"path: expected a folder, got {str(folder)!r}, which is missing. Check the current folder."
         )
-    paths = sorted(folder.glob("*.obj"), key=lambda path: natural_order(path.name)) if folder.is_dir() else []
+    paths = sorted(folder.glob("*.obj"), key=lambda path: natural_sort_key(path.name)) if folder.is_dir() else []
     if not paths:
         cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
         raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)
-    notes = _notes(folder, len(paths))
+    notes = _read_notes(folder, len(paths))
     given = {"size": size, "fps": fps}
     notes |= {name: value for name, value in given.items() if value is not None}
-    facts = _checked_notes(folder, notes, len(paths))
+    facts = _check_notes(folder, notes, len(paths))
     return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
 
 
-def _notes(folder: Path, num_frames: int) -> dict:
-    """What pseudomesh.json says, over the defaults for folders of other programs."""
+def _read_notes(folder: Path, num_frames: int) -> dict:
+    """The content of pseudomesh.json, with defaults for folders of other programs."""
     evenly = np.linspace(0, 1, num_frames).tolist()
     defaults = {"times": evenly, "size": None, "fps": DEFAULT_FPS, "options": {}, "compositing": "over"}
     path = folder / NOTES
@@ -240,7 +241,7 @@ def _notes(folder: Path, num_frames: int) -> dict:
     return defaults | {name: value for name, value in found.items() if name in defaults}
 
 
-def _checked_notes(folder: Path, notes: dict, num_frames: int) -> dict:
+def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
     if notes["size"] is None:
         cure = "Give the size of the video, such as size=(480, 854)."
         raise format_error(folder, expected=f"a size in {NOTES}", got="none", cure=cure)
@@ -266,13 +267,13 @@ def _read_frame(path: Path, axes: str) -> Triangles:
     if not beside.exists():
         got = f"{path.name!r} without {beside.name!r}"
         raise format_error(path.parent, expected="a .ply with opacity and colour beside every .obj", got=got)
-    look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where nothing was to be seen
+    look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where no Gaussian was visible
     if len(vertices) != len(look.opacity):
-        cure = "Faces were added or removed: keep them all, and make a Gaussian vanish by opacity instead."
+        cure = "Faces were added or removed: keep them all, and hide Gaussians by opacity instead."
         expected = f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}"
         raise format_error(path, expected=expected, got=str(len(vertices)), cure=cure)
     if axes == "y-up":
-        vertices = vertices * _TURN
+        vertices = vertices * _AXES_TURN
     edges = vertices[:, 1:] - vertices[:, :1]
     _check_area(path, edges)
     origin = vertices[:, 0].astype(np.float32) + np.float32(0)  # no -0
@@ -283,10 +284,10 @@ def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
     first, second = edges[:, 0], edges[:, 1]
     with np.errstate(over="ignore", invalid="ignore"):
         area = np.linalg.norm(np.cross(first, second), axis=-1)
-        sound = area > _COLLINEAR * np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
-    if not sound.all():
+        valid = area > _COLLINEAR * np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
+    if not valid.all():
         cure = "Move a vertex off the line through the other two."
-        raise format_error(path, expected="faces of some area", got=f"none in face {np.argmin(sound) + 1}", cure=cure)
+        raise format_error(path, expected="faces of some area", got=f"none in face {np.argmin(valid) + 1}", cure=cure)
 
 
 def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
@@ -308,9 +309,9 @@ def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
     faces: list[tuple[int, list[int]]] = []
     for number, words in _obj_lines(path):
         if words[0] == "v":
-            vertices.append(_parsed_vertex(path, number, words[1:]))
+            vertices.append(_parse_vertex(path, number, words[1:]))
         elif words[0] == "f":
-            faces.append((number, _parsed_face(path, number, words[1:], len(vertices))))
+            faces.append((number, _parse_face(path, number, words[1:], len(vertices))))
     if not faces and vertices:
         raise format_error(path, expected="faces", got=f"none, and {len(vertices)} vertices", cure="Export them too.")
     _check_soup(path, faces, len(vertices))
@@ -337,7 +338,7 @@ def _obj_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _parsed_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...]:
+def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...]:
     try:
         place = tuple(float(word) for word in words[:3])
     except ValueError:
@@ -348,7 +349,7 @@ def _parsed_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ..
     return place
 
 
-def _parsed_face(path: Path, number: int, words: list[str], num_vertices: int) -> list[int]:
+def _parse_face(path: Path, number: int, words: list[str], num_vertices: int) -> list[int]:
     """Numbers of the vertices from 0 on; a negative index counts back from the last vertex so far."""
     where = f"{path}, line {number}"
     try:

@@ -8,9 +8,9 @@ from foldgauss.uncertainty import (
     FrameTimePosterior,
     Increments,
     LikelihoodProfiles,
-    Profiles,
-    exact_times,
-    laplace_times,
+    ProfileCurves,
+    exact_posterior,
+    laplace_approximation,
 )
 
 
@@ -23,15 +23,15 @@ def posterior_about(
     nodes = [np.unique(np.clip(np.concatenate([np.linspace(0, 1, 60), t + s * np.linspace(-7, 7, 57)]), 0, 1))
              for t, s in zip(times, std, strict=True)]  # fmt: skip
     values = [-0.5 * ((at - t) / s) ** 2 for at, t, s in zip(nodes, times, std, strict=True)]
-    increments = Increments.among(np.asarray(times, float), frames, concentration)
-    log_prob = FrameTimeLogProb(Profiles.of(nodes, values), increments)
-    exact = exact_times(log_prob.profiles, increments)
-    laplace = laplace_times(log_prob.profiles, increments, exact.quantile(0.5))
+    increments = Increments.with_free(np.asarray(times, float), frames, concentration)
+    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes(nodes, values), increments)
+    exact = exact_posterior(log_prob.curves, increments)
+    laplace = laplace_approximation(log_prob.curves, increments, exact.quantile(0.5))
     draws = exact.sample(int(np.prod(shape)), seed).reshape(*shape, num)
     told = np.ones(increments.num_free)
     noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
-    seen = LikelihoodProfiles(log_prob.profiles, noise, 0.7 ** np.arange(12.0), 100)
+    profiles = LikelihoodProfiles(log_prob.curves, noise, 0.7 ** np.arange(12.0), 100)
     return FrameTimePosterior(
         log_prob, draws, np.full(shape[0], 0.3), 40 * told, 1.001 * told, 1000 * told, True, "Converged.",
-        laplace, exact, seen,
+        laplace, exact, profiles,
     )  # fmt: skip

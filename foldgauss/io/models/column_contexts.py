@@ -1,6 +1,6 @@
-"""What is known of a column of a compact file before its numbers: the contexts that they are coded in.
+"""The contexts in which the columns of a compact file are entropy-coded.
 
-Both sides walk the columns in their order and come to the same, since all of it follows from columns before.
+Encoder and decoder derive them, column by column, from the columns before.
 """
 
 import dataclasses
@@ -10,7 +10,16 @@ from jaxtyping import Float, Int, Int32, UInt8
 
 from foldgauss._runtime.kernels import exact_kernel
 from foldgauss.io.models.range_coder import Column
-from foldgauss.video.compression.quantize import COLORS, Facts, Rule, Unrolling, in_clip, power_of, span_of, steps_of
+from foldgauss.video.compression.quantize import (
+    COLORS,
+    ColumnDecoder,
+    CompactInfo,
+    Rule,
+    clamp_unit,
+    compute_steps,
+    path_power,
+    path_span,
+)
 
 #: Gaussians nearby that say what to expect; candidates for them in each square of a grid; what time counts as length.
 NEIGHBOURS, CANDIDATES, TIME = 4, 16, 0.3
@@ -20,41 +29,41 @@ _LEVELS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
 class Walk:
     """The columns of a file, one after another: ask for `column`, then `add` its numbers."""
 
-    def __init__(self, rules: dict[str, Rule], facts: Facts):
-        self._facts, self._unrolling = facts, Unrolling(rules, facts)
+    def __init__(self, rules: dict[str, Rule], info: CompactInfo):
+        self._info, self._decoder = info, ColumnDecoder(rules, info)
         self._numbers: dict[str, np.ndarray] = {}
-        self._in_cell = self._nearest = np.zeros((facts.num_gaussians, 0), np.int32)
-        self._half = np.ones(facts.num_gaussians)
+        self._in_cell = self._nearest = np.zeros((info.num_gaussians, 0), np.int32)
+        self._half = np.ones(info.num_gaussians)
 
     def column(self, name: str) -> Column:
         """The one that comes next."""
-        unrolling = self._unrolling
-        rows = unrolling.rows(name)
+        decoder = self._decoder
+        rows = decoder.rows(name)
         if name == "cell":
             return Column.plain(rows)
-        halves = unrolling.halves(name)
-        known = {"origin": unrolling.origin(name), "step": steps_of(halves, name)}
-        if name in COLORS and self._facts.shared:
+        halves = decoder.half_exponents(name)
+        known = {"origin": decoder.origin(name), "step": compute_steps(halves, name)}
+        if name in COLORS and self._info.shared:
             return dataclasses.replace(Column.plain(rows), near=np.arange(-1, rows - 1)[:, None], **known)
-        power = power_of(name)
+        power = path_power(name)
         near = self._nearest if power or name in ("angle", "shade", *COLORS) else self._in_cell
         scale = np.ones(rows)
         for _ in range(power):  # not a power, whose last bit libraries do not agree on
             scale = scale * self._half
         contexts = self._contexts(name, power, halves)
-        return Column(present=unrolling.has(name), contexts=contexts, scale=scale, near=near, **known)
+        return Column(present=decoder.has(name), contexts=contexts, scale=scale, near=near, **known)
 
     def add(self, name: str, numbers: Int32[np.ndarray, " rows"]) -> None:
         """Its numbers."""
-        unrolling, facts = self._unrolling, self._facts
+        decoder, info = self._decoder, self._info
         self._numbers[name] = numbers
-        unrolling.add(name, numbers, unrolling.halves(name))
+        decoder.add(name, numbers, decoder.half_exponents(name))
         if name == "cell":
-            self._in_cell = latest_in(numbers, 1 << sum(facts.cells))
+            self._in_cell = latest_in(numbers, 1 << sum(info.cells))
         if name == "y0":
-            v = unrolling.values
-            middle, self._half = span_of(in_clip(v["time"]), v["duration"], facts.reach)
-            bits = max(facts.cells[:2]) + 1
+            v = decoder.values
+            middle, self._half = path_span(clamp_unit(v["time"]), v["duration"], info.reach)
+            bits = max(info.cells[:2]) + 1
             self._nearest = nearest_of(v["x0"], v["y0"], TIME * middle, bits)
 
     def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:

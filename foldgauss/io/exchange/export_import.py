@@ -1,4 +1,4 @@
-"""The roads in and out by the name of a format: what `foldgauss export` and `foldgauss import` do."""
+"""Export and import of models, with the format chosen by name."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -8,25 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import OutputError, atomic_folder, check_replaceable, check_writable, checked_path
-from foldgauss.io.exchange.mesh import write_pseudomesh
-from foldgauss.io.exchange.ply import (
-    AXES,
-    DEPTH_STEP,
-    read_vegas_ply,
-    write_3dgs_frames,
-    write_3dgs_ply,
-    write_vegas_ply,
-)
-from foldgauss.io.exchange.ply_format import format_error
-from foldgauss.io.page.html import HTML_SUFFIX, QUALITY, Frames, write_html
+from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_replaceable, check_writable
+from foldgauss.io.exchange.gaussians_ply import AXES, DEPTH_STEP, write_3dgs_frames, write_3dgs_ply
+from foldgauss.io.exchange.ply_file import format_error
+from foldgauss.io.exchange.pseudomesh import write_pseudomesh
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
+from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, Frames, write_html
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame;
-#: a page that plays.
+#: an HTML page with a player.
 FORMATS = ("ply", "ply3dgs", "obj", "html")
 
 
@@ -52,13 +46,13 @@ def export(
     - `ply3dgs`: a folder with a 3DGS scene of each frame (`write_3dgs_frames`); or one file, where `out` ends in .ply
       and `times` is one (`write_3dgs_ply`)
     - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
-    - `html`: one page for browsers, which draws the Gaussians at any time (`write_html`)
+    - `html`: one page for browsers, which renders the Gaussians at any time (`write_html`)
 
     `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
-    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality` and `title` for `html`. What exists
+    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality` and `title` for `html`. An existing output
     is refused unless `overwrite`. `on_frame` is called after each frame of a folder.
 
-    **Raises:** ValueError for an unknown format, an option that the format does not know, and as the function;
+    **Raises:** ValueError for an unknown format, an option of another format, and as the function;
     `OutputError` where the output cannot be written or exists.
 
     **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
@@ -67,7 +61,7 @@ def export(
         cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     check_one_of("format", format, FORMATS)
-    out = checked_path(out, "model, format, out")
+    out = check_path(out, "model, format, out")
     of_scenes = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
     of_pages = {"original": original, "quality": quality, "title": title}
     given = {name: value for name, value in of_scenes.items() if value is not None}
@@ -127,13 +121,13 @@ def import_model(
 ) -> VideoModel:
     """The model in a file of another program: a published VeGaS video. See `read_vegas_ply` for `size` and `fps`.
 
-    **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Still scenes of 3DGS
-    and pseudomeshes hold none: `read_3dgs_ply` and `read_pseudomesh` read them as what they are.
+    **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Static 3DGS
+    scenes and pseudomeshes are not videos: use `read_3dgs_ply` and `read_pseudomesh`.
 
     **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
     """
-    path = checked_path(path)
+    path = check_path(path)
     if path.is_dir() or path.suffix.lower() == ".obj":
-        cure = "Draw frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
+        cure = "Render frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
         raise format_error(path, expected="a .ply file with a video", got="a folder or a mesh", cure=cure)
     return read_vegas_ply(path, size=size, fps=fps)

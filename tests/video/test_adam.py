@@ -1,16 +1,24 @@
-"""Sparse Adam against optax, and its sparsity."""
+"""Adam: all implementations agree with each other and with optax; rows that take no part stay."""
 
 import jax
 import numpy as np
 import optax
 import pytest
 
-from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, sparse_adam
+from foldgauss.video.fitting.adam import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FRAME_TIME_ADAM,
+    adam_step,
+    masked_adam,
+    sparse_adam,
+)
 from foldgauss.video.models.row_layout import columns
 
 
 @pytest.mark.parametrize("width", [11, 17, 25])
-def test_agrees_with_optax_where_all_rows_take_part(width):
+def test_sparse_adam_on_all_rows_agrees_with_optax(width):
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(5000, width)).astype(np.float32)
     rates = rng.uniform(1e-3, 1e-1, width).astype(np.float32)
@@ -28,7 +36,7 @@ def test_agrees_with_optax_where_all_rows_take_part(width):
     np.testing.assert_allclose(rows, truth, atol=2e-5)
 
 
-def test_rows_that_take_no_part_are_untouched_and_count_their_own_steps():
+def test_untouched_rows_stay_and_each_row_counts_its_own_steps():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(100, 11)).astype(np.float32)
     before = rows.copy()
@@ -47,14 +55,14 @@ def test_rows_that_take_no_part_are_untouched_and_count_their_own_steps():
     assert list(counts[touched]) == [2, 1, 1]
 
 
-def test_zero_gradient_is_no_step():
+def test_zero_gradient_changes_nothing():
     rows = np.ones((4, 11), np.float32)
     moments = np.zeros_like(rows), np.zeros_like(rows)
     sparse_adam(rows, np.zeros_like(rows), *moments, np.zeros(4, np.int32), np.arange(4), np.ones(11, np.float32))
     np.testing.assert_array_equal(rows, 1)
 
 
-def test_rates_in_units_of_own_time():
+def test_rates_scale_with_duration():
     """A first step is the rate itself: c_k moves by (unit / sigma_t)^k of it, m_t by sigma_t / unit, others as ever."""
     degree, unit, spread = 3, 0.06, np.array([0.03, 0.06, 0.24], np.float32)
     place = columns(degree)
@@ -70,3 +78,27 @@ def test_rates_in_units_of_own_time():
     np.testing.assert_allclose(factor[:, place["time_loc_logit"].start], spread / unit, rtol=1e-4)
     np.testing.assert_allclose(factor[:, place["loc"]], 1, rtol=1e-4)
     np.testing.assert_allclose(factor[:, place["log_time_scale"]], 1, rtol=1e-3)
+
+
+def test_all_implementations_take_the_same_steps():
+    """The rule in NumPy, its twins in Numba and JAX, and optax, over several steps."""
+    rng, num, width = np.random.default_rng(0), 60, 17
+    rows = rng.normal(size=(num, width)).astype(np.float32)
+    rates, kinds = rng.uniform(1e-3, 1e-1, width).astype(np.float32), np.full(num, 3, np.uint8)
+    zeros = np.zeros_like(rows), np.zeros_like(rows), np.zeros(num, np.int32)
+    own, sparse, masked = ([rows.copy(), *(part.copy() for part in zeros)] for _ in range(3))
+    by_optax, moments = rows.copy(), FRAME_TIME_ADAM.init(rows)
+    for _ in range(4):
+        grad = rng.normal(size=rows.shape).astype(np.float32)
+        own[3] += 1
+        change, *own[1:3] = adam_step(grad, *own[1:], rates)
+        own[0] -= change.astype(np.float32)
+        sparse_adam(sparse[0], grad.copy(), *sparse[1:], np.arange(num), rates)
+        masked = masked_adam(masked[0], grad, *masked[1:], np.ones(num, bool), rates, kinds=kinds, unit_time=0.0)
+        with jax.numpy_dtype_promotion("standard"):
+            update, moments = FRAME_TIME_ADAM.update(grad, moments)
+        by_optax -= rates * np.asarray(update)
+    for one in (sparse, masked):
+        for part, judge in zip(one, own, strict=True):
+            np.testing.assert_allclose(part, judge, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(by_optax, own[0], atol=2e-5)  # its bias corrections are float32

@@ -1,4 +1,4 @@
-"""Fits that come apart: seen, named, taken back; and no others."""
+"""Divergence: detected, named and undone; and no alarm in fits that converge."""
 
 import dataclasses
 import warnings
@@ -9,9 +9,9 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, evaluate, fit, fit_steps
-from foldgauss.video.fitting.divergence import MOST_BACKOFFS, Guard
-from foldgauss.video.fitting.loop import _Stepper
+from foldgauss.video.fitting.divergence import MAX_BACKOFFS, Guard
 from foldgauss.video.fitting.state import running_psnr, to_model
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.row_layout import columns
 
 CLIP = moving_blobs()
@@ -37,7 +37,7 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("leaf", ["loc", "opacity_logit", "coefficients", "log_time_scale"])
-def test_a_number_that_is_none_is_named_and_made_good(usual, leaf, value):
+def test_nonfinite_parameter_is_named_and_repaired(usual, leaf, value):
     def spoil(state):
         state.rows[17, columns(CONFIG.degree)[leaf]] = value
 
@@ -46,7 +46,7 @@ def test_a_number_that_is_none_is_named_and_made_good(usual, leaf, value):
     assert got > usual - 3  # 240 steps, half of them at a quarter of the rates
 
 
-def test_frame_times_that_are_none_are_named():
+def test_nonfinite_frame_times_are_named():
     def spoil(state):
         state.time_logits = state.time_logits + np.float32(np.nan)
 
@@ -54,7 +54,7 @@ def test_frame_times_that_are_none_are_named():
         _fit_with(spoil)
 
 
-def test_it_may_stop_instead_and_then_hands_over_what_was_sound():
+def test_stop_raises_with_the_last_finite_state():
     config = dataclasses.replace(CONFIG, on_divergence="stop")
 
     def spoil(state):
@@ -71,7 +71,7 @@ def test_it_may_stop_instead_and_then_hands_over_what_was_sound():
 
 # Of the others a thousand times as much is borne: they come to an end of what they can do.
 @pytest.mark.parametrize("leaf", ["loc", "color_dc", "log_scale", "log_time_scale"])
-def test_rates_far_too_high_are_lowered_until_it_fits(leaf):
+def test_too_high_rates_are_lowered_until_the_fit_converges(leaf):
     rates = dataclasses.replace(RATES, **{leaf: 1000 * getattr(RATES, leaf)})
     with pytest.warns(DivergenceWarning, match=r"worse than they were|worse than at the start|no finite"):
         model = fit(CLIP, dataclasses.replace(CONFIG, rates=rates)).model
@@ -79,16 +79,16 @@ def test_rates_far_too_high_are_lowered_until_it_fits(leaf):
     assert evaluate(model, CLIP).mean_psnr > start
 
 
-def test_folds_that_explode_are_named(usual):
+def test_exploding_folds_are_named(usual):
     def explode(state):
         state.rows[:, columns(CONFIG.degree)["coefficients"]] *= 1e6
 
-    with pytest.warns(DivergenceWarning, match="dB worse than they were, coefficients having moved most"):
+    with pytest.warns(DivergenceWarning, match="dB worse than they were; coefficients moved most"):
         got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_fraction=0, half_fraction=0))
     assert got > usual - 3
 
 
-def test_a_fit_that_cannot_be_saved_says_so():
+def test_exhausted_backoffs_raise():
     def spoiled():
         for state, _ in fit_steps(CLIP, CONFIG):
             state.rows[:] = np.nan
@@ -97,15 +97,15 @@ def test_a_fit_that_cannot_be_saved_says_so():
         warnings.simplefilter("always", DivergenceWarning)
         with pytest.raises(FitDiverged, match="lower these"):
             spoiled()
-    assert sum(issubclass(one.category, DivergenceWarning) for one in told) == MOST_BACKOFFS
+    assert sum(issubclass(one.category, DivergenceWarning) for one in told) == MAX_BACKOFFS
 
 
-def test_a_broken_state_is_not_gone_on_with():
+def test_nonfinite_state_is_refused():
     for state, info in fit_steps(CLIP, CONFIG):
         if info.step == 5:
             break
     state.rows[3] = np.nan
-    with pytest.raises(FitDiverged, match="state: expected finite numbers"):
+    with pytest.raises(FitDiverged, match="state: expected finite parameters"):
         next(fit_steps(CLIP, CONFIG, state))
 
 
@@ -136,23 +136,23 @@ def _clips():
 
 @pytest.mark.parametrize("name", list(_clips()))
 @pytest.mark.parametrize("num", [3, 200])
-def test_fits_that_are_well_are_left_alone(name, num):
+def test_good_fits_raise_no_warning(name, num):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DivergenceWarning)
         fit(_clips()[name], FitConfig(num_gaussians=num, steps=150))
 
 
-def test_watching_changes_no_bit(monkeypatch):
+def test_guard_changes_no_bit(monkeypatch):
     watched = fit(CLIP, CONFIG).model
-    monkeypatch.setattr(Guard, "fault", lambda self, state, loss: "")
-    monkeypatch.setattr(Guard, "remember", lambda self, state: None)
-    monkeypatch.setattr(_Stepper, "errors_at_start", lambda self, state: {})
+    monkeypatch.setattr(Guard, "find_fault", lambda self, state, loss: "")
+    monkeypatch.setattr(Guard, "keep_good", lambda self, state: None)
+    monkeypatch.setattr(CpuStepper, "measure_start", lambda self, state: {})
     alone = fit(CLIP, CONFIG).model
     for one, other in zip(jax.tree.leaves(watched), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_opacity_resets_are_none_of_its_business():
+def test_opacity_resets_raise_no_warning():
     config = FitConfig.preset("paper", initialization="clip", num_gaussians=200, max_gaussians=400, steps=300, degree=2)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DivergenceWarning)

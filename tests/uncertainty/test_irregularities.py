@@ -4,11 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from drawn_times import posterior_about
+from synthetic_posteriors import posterior_about
 from tiny_clips import NUM_FRAMES, TWICE, clip_of, model_of_12
 
-from foldgauss.uncertainty import FrameNoise, compare_times, drawn_log_likelihood, intervals, irregularities
-from foldgauss.uncertainty.diagnostics.irregularities import even_pace
+from foldgauss.uncertainty import (
+    FrameNoise,
+    compare_times,
+    increment_intervals,
+    irregularities,
+    rendered_log_likelihood,
+)
+from foldgauss.uncertainty.diagnostics.irregularities import even_times
 from foldgauss.video import FrameTimes, VideoModel
 
 
@@ -89,7 +95,7 @@ def test_intervals_cover():
         posterior = posterior_about(truth + np.r_[0, 0.1 * rng.standard_normal(28), 0] / 29, 0.1, seed=n)
         steps = steps / np.median(steps)
         for level, inside in ((0.9, wide), (0.6, narrow)):
-            found = intervals(posterior, level)
+            found = increment_intervals(posterior, level)
             inside.append((found.low <= steps) & (steps <= found.high))
     assert 0.8 < np.mean(wide) < 1.0
     assert np.mean(narrow) < 0.75
@@ -105,7 +111,7 @@ def test_settings_out_of_range(setting, value):
     with pytest.raises(ValueError, match=rf"^{setting}: expected"):
         irregularities(posterior, **{setting: value})
     with pytest.raises(ValueError, match=r"^level: expected"):
-        intervals(posterior, 1.0)
+        increment_intervals(posterior, 1.0)
 
 
 def test_models_are_compared_under_one_noise():
@@ -126,7 +132,7 @@ def test_models_are_compared_under_one_noise():
     assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.5)
     assert other.mean_psnr > one.mean_psnr
     # The evidence is a mean of likelihoods: below the greatest, here about the truth's.
-    best = drawn_log_likelihood(even, clip, truth, noise.of(NUM_FRAMES)).sum()
+    best = rendered_log_likelihood(even, clip, truth, noise.for_frames(NUM_FRAMES)).sum()
     assert best - 80 < one.log_evidence < best + 5
     again = compare_times({"learned": learned}, clip)[0]  # a noise estimated from the same residuals
     assert again.at_own == pytest.approx(other.at_own, rel=0.1)
@@ -148,8 +154,8 @@ def test_summary_says_what_is_not_known():
     posterior = posterior_about(times, std)
     text = summary(posterior, times)
     assert "Not identified: frame 5.**" in text
-    assert "Of 9 intervals none looks like" in text
-    assert "2 others were not judged" in text
+    assert "None of 9 intervals shows a duplicated or dropped frame" in text
+    assert "2 others were not assessed" in text
     assert "20" not in text.split("grey")[0].rsplit("residuals", 1)[1]
     unsure = dataclasses.replace(posterior, converged=False, message="Not converged after 9 steps.")
     assert summary(unsure).startswith("Not converged")
@@ -162,11 +168,11 @@ def test_summary_says_what_is_not_known():
 
 
 def test_even_pace_within_shots():
-    even, unit = even_pace(posterior_about(np.linspace(0, 1, 9)))
+    even, unit = even_times(posterior_about(np.linspace(0, 1, 9)))
     np.testing.assert_allclose(even, np.linspace(0, 1, 9), atol=2e-2 / 8)
     assert unit == pytest.approx(1 / 8)
     steps = np.concatenate([np.ones(5), [40.0], np.full(4, 2.0)])
-    even, unit = even_pace(posterior_about(times_of(steps), 0.002))
+    even, unit = even_times(posterior_about(times_of(steps), 0.002))
     np.testing.assert_allclose(np.diff(even), steps / steps.sum(), rtol=1e-2)
     assert unit == pytest.approx(13 / 9 / steps.sum(), rel=1e-2)
 
@@ -175,8 +181,8 @@ def test_evidence_tells_what_was_warned_of():
     from foldgauss.uncertainty import summary
 
     posterior = posterior_about(np.linspace(0, 1, 12))
-    noted = dataclasses.replace(posterior.seen, notes=("It is late.",), level="colors")
-    text = summary(dataclasses.replace(posterior, seen=noted))
+    noted = dataclasses.replace(posterior.profiles, notes=("It is late.",), level="colors")
+    text = summary(dataclasses.replace(posterior, profiles=noted))
     assert "**Note:** It is late." in text
-    assert "their colours are integrated out" in text
+    assert "their colors are integrated out" in text
     assert len(repr(posterior)) < 200

@@ -11,7 +11,7 @@ from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikeliho
 from foldgauss.estimator.em.loop import EMStatus
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.gradient_fit import fit_gradient
-from foldgauss.estimator.model_selection import _parts, select_mixture
+from foldgauss.estimator.model_selection import _assign_folds, select_mixture
 from foldgauss.mixture import FoldedMixture
 
 
@@ -31,9 +31,9 @@ def test_size_and_degree_are_found(criterion):
     assert choice.scores.min() == choice.scores[1, 1]
 
 
-def test_groups_stay_whole():
+def test_groups_stay_in_one_fold():
     groups = np.repeat(np.arange(10), 7)
-    parts = _parts(70, 5, groups)
+    parts = _assign_folds(70, 5, groups)
     assert all(len(set(parts[groups == g])) == 1 for g in range(10))
     assert (np.bincount(parts) == 14).all()
 
@@ -48,7 +48,7 @@ def test_groups_stay_whole():
         ("groups", {"criterion": "cv", "groups": np.zeros(3)}),
     ],
 )
-def test_wrong_words_are_named(match, options):
+def test_invalid_arguments_raise(match, options):
     with pytest.raises(ValueError, match=match):
         select_mixture(FoldedGaussianMixture(), _two_parabolas(), **({"n_components": [1], "degrees": [1]} | options))
 
@@ -61,7 +61,7 @@ def _start(fold=None):
 
 
 @pytest.mark.slow
-def test_gradients_end_where_em_does():
+def test_gradient_fit_matches_em():
     x = _two_parabolas()
     em = FoldedGaussianMixture(2, degree=2, random_state=0, tol=1e-6, max_iter=200).fit(x)
     result = fit_gradient(_start(), x, steps=600)
@@ -71,7 +71,7 @@ def test_gradients_end_where_em_does():
 
 
 @pytest.mark.slow
-def test_gradients_train_a_fold_of_ones_own():
+def test_gradient_fit_trains_a_custom_fold():
     def bend(coefficient, u):
         return coefficient * u**2
 
@@ -86,7 +86,7 @@ def test_gradients_train_a_fold_of_ones_own():
 
 
 @pytest.mark.slow
-def test_gradients_never_end_in_nan():
+def test_gradient_fit_never_returns_nan():
     x = _two_parabolas()
     x[3] = np.nan
     result = fit_gradient(_start(), x, steps=5)
@@ -98,16 +98,16 @@ def test_gradients_never_end_in_nan():
 
 
 @pytest.mark.slow
-def test_gradients_that_run_away_leave_the_last_good_mixture():
+def test_diverging_gradient_fit_returns_last_finite_mixture():
     """Steps far too long: what is returned has a finite likelihood nevertheless."""
     x = _two_parabolas()
     for rate in (3.0, 30.0):
-        result = fit_gradient(_start(), x, steps=20, optimiser=optax.sgd(rate))
+        result = fit_gradient(_start(), x, steps=20, optimizer=optax.sgd(rate))
         assert np.isfinite(result.mixture.log_prob(x).mean())
         assert np.isfinite(result.mixture.components.time_scale).all()
 
 
-def test_the_choice_is_the_fit_that_was_scored():
+def test_selected_fit_is_the_scored_one():
     x = _two_parabolas()
     choice = select_mixture(FoldedGaussianMixture(max_iter=3), x, n_components=[2], degrees=[1])
     assert choice.estimator.bic(x) == pytest.approx(choice.scores.min())

@@ -1,4 +1,4 @@
-"""Tracks of a clip whose motion is known, their folds, and cuts."""
+"""Optical flow of clips whose motion is known: tracks, folds, cuts and interpolated frames."""
 
 import cv2
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video.fitting import optical_flow as motion
-from foldgauss.video.fitting.optical_flow import LONGEST, Motion, Tracks, fitted_folds
+from foldgauss.video.fitting.optical_flow import LONGEST, Motion, Tracks, fit_folds
 
 
 def panning(num_frames: int, step: tuple[float, float], height: int = 96, width: int = 160, seed: int = 0):
@@ -27,7 +27,7 @@ def panning(num_frames: int, step: tuple[float, float], height: int = 96, width:
 def test_tracks_follow_a_panning_camera(step):
     frames = panning(16, step)
     position = np.random.default_rng(1).uniform([50, 40], [110, 56], (200, 2)).astype(np.float32)
-    tracks = Motion.of(frames).follow(np.full(200, 8), position)
+    tracks = Motion.from_frames(frames).follow(np.full(200, 8), position)
     assert tracks.known[:, LONGEST].all()
     assert np.median(tracks.reach) >= 10
     elapsed = np.arange(-LONGEST, LONGEST + 1)[None, :, None]
@@ -36,7 +36,7 @@ def test_tracks_follow_a_panning_camera(step):
     # One stretch, around the point's own frame, within the clip.
     assert not tracks.known[:, : LONGEST - 8].any()
     assert (np.abs(np.diff(tracks.known.astype(int), axis=1)).sum(1) <= 2).all()
-    folds, rms = fitted_folds(tracks, np.full(200, 4.0), 3)
+    folds, rms = fit_folds(tracks, np.full(200, 4.0), 3)
     assert np.median(rms) < 0.3
     u = -np.array([-3.0, 3.0])  # own time minus t
     moved = (folds[:, None] * u[:, None, None] ** np.arange(1, 4)[:, None]).sum(2)
@@ -45,29 +45,29 @@ def test_tracks_follow_a_panning_camera(step):
     )
 
 
-def test_what_lies_between_two_frames():
+def test_interpolated_frame_matches_the_motion():
     """Of a texture that moves by 4 pixels a frame it is the same texture, moved by a share of that."""
     finer = panning(9, (1.0, 0.5))
     seen = np.ascontiguousarray(finer[::4])
-    motion = Motion.of(seen)
-    found = motion.between(seen, 1, 0.75, (96, 160))
+    motion = Motion.from_frames(seen)
+    found = motion.interpolate(seen, 1, 0.75, (96, 160))
     inner = np.s_[8:-8, 8:-8]
     assert np.abs(found - finer[7])[inner].mean() < 0.15 * np.abs(np.float32(seen[2]) - finer[7])[inner].mean()
     # The left border comes from outside frame 1, not from a mean with what is not there.
     assert np.abs(found - finer[7])[8:-8, :2].mean() < 4
-    small = motion.between(seen, 1, 0.75, (48, 80))
+    small = motion.interpolate(seen, 1, 0.75, (48, 80))
     assert small.shape == (48, 80, 3)
     same = cv2.resize(finer[7], (80, 48), interpolation=cv2.INTER_AREA)
     assert np.abs(small - same)[inner].mean() < 3
 
 
-def test_between_frames_something_passes_before_something():
+def test_interpolation_beats_plain_warping_at_occlusions():
     """Closer to the truth than frames moved by the flow at the pixel itself, at every time between."""
     finer = passing(9, before=(1.0, 0.0), behind=(-1.0, 0.0))
     seen = np.ascontiguousarray(finer[::4])
-    motion = Motion.of(seen)
+    motion = Motion.from_frames(seen)
     for k, share, number in [(0, 0.25, 1), (0, 0.5, 2), (0, 0.75, 3), (1, 0.5, 6)]:
-        found, plain = motion.between(seen, k, share, (96, 160)), plainly_warped(*seen[k : k + 2], share)
+        found, plain = motion.interpolate(seen, k, share, (96, 160)), plainly_warped(*seen[k : k + 2], share)
         target = finer[number]
         assert np.square(found - target).mean() < 0.85 * np.square(plain - target).mean()
 
@@ -100,16 +100,16 @@ def plainly_warped(one, other, share: float):
 
 def test_cuts_are_found():
     one, other, third = panning(7, (2, 0)), panning(5, (0, 0), seed=5), panning(4, (0, -1), seed=9)
-    assert Motion.of(np.concatenate([one, other, third])).cuts() == [7, 12]
-    assert Motion.of(one).cuts() == []
-    assert Motion.of(moving_blobs()).cuts() == []
-    assert Motion.of(np.full((3, 20, 30, 3), 7, np.uint8)).cuts() == []
+    assert Motion.from_frames(np.concatenate([one, other, third])).find_cuts() == [7, 12]
+    assert Motion.from_frames(one).find_cuts() == []
+    assert Motion.from_frames(moving_blobs()).find_cuts() == []
+    assert Motion.from_frames(np.full((3, 20, 30, 3), 7, np.uint8)).find_cuts() == []
 
 
 def test_tracks_end_at_a_cut():
     frames = np.concatenate([panning(7, (2, 0)), panning(7, (2, 0), seed=5)])
     position = np.random.default_rng(1).uniform([50, 40], [110, 56], (100, 2)).astype(np.float32)
-    tracks = Motion.of(frames).follow(np.full(100, 5), position)
+    tracks = Motion.from_frames(frames).follow(np.full(100, 5), position)
     assert tracks.known[:, LONGEST + 2 :].mean() < 0.03
 
 
@@ -120,7 +120,7 @@ def test_folds_of_known_tracks(degree):
     u = -elapsed[:, None] / 10.0
     shift = (np.array([[3.0, -1.0]]) * u + np.array([[0.5, 2.0]]) * u**2 + np.array([[0.2, 0.0]]) * u**3)[None]
     tracks = Tracks(shift.astype(np.float32), np.ones((1, 2 * LONGEST + 1), bool))
-    folds, rms = fitted_folds(tracks, np.array([20.0]), degree)
+    folds, rms = fit_folds(tracks, np.array([20.0]), degree)
     assert folds.shape == (1, degree, 2)
     if degree >= 3:
         near, powers = np.abs(elapsed) <= 15, (-elapsed[:, None]) ** np.arange(1.0, degree + 1)
@@ -133,13 +133,13 @@ def test_folds_of_known_tracks(degree):
         assert rms[0] > 0.3
 
 
-def test_maps_shrink_to_their_share_of_memory(monkeypatch):
+def test_maps_shrink_to_the_memory_limit(monkeypatch):
     frames = panning(4, (2.0, 0.0))
-    assert Motion.of(frames).small.shape == (4, 96, 160, 3)
+    assert Motion.from_frames(frames).small.shape == (4, 96, 160, 3)
     monkeypatch.setattr(motion, "MAP_BYTES", 0)  # as where the clip is long: then the share of the frames' bytes counts
-    small = Motion.of(frames)
+    small = Motion.from_frames(frames)
     kept = small.small.nbytes + small.there.nbytes + small.back.nbytes
-    assert 0.1 * frames.nbytes < kept <= motion.MAP_SHARE * frames.nbytes
+    assert 0.1 * frames.nbytes < kept <= motion.MAP_FRACTION * frames.nbytes
     tracks = small.follow(np.full(20, 1), np.full((20, 2), [80.0, 48.0], np.float32))
     assert tracks.known[:, LONGEST + 1].all()
     np.testing.assert_allclose(tracks.shift[:, LONGEST + 1], np.tile([2.0, 0.0], (20, 1)), atol=0.5)

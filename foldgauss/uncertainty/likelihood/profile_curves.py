@@ -1,4 +1,4 @@
-"""The log-likelihood of each frame as a function of its own time alone, drawn once and then looked up."""
+"""Log-likelihood of each frame as a piecewise cubic function of its own time, evaluated by compiled look-ups."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,18 +14,18 @@ _d = nb.float64
 
 
 @dataclasses.dataclass(frozen=True)
-class Profiles:
-    r"""Functions $\ell_k(t)$, piecewise cubic between nodes; -inf outside of a frame's first and last node.
+class ProfileCurves:
+    r"""Functions $\ell_k(t)$, one per frame, piecewise cubic between nodes and -inf outside of them.
 
-    Given the splats, frame k's likelihood depends on t_k only: the log-likelihood of all times is the sum of these.
+    Given the splats, the likelihood of frame k depends on t_k only, and the log-likelihood of all times is their sum.
 
     **Shapes:** `nodes`, `values`, `slopes` (num_frames, most), of which `count` (num_frames,) are used of each row.
     **Units:** times of the model, [0, 1]; nats.
 
-    **Example:** `profiles(times)` with times (*batch, num_frames) gives (*batch, num_frames).
+    **Example:** `curves(times)` with times (*batch, num_frames) gives (*batch, num_frames).
 
-    **Source:** VeGaS eq:frame_fitting, with the splats held. Hermite's cubics, with slopes of second order: exact for
-    parabolas, which likelihoods are near their maxima.
+    **Source:** VeGaS eq:frame_fitting, with the splats held. Cubic Hermite interpolation with second-order
+    slopes: exact for parabolas, which log-likelihoods resemble near their maxima.
     """
 
     nodes: Float64[np.ndarray, "num_frames most"]
@@ -34,12 +34,12 @@ class Profiles:
     count: Int[np.ndarray, "num_frames"]
 
     @classmethod
-    def of(
+    def from_nodes(
         cls, nodes: Sequence[Float[np.ndarray, " nodes"]], values: Sequence[Float[np.ndarray, " nodes"]]
-    ) -> "Profiles":
-        """From one rising array of times and one of log-likelihoods a frame, at least three each.
+    ) -> "ProfileCurves":
+        """From one increasing array of times and one of log-likelihoods per frame, at least three each.
 
-        Raises ValueError for other shapes, times that do not rise, and NaN.
+        Raises ValueError for other shapes, times that do not increase, and log-likelihoods that are not finite.
         """
         count = np.array([len(each) for each in nodes])
         if len(nodes) != len(values) or not len(nodes) or (count < 3).any():
@@ -48,7 +48,7 @@ class Profiles:
         for k, (times, height) in enumerate(zip(nodes, values, strict=True)):
             times, height = np.asarray(times, np.float64), np.asarray(height, np.float64)
             if times.shape != height.shape or times.ndim != 1 or not (np.diff(times) > 0).all():
-                raise invalid(f"nodes[{k}]", expected=f"{height.size} rising times", got=f"shape {times.shape}")
+                raise invalid(f"nodes[{k}]", expected=f"{height.size} increasing times", got=f"shape {times.shape}")
             if not np.isfinite(height).all():
                 raise invalid(f"values[{k}]", expected="finite log-likelihoods", got=height[~np.isfinite(height)][0])
             table[:, k, : count[k]] = times, height, np.gradient(height, times, edge_order=2)
@@ -68,23 +68,23 @@ class Profiles:
         _look_up(flat, self.nodes, self.values, self.slopes, self.count, found)
         return found.reshape(times.shape)
 
-    def one(self, k: int) -> tuple[Float64[np.ndarray, " nodes"], Float64[np.ndarray, " nodes"]]:
+    def nodes_and_values(self, k: int) -> tuple[Float64[np.ndarray, " nodes"], Float64[np.ndarray, " nodes"]]:
         """Nodes and values of frame k."""
         return self.nodes[k, : self.count[k]], self.values[k, : self.count[k]]
 
     def modes(self) -> Float64[np.ndarray, "num_frames"]:
-        """The nodes with the greatest values."""
+        """The node with the largest value of each frame."""
         return self.nodes[np.arange(self.num_frames), np.nanargmax(self.values, axis=1)]
 
-    def __getitem__(self, which) -> "Profiles":
-        """Of some frames."""
+    def __getitem__(self, which) -> "ProfileCurves":
+        """The curves of some frames."""
         which = np.atleast_1d(np.arange(self.num_frames)[which])
-        return Profiles(self.nodes[which], self.values[which], self.slopes[which], self.count[which])
+        return ProfileCurves(self.nodes[which], self.values[which], self.slopes[which], self.count[which])
 
-    def scaled(self, factor: Float[np.ndarray, "num_frames"] | float) -> "Profiles":
-        """With all log-likelihoods times `factor`, a number > 0 or one a frame: for another noise of the same pictures.
+    def scaled(self, factor: Float[np.ndarray, "num_frames"] | float) -> "ProfileCurves":
+        """Multiply all log-likelihoods by `factor` > 0, one number or one per frame, to change the noise.
 
-        Raises ValueError for factors that are not finite and above 0, and for another number of them.
+        Raises ValueError for factors that are not finite and positive, and for another number of them.
         """
         factor = np.asarray(factor)
         if factor.dtype.kind not in "iuf" or factor.shape not in ((), (1,), (self.num_frames,)):
@@ -97,12 +97,12 @@ class Profiles:
 
 
 @inline
-def piece_of(value, rising, last):
-    """Number of the piece, between an entry of `rising` and the next, that a value is in; the end ones go on."""
+def piece_of(value, knots, last):
+    """Index of the interval of increasing `knots` that contains a value; the first and last are unbounded."""
     low, high = 0, last
     while high - low > 1:
         middle = (low + high) // 2
-        if rising[middle] <= value:
+        if knots[middle] <= value:
             low = middle
         else:
             high = middle
@@ -111,7 +111,7 @@ def piece_of(value, rising, last):
 
 @inline
 def value_at(t, nodes, values, slopes, last):
-    """A profile at time t; `last` is the number of its last node. -inf outside, and for NaN."""
+    """A curve at time t; `last` is the index of its last node. -inf outside, and for NaN."""
     if not (t >= nodes[0] and t <= nodes[last]):
         return -np.inf
     low = piece_of(t, nodes, last)

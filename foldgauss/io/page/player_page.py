@@ -1,7 +1,7 @@
-"""A model as one page of HTML: a player that draws the folded Gaussians themselves, at any time, in a browser.
+"""A model as one HTML page with a player that renders the folded Gaussians at any time in a browser.
 
-The page holds all it needs, the model as a compact file (of a video in segments one of each), and asks no network for
-anything. Its sources are the files in `player/`; `compact.js` decodes the models there. See docs/player.md.
+The page is self-contained: it holds the model as a compact file (one per segment) and makes no network requests.
+Its sources are the files in `player/`; `compact.js` decodes the models there. See docs/player.md.
 """
 
 import base64
@@ -19,11 +19,18 @@ import numpy as np
 from jaxtyping import UInt8
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss.io._atomic import atomic_path, checked_path
-from foldgauss.io.media.video_file import Clip
-from foldgauss.io.models.compact import is_compact, packed
+from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.video.compression.quantize import Quantized, Rule, column_names, describe, is_whole, quantize
+from foldgauss.video.compression.quantize import (
+    Quantized,
+    Rule,
+    column_names,
+    compute_columns,
+    is_integral,
+    quantize,
+)
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.video_model import VideoModel
@@ -31,9 +38,9 @@ from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 HTML_SUFFIX = ".html"
-#: Quality of the original's pictures, as WebP counts it.
+#: WebP quality of the original's frames.
 QUALITY = 80
-#: Above, browsers take long to open a page; and no notebook shows one by itself.
+#: Bytes above which browsers open a page slowly, and above which notebooks do not show it automatically.
 LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
@@ -61,7 +68,7 @@ def write_html(
 
     Example: `write_html("clip.html", model, original=clip.frames)`.
     """
-    path = checked_path(path, "path, model")
+    path = check_path(path, "path, model")
     if path.suffix.lower() != HTML_SUFFIX:
         raise invalid("path", expected=f"a name ending in {HTML_SUFFIX}", got=repr(str(path)))
     page = html_page(model, original=original, quality=quality, title=path.stem if title is None else title)
@@ -72,7 +79,7 @@ def write_html(
 
 
 def warn_of_size(page: str, has_original: bool) -> None:
-    """Say so where a page is larger than browsers like, with the cure."""
+    """Warn of a page that browsers open slowly."""
     if len(page) > LARGE:
         cure = (
             "Leave the original out, or lower its quality." if has_original else "Compress the model, or show a part."
@@ -84,7 +91,7 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
     """The page as text.
 
     `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantized
-    finely, and so is each segment of a video in segments: see docs/player.md for how near the picture comes.
+    finely, and so is each segment of a video in segments: see docs/player.md for the accuracy.
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
@@ -94,15 +101,15 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
     """
     if not (is_integer(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
-    plain, name = _loaded(model)
-    pictures = [] if original is None else _pictures(original, plain, quality)
-    return _assembled(_model_blocks(model, plain), pictures, name if title is None else title)
+    plain, name = _load(model)
+    pictures = [] if original is None else _encode_original(original, plain, quality)
+    return _assemble(_encode_model(model, plain), pictures, name if title is None else title)
 
 
-def notebook_frame(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
-    """The page in a frame of a notebook; None where it would be too large, or there is no page of such a model."""
+def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
+    """The page as an iframe for notebooks; None where it is too large or the model cannot be shown."""
     try:
-        page = _assembled(_up_to(_model_blocks(model, model), LARGEST_IN_NOTEBOOK), [], "foldgauss")
+        page = _assemble(_limit_size(_encode_model(model, model), LARGEST_IN_NOTEBOOK), [], "foldgauss")
     except (ValueError, OSError):  # the file of a video in segments may be gone
         return None
     if len(page) > LARGEST_IN_NOTEBOOK:
@@ -116,10 +123,10 @@ def notebook_frame(model: VideoModel | EditedVideo | SegmentedVideo) -> str | No
 # ----------------------------------------------------------------------------------------------- the model
 
 
-def _loaded(model: Model) -> tuple[Loaded, str]:
+def _load(model: Model) -> tuple[Loaded, str]:
     """The model, and a name for it."""
     if isinstance(model, str | os.PathLike):
-        path = checked_path(model, "model")
+        path = check_path(model, "model")
         name = read_origin(path).get("clip", path.stem)
         return load_video_model(path), name
     if not isinstance(model, Loaded):
@@ -128,31 +135,31 @@ def _loaded(model: Model) -> tuple[Loaded, str]:
     return model, "foldgauss"
 
 
-def _model_blocks(model: Model, loaded: Loaded) -> Iterator[str]:
-    """The page's blocks with the model, made one by one: of a compact file its own bytes."""
+def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
+    """The page's data blocks of the model, one by one; a compact file is embedded unchanged."""
     if isinstance(loaded, SegmentedVideo):
         names = ("first", "num_frames", "num_gaussians")
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
-            yield _block(f"model-{number}", packed(_fine(_flattened(number, segment.model))))
+            yield _block(f"model-{number}", pack_compact(quantize_finely(_flatten_segment(number, segment.model))))
     elif isinstance(model, Quantized):
-        yield _block("model", packed(model))
+        yield _block("model", pack_compact(model))
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
-        yield _block("model", packed(_fine(flatten_video(loaded))))
+        yield _block("model", pack_compact(quantize_finely(flatten_video(loaded))))
 
 
-def _flattened(number: int, model: VideoModel | EditedVideo) -> VideoModel:
+def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel:
     try:
         return flatten_video(model)
     except ValueError as error:
         raise ValueError(f"segment {number}: {error}") from error
 
 
-def _up_to(blocks: Iterable[str], most: float) -> Iterator[str]:
-    """The blocks as long as there is room for them. Raises ValueError at the first that goes beyond."""
+def _limit_size(blocks: Iterable[str], most: float) -> Iterator[str]:
+    """The blocks; raises ValueError once their total size exceeds `most`."""
     total = 0
     for block in blocks:
         total += len(block)
@@ -161,18 +168,18 @@ def _up_to(blocks: Iterable[str], most: float) -> Iterator[str]:
         yield block
 
 
-def _fine(model: VideoModel) -> Quantized:
-    """All its Gaussians in their own order, by steps so fine that the picture stays."""
-    described = describe(model)
+def quantize_finely(model: VideoModel) -> Quantized:
+    """The model quantized in steps too fine to change the image, with its Gaussians in their order."""
+    described = compute_columns(model)
     classes = np.zeros(model.num_gaussians, np.int32)
     try:
-        return quantize(described, classes, _rules(model.degree))
+        return quantize(described, classes, _fine_rules(model.degree))
     except ValueError:  # Gaussians so thin that steps in proportion would be beyond the format
-        names = [name for name in column_names(model.degree) if not is_whole(name)]
+        names = [name for name in column_names(model.degree) if not is_integral(name)]
         return quantize(described, classes, {name: Rule(0.0, _EVEN) for name in names})
 
 
-def _rules(degree: int) -> dict[str, Rule]:
+def _fine_rules(degree: int) -> dict[str, Rule]:
     """Steps in proportion to what a number is measured by: paths by the shorter deviation, times by the longer ones.
 
     Features are class, size, stretch, duration, opacity, in this order.
@@ -192,25 +199,25 @@ _STEPS = {"size": -8.5, "stretch": -8.5, "luma": -8.5, "blue": -8.5, "green": -8
 # -------------------------------------------------------------------------------------------- the original
 
 
-def _pictures(original: Frames, model: Loaded, quality: int) -> list[bytes]:
+def _encode_original(original: Frames, model: Loaded, quality: int) -> list[bytes]:
     """The original's frames as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
-    size, num = _size_and_number(model)
+    size, num = _frame_size_and_count(model)
     shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
     if len(shape) != 4 or shape[:3] != (num, *size) or shape[3] not in (3, 4) or dtype != np.uint8:
         expected = f"frames uint8 ({num}, {size[0]}, {size[1]}, 3), those of the model"
         cure = "Read them with read_video(path, size=model.size)."
         raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
-    return [_webp(frame, quality) for frame in frames]
+    return [_encode_webp(frame, quality) for frame in frames]
 
 
-def _size_and_number(model: Loaded) -> tuple[tuple[int, int], int]:
+def _frame_size_and_count(model: Loaded) -> tuple[tuple[int, int], int]:
     if isinstance(model, Quantized):
-        return tuple(model.facts.size), len(model.intervals) + 1
+        return tuple(model.info.size), len(model.intervals) + 1
     return tuple(model.size), model.num_frames
 
 
-def _webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
+def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
     opaque = frame if frame.shape[-1] == 3 else composite(frame, np.float32(BLACK))
     done, data = cv2.imencode(".webp", opaque[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not done:
@@ -221,8 +228,8 @@ def _webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> by
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assembled(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
-    script, style = bundled("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
+def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
+    script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
     blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
     parts = {
         "policy": _policy(script, style),
@@ -236,12 +243,12 @@ def _assembled(models: Iterable[str], pictures: Iterable[bytes], title: str) -> 
 
 
 def _block(name: str, data: bytes) -> str:
-    """Bytes in the page: a script element of a type that no browser runs."""
+    """Bytes as a script element of a type that browsers do not execute."""
     return f'<script type="application/octet-stream" id="{name}">{base64.b64encode(data).decode()}</script>'
 
 
 def _policy(script: str, style: str) -> str:
-    """What the page may do: run its own script and style, show pictures that it holds, start its own worker."""
+    """The content security policy: the page's own script, style, images and worker, and nothing else."""
     allowed = {
         "default-src": "'none'",
         "script-src": _digest(script),
@@ -258,7 +265,7 @@ def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def bundled(entry: str) -> str:
+def bundle_script(entry: str) -> str:
     """A module and all that it imports, each once, as one script without imports; texts become strings."""
     done: dict[str, str] = {}
 

@@ -1,0 +1,95 @@
+"""Settings in dataclasses: documentation, valid values and command-line option of each field, in its metadata.
+
+    steps: int | None = field(default=None, metadata=setting("Optimizer steps", least=1, option="--steps"))
+
+`check_settings` validates by this metadata, commands generate their options from it, and the API page its table.
+"""
+
+import dataclasses
+import types
+import typing
+from typing import Any
+
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+
+_KEY = "setting"
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """Metadata of one field.
+
+    `help` is a sentence without its full stop, `details` adds to it in the API reference. Valid are whole numbers from
+    `least` to `most`, numbers in `bounds` as "[0, 1)", or `choices`, by the field's type. `unset` says what None
+    stands for. `option` is the command-line option, in the `group` of options that belong together.
+    """
+
+    help: str
+    details: str = ""
+    least: int = 0
+    most: int | None = None
+    bounds: str = "(-inf, inf)"
+    choices: tuple[str, ...] = ()
+    unset: str = ""
+    option: str = ""
+    group: str = ""
+
+
+def setting(help: str, details: str = "", **more: Any) -> dict[str, Setting]:
+    """Metadata for `dataclasses.field`; `more` are the other fields of `Setting`."""
+    return {_KEY: Setting(help, details, **more)}
+
+
+def setting_of(field: dataclasses.Field) -> Setting:
+    return field.metadata[_KEY]
+
+
+def type_of(field: dataclasses.Field) -> type:
+    """The type of a field's values other than None."""
+    if not isinstance(field.type, types.UnionType):
+        return field.type
+    return next(kind for kind in typing.get_args(field.type) if kind is not types.NoneType)
+
+
+def check_settings(settings: Any, prefix: str = "") -> None:
+    """Raise ValueError for a value that its field's metadata or type forbids; NumPy scalars become Python numbers.
+
+    For `__post_init__` of a frozen dataclass whose fields all have `setting` metadata. None is valid where it is the
+    default. `prefix` precedes names in messages.
+    """
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if value is not None or field.default is not None:
+            checked = _checked_value(prefix + field.name, value, type_of(field), setting_of(field))
+            object.__setattr__(settings, field.name, checked)
+
+
+def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
+    if kind is int:
+        if not is_integer(value, valid.least):
+            raise invalid(name, expected=f"a whole number >= {valid.least}", got=repr(value))
+        if valid.most is not None and value > valid.most:
+            raise invalid(name, expected=f"at most {valid.most:,}", got=f"{value:,}")
+        return int(value)
+    if kind is float:
+        if not is_within(value, valid.bounds):
+            raise invalid(name, expected=f"a number in {valid.bounds}", got=repr(value))
+        return float(value)
+    if kind is str:
+        check_one_of(name, value, valid.choices)
+    elif not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise invalid(name, expected=f"{article} {kind.__name__}", got=repr(value))
+    return value
+
+
+def markdown_table(settings: type) -> str:
+    """The fields of a settings dataclass as a table in Markdown."""
+    rows = ["| field | default | meaning | option |", "|---|---|---|---|"]
+    for field in dataclasses.fields(settings):
+        about, is_plain = setting_of(field), isinstance(field.default, int | float | str | None)
+        default = f"`{field.default!r}`" if is_plain else f"`{type(field.default).__name__}(...)`"
+        default += f": {about.unset}" if about.unset else ""
+        option = f"`{about.option}`" if about.option else ""
+        rows.append(f"| `{field.name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
+    return "\n".join(rows)

@@ -1,0 +1,217 @@
+"""Initial parameters of EM from responsibilities: by k-means, random curves grown along the points, or at random."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from foldgauss.envelope import Constant
+from foldgauss.estimator.em.components import Parameters
+from foldgauss.estimator.em.statistics import Points, accumulate, make_points
+from foldgauss.estimator.em.updates import Model, update_components
+
+__all__ = [
+    "INITIALIZERS",
+    "draw_subset",
+    "initialize",
+    "params_from_gaussians",
+    "params_from_responsibilities",
+    "restrict_covariances",
+]
+
+#: The largest subset of points that an initialization uses; EM itself uses all points.
+_MAX_POINTS = 20_000
+#: Beyond this many points, NumPy's draw without replacement, a permutation of all of them, would need much memory.
+_MAX_PERMUTED = 2**20
+_LLOYD_STEPS = 10
+#: Curves tried for each component, points that they are tried on, and steps in which each grows along the points.
+_CURVES, _CURVE_POINTS, _GROWTH_STEPS = 12, 2_000, 8
+
+
+def initialize(
+    kind: str, y: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"], model: Model, degree: int, rng
+) -> Parameters:
+    """Initial parameters for scaled points by one of `INITIALIZERS`; `rng` is NumPy's."""
+    keep = np.flatnonzero(weights > 0)
+    if (some := draw_subset(len(keep), rng)) is not None:
+        keep = keep[some]
+    # Points sorted and without duplicates: a weight of 2 gives the same result as a repeated point.
+    y, which = np.unique(y[keep], axis=0, return_inverse=True)
+    weights = np.bincount(which.ravel(), weights[keep]).astype(y.dtype)
+    responsibilities = INITIALIZERS[kind](y.astype(np.float64), weights, len(model.degrees), degree, rng)
+    return params_from_responsibilities(y, weights, responsibilities, model, degree)
+
+
+def draw_subset(num: int, rng) -> Int[np.ndarray, " m"] | None:
+    """Draw the indices, out of `num`, of the points that an initialization uses; None for all."""
+    if num <= _MAX_POINTS:
+        return None
+    if num <= _MAX_PERMUTED:
+        return rng.choice(num, _MAX_POINTS, replace=False)
+    # Draws with replacement, twice as many as needed, hold hardly any duplicates; a uniform subset of them is kept.
+    return rng.choice(np.unique(rng.choice(num, 2 * _MAX_POINTS)), _MAX_POINTS, replace=False)
+
+
+def params_from_responsibilities(y, weights, responsibilities, model: Model, degree: int) -> Parameters:
+    """Fit the components to points with given responsibilities (n, k)."""
+    num = responsibilities.shape[1]
+    points = make_points(y, weights, num)
+    rows = points.x.shape[1] * points.x.shape[2]
+    padded = np.zeros((rows, num), y.dtype)
+    padded[: len(y)] = responsibilities
+    padded = jnp.asarray(padded.reshape(*points.x.shape[:3], num))
+    dim, dtype = y.shape[1] - 1, y.dtype
+    params = Parameters(
+        jnp.full(num, -np.log(num), dtype),
+        jnp.zeros(num, dtype),
+        jnp.ones(num, dtype),
+        jnp.zeros((num, degree + 1, dim), dtype),
+        jnp.broadcast_to(jnp.eye(dim, dtype=dtype)[None], (num, dim, dim)),
+    )
+    for _ in range(2):  # the second time relative to the fitted curves, for accuracy
+        params = _maximize(params, points, padded, model)
+    return params
+
+
+@eqx.filter_jit
+def _maximize(params: Parameters, points: Points, padded, model: Model) -> Parameters:
+    return update_components(params, accumulate(params, Constant(), points, responsibilities=padded), model)[0]
+
+
+def params_from_gaussians(weights, means, covariances, degree: int, dtype) -> Parameters:
+    """Components with linear folds from joint Gaussians of space and time, in scaled units."""
+    variance = covariances[:, -1, -1]
+    slope = covariances[:, :-1, -1] / variance[:, None]
+    conditional = covariances[:, :-1, :-1] - slope[:, :, None] * covariances[:, None, :-1, -1]
+    curve = np.zeros((len(means), degree + 1, means.shape[1] - 1))
+    curve[:, 0] = means[:, :-1]
+    if degree:
+        curve[:, 1] = -slope * np.sqrt(variance)[:, None]  # v decreases with time
+    parts = (np.log(weights), means[:, -1], np.sqrt(variance), curve, np.linalg.cholesky(conditional))
+    return Parameters(*(jnp.asarray(z, dtype) for z in parts))
+
+
+def restrict_covariances(params: Parameters, kind: str) -> Parameters:
+    """Replace the covariances by those of the kind that is fitted, which EM's updates then preserve."""
+    tril = np.asarray(params.tril, np.float64)
+    covariances, eye = tril @ tril.swapaxes(-1, -2), np.eye(tril.shape[-1])
+    if kind == "full" or not np.isfinite(covariances).all():
+        return params
+    if kind == "tied":
+        weights = np.exp(np.asarray(params.log_weights, np.float64))
+        covariances = np.broadcast_to(np.einsum("k,kab->ab", weights / weights.sum(), covariances), covariances.shape)
+    if kind == "diag":
+        covariances = covariances * eye
+    if kind == "spherical":
+        covariances = np.trace(covariances, axis1=1, axis2=2)[:, None, None] / len(eye) * eye
+    return params._replace(tril=jnp.asarray(np.linalg.cholesky(covariances), params.tril.dtype))
+
+
+# --- responsibilities ---------------------------------------------------------------------------------------
+
+
+def _one_hot(labels: Int[np.ndarray, " n"], num: int) -> Float[np.ndarray, "n k"]:
+    return (labels[:, None] == np.arange(num)).astype(np.float64)
+
+
+def _distances(y, centers) -> Float[np.ndarray, "n k"]:
+    square = (y * y).sum(1)[:, None] - 2 * y @ centers.T + (centers * centers).sum(1)
+    return np.maximum(square, 0)
+
+
+def _draw_plus_plus_centers(y, weights, num, rng) -> Float[np.ndarray, "k d"]:
+    """k-means++ (Arthur and Vassilvitskii 2007): each next center drawn in proportion to its squared distance to those
+    chosen before."""
+    chosen = [rng.choice(len(y), p=weights / weights.sum())]
+    nearest = np.full(len(y), np.inf)
+    for _ in range(1, num):
+        nearest = np.minimum(nearest, ((y - y[chosen[-1]]) ** 2).sum(1))
+        mass = weights * nearest
+        chosen.append(rng.choice(len(y), p=mass / mass.sum() if mass.sum() > 0 else None))
+    return y[chosen]
+
+
+def _assign_by_plus_plus(y, weights, num, degree, rng):
+    return _one_hot(_distances(y, _draw_plus_plus_centers(y, weights, num, rng)).argmin(1), num)
+
+
+def _assign_by_k_means(y, weights, num, degree, rng):
+    centers = _draw_plus_plus_centers(y, weights, num, rng)
+    for _ in range(_LLOYD_STEPS):
+        shares = _one_hot(_distances(y, centers).argmin(1), num) * weights[:, None]
+        mass = shares.sum(0)
+        moved = shares.T @ y / np.where(mass > 0, mass, 1)[:, None]
+        moved = np.where((mass > 0)[:, None], moved, centers)
+        if np.array_equal(moved, centers):
+            break
+        centers = moved
+    return _one_hot(_distances(y, centers).argmin(1), num)
+
+
+def _assign_at_random(y, weights, num, degree, rng):
+    shares = rng.uniform(size=(len(y), num))
+    return shares / shares.sum(1, keepdims=True)
+
+
+def _assign_to_random_points(y, weights, num, degree, rng):
+    there = rng.choice(len(y), num, replace=len(y) < num, p=weights / weights.sum() if len(y) < num else None)
+    return _one_hot(_distances(y, y[there]).argmin(1), num)
+
+
+def _assign_to_trajectories(y, weights, num, degree, rng):
+    """Assign each point to the nearest of `num` curves, selected greedily from many by how many points they explain."""
+    some = rng.choice(len(y), min(len(y), _CURVE_POINTS), replace=False)
+    part, mass = y[some], weights[some]
+    curves, widths = _grow_curves(part, mass, _CURVES * num, max(degree, 1), rng)
+    square = _curve_distances(part, curves)
+    near = np.exp(-0.5 * square / np.median(widths) ** 2) * mass[:, None]
+    chosen, left = [], np.ones(len(part))
+    for _ in range(num):
+        gain = left @ near
+        gain[chosen] = -1  # a curve selected twice would leave a component without points
+        best = int(np.argmax(gain))
+        chosen.append(best)
+        left = left * (1 - near[:, best] / mass)
+    return _one_hot(_curve_distances(y, curves[chosen]).argmin(1), num)
+
+
+def _grow_curves(y, weights, num, degree, rng):
+    """Grow polynomials of time (num, degree + 1, d-1), each along the points from a random one; also their widths.
+
+    Each is fitted to a few neighbors first, then repeatedly to the points near it in a growing window of time.
+    """
+    t, s = y[:, -1], y[:, :-1]
+    seed = rng.choice(len(y), num, replace=True)
+    reach = np.ptp(t) or 1.0
+    nearest = np.sort(_distances(y, y[seed]), axis=0)[min(len(y) - 1, max(8, len(y) // 50))]
+    near = weights[:, None] * np.exp(-0.5 * _distances(y, y[seed]) / np.maximum(nearest, 1e-12))
+    width = np.maximum(np.sqrt(nearest), 1e-3)
+    ridge = 1e-3 * np.diag(np.arange(degree + 1) ** 2.0)  # penalizes curvature
+    for step in range(_GROWTH_STEPS + 1):
+        current = min(degree, 1 + step // 2)
+        powers = t[:, None] ** np.arange(current + 1)
+        normal = np.einsum("nc,ni,nj->cij", near, powers, powers) + ridge[: current + 1, : current + 1]
+        right = np.einsum("nc,ni,nj->cij", near, powers, s)
+        curves = np.zeros((num, degree + 1, s.shape[1]))
+        curves[:, : current + 1] = np.linalg.solve(normal + 1e-9 * np.eye(current + 1), right)
+        square = _curve_distances(y, curves)
+        total = np.maximum(near.sum(0), 1e-300)
+        width = np.clip(np.sqrt((near * square).sum(0) / total), 1e-3, width)
+        window = reach * 2.0 ** (0.5 * (step + 1 - _GROWTH_STEPS))
+        inside = np.abs(t[:, None] - t[seed]) <= window
+        near = weights[:, None] * inside * np.exp(-0.5 * square / (1.5 * width) ** 2)
+    return curves, width
+
+
+def _curve_distances(y, curves) -> Float[np.ndarray, "n c"]:
+    powers = y[:, -1:] ** np.arange(curves.shape[1])
+    return ((y[:, None, :-1] - np.einsum("nj,cjp->ncp", powers, curves)) ** 2).sum(-1)
+
+
+INITIALIZERS = {
+    "kmeans": _assign_by_k_means,
+    "k-means++": _assign_by_plus_plus,
+    "random": _assign_at_random,
+    "random_from_data": _assign_to_random_points,
+    "trajectories": _assign_to_trajectories,
+}

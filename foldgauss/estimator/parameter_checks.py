@@ -1,0 +1,109 @@
+"""Validation of the parameters of `FoldedGaussianMixture`; all errors name the parameter."""
+
+from numbers import Integral
+
+import jax
+import numpy as np
+
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.estimator.em.initialization import INITIALIZERS
+
+__all__ = ["check_array", "check_column", "check_parameters", "check_sizes", "invert_precisions", "make_envelope"]
+
+_COVARIANCES = ("full", "diag", "spherical", "tied")
+_ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
+
+
+def check_parameters(estimator) -> None:
+    """Raise ValueError naming the first parameter that is out of its bounds."""
+    for name, least in {"n_components": 1, "degree": 0}.items():
+        value = getattr(estimator, name)
+        if value != "auto" and not is_integer(value, least):
+            raise invalid(name, expected=f'a whole number >= {least} or "auto"', got=repr(value))
+    for name, least in {"max_components": 1, "max_degree": 0, "max_iter": 1, "n_init": 1, "devices": 1}.items():
+        if not is_integer(getattr(estimator, name), least):
+            raise invalid(name, expected=f"a whole number >= {least}", got=repr(getattr(estimator, name)))
+    for name in ("tol", "reg_covar", "reg_relative"):
+        if not is_within(getattr(estimator, name), "[0, inf)"):
+            raise invalid(name, expected="a number >= 0", got=repr(getattr(estimator, name)))
+    if not isinstance(estimator.warm_start, bool | np.bool_):
+        raise invalid("warm_start", expected="True or False", got=repr(estimator.warm_start))
+    if not isinstance(estimator.verbose, bool | np.bool_) and not is_integer(estimator.verbose, 0):
+        raise invalid("verbose", expected="a whole number >= 0", got=repr(estimator.verbose), cure="0 is silent.")
+    if not is_within(estimator.annealing, "(0, 1]"):
+        raise invalid(
+            "annealing", expected="a number in (0, 1]", got=repr(estimator.annealing), cure="1 is no annealing."
+        )
+    check_one_of("covariance_type", estimator.covariance_type, _COVARIANCES)
+    check_one_of("init_params", estimator.init_params, tuple(INITIALIZERS))
+    check_one_of("criterion", estimator.criterion, ("bic", "aic"))
+    if isinstance(estimator.envelope, str):
+        check_one_of("envelope", estimator.envelope, tuple(_ENVELOPES))
+    elif not isinstance(estimator.envelope, AbstractEnvelope):
+        cure = "as_envelope(f)."
+        raise invalid("envelope", expected="an envelope or its name", got=repr(estimator.envelope), cure=cure)
+    if estimator.devices > len(jax.devices()):
+        expected, cure = f"at most {len(jax.devices())}", "See jax.devices()."
+        raise invalid("devices", expected=expected, got=estimator.devices, cure=cure)
+    initial = (estimator.weights_init, estimator.means_init, estimator.precisions_init)
+    if estimator.n_components == "auto" and any(value is not None for value in initial):
+        raise invalid(
+            "n_components", expected="a number where initial values are given", got='"auto"', cure="Pass their number."
+        )
+
+
+def check_sizes(num_columns: int, num_points: int, total: float, least: int) -> None:
+    """Raise unless there are a time and a space column, positive weights, and at least `least` points."""
+    if num_columns < 2:
+        cure = "One column is time; at least one of space is needed."
+        raise invalid("X", expected="at least 2 columns", got=f"n_features = {num_columns}", cure=cure)
+    if not total > 0:
+        raise invalid("sample_weight", expected="a positive sum", got="0", cure="Rows of weight 0 are left out.")
+    if num_points < least:
+        raise invalid(
+            "n_components",
+            expected=f"at most the number of points (n_samples = {num_points})",
+            got=least,
+            cure='Fewer components, or n_components="auto".',
+        )
+
+
+def check_column(column, num_columns: int) -> int:
+    """The index of the time column, not negative."""
+    if not isinstance(column, Integral) or isinstance(column, bool) or not -num_columns <= column < num_columns:
+        raise invalid("time_column", expected=f"a column of {num_columns}", got=repr(column), cure="-1 is the last.")
+    return int(column) % num_columns
+
+
+def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+    """`value` as a finite float64 array of this shape."""
+    value = np.asarray(value, np.float64)
+    if not np.isfinite(value).all():
+        raise invalid(name, expected="finite numbers", got="NaN or infinity")
+    if value.shape != shape:
+        raise invalid(name, expected=f"shape {shape}", got=f"shape {value.shape}", cure="One entry per component.")
+    return value
+
+
+def invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
+    """Covariances (k, d, d) from precisions in scikit-learn's shape for each kind of covariance."""
+    shape = {"full": (num, dim, dim), "tied": (dim, dim), "diag": (num, dim), "spherical": (num,)}[kind]
+    precisions = check_array("precisions_init", precisions, shape)
+    eye = np.eye(dim)
+    if kind == "spherical":
+        precisions = precisions[:, None, None] * eye
+    if kind == "diag":
+        precisions = precisions[:, :, None] * eye
+    precisions = np.broadcast_to(precisions, (num, dim, dim))
+    symmetric = np.allclose(precisions, precisions.swapaxes(-1, -2))
+    if not (symmetric and (np.linalg.eigvalsh(precisions) > 0).all()):
+        raise invalid(
+            "precisions_init", expected="symmetric and positive definite", got="others", cure="Invert covariances."
+        )
+    return np.linalg.inv(precisions)
+
+
+def make_envelope(envelope) -> AbstractEnvelope:
+    """The envelope itself, or the one with this name."""
+    return _ENVELOPES[envelope]() if isinstance(envelope, str) else envelope

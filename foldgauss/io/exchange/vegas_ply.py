@@ -1,0 +1,267 @@
+"""The PLY file of the published VeGaS code: a video of folded Gaussians."""
+
+import dataclasses
+import json
+import math
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from foldgauss._runtime.checks import invalid, is_within
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.io.exchange.ply_file import (
+    Ply,
+    facts_error,
+    format_error,
+    is_3dgs,
+    is_vegas,
+    read_ply,
+    to_float32,
+    write_ply,
+)
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS
+from foldgauss.render import RenderOptions
+from foldgauss.render.camera import FIELD_OF_VIEW
+from foldgauss.render.splats import check_size
+from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE, FoldedSplats
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+#: The envelope's power of the published code, which scales standard deviations by exp(-tau^2 / 2).
+VEGAS_POWER = 2.0
+
+
+#: Standard deviations, in its units, above which the published code renders a Gaussian.
+VEGAS_SCALE_CUTOFF = 1e-4
+
+
+#: `scale_1`, across the plane, has no effect on the image; this eps is written.
+_VEGAS_ACROSS = math.log(1e-8)
+
+
+#: Prefix of our metadata in a comment of the header, which other programs skip.
+_NOTE = "foldgauss "
+
+
+def read_vegas_ply(
+    path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
+) -> VideoModel:
+    r"""A video from the PLY file of the published VeGaS code, rendered as its formulas define.
+
+    **Shapes:** element `vertex` with x, z, f_dc_0..2, opacity, scale_0, scale_2, rot_0, m_0, sigma_0 and
+    w1_0..(2 degree - 1) (pairs (x, z) per power of u = m_t - t), element `time` with time_func_0..(num_frames - 2).
+
+    **Units:** the file's space has its camera at (0, -1, 0) looking along y, the picture's right along x and its down
+    along -z, with a horizontal field of view of 0.6911112, so its frame is 2 tan(0.6911112 / 2) = 0.72 wide. With
+    w = min(1, width / height) the frame's width in model space,
+
+    $$
+    (x, y) = k\,(x, -z), \quad c_j = k\,(w_{j,x}, -w_{j,z}), \quad s = k\,(s_0, s_2),
+    \quad k = \frac{w}{2 \tan(0.6911112 / 2)}
+    $$
+
+    The angle is the file's own: it turns about y there, and its axes (cos, -sin) and (sin, cos) in (x, z) are
+    (cos, sin) and (sin, -cos) in the picture, where (-sin, cos) is the same axis. y, scale_1 and the normals are not
+    read: the published renderer puts every Gaussian on the plane y = 0 and takes an eps for the scale across it.
+
+    `size` = (height, width) and `fps` are not in such a file and must be given, the first always, the second where 25
+    is wrong; files that `write_vegas_ply` made carry both. Rendering follows the published constants: power 2, low
+    pass 0.3 px^2, alpha up to 0.99 and from 1/255 on, exp(-tau^2 / 2) > 0.01, and standard deviations above 1e-4 of its
+    units (`VideoModel.scale_cutoff`). Files written by foldgauss record the model's own values instead.
+
+    **Raises:** `FileNotFoundError`, and `FormatError` for a file that is damaged, of another kind, with colours that
+    depend on the view, or without a size.
+
+    **Example:** `model = read_vegas_ply("point_cloud.ply", size=(480, 854), fps=24)`
+
+    **Source:** VeGaS "Implementation Details", eq:vegas_equiv_cond and eq:frame_fitting; the layout is that of its
+    published code.
+    """
+    ply = read_ply(path, ("vertex", "time"))
+    _check_is_vegas(ply)
+    size, fps, options, scale_cutoff, power = _fill_in(ply, size, fps)
+    degree = _degree(ply)
+    names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
+    columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(2 * degree))])
+    unit = _vegas_unit(size)
+    plane = unit * np.array([1.0, -1.0])
+    angle, time_loc, log_time_scale, opacity = columns[:, 4:8].T
+    leaves = {
+        "loc": plane * columns[:, 0:2],
+        "log_scale": columns[:, 2:4] + math.log(unit),
+        "angle_logit": angle,
+        "time_loc_logit": time_loc,
+        "log_time_scale": _convert_time_scale(log_time_scale, VEGAS_POWER, power),
+        "coefficients": plane * columns[:, 11:].reshape(len(columns), degree, 2),
+        "opacity_logit": opacity,
+        "color_dc": columns[:, 8:11],
+    }
+    splats = FoldedSplats(
+        **{name: to_float32(ply, name, leaf) for name, leaf in leaves.items()},
+        envelope=TimeLikelihood(np.float32(power), np.float32(0)),
+    )
+    return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
+
+
+def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
+    r"""Write a video in the format of the published VeGaS code; returns the path. See `read_vegas_ply` for the layout.
+
+    The envelope has power 2 there. That of another power p > 0 is the same function of time with
+
+    $$ \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2)) $$
+
+    Leaves, sigma_t and the power among them, come back here to float32 rounding. The published code renders it with its
+    own constants: a Gaussian up to 3.03 sigma_t' from m_t, where it is a hundredth as wide as at its widest (at p = 1
+    the model itself ends at a tenth); a model that was fitted with another low pass than 0.3 px^2 (the presets' is 0.1)
+    a little softer; and Gaussians whose scale, after the envelope, is below 1e-4 of its units (a fifth of a pixel at
+    1280 wide) not at all.
+
+    **Raises:** ValueError for a model that the published code cannot render: an envelope of power 0, a floor,
+    compositing "sum", one frame alone; `OutputError` where the path cannot be written.
+
+    **Example:** `write_vegas_ply("point_cloud.ply", load_video_model("holiday.safetensors"))`
+
+    **Source:** the layout of the published VeGaS code.
+    """
+    _check_writable_as_vegas(model)
+    splats, unit = model.splats, _vegas_unit(model.size)
+    plane = np.array([1.0, -1.0]) / unit
+    loc = plane * np.asarray(splats.loc, np.float64)
+    scale = np.asarray(splats.log_scale, np.float64) - math.log(unit)
+    zeros = np.zeros(len(loc))
+    columns = {"x": loc[:, 0], "y": zeros, "z": loc[:, 1], "nx": zeros, "ny": zeros, "nz": zeros}
+    columns |= {f"f_dc_{c}": np.asarray(splats.color_dc, np.float64)[:, c] for c in range(3)}
+    columns |= {"opacity": splats.opacity_logit, "scale_0": scale[:, 0]}
+    columns |= {"scale_1": np.full(len(loc), _VEGAS_ACROSS), "scale_2": scale[:, 1]}
+    powers = np.asarray(splats.envelope.power, np.float64)
+    spread = _convert_time_scale(np.asarray(splats.log_time_scale, np.float64), powers, VEGAS_POWER)
+    columns |= {"rot_0": splats.angle_logit, "m_0": splats.time_loc_logit, "sigma_0": spread}
+    weights = (plane * np.asarray(splats.coefficients, np.float64)).reshape(len(loc), -1)
+    columns |= {f"w1_{k}": weights[:, k] for k in range(weights.shape[1])}
+    time_weights = {
+        f"time_func_{k}": [weight] for k, weight in enumerate(np.asarray(model.frame_times.logits, np.float64))
+    }
+    note = {"size": list(model.size), "fps": model.fps, "options": dataclasses.asdict(model.options)}
+    note["scale_cutoff"] = model.scale_cutoff
+    if np.unique(powers).size == 1:
+        note["power"] = float(np.unique(powers)[0])
+    return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[_NOTE + json.dumps(note)])
+
+
+def _convert_time_scale(
+    log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
+) -> Float[np.ndarray, " num"]:
+    """log sigma_t that gives an envelope of power `other` the same values; static Gaussians keep the value 1."""
+    return np.where(
+        log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
+    )
+
+
+def _vegas_unit(size: tuple[int, int]) -> float:
+    """One unit of the published space in model units."""
+    height, width = size
+    return min(1.0, width / height) / (2 * math.tan(FIELD_OF_VIEW / 2))
+
+
+def _check_is_vegas(ply: Ply) -> None:
+    if not is_vegas(ply):
+        cure = "For a still scene use read_3dgs_ply." if is_3dgs(ply) else "Check that it is the right file."
+        got = "properties " + ", ".join(ply.names("vertex")[:20]) if ply.names("vertex") else "no element 'vertex'"
+        raise format_error(ply.path, expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
+    if "time" not in ply.elements:
+        cure = "It may be of another version of the published code."
+        raise format_error(ply.path, expected="an element 'time' with the frames' weights", got="none", cure=cure)
+    if len(ply.elements["vertex"]) == 0:
+        raise format_error(ply.path, expected="Gaussians", got="none")
+    rest = [name for name in ply.names("vertex") if name.startswith("f_rest_")]
+    if rest and np.any(ply.columns("vertex", rest)):
+        expected = "colours of degree 0, as VeGaS has them"
+        raise format_error(ply.path, expected=expected, got="f_rest columns that are not 0")
+
+
+def _degree(ply: Ply) -> int:
+    num = sum(name.startswith("w1_") for name in ply.names("vertex"))
+    if num % 2:
+        expected = "an even number of w1 columns, pairs (x, z)"
+        raise format_error(ply.path, expected=expected, got=str(num), cure="The file is damaged.")
+    return num // 2
+
+
+def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
+    """The weights of the frame times: columns of one row, or rows of one column."""
+    names = sorted(ply.names("time"), key=lambda name: (len(name), name))
+    weights = ply.columns("time", names)
+    if 1 not in weights.shape or weights.size == 0:
+        got = f"{weights.shape[0]} rows of {weights.shape[1]}"
+        raise format_error(ply.path, expected="one row of weights in element 'time'", got=got)
+    if weights.shape[0] == 1 and names != [f"time_func_{k}" for k in range(len(names))]:
+        got = ", ".join(names[:9])
+        raise format_error(ply.path, expected="time_func_0, time_func_1, ... in element 'time'", got=got)
+    return weights.astype(np.float32).ravel()
+
+
+def _fill_in(
+    ply: Ply, size: tuple[int, int] | None, fps: float | None
+) -> tuple[tuple[int, int], float, RenderOptions, float, float]:
+    """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
+    note = _read_note(ply)
+    if size is None and "size" not in note:
+        cure = "Give the size of the video that it was made from, such as size=(480, 854)."
+        raise format_error(ply.path, expected="a size, which a VeGaS file does not hold", got="none", cure=cure)
+    try:
+        options = RenderOptions(**note.get("options", {}))
+        size = note["size"] if size is None else size
+        fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
+        check_size(size)
+        cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
+        if not is_within(cutoff, "[0, 1]"):
+            raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
+        power = note.get("power", VEGAS_POWER)
+        if not is_within(power, "(0, 1e30]"):
+            raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
+        if not is_within(fps, f"(0, {MAX_FPS}]"):
+            raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+    except (TypeError, ValueError) as error:
+        raise facts_error(ply.path, error) from error
+    return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)
+
+
+def _read_note(ply: Ply) -> dict:
+    """The metadata that `write_vegas_ply` stores in a comment; empty for files of other programs."""
+    texts = [comment[len(_NOTE) :] for comment in ply.comments if comment.startswith(_NOTE)]
+    try:
+        note = json.loads(texts[0]) if texts else {}
+    except (ValueError, RecursionError):
+        note = None
+    if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
+        raise format_error(ply.path, expected="facts in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it.")
+    return note
+
+
+def _check_writable_as_vegas(model: VideoModel) -> None:
+    if not isinstance(model, VideoModel):
+        cure = "An edited video goes out frame by frame, as ply3dgs or obj."
+        if isinstance(model, SegmentedVideo):
+            cure = "export(model, 'ply', FOLDER) writes one for each segment."
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+    envelope = model.splats.envelope
+    facts = {
+        "floor": (np.unique(envelope.floor), 0.0, "Fit it without a floor."),
+        "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
+    }
+    if model.num_frames < 2:
+        cure = "Write the picture as a still scene, ply3dgs."
+        raise invalid("model", expected="at least 2 frames, whose distances a VeGaS file holds", got="1", cure=cure)
+    for name, (found, known, cure) in facts.items():
+        if not (found == known).all():
+            got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"
+            raise invalid(f"model's {name}", expected=expected, got=got, cure=cure)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
+        raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
+    if not (np.asarray(envelope.power) > 0).all():
+        cure = "Fit it with another --power."
+        raise invalid("model's power", expected="above 0, as VeGaS files require", got="0", cure=cure)

@@ -1,0 +1,177 @@
+"""Clips in memory, and the error and argument checks that readers and writers of clips share."""
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from foldgauss._runtime.checks import invalid, is_within
+from foldgauss.io._atomic import check_path
+from foldgauss.io.media.format_detection import HEAD_BYTES
+from foldgauss.io.media.frame_rate import MAX_FPS, FrameRate
+
+Range = tuple[int | None, int | None]
+PathLike = str | os.PathLike
+#: (prepared frames, frames declared within the range, frame rate, notes)
+ReadResult = tuple[list[np.ndarray], int, FrameRate, tuple[str, ...]]
+
+
+class VideoError(ValueError):
+    """A clip cannot be read or written as requested; the one-line message says what was expected, what was got, and
+    how to correct it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames in memory.
+
+    `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous; for images with alpha RGBA, shape
+    (num_frames, height, width, 4), with colors premultiplied by alpha (the image over black). `fps`: frames per
+    second. `source`: the path as given. `num_declared`: number of frames that the container declares within the
+    requested range; larger than `num_frames` where a damaged file is truncated. `times`: display times of the frames,
+    float64 (num_frames,), in seconds from the first one; None where frames are evenly spaced at `fps`, otherwise `fps`
+    is their mean rate. `notes`: remarks on how the file was read, one line each.
+    """
+
+    frames: np.ndarray
+    fps: float
+    source: str
+    num_declared: int
+    times: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.frames.shape[3] == 4
+
+    @property
+    def over_black(self) -> np.ndarray:
+        """The frames composited over black: uint8 (num_frames, height, width, 3)."""
+        return np.ascontiguousarray(self.frames[..., :3])
+
+    @property
+    def num_frames(self) -> int:
+        return self.frames.shape[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.frames.shape[1], self.frames.shape[2]
+
+
+# ------------------------------------------------------------------------------------------------ paths
+
+
+def check_readable(path: PathLike) -> Path:
+    """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
+    address, path = str(path), check_path(path)
+    if not os.path.exists(path):
+        raise FileNotFoundError(_missing_text(address))
+    if not (path.is_dir() or path.is_file()):
+        raise video_error(
+            "path",
+            expected="a video file or a folder of images",
+            got=f"{str(path)!r}, a pipe or a device",
+            cure="Save its output to a file.",
+        )
+    return path
+
+
+def _missing_text(address: str) -> str:
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", address):
+        return f"path: expected a file or a folder, got the address {address!r}. Download it first."
+    return (
+        f"path: expected a video file or a folder of images, got {address!r}, which is missing. "
+        "Check the spelling and the current folder."
+    )
+
+
+@contextmanager
+def translate_os_errors(path: Path) -> Iterator[None]:
+    """Raise an OSError of reading `path` as a `VideoError`."""
+    try:
+        yield
+    except OSError as error:
+        got = f"{str(path)!r} ({error.strerror or error})"
+        raise video_error("path", expected="a file that can be read", got=got) from error
+
+
+def read_head(path: Path) -> bytes:
+    """The first bytes of a file. Raises `VideoError` for a name that is not Unicode: OpenCV crashes on it."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        got, cure = f"{str(path)!a}, which is not Unicode", "Rename the file or its folder."
+        raise video_error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
+    with open(path, "rb") as file:
+        return file.read(HEAD_BYTES)
+
+
+# ----------------------------------------------------------------------------------------------- checks
+
+
+def check_range(frames: Range | None) -> tuple[int, int | None]:
+    start, stop = (None, None) if frames is None else frames
+    start = 0 if start is None else start
+    got = format_range(start, stop)
+    if start < 0 or (stop is not None and stop < 0):
+        raise video_error("frames", expected="A:B counted from the start", got=got, cure="Use 0 or more.")
+    if stop is not None and stop <= start:
+        raise video_error("frames", expected="A:B with at least 1 frame", got=got, cure="Choose B > A.")
+    return start, stop
+
+
+def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
+    if start >= num_total or (stop is not None and stop > num_total):
+        raise video_error(
+            "frames",
+            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+            got=format_range(start, stop),
+            cure=f"Choose B <= {num_total} and A below it.",
+        )
+
+
+def check_frame_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
+    if size is None:
+        return None
+    height, width = size
+    if height != int(height) or width != int(width) or min(height, width) < 1:
+        raise video_error(
+            parameter,
+            expected="height and width of whole pixels, at least 1",
+            got=f"{height}x{width}",
+            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
+        )
+    return int(height), int(width)
+
+
+def check_fps(fps: float) -> None:
+    if not is_within(fps, f"(0, {MAX_FPS}]"):
+        raise video_error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+
+
+def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:
+    return VideoError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
+
+
+def no_frames_error(start: int, stop: int | None, num_decoded: int, num_total: int, path: Path) -> VideoError:
+    """The error for a range in which no frame decodes."""
+    got = f"{format_range(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}"
+    return video_error("frames", expected="a range with frames that decode", got=got, cure="Ask for earlier frames.")
+
+
+def format_range(start: int, stop: int | None) -> str:
+    return f"{start}:{'' if stop is None else stop}"
+
+
+def format_size(shape: tuple) -> str:
+    return f"{shape[0]}x{shape[1]} (height x width)"
+
+
+def format_num_bytes(path: Path) -> str:
+    size = path.stat().st_size
+    return "an empty file" if size == 0 else f"{size} bytes"

@@ -1,0 +1,76 @@
+"""Frame rates and frame times, estimated from the time stamps of a container."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+DEFAULT_FPS = 25.0  # of a folder of images, and of a container without a usable rate
+MAX_FPS = 1000.0  # time stamps of containers are milliseconds
+#: Fraction of a frame interval. Times that deviate less from an even grid count as even: time stamps are rounded, in a
+#: GIF to 10 ms.
+OFF_GRID = 1 / 3
+#: In units of the longest interval. The last frame's duration is not recorded; frames are missing only beyond this.
+MAX_LAST_DURATION = 1.5
+
+
+class FrameRate(NamedTuple):
+    """The rate of a clip; where its frames are not evenly spaced, their `times` in seconds and `fps` as the mean rate.
+
+    `guessed`: the file records no usable rate.
+    """
+
+    fps: float
+    times: Float[np.ndarray, " num_frames"] | None = None
+    guessed: bool = False
+
+
+def estimate_rate(seconds: Float[np.ndarray, " num_frames"], fps: float) -> FrameRate:
+    """The rate of frames shown at the increasing times `seconds`: the container's `fps` where they agree with it."""
+    if len(seconds) < 2:
+        return FrameRate(fps)
+    times = seconds - seconds[0]
+    mean = (len(times) - 1) / times[-1]
+    for rate in (fps, mean):
+        if np.abs(times - np.arange(len(times)) / rate).max() <= OFF_GRID / rate:
+            return FrameRate(rate)
+    return FrameRate(mean, times)
+
+
+def replace_unusable_rate(rate: FrameRate) -> FrameRate:
+    """The rate itself, or the default one where it is above `MAX_FPS`."""
+    return rate if rate.fps <= MAX_FPS else FrameRate(DEFAULT_FPS, guessed=True)
+
+
+def describe_rate(rate: FrameRate) -> tuple[str, ...]:
+    """Notes about a rate that was guessed, and about uneven frame times."""
+    if rate.guessed:
+        return (
+            f"the file records no usable frame rate; {rate.fps:g} frames per second are assumed unless fps is given.",
+        )
+    if rate.times is None:
+        return ()
+    intervals = np.diff(rate.times)
+    return (
+        f"frames are {intervals.min():.3g} to {intervals.max():.3g} s apart; all are kept, and treated as evenly "
+        f"spaced at their mean rate of {rate.fps:.4g} per second.",
+    )
+
+
+def make_increasing(milliseconds: list[float], fps: float) -> Float[np.ndarray, " num_frames"]:
+    """Strictly increasing times in seconds: stamps that repeat or decrease, as in raw streams, continue at `fps`."""
+    seconds: list[float] = []
+    for value in milliseconds:
+        valid = np.isfinite(value) and (not seconds or value / 1000 > seconds[-1])
+        seconds.append(value / 1000 if valid else seconds[-1] + 1 / fps if seconds else 0.0)
+    return np.array(seconds)
+
+
+def estimate_num_frames(
+    seconds: Float[np.ndarray, " num_frames"], duration: float, fps: float, num_reached: int
+) -> int:
+    """Total number of frames of a container that records only its duration; frame `num_reached` is at seconds[-1]."""
+    remaining, intervals = duration - seconds[-1], np.diff(seconds)
+    if remaining <= MAX_LAST_DURATION * max(1 / fps, intervals.max(initial=0.0)):
+        return num_reached
+    return num_reached - 1 + round(remaining / (intervals.mean() if len(intervals) else 1 / fps))

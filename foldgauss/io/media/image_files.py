@@ -1,0 +1,230 @@
+"""Frames from image files, folders of images and animations."""
+
+import mmap
+import re
+import struct
+import warnings
+from collections.abc import Callable
+from itertools import count, islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from foldgauss.io.media.clip import (
+    ReadResult,
+    VideoError,
+    check_range_within,
+    format_num_bytes,
+    format_size,
+    no_frames_error,
+    read_head,
+    video_error,
+)
+from foldgauss.io.media.format_detection import is_image_format, min_file_bytes, parse_image_size
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, estimate_rate, replace_unusable_rate
+from foldgauss.io.media.opencv import MAX_LOST_FRAMES, check_num_pixels, silence_opencv
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+GIF_DELAY = 100.0  # milliseconds for which browsers show a frame that has no duration of its own
+#: What Pillow raises for damaged files.
+_PILLOW_ERRORS = (
+    EOFError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    IndexError,
+    OverflowError,
+    struct.error,
+    Image.DecompressionBombError,
+)
+
+
+# ---------------------------------------------------------------------------------------------- folders
+
+
+def read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> ReadResult:
+    """The images of a folder."""
+    images = image_paths(folder)
+    if not images:
+        raise video_error(
+            "path",
+            expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
+            got=f"{str(folder)!r} without any",
+            cure="Give the folder that holds the frames, or a video file.",
+        )
+    check_range_within(start, stop, len(images), folder)
+    return read_images(images[start:stop], prepare)
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """The images in `folder` in the order in which `read_video` reads them."""
+    images = (
+        entry
+        for entry in folder.iterdir()
+        if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
+    )
+    return sorted(images, key=lambda entry: natural_sort_key(entry.name))
+
+
+def natural_sort_key(name: str) -> tuple:
+    """Sort key by which runs of digits compare as numbers; the name itself breaks ties (1.png, 01.png)."""
+    parts = re.split(r"([0-9]+)", name.lower())
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
+
+
+# ----------------------------------------------------------------------------------------- single images
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether a file is one image, by its content."""
+    head, known_suffix = read_head(path), path.suffix.lower() in IMAGE_SUFFIXES
+    if not known_suffix and not is_image_format(head):
+        return False
+    with silence_opencv():
+        num_images = cv2.imcount(str(path))
+    if num_images > 1 and head.startswith((b"II*\0", b"MM\0*")):  # OpenCV's video decoder sees only the first
+        got = f"{num_images} in {str(path)!r}"
+        raise video_error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
+    if not known_suffix and _is_jpeg_sequence(path, head):
+        got = f"a bare sequence of JPEGs, {str(path)!r}"
+        cure = "Put it into a container: ffmpeg -i VIDEO -c copy NEW.avi."
+        raise video_error("path", expected="a video in a container", got=got, cure=cure)
+    return num_images == 1
+
+
+def _is_jpeg_sequence(path: Path, head: bytes) -> bool:
+    """Whether one JPEG directly follows another: a video without container, which OpenCV does not open.
+
+    Additional images of a camera, such as another exposure or a stereo view, are announced by "MPF" in the header.
+    """
+    if not head.startswith(b"\xff\xd8\xff") or b"MPF\0" in head:
+        return False
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return data.find(b"\xff\xd9\xff\xd8\xff") >= 0
+
+
+def read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> ReadResult:
+    """As `read_folder`, for a file with one image."""
+    check_range_within(start, stop, 1, path)
+    return read_images([path], prepare)
+
+
+def read_images(paths: list[Path], prepare: Callable) -> ReadResult:
+    """Images of one size."""
+    first_shape, kept = None, []
+    for path in paths:
+        image = read_image(path)
+        first_shape = first_shape or image.shape[:2]
+        if image.shape[:2] != first_shape:
+            raise video_error(
+                "path",
+                expected=f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}",
+                got=f"{format_size(image.shape)} in {path.name!r}",
+                cure="Resize the images, or choose others with frames=(A, B).",
+            )
+        kept.append(prepare(image))
+    return kept, len(paths), FrameRate(DEFAULT_FPS), ()
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(height, width) of an image, in pixels."""
+    return read_image(path).shape[:2]
+
+
+def read_image(path: Path) -> np.ndarray:
+    """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
+    head = read_head(path)
+    _check_image_header(path, head)
+    # UNCHANGED keeps a fourth channel; JPEG has none, and COLOR also applies its orientation.
+    flags = cv2.IMREAD_COLOR if head.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
+    with silence_opencv():
+        try:
+            image = cv2.imread(str(path), flags)
+        except cv2.error:  # an absurd size in the header
+            image = None
+    if image is None:
+        raise _undecodable_error(path)
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
+    if image.dtype != np.uint8:
+        raise video_error(
+            "path",
+            expected="images of 8 or 16 bits",
+            got=f"{image.dtype} in {str(path)!r}",
+            cure="Convert it to an 8-bit PNG.",
+        )
+    if image.ndim == 3 and image.shape[2] == 4:
+        return _premultiply(image)
+    return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+
+
+def _premultiply(image: np.ndarray) -> np.ndarray:
+    """Colors times alpha, to nearest, so that the colors of transparent pixels have no effect."""
+    alpha = image[..., 3:].astype(np.uint16)
+    return np.concatenate([((image[..., :3] * alpha + 127) // 255).astype(np.uint8), image[..., 3:]], axis=-1)
+
+
+def _check_image_header(path: Path, head: bytes) -> None:
+    """Raise for an image whose header claims more pixels than are accepted, or than its bytes can hold."""
+    size = parse_image_size(head)
+    check_num_pixels(path, size)
+    if size is not None and path.stat().st_size < min_file_bytes(head, size):
+        raise _undecodable_error(path)
+
+
+def _undecodable_error(path: Path) -> VideoError:
+    got = f"{str(path)!r} ({format_num_bytes(path)}), which does not"
+    return video_error("path", expected="images that decode", got=got, cure="Replace or remove it.")
+
+
+# ------------------------------------------------------------------------------------------- animations
+
+
+def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) -> ReadResult:
+    """The frames of a GIF, PNG or WebP with their alpha and times, which no decoder in FFmpeg keeps both.
+
+    A PNG or WebP that is not animated is left to the image decoder, which keeps 16 bits.
+    """
+    _check_image_header(path, read_head(path))
+    kept, delays, damaged, size = [], [], False, None
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
+            if animation.format != "GIF" and not getattr(animation, "is_animated", False):
+                return read_image_file(path, start, stop, prepare)
+            num_declared = _count_declared_images(animation)
+            for number in islice(count(), min(num_declared or MAX_LOST_FRAMES, stop or MAX_LOST_FRAMES)):
+                animation.seek(number)
+                animation.load()
+                size = size or animation.size
+                if animation.size != size:  # Pillow lets a damaged frame enlarge the image
+                    damaged = True
+                    break
+                delays.append(animation.info.get("duration") or GIF_DELAY)
+                if number >= start:
+                    rgba = np.asarray(animation.convert("RGBA"))
+                    kept.append(prepare(_premultiply(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))))
+    except VideoError:
+        raise
+    except _PILLOW_ERRORS:
+        damaged = True
+    if not delays:
+        raise _undecodable_error(path)
+    num_total = max(num_declared, len(delays) + damaged)
+    check_range_within(start, stop, num_total, path)
+    if not kept:
+        raise no_frames_error(start, stop, len(delays), num_total, path)
+    shown = np.array(delays[start:])
+    rate = estimate_rate(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
+    if rate.times is not None:
+        rate = FrameRate(rate.fps, rate.times[:-1])
+    return kept, (num_total if stop is None else stop) - start, replace_unusable_rate(rate), ()
+
+
+def _count_declared_images(animation: Image.Image) -> int:
+    """Their number as the file gives it; 0 for a damaged GIF, whose frames are counted by reading them."""
+    try:
+        return animation.n_frames
+    except _PILLOW_ERRORS:
+        return 0

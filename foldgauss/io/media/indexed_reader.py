@@ -1,0 +1,285 @@
+"""Random access to the frames of an indexed clip, equal to the bit to sequential reading."""
+
+import operator
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+
+from foldgauss.io.media.clip import (
+    Clip,
+    VideoError,
+    check_frame_size,
+    check_range,
+    check_readable,
+    format_range,
+    no_frames_error,
+    translate_os_errors,
+    video_error,
+)
+from foldgauss.io.media.frame_index import FrameIndex, digest_frame
+from foldgauss.io.media.frame_rate import FrameRate, describe_rate
+from foldgauss.io.media.image_files import read_images
+from foldgauss.io.media.opencv import GrabbedFrame, decode_frames, grab_frames, open_video, silence_opencv
+from foldgauss.io.media.resizing import convert_channels, make_resizer
+from foldgauss.io.media.video_decoding import describe_span
+from foldgauss.io.media.video_reading import choose_reader
+
+#: frames may show artifacts until the next key frame.
+MARGINS = (1, 16, 64, 256, 1024, 4096, 16384)
+#: Distance in frames up to which an open decoder reads on instead of seeking.
+NEAR = 64
+#: Milliseconds within which two time stamps are equal.
+SAME_TIME = 1e-3
+_FROM_START, _FROM_START_DECODING_ALL = "from the start", "from the start, decoding every frame"
+
+
+def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple[int, int] | None = None) -> Clip:
+    """Frames `first` up to `stop` of an indexed clip, without decoding from the start: equal to the bit to
+    `read_video(path, frames=(first, stop), size=size)`.
+
+    The range counts positions in the clip, as that of `read_video` does: frames lost to damage are missing from the
+    result (`FrameIndex.span` converts from numbers of decoded frames). `stop=None`: to the end. An index made with
+    `frames=(A, B)` counts from A. Where any frame of the whole clip is transparent, the result has alpha, even if none
+    of its own frames is. Every frame is compared with the index.
+
+    Raises `FileNotFoundError` for a missing path; `VideoError` for a range outside the clip, one in which no frame
+    decodes, and a file that is not the one indexed.
+    """
+    first, stop = _check_span(index, first, stop)
+    path = check_readable(index.path)
+    size = check_frame_size(size)
+    low, high = np.searchsorted(index.positions, [first, index.num_positions if stop is None else stop]).tolist()
+    if low == high:
+        raise no_frames_error(first, stop, index.num_frames, index.num_positions, path)
+    with translate_os_errors(path):
+        reader = IndexedReader(index)
+        try:
+            frames, num_declared, rate, notes = reader.read(low, high, size)
+        finally:
+            reader.close()
+    if index.kind == "video":
+        last = index.num_before + high
+        end = index.start + (index.num_declared if stop is None else stop)
+        milliseconds, places = index.milliseconds[:last], index.places[:last].tolist()
+        num_declared, rate, notes = describe_span(
+            index.report, milliseconds, places, high - low, index.start + first, end
+        )
+    elif stop is None:
+        num_declared = index.num_declared - first
+    if index.fixed_fps is not None:
+        return Clip(frames, index.fixed_fps, index.source, num_declared, None, notes)
+    return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate))
+
+
+def _check_span(index: FrameIndex, first: int, stop: int | None) -> tuple[int, int | None]:
+    first, stop = check_range((operator.index(first), None if stop is None else operator.index(stop)))
+    num = max(index.num_positions, index.num_declared)
+    if first >= num or (stop is not None and stop > num):
+        raise video_error(
+            "first, stop",
+            expected=f"a range within 0:{num}, the frames indexed of {index.source!r}",
+            got=format_range(first, stop),
+            cure=f"Choose stop <= {num} and first below it.",
+        )
+    return first, stop
+
+
+class IndexedReader:
+    """An open indexed clip, whose frames are found by their numbers."""
+
+    def __init__(self, index: FrameIndex):
+        self.index = index
+        self._capture: cv2.VideoCapture | None = None
+        self._last: int | None = None  # number of the frame grabbed last, among all frames of the file
+        self._next = 0  # number of the next wanted frame, among those indexed
+
+    def close(self) -> None:
+        if self._capture is not None:
+            self._capture.release()
+        self._capture, self._last = None, None
+
+    def read(
+        self, first: int, stop: int, size: tuple[int, int] | None
+    ) -> tuple[np.ndarray, int, FrameRate, tuple[str, ...]]:
+        """Frames `first` up to `stop` of those that decode, as `Clip.frames`, and the rest of a `ReadResult`."""
+        channels, prepare, buffer = 4 if self.has_alpha(size) else 3, make_resizer(size), _FrameBuffer(stop - first)
+
+        def take(image: np.ndarray) -> None:
+            buffer.add(convert_channels(prepare(image), channels))
+
+        facts = self._read_each(first, stop, take)
+        return buffer.frames, *facts
+
+    def has_alpha(self, size: tuple[int, int] | None) -> bool:
+        """Whether any frame of the whole clip is transparent anywhere within the crop to `size`."""
+        index = self.index
+        if size is None or not index.has_alpha:
+            return index.has_alpha
+        if size not in index.alpha_at_size:
+            candidates = np.flatnonzero(index.transparent).tolist()
+            index.alpha_at_size[size] = any(self._is_transparent(number, size) for number in candidates)
+        return index.alpha_at_size[size]
+
+    def _is_transparent(self, number: int, size: tuple[int, int]) -> bool:
+        found, prepare = [], make_resizer(size)
+        self._read_each(number, number + 1, lambda image: found.append(prepare(image)[..., 3].min() < 255))
+        return bool(found[0])
+
+    def _read_each(
+        self, first: int, stop: int, take: Callable[[np.ndarray], object]
+    ) -> tuple[int, FrameRate, tuple[str, ...]]:
+        """Pass the frames as stored to `take`, one by one; returns the rest of a `ReadResult`."""
+        index = self.index
+        if index.kind == "video":
+            for image in self._decode_video(first, stop):
+                take(image)
+            return stop - first, FrameRate(index.fps), ()
+        numbers = iter(range(first, stop))
+
+        def check_and_take(image: np.ndarray) -> object:
+            number = next(numbers)
+            if not self._is_frame(number, image):
+                raise _changed_error(index, number)
+            return take(image)
+
+        if index.kind == "folder":
+            paths = [index.path / name for name in index.names[first:stop]]
+            for number, path in enumerate(paths, first):
+                if not path.is_file():
+                    raise _changed_error(index, number)
+            facts = read_images(paths, check_and_take)[1:]
+        else:
+            facts = choose_reader(index.path)(index.path, index.start + first, index.start + stop, check_and_take)[1:]
+        missing = next(numbers, None)
+        if missing is not None:
+            raise _changed_error(index, missing)
+        return facts
+
+    def _is_frame(self, number: int, image: np.ndarray) -> bool:
+        return digest_frame(image) == self.index.digests[number].tobytes()
+
+    def _decode_video(self, first: int, stop: int) -> Iterator[np.ndarray]:
+        """BGR frames of a video file, each equal to the indexed one."""
+        self._next = first
+        for way in self._list_ways(first):
+            yield from self._decode_by(way, stop)
+            if self._next == stop:
+                if isinstance(way, int):
+                    self.index.last_margin = way
+                return
+        self.close()
+        raise _changed_error(self.index, self._next)
+
+    def _list_ways(self, first: int) -> Iterator[int | str | None]:
+        """Ways to reach a frame, fastest first: None (read on), a place in MARGINS (seek), or from the start."""
+        index = self.index
+        ahead = index.num_before + first - self._last if self._last is not None else -1
+        can_seek = np.ptp(index.milliseconds) > 0  # a raw stream has no time stamps
+        if 0 < ahead <= NEAR or (ahead > 0 and not can_seek):
+            yield None
+        if can_seek:
+            for place in range(index.last_margin, len(MARGINS)):
+                if index.num_before + self._next - MARGINS[place] <= 0:
+                    break
+                yield place
+        yield _FROM_START
+        yield _FROM_START_DECODING_ALL
+
+    def _decode_by(self, way: int | str | None, stop: int) -> Iterator[np.ndarray]:
+        """Wanted frames from the next one on, as far as this way reaches."""
+        index = self.index
+        with silence_opencv():
+            if way in (_FROM_START, _FROM_START_DECODING_ALL):
+                self.close()
+                self._capture, self._last = open_video(index.path, index.report.threads), -1
+            elif way is not None:
+                if self._capture is None:
+                    self._capture = open_video(index.path, index.report.threads)
+                target = index.num_before + self._next
+                self._capture.set(cv2.CAP_PROP_POS_MSEC, index.milliseconds[target - MARGINS[way]])
+                self._last = None
+        if way == _FROM_START_DECODING_ALL:
+            yield from self._decode_all(stop)
+            return
+        grabbed = grab_frames(self._capture, index.report.fps)
+        while self._next < stop:
+            image = self._decode_next(grabbed)
+            if image is None:
+                self._last = None
+                return
+            self._next += 1
+            yield image
+
+    def _decode_next(self, grabbed: Iterator[GrabbedFrame]) -> np.ndarray | None:
+        """The next wanted frame; None where it does not follow."""
+        index = self.index
+        target = index.num_before + self._next
+        with silence_opencv():
+            for frame in grabbed:
+                number = self._find_number(frame.milliseconds)
+                if number is None:
+                    if frame.milliseconds > index.milliseconds[target] + SAME_TIME:
+                        break
+                    continue
+                self._last = number
+                if number < target:
+                    continue
+                if number > target:
+                    break
+                found, image = self._capture.retrieve()
+                return image if found and self._is_frame(self._next, image) else None
+        return None
+
+    def _decode_all(self, stop: int) -> Iterator[np.ndarray]:
+        """Wanted frames, decoded exactly as the index was made."""
+        index = self.index
+        start, end = index.start, index.start + int(index.positions[stop - 1]) + 1
+        grabbed: list[GrabbedFrame] = []
+        decoded = decode_frames(self._capture, index.report.fps, start, end, grabbed)
+        number = 0
+        while self._next < stop:
+            with silence_opencv():
+                image = next(decoded, None)
+            if image is None:
+                return
+            number += 1
+            if number <= self._next:
+                continue
+            if not self._is_frame(self._next, image):
+                return
+            self._last = len(grabbed) - 1
+            self._next += 1
+            yield image
+
+    def _find_number(self, milliseconds: float) -> int | None:
+        """Number of the frame with that time stamp among all frames; where several have it, the next one, or the
+        first."""
+        known = self.index.milliseconds
+        after = 0 if self._last is None else self._last + 1
+        if self._last is not None and after < len(known) and abs(known[after] - milliseconds) <= SAME_TIME:
+            return after
+        near = np.flatnonzero(np.abs(known[after:] - milliseconds) <= SAME_TIME)
+        return after + int(near[0]) if len(near) else None
+
+
+class _FrameBuffer:
+    """An array filled frame by frame, allocated when the first frame shows its shape."""
+
+    def __init__(self, num_frames: int):
+        self._num, self._filled, self.frames = num_frames, 0, np.empty((0, 0, 0, 0), np.uint8)
+
+    def add(self, frame: np.ndarray) -> None:
+        if not self._filled:
+            self.frames = np.empty((self._num, *frame.shape), np.uint8)
+        self.frames[self._filled] = frame
+        self._filled += 1
+
+
+def _changed_error(index: FrameIndex, number: int) -> VideoError:
+    return video_error(
+        "path",
+        expected=f"the file that was indexed, {index.num_frames} frames with the digest {index.digest}",
+        got=f"{str(index.path)!r}, in which frame {number} differs",
+        cure="It has changed, or another OpenCV decodes it: index it again with index_video, or restore the file.",
+    )

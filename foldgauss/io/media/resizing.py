@@ -1,0 +1,113 @@
+"""Frames cropped, resized and converted to RGB, and stacked without a second copy in memory."""
+
+import os
+from collections.abc import Callable, Iterable
+
+import cv2
+import numpy as np
+
+from foldgauss.io.media.clip import format_size, video_error
+
+BLOCK_BYTES = 64 << 20
+
+
+def memory_limit() -> int:
+    """Bytes that a clip may take: a third of the machine's memory, since a fit holds it twice."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 3
+    except (AttributeError, ValueError, OSError):  # not POSIX
+        return 8 << 30
+
+
+def make_resizer(
+    size: tuple[int, int] | None, crop: tuple[int, int] | None = None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from BGR frames to RGB frames: crop the central window `crop`, then the aspect of `size`, then resize.
+
+    It raises `VideoError` once its outputs add up to more than `memory_limit()`.
+    """
+    limit, num_bytes, num_frames = memory_limit(), 0, 0
+
+    def prepare(image: np.ndarray) -> np.ndarray:
+        nonlocal num_bytes, num_frames
+        if crop is not None:
+            image = image[center_window(image.shape[:2], crop)]
+        height, width = image.shape[:2] if size is None else size
+        channels = image.shape[2]
+        num_bytes, num_frames = num_bytes + channels * height * width, num_frames + 1
+        if num_bytes > limit:
+            raise video_error(
+                "size",
+                expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
+                got=f"more, at frame {num_frames} of {height}x{width}",
+                cure="Take fewer frames or a smaller size.",
+            )
+        if size is not None and image.shape[:2] != size:
+            image = _resize(image[aspect_window(image.shape[:2], size)], size)
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGRA2RGBA)
+
+    return prepare
+
+
+def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, slice]:
+    """The largest central window of `have` with the aspect of `want`, to whole pixels."""
+    height, width = have
+    if width * want[0] > height * want[1]:
+        window = height, max(1, round(height * want[1] / want[0]))
+    else:
+        window = max(1, round(width * want[0] / want[1])), width
+    return center_window(have, window)
+
+
+def center_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the central (height, width) `window`. Raises `VideoError` where it does not fit."""
+    if window[0] > have[0] or window[1] > have[1]:
+        raise video_error(
+            "center_crop",
+            expected=f"at most the frame's {format_size(have)}",
+            got=f"{window[0]}x{window[1]}",
+            cure="Crop a smaller window, or enlarge with size=(height, width) instead.",
+        )
+    top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
+    return slice(top, top + window[0]), slice(left, left + window[1])
+
+
+def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    if image.shape[:2] == size:
+        return image
+    shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
+    return cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+
+
+def convert_channels(frame: np.ndarray, channels: int) -> np.ndarray:
+    """An RGB or RGBA frame with 3 or 4 channels: alpha is dropped, or added as opaque."""
+    if frame.shape[2] == channels:
+        return frame
+    return cv2.cvtColor(frame, cv2.COLOR_RGB2RGBA) if channels == 4 else frame[..., :3]
+
+
+def unify_channels(frames: list[np.ndarray]) -> list[np.ndarray]:
+    """All frames with alpha where any is transparent anywhere, otherwise all without."""
+    transparent = any(frame.shape[2] == 4 and frame[..., 3].min() < 255 for frame in frames)
+    return [convert_channels(frame, 4 if transparent else 3) for frame in frames]
+
+
+def copy_to_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
+    """Copies of the frames in large blocks, each of which is returned to the system when its last frame is freed."""
+    kept, block, used = [], np.empty((0, 0), np.uint8), 0
+    for frame in frames:
+        if used == len(block) or block.shape[1:] != frame.shape:
+            block, used = np.empty((max(1, BLOCK_BYTES // frame.nbytes), *frame.shape), np.uint8), 0
+        block[used] = frame
+        kept.append(block[used])
+        used += 1
+    return kept
+
+
+def stack_frames(frames: list[np.ndarray]) -> np.ndarray:
+    """`np.stack` that empties the list as it goes, so that the peak is one copy of the clip and not two."""
+    clip = np.empty((len(frames), *frames[0].shape), np.uint8)
+    for number in range(len(frames)):
+        clip[number] = frames[number]
+        frames[number] = None
+    return clip

@@ -1,0 +1,72 @@
+"""Reading clips: `read_video` detects the format and chooses the reader."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from foldgauss.io.media.clip import (
+    Clip,
+    PathLike,
+    Range,
+    ReadResult,
+    check_fps,
+    check_frame_size,
+    check_range,
+    check_readable,
+    read_head,
+    translate_os_errors,
+)
+from foldgauss.io.media.format_detection import may_be_animation
+from foldgauss.io.media.frame_rate import describe_rate
+from foldgauss.io.media.image_files import is_image_file, read_animation, read_folder, read_image_file
+from foldgauss.io.media.resizing import make_resizer, stack_frames, unify_channels
+from foldgauss.io.media.video_decoding import read_video_file
+
+
+def read_video(
+    path: PathLike,
+    *,
+    frames: Range | None = None,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    center_crop: tuple[int, int] | None = None,
+) -> Clip:
+    """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
+
+    `frames = (A, B)` keeps frames A <= i < B, None for an open end. `size = (height, width)` crops each frame to that
+    aspect around its center (to whole pixels), then resizes it, by area averaging to shrink and by cubic interpolation
+    to enlarge: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides the rate of the container (25 for
+    images). `center_crop = (height, width)` first crops that window around the center (an odd remainder is cut below
+    and to the right). Frames are decoded one by one: memory is that of the output plus two source frames, and a clip
+    that would take over a third of the machine's memory is refused.
+
+    Images of 16 bits are scaled to 8, gray ones get three equal channels. Where any image of a folder, or any frame of
+    an animated GIF, PNG or WebP, is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get an
+    alpha of 255. Other videos with alpha are refused, since decoding drops it, and so are interlaced ones that OpenCV
+    does not convert. Videos are rotated upright. A damaged one yields the frames that decode; see
+    `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
+
+    The format is detected from the first bytes, not from the name. No file or address that `path` refers to is opened,
+    such as the entries of a playlist. Images of more than 16384x16384 pixels are refused by their header.
+
+    Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
+    """
+    path = check_readable(path)
+    start, stop = check_range(frames)
+    prepare = make_resizer(check_frame_size(size), check_frame_size(center_crop, "center_crop"))
+    if fps is not None:
+        check_fps(fps)
+    with translate_os_errors(path):
+        kept, num_declared, rate, notes = choose_reader(path)(path, start, stop, prepare)
+    clip_fps, times = (rate.fps, rate.times) if fps is None else (fps, None)
+    if fps is None:
+        notes += describe_rate(rate)
+    kept = unify_channels(kept)
+    return Clip(stack_frames(kept), float(clip_fps), str(path), num_declared, times, notes)
+
+
+def choose_reader(path: Path) -> Callable[..., ReadResult]:
+    if path.is_dir():
+        return read_folder
+    if may_be_animation(read_head(path)):
+        return read_animation
+    return read_image_file if is_image_file(path) else read_video_file

@@ -1,0 +1,126 @@
+"""The budget of a fit: its number of steps, planned from minutes; when it stops; how much time is left."""
+
+import math
+
+import numpy as np
+
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.economy import MIN_PASSES_PER_ROUND
+from foldgauss.video.fitting.schedule import Level, find_level, steps_per_pass, work_fraction
+from foldgauss.video.fitting.state import FitState, mean_psnr
+
+#: A fit to a target PSNR evaluates all frames once in so many passes, which takes a tenth of its time.
+PASSES_PER_EVALUATION = 4
+#: A fit of the smallest model at a PSNR that it has not reached goes on to so many times its plan.
+OVERTIME = 1.5
+#: Births make steps slower by this factor, at first.
+BIRTH_SLOWDOWN = 1.15
+#: A round of pruning costs as much for each frame as so many steps with it: a forward pass and four backward.
+STEPS_PER_ROUND = 2.0
+#: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
+#: fraction of the time.
+WARM_UP, MIN_STEPS, MEASURED_FRACTION = 5, 10, 0.05
+#: Steps of the whole fit are slower than the first ones by this: Gaussians grow longer in time.
+SLOWDOWN = 1.05
+
+
+class StepPlanner:
+    """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that a resumed
+    fit continues as if it had not been interrupted."""
+
+    def __init__(self, config: FitConfig, fractions: list[float], num_frames: int):
+        """`fractions` of the plan by level."""
+        self.config, self.fractions, self.count = config, fractions, 0
+        rounds = 0 if config.economy is None else config.economy.rounds
+        self.for_pruning = STEPS_PER_ROUND * rounds * num_frames / config.batch_size  # steps' worth of time, at most
+        self.seconds = [[] for _ in fractions]  # of steps, by level
+
+    def plan(self, state: FitState, level: int, seconds: float) -> int:
+        """Steps of the whole fit, or 0 while the speed is not known yet; the last step took `seconds`, at `level`."""
+        if state.step == self.config.steps:
+            return state.step
+        budget = 60 * self.config.minutes
+        if state.seconds >= budget:
+            return state.step
+        self.count += 1
+        if self.count > WARM_UP * len(self.fractions):
+            self.seconds[level].append(seconds)
+        enough = sum(map(sum, self.seconds)) >= budget * MEASURED_FRACTION
+        enough |= self.config.steps is not None and state.step >= self.config.steps * MEASURED_FRACTION
+        if min(map(len, self.seconds)) < MIN_STEPS or not enough:
+            return 0
+        seconds = [np.mean(own) for own in self.seconds]
+        # The steps so far count as steps of the first level, of which so many fewer are left.
+        left = (budget - state.seconds) / SLOWDOWN + state.step * seconds[0]
+        if self.for_pruning:
+            most = left * STEPS_PER_ROUND / (STEPS_PER_ROUND + MIN_PASSES_PER_ROUND)
+            left = left / BIRTH_SLOWDOWN - min(self.for_pruning * seconds[-1], most)
+        planned = max(int(left / np.dot(self.fractions, seconds)), state.step)
+        return min(planned, self.config.steps or planned)
+
+
+class TimeLeft:
+    """Estimates how long a fit will still take, by the speed since it began or was resumed, without the first steps."""
+
+    def __init__(self, state: FitState, config: FitConfig, levels: list[Level]):
+        self.config, self.levels, self.first = config, levels, state.step + WARM_UP
+        self.seconds, self.work = math.nan, math.inf
+
+    def estimate(self, state: FitState, progress: float) -> float:
+        """Seconds; at most what is left of the minutes, where they are limited."""
+        most = math.inf if self.config.minutes is None else max(60 * self.config.minutes - state.seconds, 0.0)
+        work = work_fraction(self.levels, progress)
+        if state.step <= self.first or not state.plan:
+            self.seconds, self.work = state.seconds, work
+        known = work > self.work
+        return min((state.seconds - self.seconds) * (1 - work) / (work - self.work), most) if known else most
+
+
+def measure_progress(state: FitState, config: FitConfig) -> float:
+    """The fraction of the plan that is done, above 1 in overtime; without a plan, of the steps asked for, or 0."""
+    plan = state.plan or config.steps
+    return state.step / plan if plan else 0.0
+
+
+def next_level(state: FitState, levels: list[Level]) -> int:
+    """The level of the next step; while the speed is measured, all in turn."""
+    return find_level(levels, state.step / state.plan) if state.plan else state.step % len(levels)
+
+
+def starts_level(state: FitState, levels: list[Level], level: int) -> bool:
+    """Whether the next step is the first one of a `level` of the plan."""
+    return state.plan > 0 and level != find_level(levels, (state.step - 1) / state.plan)
+
+
+def find_limit(state: FitState, config: FitConfig, frames: np.ndarray) -> str | None:
+    """The budget that ends the fit now: "steps", "minutes", "target_psnr" or "smallest_at_psnr"."""
+    if config.target_psnr is not None and _reaches_target(state, config, frames):
+        return "target_psnr"
+    # Minutes are planned by the speed with the Gaussians at the start, and by that of steps alone: where Gaussians are
+    # added, or frames evaluated between steps, the clock decides.
+    by_clock = config.growth is not None or config.target_psnr is not None or config.economy is not None
+    late = by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes
+    wanted = None if config.economy is None else config.economy.psnr
+    if wanted is not None and state.plan:
+        over = late or state.step >= OVERTIME * state.plan
+        if not over and (state.step < state.plan or (state.step - state.plan) % len(frames)):
+            return None
+        if np.isfinite(state.rows).all() and mean_psnr(state, config, frames) >= wanted:
+            return "smallest_at_psnr"
+        if not over:
+            return None
+    if late:
+        return "minutes"
+    if not state.plan or state.step < state.plan:
+        return None
+    return "minutes" if config.minutes is not None and state.plan != config.steps else "steps"
+
+
+def _reaches_target(state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
+    """Whether the mean PSNR over all frames is `target_psnr`, evaluated once in `PASSES_PER_EVALUATION` passes.
+
+    The running PSNR does not tell: it lags, averages errors over unlike frames, and with alpha random backgrounds.
+    """
+    steps = steps_per_pass(config, len(frames))
+    due = state.step > 0 and state.step % (PASSES_PER_EVALUATION * steps) == 0
+    return due and bool(np.isfinite(state.rows).all()) and mean_psnr(state, config, frames) >= config.target_psnr

@@ -1,0 +1,208 @@
+"""`CpuStepper`: the steps of a fit by the Numba kernels."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from foldgauss.render import cpu
+from foldgauss.video.fitting.adam import update_frame_times
+from foldgauss.video.fitting.config import UNIT_TIME, FitConfig
+from foldgauss.video.fitting.densify import grow
+from foldgauss.video.fitting.optical_flow import Motion, motion_finder
+from foldgauss.video.fitting.pruning.description_length import weigh_frames
+from foldgauss.video.fitting.pruning.pruner import Pruner
+from foldgauss.video.fitting.schedule import (
+    RateSchedule,
+    choose_start_frames,
+    choose_views,
+    plan_levels,
+    shrink_frame,
+    steps_per_pass,
+    to_planes,
+)
+from foldgauss.video.fitting.state import FitState, frame_times, update_rows
+from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
+from foldgauss.video.fitting.steppers.protocol import StepResult
+from foldgauss.video.models.background import random_background
+from foldgauss.video.models.conditioning import (
+    ConditionedSplats,
+    ConditioningSpec,
+    backpropagate,
+    condition,
+    update_windows,
+)
+from foldgauss.video.models.row_layout import columns
+
+
+class CpuStepper:
+    """A `Stepper` with the buffers and constants that all steps share."""
+
+    def __init__(
+        self, frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion] | None = None
+    ):
+        """`find_motion` gives the optical flow of the frames, which is needed by a part of the settings only."""
+        self.frames, self.config = frames, config
+        find_motion = motion_finder(frames) if find_motion is None else find_motion
+        self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
+        self.num_frames, height, width, _ = frames.shape
+        self.levels, self.rates = plan_levels(config, (height, width)), RateSchedule(config)
+        self.steps_per_pass = steps_per_pass(config, self.num_frames)
+        own = config.degree, config.power, config.floor
+        self.shapes = [ConditioningSpec(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
+        self.shapes.append(ConditioningSpec(*own, (height, width)))
+        interpolates = config.interpolation_fraction > 0
+        self.interpolation = _InterpolatedFrames(frames, config, find_motion()) if interpolates else None
+        if config.economy is not None:
+            coarse = 1 - self.levels[-1].fraction
+            self.pruner = Pruner(frames, config, self.shapes[-1], coarse, find_motion)
+        self.adopt(state)
+
+    def adopt(self, state: FitState) -> None:
+        self.grad = np.zeros_like(state.rows)
+        self.window = np.empty((len(state.rows), 2), np.float32)
+        update_windows(state.rows, np.arange(len(state.rows)), self.window)
+
+    def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
+        config, num_frames = self.config, self.num_frames
+        if self.frames.shape[3] == 4:
+            self.background = random_background(config.seed, state.step)
+        times = np.asarray(frame_times(state.time_logits))
+        by_time = np.zeros_like(times)
+        losses, alive, errors = [], [], []
+        squared = progress >= 1 - config.l2_fraction
+        seen = None if state.statistics is None else []
+        for view in choose_views(config, num_frames, state.step):
+            k, mirrored = int(view) % num_frames, int(view) >= num_frames
+            fraction = None if self.interpolation is None else self.interpolation.choose(state.step, k)
+            t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
+            loss, done, d_time = self._differentiate(
+                state, k, t, self.shapes[level], squared=squared, mirrored=mirrored, seen=seen, fraction=fraction
+            )
+            if fraction is None:
+                by_time[k] += d_time  # a batch may hold a frame twice
+                errors.append(loss.mean_squared_error)
+            losses.append(loss.value)
+            alive.append(done.alive)
+        if state.statistics is not None:
+            state.statistics.add(seen, self.grad[:, columns(config.degree)["time_loc_logit"]][:, 0])
+        touched = alive[0] if len(alive) == 1 else np.unique(np.concatenate(alive))
+        num_alive = len(touched)
+        if not config.sparse_updates:
+            touched = np.arange(len(state.rows))
+        rates, time_rate = self.rates.at(progress, state.backoffs)
+        unit = UNIT_TIME if config.scale_rates_by_duration else 0.0
+        update_rows(state, self.grad, touched, rates, degree=config.degree, unit_time=unit)
+        update_windows(state.rows, touched, self.window)
+        if config.learn_frame_times and num_frames > 2:
+            updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
+            state.time_logits, state.time_moments = updated
+        squared_error = float(np.mean(errors)) if errors else math.nan
+        return StepResult(float(np.mean(losses)), squared_error, num_alive)
+
+    def measure_start(self, state: FitState) -> dict[int, float]:
+        begun, shape, errors = time.perf_counter(), self.shapes[-1], {}
+        times = np.asarray(frame_times(state.time_logits))
+        for k in choose_start_frames(self.num_frames):
+            image = self._render(condition(state.rows, self.window, times[k], shape), shape).image
+            errors[int(k)] = float(np.mean(np.square(image - to_planes(self.frames[k], self.background))))
+        state.seconds += time.perf_counter() - begun
+        return errors
+
+    def grow(self, state: FitState) -> None:
+        if grow(state, self.config, self.shapes[-1].size):
+            self.adopt(state)
+
+    def prune(self, state: FitState) -> None:
+        if self.pruner.prune(state):
+            self.adopt(state)
+
+    def trim(self, state: FitState) -> None:
+        self.pruner.trim(state)
+
+    def _differentiate(
+        self,
+        state: FitState,
+        k: int,
+        t: np.float32,
+        shape: ConditioningSpec,
+        *,
+        squared: bool,
+        mirrored: bool,
+        seen: list[tuple[np.ndarray, np.ndarray]] | None,
+        fraction: float | None,
+    ) -> tuple[ImageLoss, ConditionedSplats, float]:
+        """The loss of frame k, or of the image interpolated at `fraction` of the way to the next, and dL/dt.
+
+        Gradients by rows are added to `self.grad`. To the list `seen` is appended what `GradientStatistics.add` takes.
+        """
+        if fraction is None:
+            target = to_planes(shrink_frame(self.frames[k], shape.size), self.background)
+        else:
+            target = self.interpolation.interpolate(k, fraction, shape.size)
+        rows = state.rows
+        done = condition(rows, self.window, t, shape)
+        mean, factor = done.mean, done.factor
+        if mirrored:
+            target = np.ascontiguousarray(target[:, :, ::-1])
+            mean, factor = mirror(mean, factor, shape.size[1])
+        trace = self._render(dataclasses.replace(done, mean=mean, factor=factor), shape)
+        if squared:
+            loss = squared_loss(trace.image, target)
+        else:
+            loss = image_loss(trace.image, target, ssim_fraction=self.config.ssim_fraction)
+        weight = 1.0
+        if fraction is None:
+            state.frame_errors[k] = loss.mean_squared_error
+            weight = self._weight(state.frame_errors, k)
+        d_mean, d_factor, *others, _ = cpu.backward(trace, loss.gradient * np.float32(weight / self.config.batch_size))
+        if mirrored:
+            d_mean, d_factor = mirror(d_mean, d_factor, 0)
+        if seen is not None:
+            half = np.float32(shape.size[::-1]) / 2
+            seen.append((done.alive[trace.visible], cpu.screen_gradient(d_mean[trace.visible] * half)))
+        return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad)
+
+    def _weight(self, errors: np.ndarray, k: int) -> float:
+        """The weight of frame k's loss. For a mean PSNR, each dB of each frame counts the same."""
+        wanted = self.config.economy is not None and self.config.economy.psnr is not None
+        return float(weigh_frames(errors)[k]) if wanted else 1.0
+
+    def _render(self, done: ConditionedSplats, shape: ConditioningSpec) -> cpu.Trace:
+        return cpu.forward(
+            done.mean,
+            done.factor,
+            done.opacity,
+            done.color,
+            self.background,
+            shape.size,
+            compositing=self.config.compositing,
+            options=self.config.options,
+        )
+
+
+class _InterpolatedFrames:
+    """Training images between frames: which steps have one, and what the optical flow predicts there."""
+
+    def __init__(self, frames: np.ndarray, config: FitConfig, motion: Motion):
+        self.frames, self.config, self.motion = np.ascontiguousarray(frames[..., :3]), config, motion
+        self.last_of_shots = {*(k - 1 for k in motion.find_cuts()), len(frames) - 1}
+
+    def choose(self, step: int, k: int) -> float | None:
+        """At which fraction of the way from frame k to the next the time of a step lies; None for the frame itself."""
+        rng = np.random.default_rng([self.config.seed, 2, step, k])
+        chosen, fraction = rng.random() < self.config.interpolation_fraction, rng.uniform(0.1, 0.9)
+        return fraction if chosen and step and k not in self.last_of_shots else None
+
+    def interpolate(self, k: int, fraction: float, size: tuple[int, int]) -> np.ndarray:
+        """Planes (3, height, width)."""
+        image = self.motion.interpolate(self.frames, k, fraction, size)
+        return np.ascontiguousarray(np.moveaxis(image, -1, 0) * np.float32(1 / 255))
+
+
+def mirror(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Splats in pixels as the opposite camera sees them, left for right; with width 0 the transpose, for gradients."""
+    sign = np.float32([-1, 1])
+    return mean * sign + np.float32([width, 0]), factor * sign[:, None]

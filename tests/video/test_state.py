@@ -1,0 +1,164 @@
+"""`FitState`: every operation goes by the metadata of its fields, so a new array is added in one place."""
+
+import dataclasses
+from dataclasses import field
+
+import jax
+import numpy as np
+import pytest
+
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.video import FitConfig
+from foldgauss.video.fitting.state import (
+    ARRAYS,
+    DeviceArrays,
+    FitState,
+    PerFrame,
+    PerGaussian,
+    Shared,
+    Sizes,
+    StateArray,
+)
+from foldgauss.video.fitting.steppers.jax_stepper import JaxStepper
+
+NUM, WIDTH, FRAMES = 7, 13, 4
+SIZES = Sizes(NUM, WIDTH, FRAMES, growing=True, colors=3, shapes=2)
+
+
+def random_arrays(sizes: Sizes, kinds: dict[str, StateArray]) -> dict:
+    """Values of all arrays, by their metadata, such that no two rows are equal by chance."""
+    rng = np.random.default_rng(0)
+    fill = lambda leaf: rng.integers(0, 2, leaf.shape).astype(leaf.dtype)  # noqa: E731
+    arrays = jax.tree.map(fill, {name: kind.spec(sizes) for name, kind in kinds.items()})
+    arrays["rows"] = rng.normal(size=(sizes.num_gaussians, sizes.width)).astype(np.float32)
+    arrays["first"] = arrays["rows"] + 1
+    return arrays
+
+
+def make_state(sizes: Sizes = SIZES) -> FitState:
+    counters = {"step": 3, "plan": 20, "seconds": 1.5, "error": 0.25, "best_error": 0.125, "backoffs": 2}
+    counters |= {"compare_from": 9, "improve_by": 12, "start_errors": ((0, 0.5), (3, 0.25))}
+    return FitState(**random_arrays(sizes, FitState.array_fields()), **counters)
+
+
+def assert_equal(one: FitState, other: FitState) -> None:
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_every_field_has_metadata():
+    arrays, counters = FitState.array_fields(), FitState.counter_fields()
+    names = {one.name for one in dataclasses.fields(FitState)}
+    assert names == {*arrays, *counters, "last_finite"}
+    assert tuple(arrays) == ARRAYS
+    assert set(DeviceArrays._fields) == {name for name, kind in arrays.items() if kind.on_device}
+
+
+def test_sizes_describe_all_arrays():
+    state = make_state()
+    assert state.sizes == SIZES
+    for name, kind in FitState.array_fields().items():
+        values, specs = jax.tree.leaves(getattr(state, name)), jax.tree.leaves(kind.spec(SIZES))
+        assert [(leaf.shape, leaf.dtype) for leaf in values] == [(leaf.shape, leaf.dtype) for leaf in specs], name
+
+
+def test_a_checkpoint_holds_every_field(tmp_path):
+    state = make_state()
+    state.last_finite = make_state(Sizes(NUM + 2, WIDTH, FRAMES, colors=1))
+    path, config = tmp_path / "checkpoint", FitConfig()
+    save_checkpoint(path, state, config=config, source={})
+    assert_equal(load_checkpoint(path, config=config, source={}), state)
+
+
+def test_a_copy_has_every_field_and_its_own_arrays():
+    state = make_state()
+    state.last_finite = make_state()
+    copy = state.copy()
+    assert copy.last_finite is None
+    assert_equal(copy, dataclasses.replace(state, last_finite=None))
+    for one, other in zip(jax.tree.leaves(copy), jax.tree.leaves(state), strict=False):
+        assert not np.shares_memory(one, other)
+
+
+def test_restore_takes_every_array_back():
+    state, kept = make_state(), make_state(Sizes(NUM - 2, WIDTH, FRAMES, colors=2))
+    kept.rows += 1
+    state.last_finite, state.step = kept, 17
+    state.restore()
+    assert state.step == 17
+    for name in ARRAYS:
+        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(kept, name))
+
+
+def test_keep_cuts_every_per_gaussian_array():
+    state, before, index = make_state(), make_state(), np.array([5, 0, 3])
+    state.keep(index)
+    for name, kind in FitState.array_fields().items():
+        now, then = getattr(state, name), getattr(before, name)
+        if isinstance(kind, PerGaussian):
+            np.testing.assert_array_equal(now, then[index])
+        elif isinstance(kind, Shared):
+            np.testing.assert_array_equal(now.index, then.index[index])
+            np.testing.assert_array_equal(now.first, then.first)
+        elif isinstance(kind, PerFrame):
+            jax.tree.map(np.testing.assert_array_equal, now, then)
+    assert not any(part.any() or len(part) != 3 for part in state.statistics)
+    assert state.sizes == SIZES._replace(num_gaussians=3)
+
+
+def test_extend_fills_every_per_gaussian_array():
+    state, before = make_state(), make_state()
+    rows, kinds = np.full((2, WIDTH), 5, np.float32), np.full(2, 3, np.uint8)
+    state.extend(rows, kinds, newborn=np.ones(2, bool))
+    given = {"rows": rows, "kinds": kinds, "newborn": np.ones(2, bool)}
+    for name, kind in FitState.array_fields().items():
+        if isinstance(kind, PerGaussian):
+            new = given.get(name, kind.build(Sizes(2, WIDTH, FRAMES)))
+            np.testing.assert_array_equal(getattr(state, name), np.concatenate([getattr(before, name), new]))
+    assert state.sizes == Sizes(NUM + 2, WIDTH, FRAMES, growing=True)  # nothing is shared any more
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class Extended(FitState):
+    """A state with one more array, which only its own line knows."""
+
+    birthday: np.ndarray = field(default=None, metadata={"arrays": PerGaussian(np.int16, (2, "width"), fill=-1)})
+
+
+def test_a_new_array_is_added_in_one_place():
+    rows, logits = np.zeros((3, WIDTH), np.float32), np.zeros(FRAMES - 1, np.float32)
+    state = Extended.create(rows, np.zeros(3, np.uint8), logits)
+    assert state.birthday.shape == (3, 2, WIDTH)
+    assert state.birthday.dtype == np.int16
+    state.birthday[1] = 7
+    state.keep(np.array([1, 2]))
+    state.extend(rows[:1], np.zeros(1, np.uint8))
+    assert state.birthday[:, 0, 0].tolist() == [7, -1, -1]
+    state.last_finite = state.copy()
+    state.birthday[:] = 0
+    state.restore()
+    assert state.birthday[:, 0, 0].tolist() == [7, -1, -1]
+
+
+@pytest.mark.parametrize("growing", [False, True])
+def test_a_device_gives_every_array_back(growing):
+    """Arrays are padded there, and fetched without the padding; a Gaussian's share in codebooks is not supported."""
+    frames = np.zeros((FRAMES, 8, 8, 3), np.uint8)
+    config = FitConfig(num_gaussians=NUM, degree=1, steps=1, engine="xla")
+    sizes = Sizes(NUM, 13, FRAMES)
+    if growing:
+        config = FitConfig.preset("paper", num_gaussians=NUM, max_gaussians=9, degree=1, steps=1, engine="xla")
+        sizes = sizes._replace(growing=True)
+    state, before = make_state(sizes), make_state(sizes)
+    JaxStepper(frames, config, state, "xla")
+    assert state.held is not None
+    for name in ARRAYS:
+        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(before, name))
+    copy = state.copy()
+    state.rows = state.rows + 1
+    assert state.changed
+    state.land()
+    np.testing.assert_array_equal(state.rows, before.rows + 1)
+    np.testing.assert_array_equal(copy.rows, before.rows)
+    assert all(name in vars(state) for name in ARRAYS)
