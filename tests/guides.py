@@ -1,8 +1,8 @@
-"""The programs that README and the guides hold: found in the text, and run as a reader would.
+"""The programs in README and the guides, extracted and run as a reader would.
 
-Every fenced block says what it is, and what it is says what becomes of it:
+The language of every fenced block determines how it is tested:
 
-| language | is |
+| language | handling |
 |---|---|
 | `python` | run, all blocks of a page in order as one program |
 | `sh` | run, between the page's Python blocks, in the order of the page |
@@ -10,21 +10,18 @@ Every fenced block says what it is, and what it is says what becomes of it:
 | `text`, `math` | output, or a formula: nothing to run |
 
 A block without one of these languages is refused, as are commands that stand in an indented block, so that none
-escapes. All of a page runs in one folder, which holds the clip and whatever else the page takes for granted (`GIVEN`).
+is missed. All of a page runs in one folder, which contains the clip and what else the page presupposes (`GIVEN`).
 
-Commands run in this process, where kernels are compiled once. What they are given is what the page says, with six
-exceptions, which are all there are:
+Commands run in this process, where kernels are compiled once, with the arguments of the page and these exceptions:
 
-- `CHEAPER` adds options to what would take minutes: fewer steps, no other work. Only to a command that does not say
-  itself how many.
-- `foldgauss.video.fit` takes as many steps as the page says, and where it gives more than `SHORT` minutes or
-  nothing, `STEPS`.
+- `CHEAPER` adds options that reduce the number of steps of long commands, unless the command has them itself.
+- `foldgauss.video.fit` takes as many steps as stated, or `STEPS` for more than `SHORT` minutes or no budget.
 - `foldgauss demo` takes all its steps on one page, README, and `STEPS` on others.
-- Workers are tested elsewhere: what `--workers` and `--scheduler` are asked to do is done by this process; of `dask`
-  the options are looked up.
-- `foldgauss view` makes its page and its server, opens no browser, and is ended as by Ctrl-C.
-- `pip`, `pytest`, `ruff` and so on change the machine or run this very suite: what they name (extras, files, markers,
-  tools) is looked up. `python -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no
+- Workers are tested elsewhere: with `--workers` and `--scheduler` this process does the work; the options of `dask` are
+  looked up.
+- `foldgauss view` makes its page and its server, opens no browser, and ends as by Ctrl-C.
+- `pip`, `pytest`, `ruff` and so on are not run: what they name (extras, files, markers, tools) is looked up. `python
+  -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no
   further.
 """
 
@@ -48,23 +45,23 @@ from markdown_it import MarkdownIt
 from PIL import Image
 
 from foldgauss import video
-from foldgauss.cli import view as viewing
-from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.fitting import demo
+from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import datasets, export, save_video_model, write_image, write_video
 from foldgauss.video import FitConfig, fit
 
 ROOT = Path(__file__).parents[1]
-#: All that a visitor reads.
+#: All pages of the documentation.
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
 RUN, READ = ("python", "sh"), ("toml", "text", "math")
-#: First words of commands, for those that hide in an indented block.
+#: First words of commands, to find them in indented blocks.
 _COMMAND = re.compile(r"\s*(?:\$ )?(?:foldgauss|pip|python|pytest|mkdocs|ruff|git|bash|lint-imports)\b")
 
-#: Steps of a fit that says nothing of steps.
+#: Steps of a fit without a number of steps.
 STEPS = 100
-#: Minutes that a fit may take as the page says.
+#: Longest stated budget of a fit, in minutes, that is kept.
 SHORT = 0.2
-#: What each command is given beside its own arguments, unless one of these options is there.
+#: Options added to commands, unless they have them.
 CHEAPER = {
     "fit": ["--steps", STEPS],
     "tradeoff": ["--steps", STEPS],
@@ -73,7 +70,7 @@ CHEAPER = {
 }
 #: The page whose `foldgauss demo` takes all its steps; on others it takes `STEPS`.
 WHOLE_DEMO = "README.md"
-#: Of `tradeoff` without axes: one, instead of all eleven, each of which has tests of its own.
+#: One axis for `tradeoff` without axes, instead of all eleven, which have their own tests.
 ONE_AXIS = ["--axes", "power"]
 SIZE, NUM_FRAMES = (48, 80), 12
 
@@ -96,7 +93,7 @@ def blocks(page: str) -> Iterator[Block]:
 
 
 def check_languages(page: str) -> None:
-    """Every block says what it is, and no command stands in an indented one."""
+    """Every block has a known language, and no indented block contains a command."""
     for block in blocks(page):
         where = f"{page}:{block.line}"
         if block.language == "indented":
@@ -120,7 +117,7 @@ def run_page(page: str, folder: Path, monkeypatch) -> dict:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(video, "fit", _fit)
     if page != WHOLE_DEMO:
-        monkeypatch.setattr(fitting, "DEMO_CONFIG", dataclasses.replace(fitting.DEMO_CONFIG, steps=STEPS))
+        monkeypatch.setattr(demo, "CONFIG", dataclasses.replace(demo.CONFIG, steps=STEPS))
     names = {"__name__": "guide"}
     # As a reader has JAX: the suite's own rules are stricter.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):

@@ -1,4 +1,4 @@
-"""The documentation holds together: every page in the site, every link to something, every public name described."""
+"""The documentation is consistent: every page is in the site, links resolve, public names are documented."""
 
 import importlib
 import inspect
@@ -21,12 +21,12 @@ _NAMES = (
     *(f"analysis.{name}" for name in ("moments", "divergence", "interop", "plot")),
     *("render", "video", "io", "io.datasets", "uncertainty", "jobs"),
 )
-#: Modules that an API page is made of.
+#: Modules that have an API page.
 MODULES = ["foldgauss." + name for name in _NAMES]
 
 
 class _Loader(yaml.SafeLoader):
-    """mkdocs.yml names a Python function, which is nothing to us."""
+    """Ignores the Python function that mkdocs.yml names."""
 
 
 _Loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: None)
@@ -69,7 +69,7 @@ def _anchors(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_and_pictures_are_there(page):
+def test_links_and_images_resolve(page):
     for target in _targets(page):
         if re.match(r"https?:|mailto:", target):
             continue
@@ -81,18 +81,18 @@ def test_links_and_pictures_are_there(page):
             assert anchor in _anchors(place), f"{page}: {target}"
 
 
-def test_links_would_be_missed(tmp_path, monkeypatch):
+def test_broken_links_are_detected(tmp_path, monkeypatch):
     (tmp_path / "page.md").write_text("# One\n\n[a](gone.md)\n")
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
     with pytest.raises(AssertionError, match=r"gone\.md"):
-        test_links_and_pictures_are_there("page.md")
+        test_links_and_images_resolve("page.md")
     (tmp_path / "page.md").write_text("# One: two\n\n[a](#one-two) [b](#three)\n")
     with pytest.raises(AssertionError, match="three"):
-        test_links_and_pictures_are_there("page.md")
+        test_links_and_images_resolve("page.md")
 
 
 def _documented() -> set[str]:
-    """What API pages are made of: `::: NAME`."""
+    """Names documented by API pages: `::: NAME`."""
     pages = (DOCS / "api").glob("*.md")
     return {name for page in pages for name in re.findall(r"^::: ([\w.]+)", page.read_text(), re.M)}
 
@@ -110,7 +110,7 @@ def _public(module) -> list[str]:
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_every_public_name_says_what_it_is(module):
+def test_every_public_name_has_a_docstring(module):
     pytest.importorskip("sklearn", reason="foldgauss.estimator needs it")
     loaded = importlib.import_module(module)
     for name in _public(loaded):
@@ -118,11 +118,11 @@ def test_every_public_name_says_what_it_is(module):
         if callable(value):
             own = value.__doc__ if not inspect.isclass(value) else vars(value).get("__doc__")
             assert own, f"{module}.{name} has no docstring"
-            assert not own.startswith(f"{name}("), f"{module}.{name}: a dataclass's own words are none"
+            assert not own.startswith(f"{name}("), f"{module}.{name}: the generated docstring of a dataclass is none"
 
 
 def test_names_at_the_top_are_in_the_api():
-    """What `import foldgauss` has is documented where it comes from."""
+    """Names of `foldgauss` are documented in the modules that define them."""
     import foldgauss
 
     documented = {getattr(importlib.import_module(module), name, None) for module in MODULES for name in _names(module)}
@@ -136,7 +136,7 @@ def _names(module: str) -> list[str]:
     return [name for name in _public(loaded) if callable(getattr(loaded, name))]
 
 
-def test_what_the_site_needs_is_pinned():
+def test_requirements_of_the_site_are_pinned():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     pinned = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()[1:]}
     named = {re.split(r"[\[<>=;,]", requirement)[0].strip().lower() for requirement in extras["docs"]}
@@ -144,7 +144,7 @@ def test_what_the_site_needs_is_pinned():
     assert not any("://" in line for line in (ROOT / "constraints.txt").read_text().splitlines())
 
 
-def test_nothing_is_fetched_by_the_source():
+def test_no_external_resources():
     """No script, font or style from elsewhere, in the configuration and in the hooks."""
     for path in (ROOT / "mkdocs.yml", DOCS / "_hooks.py", DOCS / "stylesheets" / "site.css"):
         assert not re.search(r"https?://", path.read_text()), path

@@ -1,4 +1,4 @@
-"""README's and the guides' programs run, each page as a reader would do it: see `guides`."""
+"""The programs of README and the guides run, page by page: see `guides`."""
 
 import guides
 import numpy as np
@@ -9,7 +9,7 @@ from foldgauss.io import load_video_model
 from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.video import EditedVideo
 
-#: Extras that a page says it needs; all come with the extra `test`.
+#: Extras that a page needs; all are part of the extra `test`.
 NEEDS = {
     "README.md": ("emcee", "matplotlib"),
     "docs/commands.md": ("matplotlib",),
@@ -20,7 +20,7 @@ NEEDS = {
     "docs/tradeoff.md": ("matplotlib",),
     "docs/uncertainty.md": ("emcee",),
 }
-#: Pages of a few seconds, which run by default; all others, a new one too, are slow ones.
+#: Pages that take a few seconds and run by default; all others, new ones included, are marked slow.
 QUICK = {"CONTRIBUTING.md", "docs/economy.md", "docs/own-loss.md"}
 
 
@@ -34,7 +34,7 @@ PAGES = [
 
 
 @pytest.mark.parametrize("page", guides.PAGES)
-def test_every_block_says_what_it_is(page):
+def test_every_block_has_a_language(page):
     guides.check_languages(page)
 
 
@@ -54,7 +54,7 @@ def test_every_check_has_its_page():
         assert known <= set(guides.PAGES) if isinstance(known, set) else known.keys() <= set(guides.PAGES)
 
 
-# What the programs must come to.
+# Expected results of the programs.
 
 
 def _readme(names, folder):
@@ -253,7 +253,7 @@ CHECKS = {
 }
 
 
-# The collector itself: what it must refuse.
+# The extraction itself: what it must refuse.
 
 
 @pytest.mark.parametrize(

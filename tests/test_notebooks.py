@@ -1,4 +1,4 @@
-"""The notebooks: what is stored in them is whole, small and in order, and they run from top to bottom.
+"""The notebooks: stored outputs are complete, small and in order, and the notebooks run from top to bottom.
 
 They run with FOLDGAUSS_SMALL=1, which a cell of each reads; their stored outputs are those of the full size.
 """
@@ -11,7 +11,7 @@ import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 SWITCH = 'SMALL = os.environ.get("FOLDGAUSS_SMALL") == "1"'
-#: Of a file, which everybody downloads with the repository.
+#: Size limit of a notebook, since it is part of the repository.
 MOST_BYTES = 1_500_000
 
 
@@ -20,7 +20,7 @@ def code_of(notebook) -> list:
 
 
 def kinds(cell) -> set[str]:
-    """What a cell shows: pictures, text, whatever the number of pieces it came in."""
+    """The kinds of a cell's outputs, independent of their number."""
     found = set()
     for output in cell["outputs"]:
         pictures = {name for name in output.get("data", {}) if name.startswith("image/")}

@@ -1,4 +1,4 @@
-"""Posteriors of frame times made by hand: independent draws, no pictures and no sampler."""
+"""Synthetic posteriors of frame times: independent draws, without images and sampler."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from foldgauss.uncertainty import (
 def posterior_about(
     times, std=0.02, *, frames=None, concentration=1.0, shape=(4, 25, 10), seed=0
 ) -> FrameTimePosterior:
-    """Likelihoods of frames are Gaussians about `times`, of standard deviation `std` frames (a number, or one each)."""
+    """Likelihoods of frames are Gaussians about `times` of standard deviation `std` frames (one, or one per frame)."""
     num = len(times)
     std = np.broadcast_to(np.asarray(std, float), num) / (num - 1)
     nodes = [np.unique(np.clip(np.concatenate([np.linspace(0, 1, 60), t + s * np.linspace(-7, 7, 57)]), 0, 1))
@@ -28,10 +28,10 @@ def posterior_about(
     exact = exact_posterior(log_prob.curves, increments)
     laplace = laplace_approximation(log_prob.curves, increments, exact.quantile(0.5))
     draws = exact.sample(int(np.prod(shape)), seed).reshape(*shape, num)
-    told = np.ones(increments.num_free)
+    ones = np.ones(increments.num_free)
     noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
     profiles = LikelihoodProfiles(log_prob.curves, noise, 0.7 ** np.arange(12.0), 100)
     return FrameTimePosterior(
-        log_prob, draws, np.full(shape[0], 0.3), 40 * told, 1.001 * told, 1000 * told, True, "Converged.",
+        log_prob, draws, np.full(shape[0], 0.3), 40 * ones, 1.001 * ones, 1000 * ones, True, "Converged.",
         laplace, exact, profiles,
     )  # fmt: skip

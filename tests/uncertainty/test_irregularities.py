@@ -1,4 +1,4 @@
-"""Duplicated and dropped frames are found, and nothing else is taken for them; models are compared under one noise."""
+"""Duplicated and dropped frames are found without false positives; models are compared under one noise."""
 
 import dataclasses
 
@@ -51,22 +51,22 @@ def test_smooth_rates_and_cuts_are_not_flagged(steps):
     assert irregularities(posterior_about(times_of(np.asarray(steps)))) == []
 
 
-def test_shots_have_their_own_pace():
-    """After the cut the clip is three times as slow: even there, and a duplicate right behind the cut is found."""
+def test_local_median_ends_at_cuts():
+    """After the cut the clip is three times slower, which is regular; a duplicate right after the cut is found."""
     steps = np.concatenate([np.ones(14), [40.0], np.full(14, 1 / 3)])
     steps[17] = 0.005
     assert kinds(irregularities(posterior_about(times_of(steps), 0.002))) == [(17, "duplicated")]
 
 
-def test_nothing_is_found_where_nothing_is_known():
-    """Under the prior alone increments are exponential: short and long ones, none of them sure."""
+def test_flat_likelihoods_give_no_irregularities():
+    """Under the prior alone increments are exponential: short and long ones, none of them with high probability."""
     posterior = posterior_about(np.linspace(0, 1, 25), 50.0)
     assert irregularities(posterior) == []
     assert not posterior.identified()[1:-1].any()
-    assert irregularities(posterior, probability=0.05) == []  # they are not judged
+    assert irregularities(posterior, probability=0.05) == []  # they are not assessed
 
 
-def test_held_frames_are_not_judged():
+def test_intervals_between_held_frames_are_not_assessed():
     steps = np.ones(20)
     steps[[5, 14]] = 0.01
     posterior = posterior_about(times_of(steps), frames=[13, 14, 15])
@@ -84,7 +84,7 @@ def test_a_long_step_beside_a_duplicate_is_explained():
 
 
 def test_intervals_cover():
-    """Over 5 clips of 29 intervals, 90% intervals hold the truth 90% of the time, give or take 4 standard errors.
+    """Over 5 clips of 29 intervals, 90% intervals contain the truth with frequency 90%, within 4 standard errors.
 
     Intervals of 60% would not pass for them.
     """
@@ -131,14 +131,14 @@ def test_models_are_compared_under_one_noise():
     assert other.at_own > one.at_own + 100
     assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.5)
     assert other.mean_psnr > one.mean_psnr
-    # The evidence is a mean of likelihoods: below the greatest, here about the truth's.
+    # The evidence is an average of likelihoods: below the maximum, here about that of the truth.
     best = rendered_log_likelihood(even, clip, truth, noise.for_frames(NUM_FRAMES)).sum()
     assert best - 80 < one.log_evidence < best + 5
     again = compare_times({"learned": learned}, clip)[0]  # a noise estimated from the same residuals
     assert again.at_own == pytest.approx(other.at_own, rel=0.1)
 
 
-def test_what_cannot_be_compared():
+def test_compare_times_refuses_no_models_and_other_lengths():
     model = model_of_12()
     with pytest.raises(ValueError, match=r"^models: expected at least one"):
         compare_times({}, np.zeros((12, 40, 64, 3), np.uint8))
@@ -146,7 +146,7 @@ def test_what_cannot_be_compared():
         compare_times({"a": model}, np.zeros((7, 40, 64, 3), np.uint8))
 
 
-def test_summary_says_what_is_not_known():
+def test_summary_names_frames_that_are_not_identified():
     from foldgauss.uncertainty import frame_table, summary
 
     times, std = np.linspace(0, 1, 12), np.full(12, 0.02)
@@ -167,7 +167,7 @@ def test_summary_says_what_is_not_known():
         frame_table(posterior, times[:3])
 
 
-def test_even_pace_within_shots():
+def test_even_times_within_shots():
     even, unit = even_times(posterior_about(np.linspace(0, 1, 9)))
     np.testing.assert_allclose(even, np.linspace(0, 1, 9), atol=2e-2 / 8)
     assert unit == pytest.approx(1 / 8)
@@ -177,7 +177,7 @@ def test_even_pace_within_shots():
     assert unit == pytest.approx(13 / 9 / steps.sum(), rel=1e-2)
 
 
-def test_evidence_tells_what_was_warned_of():
+def test_summary_includes_notes_of_the_profiles():
     from foldgauss.uncertainty import summary
 
     posterior = posterior_about(np.linspace(0, 1, 12))

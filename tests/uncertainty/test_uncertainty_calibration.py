@@ -1,4 +1,4 @@
-"""Simulation-based calibration: right posteriors have uniform ranks, and wrong ones are found out."""
+"""Simulation-based calibration: correct posteriors have uniform ranks, and wrong ones are detected."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from time_clips import SCALE, model, white
 from foldgauss.uncertainty import FrameNoise, Increments, coverage, ecdf_band, simulated_ranks
 
 REPLICATES, FRAMES = 300, 6
-#: Each run looks at some six quantities in 99% envelopes with a fixed seed: of right runs, 1 in 20 would fail.
+#: Each run checks some six quantities against 99% envelopes with a fixed seed: 1 in 20 correct runs would fail.
 
 
 def ranks(**settings):
@@ -20,20 +20,20 @@ slow = pytest.mark.slow
 
 
 @pytest.mark.parametrize("concentration", [pytest.param(0.5, marks=slow), 1.0, pytest.param(3.0, marks=slow)])
-def test_exact_passes_are_calibrated(concentration):
+def test_exact_posterior_is_calibrated(concentration):
     found = ranks(concentration=concentration)
     assert found.inside(0.99).all()
     assert found.converged == 1
     assert found.ranks.shape == (REPLICATES, FRAMES)
     assert found.names[-2:] == ["any frame", "log-likelihood"]
     for level in (0.5, 0.9):
-        # All frames of a replicate together, as if each were a half of one alone.
+        # All frames of a replicate count as two independent ones.
         error = np.sqrt(level * (1 - level) / (REPLICATES * 2))
         assert abs(found.coverage(level)[:-2].mean() - level) < 3.3 * error
 
 
 @pytest.mark.parametrize("factor", [1.5, pytest.param(1 / 1.5, marks=slow)])
-def test_a_wrong_noise_level_is_found(factor):
+def test_wrong_noise_level_is_detected(factor):
     found = ranks(assumed_noise=FrameNoise(SCALE * factor, 1.0))
     assert not found.inside(0.99)[-2:].any()
     too_wide = found.coverage(0.9)[-2] > 0.95
@@ -41,12 +41,12 @@ def test_a_wrong_noise_level_is_found(factor):
 
 
 @slow
-def test_noise_that_is_measured_is_calibrated():
+def test_estimated_noise_is_calibrated():
     assert ranks(assumed_noise="score").inside(0.99).all()
 
 
 @slow
-def test_smoothed_noise_needs_a_share():
+def test_correlated_noise_needs_tempering():
     plain, fair = (ranks(assumed_noise=kind, correlation=1.0) for kind in ("independent", "score"))
     assert not plain.inside(0.99).any()
     assert plain.coverage(0.9)[-2] < 0.6
@@ -55,7 +55,7 @@ def test_smoothed_noise_needs_a_share():
 
 
 @slow
-def test_a_wrong_prior_is_found(monkeypatch):
+def test_wrong_prior_is_detected(monkeypatch):
     right = Increments.draw_prior
 
     def wrong(self, rng, num):
@@ -75,7 +75,7 @@ def test_emcee_is_calibrated():
 
 
 @slow
-def test_emcee_with_a_wrong_noise_level_is_found():
+def test_wrong_noise_level_is_detected_with_emcee():
     found = ranks(sampler="emcee", num_frames=5, replicates=100, assumed_noise=FrameNoise(SCALE * 1.5, 1.0))
     assert not found.inside(0.99).all()
 
@@ -94,7 +94,7 @@ def test_emcee_draws_are_ranked_too():
 
 
 @pytest.mark.parametrize("level", [0.8, 0.99])
-def test_the_envelope_holds_what_it_says(level):
+def test_envelope_has_its_level(level):
     low, high = ecdf_band(50, 20, level)
     assert low.shape == (20,)
     assert (low <= high).all()
@@ -102,7 +102,7 @@ def test_the_envelope_holds_what_it_says(level):
     found = np.random.default_rng(1).integers(0, 20, (4000, 50))
     shares = (found[:, :, None] < np.arange(1, 21)).mean(1)
     inside = ((shares >= low - 1e-12) & (shares <= high + 1e-12)).all(1).mean()
-    # Counts are whole numbers: never less than the level, and a little more.
+    # Counts are integers: never less than the level, and slightly more.
     assert level - 0.02 < inside < level + 0.05
 
 
@@ -112,7 +112,7 @@ def test_the_envelope_is_pointwise_binomial():
     np.testing.assert_allclose([low[0] * 200, high[0] * 200], expected, atol=1)
 
 
-def test_coverage_counts_the_middle_ranks():
+def test_coverage_counts_central_ranks():
     every = np.arange(100)[:, None]
     for level in (0.5, 0.9, 0.98):
         assert coverage(every, 100, level)[0] == pytest.approx(level)

@@ -1,4 +1,4 @@
-"""ProfileCurves with colours integrated out, beside explicit covariances of all pixels."""
+"""Profiles with colors integrated out, against explicit covariances of all pixels."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ SIZE, NOISE, PRIOR, FRAME = (20, 32), 0.03, 0.3, 3
 @pytest.fixture(scope="module", params=["over", "sum"])
 def scene(request):
     model = soft_model(size=SIZE, compositing=request.param)
-    if request.param == "sum":  # light adds up: less of each
+    if request.param == "sum":  # contributions add up: lower opacities
         splats = dataclasses.replace(model.splats, opacity_logit=model.splats.opacity_logit - 2)
         model = dataclasses.replace(model, splats=splats)
     return _filmed(model)
@@ -49,7 +49,7 @@ def _equations(model, video, base, prior_scale=PRIOR):
 
 
 def _by_hand(equations, k, t, prior_scale=PRIOR):
-    """The density of frame k's pixels, with their covariance written out."""
+    """The density of frame k's pixels from their explicit covariance."""
     precision, rhs = np.eye(NUM) / prior_scale**2, np.zeros((NUM, 3))
     frames = equations.residuals.frames.reshape(NUM_FRAMES, -1, 3) / 255
     for j in range(NUM_FRAMES):
@@ -79,8 +79,8 @@ def test_exact_profile_is_the_gaussian_density_of_all_pixels(scene):
     np.testing.assert_allclose(curve.profile()[1], expected - expected.max(), rtol=1e-6, atol=1e-6)
 
 
-def test_estimated_profile_is_the_exact_one_given_all_probes(over):
-    """Signs in place of all pixels' unit vectors, scaled as a mean over probes asks for: no chance is left."""
+def test_estimated_profile_with_all_probes_is_exact(over):
+    """Unit vectors of all pixels as probes, scaled as the mean over probes requires: no Monte Carlo error remains."""
     equations = _equations(*over)
     num_pixels = SIZE[0] * SIZE[1]
     exact = module._Dense(equations, FRAME)
@@ -103,7 +103,7 @@ def test_estimate_is_near_the_exact_profile(over):
     np.testing.assert_allclose(near[FRAME](nodes[top, None])[:, 0], values[top], atol=0.5)
 
 
-def test_sure_colours_give_the_base_profile_back(over):
+def test_narrow_color_prior_gives_the_base_profile(over):
     model, video, base = over
     found = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=1e-7)
     nodes, values = base.curves.nodes_and_values(FRAME)
@@ -111,7 +111,7 @@ def test_sure_colours_give_the_base_profile_back(over):
     np.testing.assert_allclose(found[FRAME](nodes[top, None])[:, 0], values[top], atol=0.1)
 
 
-def test_profiles_are_wider_and_others_are_kept(scene):
+def test_profiles_widen_and_those_of_other_frames_are_kept(scene):
     model, video, base = scene
     done = []
     found = marginalize_colors(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
@@ -137,8 +137,8 @@ def _spread(profile):
     return np.sqrt(((times - mean) ** 2 * density).sum())
 
 
-def test_information_is_what_colours_leave_of_it(scene):
-    """With g the slope of the picture: g^T C^-1 g is g^T g / s^2 less what colours could do as well, and no more."""
+def test_information_decreases_with_free_colors(scene):
+    """With g = dR/dt, g^T C^-1 g is positive and below g^T g / s^2."""
     equations = _equations(*scene)
     t, step = equations.times[FRAME], 1e-3
     at = equations.at(FRAME, t)
@@ -157,7 +157,7 @@ def test_seeds_reproduce(over):
     assert one.count[FRAME] != other.count[FRAME] or (one.values[FRAME] != other.values[FRAME]).any()
 
 
-def test_conjugate_gradients_solve_and_hold_still_at_zero():
+def test_conjugate_gradients_solve_and_keep_zero_columns():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(30, 20))
     matrix, rhs = root.T @ root + np.eye(20), rng.normal(size=(20, 3))
@@ -168,13 +168,13 @@ def test_conjugate_gradients_solve_and_hold_still_at_zero():
     np.testing.assert_allclose(found, np.linalg.solve(matrix, rhs), atol=1e-8)
 
 
-def test_equations_that_are_not_solved_are_told():
+def test_conjugate_gradients_without_convergence_raise():
     rhs = np.ones((4, 1))
     with pytest.raises(ValueError, match="prior_scale: expected colors solved to 1e-05"):
         solve_conjugate_gradient(np.zeros_like, lambda r: r, rhs, np.zeros_like(rhs), 1e-5)
 
 
-def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
+def test_joined_profile_follows_the_base_and_is_bounded():
     base_nodes = np.linspace(0, 1, 41)
     base_values = -2000 * (base_nodes - 0.5) ** 2
     base_values[2] = -1.0  # an island
@@ -206,13 +206,13 @@ def test_profile_goes_on_as_the_base_does_and_nowhere_higher():
         ({"video": np.zeros((7, 5, 5, 3), np.uint8)}, "video: expected"),
     ],
 )
-def test_wrong_input_is_told(over, change, match):
+def test_wrong_input_raises(over, change, match):
     model, video, base = over
     with pytest.raises(ValueError, match=match):
         marginalize_colors(**{"model": model, "video": video, "base": base, **change})
 
 
-def test_models_with_numbers_missing_are_told(over):
+def test_models_with_nan_raise(over):
     model, video, base = over
     broken = dataclasses.replace(model.splats, loc=jnp.asarray(model.splats.loc).at[0, 0].set(jnp.nan))
     with pytest.raises(ValueError, match="model: expected finite numbers"):

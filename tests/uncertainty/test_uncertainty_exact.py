@@ -1,4 +1,4 @@
-"""Forward and backward passes, and Laplace's approximation, against quadrature and Gaussians."""
+"""The forward-backward algorithm and Laplace's approximation, against quadrature and Gaussians."""
 
 import numpy as np
 import pytest
@@ -10,12 +10,12 @@ from time_clips import free_times, parabolas
 
 from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves, exact_posterior, laplace_approximation
 
-#: Far from each other, in standard deviations: the order ties nothing, and the posterior is Gaussian.
+#: Far from each other, in standard deviations: the order does not constrain them, and the posterior is Gaussian.
 FAR = np.array([0.2, 0.4, 0.55, 0.8]), np.array([0.01, 0.02, 0.015, 0.01])
 
 
-def knowing_only(num_frames: int, known: tuple[int, ...] = (), at: float = 0.4, width: float = 1e-6) -> ProfileCurves:
-    """Flat profiles, but of the frames `known`, which are at `at` to within `width`."""
+def flat_except(num_frames: int, known: tuple[int, ...] = (), at: float = 0.4, width: float = 1e-6) -> ProfileCurves:
+    """Flat profiles, except for the frames `known`, at `at` with standard deviation `width`."""
     vague = np.linspace(0, 1, 4 * num_frames)
     near = np.concatenate([[0], at + width * np.linspace(-40, 40, 801), [1]])
     nodes = [near if k in known else vague for k in range(num_frames)]
@@ -47,7 +47,7 @@ def by_quadrature(curves, increments, far: float, points: int):
 @pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 4.0, 20.0])
 @pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
 def test_two_frames_agree_with_quadrature(concentration, means):
-    # Also where frames are so near, or so far out of order, that only their order keeps them apart.
+    # Also where frames are so near, or so far out of order, that only their order separates them.
     curves, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
     mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 14 / min(concentration, 1), 501)
     found = exact_posterior(curves, increments)
@@ -95,7 +95,7 @@ def test_draws_follow_the_known_marginals():
     means, widths = FAR
     found = exact_posterior(parabolas(*FAR, 801), free_times(6))
     draws = found.sample(5000, 3)
-    for k in range(4):  # 1 in 1000 right runs fails each; a width wrong by a fifth does, too
+    for k in range(4):  # false-alarm rate 1e-3 each; power: a width wrong by a fifth fails
         assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], widths[k]).cdf).pvalue > 1e-3
         assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], 1.2 * widths[k]).cdf).pvalue < 1e-3
     np.testing.assert_array_equal(draws, found.sample(5000, 3))
@@ -120,8 +120,8 @@ LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (0.2, 1.0, 3.0, 20
 
 
 @pytest.mark.parametrize(("num", "concentration"), [*[(n, a) for n in (4, 30) for a in (0.2, 1.0, 3.0, 20.0)], *LONG])
-def test_profiles_that_know_nothing_leave_the_prior(num, concentration):
-    found = exact_posterior(knowing_only(num), free_times(num, concentration))
+def test_flat_profiles_give_the_prior(num, concentration):
+    found = exact_posterior(flat_except(num), free_times(num, concentration))
     frames = sorted({1, 2, num // 3, num // 2, num - 2})
     priors = [scipy.stats.beta(concentration * k, concentration * (num - 1 - k)) for k in frames]
     assert_near(found, frames, priors, [0] * len(frames), [1] * len(frames))
@@ -129,10 +129,10 @@ def test_profiles_that_know_nothing_leave_the_prior(num, concentration):
 
 
 @pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 3.0, 20.0])
-def test_a_frame_that_is_known_parts_the_prior_in_two(concentration):
-    # Its time is known to a millionth, and nothing of any other: Beta densities on both sides.
+def test_known_frame_splits_the_prior_in_two(concentration):
+    # Its time is known to 1e-6, all others are flat: Beta densities on both sides.
     num, known = 12, 5
-    found = exact_posterior(knowing_only(num, (known,)), free_times(num, concentration))
+    found = exact_posterior(flat_except(num, (known,)), free_times(num, concentration))
     before, after = [1, 2, known - 1], [known + 1, known + 2, num - 2]
     priors = [scipy.stats.beta(concentration * k, concentration * (known - k)) for k in before]
     assert_near(found, before, priors, [0] * 3, [0.4] * 3)
@@ -143,17 +143,17 @@ def test_a_frame_that_is_known_parts_the_prior_in_two(concentration):
     assert found.log_evidence == pytest.approx(likelihood_profiles + np.log(1e-6 * np.sqrt(2 * np.pi)), abs=3e-3)
 
 
-def test_many_frames_that_nothing_is_known_of_need_few_points():
-    found = exact_posterior(knowing_only(300), free_times(300))
+def test_many_flat_profiles_need_few_grid_points():
+    found = exact_posterior(flat_except(300), free_times(300))
     assert max(map(len, found.grids)) < 1000
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
 
 @pytest.mark.parametrize("concentration", [0.2, 1.0, 3.0, 20.0])
 @pytest.mark.parametrize("known", [(), (5,)])
-def test_increments_of_draws_are_of_the_prior(concentration, known):
+def test_increments_of_draws_follow_the_prior(concentration, known):
     num = 12
-    draws = exact_posterior(knowing_only(num, known), free_times(num, concentration)).sample(10_000, 5)
+    draws = exact_posterior(flat_except(num, known), free_times(num, concentration)).sample(10_000, 5)
     steps = np.diff(draws)
     assert (steps > 0).all()
     for k in (0, 1, 3, 7, 10):
@@ -163,7 +163,7 @@ def test_increments_of_draws_are_of_the_prior(concentration, known):
             start, stop = 0, 11
         length = {(0, 5): 0.4, (5, 11): 0.6, (0, 11): 1.0}[start, stop]
         prior = scipy.stats.beta(concentration, concentration * (stop - start - 1))
-        # float64 has times only to some 1e-16: no increments below 1e-13 are told apart.
+        # Times have a resolution of 1e-16: increments below 1e-13 are not resolved.
         below = prior.cdf(1e-13 / length)
 
         def cdf(step, prior=prior, length=length):
@@ -178,7 +178,7 @@ def test_increments_of_draws_are_of_the_prior(concentration, known):
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), concentration=st.sampled_from([0.5, 1.0, 3.0]))
-def test_densities_are_densities_in_order(seed, concentration):
+def test_densities_integrate_to_one_and_means_increase(seed, concentration):
     rng = np.random.default_rng(seed)
     num = int(rng.integers(1, 6))
     curves = parabolas(np.sort(rng.uniform(0.1, 0.9, num)), rng.uniform(0.02, 0.3, num))
@@ -192,7 +192,7 @@ def test_densities_are_densities_in_order(seed, concentration):
     assert (np.diff(found.sample(20)) >= 0).all()
 
 
-def test_runs_are_apart():
+def test_runs_are_independent():
     held = np.array([0, 0.2, 0.4, 0.55, 0.8, 1])
     curves = parabolas(*FAR, 801)
     part = exact_posterior(curves, Increments.with_free(held, [1, 3, 4]))
@@ -201,12 +201,12 @@ def test_runs_are_apart():
     np.testing.assert_array_equal(part.sample(5)[:, 2], 0.4)
 
 
-def test_narrow_profiles_out_of_order_have_no_times():
+def test_narrow_profiles_out_of_order_raise():
     with pytest.raises(ValueError, match="order"):
         exact_posterior(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001), free_times(4))
 
 
-def test_shares_are_checked():
+def test_probabilities_of_quantiles_are_checked():
     found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
     with pytest.raises(ValueError, match="probability"):
         found.quantile(1.5)
@@ -225,14 +225,14 @@ def test_laplace_is_exact_for_gaussians():
     np.testing.assert_array_equal(draws, found.sample(20_000, 0))
 
 
-def test_laplace_is_at_the_top_of_the_log_ratios_density():
+def test_laplace_is_at_the_mode_of_the_log_ratios_density():
     curves, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4, 2.0)
     found = laplace_approximation(curves, increments, np.linspace(0, 1, 4))
     log_prob = FrameTimeLogProb(curves, increments)
     top = increments.coordinates(found.mode)
     around = top + 1e-2 * np.random.default_rng(0).standard_normal((200, 2))
     assert (log_prob(around) <= log_prob(top)).all()
-    # Its spread is that of the negative second derivative there, carried over to times.
+    # Its covariance is the inverse of the negative Hessian there, transformed to times.
     step = 1e-3 * np.eye(2)
     hessian = np.array(
         [[(log_prob(top + a + b) - log_prob(top + a - b) - log_prob(top - a + b) + log_prob(top - a - b)) / 4e-6
@@ -243,7 +243,7 @@ def test_laplace_is_at_the_top_of_the_log_ratios_density():
     np.testing.assert_allclose(found.std[1:-1], np.sqrt(np.diag(covariance)), rtol=0.15)
 
 
-def test_laplace_is_near_the_passes_where_frames_are_told_apart():
+def test_laplace_is_near_the_exact_posterior_for_separate_frames():
     curves, increments = parabolas((0.3, 0.5, 0.7), (0.02, 0.03, 0.02), 401), free_times(5)
     exact = exact_posterior(curves, increments)
     found = laplace_approximation(curves, increments, exact.quantile(0.5))

@@ -65,7 +65,7 @@ def test_prior_of_several_runs_is_their_product():
 
 
 def test_log_prior_is_what_draws_of_it_follow():
-    # t_1 of 4 increments is Beta(a, 3a); 1 in 1000 right runs would fail.
+    # t_1 of 4 increments is Beta(a, 3a); false-alarm rate 1e-3.
     times = free_times(5, 2.0).draw_prior(np.random.default_rng(0), 5000)
     for k in (1, 2, 3):
         assert scipy.stats.kstest(times[:, k], scipy.stats.beta(2 * k, 8 - 2 * k).cdf).pvalue > 1e-3
@@ -123,12 +123,12 @@ def test_shapes_and_order_are_checked():
         increments.coordinates(np.array([0, 0.5, 0.4, 0.6, 1.0]))
 
 
-def test_the_times_of_free_frames_do_not_count():
+def test_times_of_free_frames_are_ignored():
     assert Increments.with_free([0, np.nan, -7, 0.3, 0.55, 0.7, 1.0], [1, 2]).runs == [(1, 2)]
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-300, 1e-17])
-def test_increments_that_float64_has_lost_count_as_the_least(gap):
+def test_unresolved_increments_are_replaced_by_the_least(gap):
     increments = Increments.with_free(HELD, [1, 2])
     times = HELD.copy()
     times[1:3] = gap, 0.2
@@ -142,7 +142,7 @@ def test_increments_that_float64_has_lost_count_as_the_least(gap):
             increments.coordinates(times)
 
 
-def test_low_concentrations_go_there_and_back():
+def test_low_concentrations_round_trip():
     increments = free_times(30, 0.05)
     times = increments.draw_prior(np.random.default_rng(0), 2000)
     assert (np.diff(times) >= 0).all()
@@ -154,7 +154,7 @@ def test_low_concentrations_go_there_and_back():
     np.testing.assert_allclose(again, times, atol=1e-14)
 
 
-def test_nan_coordinates_are_an_error_and_not_a_density():
+def test_nan_coordinates_raise():
     nodes = np.linspace(0, 1, 5)
     log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 4, [-nodes] * 4), free_times(4))
     assert np.isfinite(log_prob(np.zeros((3, 2)))).all()

@@ -1,4 +1,4 @@
-"""How much of the residuals' evidence counts: theory where there is one, simulation where not."""
+"""Tempering fractions of the residual noise, against theory and simulation."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def score_fraction(residual: np.ndarray, slope: np.ndarray) -> float:
 
 
 def kernel_correlation(spread: float, most: int) -> np.ndarray:
-    """Of what a Gaussian of `spread` makes of white noise: the kernel's own correlation, by lag in one direction."""
+    """Autocorrelation of white noise smoothed by a Gaussian of `spread`, by lag in one direction."""
     impulse = np.zeros(201)
     impulse[100] = 1
     kernel = scipy.ndimage.gaussian_filter1d(impulse, spread)
@@ -47,20 +47,20 @@ def test_white_noise_counts_in_full():
 
 
 @pytest.mark.parametrize("spread", [0.8, 1.5, 3.0])
-def test_smoothed_noise_counts_as_theory_says(spread):
+def test_smoothed_noise_matches_theory(spread):
     along = kernel_correlation(spread, 30)
     theory = 1 / along.sum() ** 2
     found = np.mean([effective_fraction(smoothed(spread, seed)) for seed in range(4)])
     assert found == pytest.approx(theory, rel=0.15)
 
 
-def test_channels_that_are_one_count_as_one():
+def test_equal_channels_count_as_one():
     one = smoothed(0.01)[:1]
     assert effective_fraction(np.repeat(one, 3, axis=0)) == pytest.approx(1 / 3, rel=0.05)
 
 
 @pytest.mark.parametrize("mixture", [(1, 1, 1), (1, -1, 0), (0.6, 0.8, -1)])
-def test_channels_that_go_together_count_as_one_whatever_their_signs(mixture):
+def test_proportional_channels_count_as_one(mixture):
     one = smoothed(2.0)[:1]
     shares = [effective_fraction(one * np.array(each)[:, None, None]) for each in (mixture, (1, 0, 0))]
     assert shares[0] == pytest.approx(shares[1], rel=0.05)
@@ -73,7 +73,7 @@ def test_autocorrelation_is_that_of_the_kernel():
     np.testing.assert_allclose(found, along[:, None] * along[None, :], atol=0.05)
 
 
-def test_autocorrelation_is_the_sum_it_says():
+def test_autocorrelation_matches_its_definition():
     values = np.random.default_rng(0).normal(size=(2, 7, 9))
     found = autocorrelation(values, 2)
     for dy, dx in ((0, 0), (1, 0), (2, -1), (-1, 2)):
@@ -83,7 +83,7 @@ def test_autocorrelation_is_the_sum_it_says():
         assert found[2 + dy, 2 + dx] == pytest.approx(mean / (values**2).mean())
 
 
-def test_rings_are_means_around_the_middle():
+def test_rings_are_means_by_distance():
     lags = np.arange(-4, 5)
     distance = np.hypot(lags[:, None], lags[None, :])
     found = rings(np.rint(distance))
@@ -91,8 +91,9 @@ def test_rings_are_means_around_the_middle():
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0, 2.0])
-def test_score_share_is_the_scores_own_variance(spread):
-    # The score of a time is the sum over pixels of residual times slope: its variance over many noises is known.
+def test_score_fraction_matches_the_variance_of_the_score(spread):
+    # The score of a time is the sum over pixels of residual times slope: its variance is estimated over many noise
+    # images.
     y, x = np.mgrid[:160, :200]
     bump = np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / 1800) * np.sin(x / 6)
     slope = np.stack([bump, 0.5 * bump, -0.2 * bump])
@@ -100,12 +101,12 @@ def test_score_share_is_the_scores_own_variance(spread):
     variance = (noises * slope).sum((1, 2, 3)).var()
     truth = min(1.0, (slope**2).sum() / variance)
     found = np.mean([1 / score_fraction(noise, slope) for noise in noises[:20]])
-    # 300 noises tell a variance to 8%.
+    # 300 noise images give a variance to 8%.
     assert 1 / found == pytest.approx(truth, rel=0.25)
 
 
-def test_scores_that_cancel_are_no_evidence():
-    """At the best time the residual is at a right angle to the slope: its own scores say less than noise would."""
+def test_scores_that_cancel_do_not_increase_the_fraction():
+    """At the mode the residual is orthogonal to the slope: its own score varies less than that of noise."""
     y, x = np.mgrid[:160, :200]
     slope = np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / 50) * np.ones((3, 1, 1))
     found, truth = [], []
@@ -125,15 +126,15 @@ def test_no_residual_at_all_counts_in_full():
     assert found.sum() == 1
 
 
-def test_shares_are_never_above_one():
-    # Residuals that alternate cancel: no evidence is worth more than it says.
+def test_fractions_are_at_most_one():
+    # Alternating residuals cancel: the fraction stays at most 1.
     y, x = np.mgrid[:40, :40]
     board = np.where((x + y) % 2, 1.0, -1.0)[None]
     assert effective_fraction(board) <= 1
     assert score_fraction(board, np.ones((1, 40, 40))) <= 1
 
 
-def test_frame_noise_is_checked_and_widened():
+def test_frame_noise_is_checked_and_broadcast():
     noise = FrameNoise(0.1, 0.5).for_frames(3)
     np.testing.assert_allclose(noise.weight, 0.5 / 0.02)
     assert noise.weight.shape == (3,)

@@ -1,4 +1,4 @@
-"""The pictures of a posterior: what they show, of which frames, with labels."""
+"""Plots of a posterior: data, frames and labels."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_trace_has_a_line_for_each_ensemble(posterior):
         plots.plot_trace(posterior, [0])
 
 
-def test_correlation_says_what_counts(posterior):
+def test_correlation_title_states_the_effective_number(posterior):
     ax = plots.plot_correlation(posterior.profiles)
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 0.7 ** np.arange(12))
     assert ax.get_title() == "Residuals of 5.1 grey levels, one value in 10 counts"

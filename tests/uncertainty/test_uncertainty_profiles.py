@@ -1,4 +1,4 @@
-"""ProfileCurves: looked-up log-likelihoods are those of pictures drawn at the same times."""
+"""Likelihood profiles: interpolated log-likelihoods match those of images rendered at the same times."""
 
 import dataclasses
 import warnings
@@ -40,21 +40,21 @@ def test_between_nodes_a_profile_is_the_cubic_with_its_slopes():
         np.testing.assert_allclose(curves(t)[:, k], expected, rtol=1e-10, atol=1e-12)
 
 
-def test_parabolas_are_looked_up_exactly():
+def test_parabolas_are_interpolated_exactly():
     curves = parabolas([0.3, 0.6], [0.05, 0.1], 31)
     t = np.random.default_rng(1).uniform(size=(100, 4))
     expected = -((t[:, 1] - 0.3) ** 2) / 0.005
     np.testing.assert_allclose(curves(t)[:, 1], expected, atol=1e-9)
 
 
-def test_outside_of_the_nodes_is_impossible_and_so_is_nan():
+def test_outside_of_the_nodes_and_nan_give_minus_infinity():
     curves = ProfileCurves.from_nodes([np.linspace(0.2, 0.4, 5)], [np.zeros(5)])
     found = curves(np.array([0.2, 0.4, 0.19, 0.41, np.nan])[:, None])[:, 0]
     np.testing.assert_array_equal(found, [0, 0, -np.inf, -np.inf, -np.inf])
 
 
-def test_looked_up_is_drawn(profiles):
-    # Within the frames' posterior, to what profiles promise: MISS nats, and its share of the depth.
+def test_curves_match_rendered_log_likelihoods(profiles):
+    # Within the posterior, to the stated precision: MISS nats and a fraction of the depth.
     rng, times = np.random.default_rng(0), uneven()
     modes = profiles.curves.modes()
     modes[[0, -1]] = times[[0, -1]]
@@ -77,8 +77,8 @@ def test_log_prob_is_the_sum_over_frames(profiles):
     assert log_prob(z) - log_prob.increments.log_prior(z) == pytest.approx(total - best, abs=1.0)
 
 
-def test_a_frame_half_way_between_two_coarse_nodes_is_drawn_between_them():
-    # Both nodes are as far below the maximum as each other: their difference says nothing.
+def test_profile_is_refined_between_equal_coarse_nodes():
+    # Both nodes are as far below the maximum as each other: their difference is 0.
     nodes = np.linspace(0, 1, 25)
     times = np.array([0, (nodes[5] + nodes[6]) / 2, (nodes[12] + nodes[13]) / 2, 1])
     profiles = likelihood_profiles(model(), clip(times, scale=0.0), noise=white(0.01))
@@ -87,7 +87,7 @@ def test_a_frame_half_way_between_two_coarse_nodes_is_drawn_between_them():
         assert np.abs(at - times[k]).min() < 0.002
 
 
-def test_evidence_finds_the_scale_and_the_times(profiles):
+def test_profiles_recover_scale_and_times(profiles):
     measured = likelihood_profiles(model(), clip(uneven()), noise="independent")
     np.testing.assert_allclose(measured.noise.scale, SCALE, rtol=0.1)
     spread = exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, NUM_FRAMES)))
@@ -98,21 +98,21 @@ def test_evidence_finds_the_scale_and_the_times(profiles):
     assert np.abs(measured.residual_correlation[2:]).max() < 0.1
 
 
-def test_alpha_is_blended_with_black():
+def test_alpha_is_composited_over_black():
     frames = clip(uneven())
     opaque = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], axis=3)
     one, other = (rendered_log_likelihood(model(), each, uneven(), white()) for each in (frames, opaque))
     np.testing.assert_allclose(one, other, rtol=1e-4)
 
 
-def test_a_frame_that_shows_nothing_keeps_its_prior():
+def test_flat_profile_keeps_its_prior():
     curves = parabolas([0.25, 0.5, 0.75], [0.02, 10.0, 0.02])
     found = exact_posterior(curves, Increments.with_free(np.linspace(0, 1, 5)))
     assert found.std()[2] > 0.8 * 0.5 / np.sqrt(12)
     assert found.std()[1] == pytest.approx(0.02, rel=0.02)
 
 
-def test_frames_held_stay_where_they_are(profiles):
+def test_held_frames_stay_at_their_medians(profiles):
     log_prob = frame_time_log_prob(model(), profiles=profiles, frames=[2, 3, 7])
     medians = exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, NUM_FRAMES))).quantile(0.5)
     times = log_prob.increments.times(np.zeros(3))
@@ -145,7 +145,7 @@ def test_a_constant_video_has_no_times():
         likelihood_profiles(model(), still)
 
 
-def test_noise_too_great_for_any_time_is_said():
+def test_too_large_noise_raises():
     with pytest.raises(ValueError, match="not identified"):
         likelihood_profiles(model(), clip(uneven()), noise=FrameNoise(1.0, 1e-6))
 
@@ -161,7 +161,7 @@ def test_unknown_noise_is_refused(noise):
         likelihood_profiles(model(), clip(uneven()), noise=noise)
 
 
-def test_profiles_refuse_what_is_none():
+def test_curves_refuse_wrong_shapes_and_values():
     t = np.linspace(0, 1, 5)
     for nodes, values, word in (
         ([t[:2]], [t[:2]], "three"),
@@ -182,7 +182,7 @@ def test_another_seeded_model_is_another_scene():
         frame_time_log_prob(model(), frames)
 
 
-def test_a_clip_that_begins_later_than_its_model_is_told():
+def test_clip_that_begins_later_than_its_model_warns():
     with pytest.warns(UserWarning, match="Frame 0 is held at time 0"):
         likelihood_profiles(model(), clip(0.3 + 0.7 * uneven()), noise=white(0.02))
 
@@ -198,7 +198,7 @@ def test_a_reach_that_is_too_short_is_widened_or_refused(monkeypatch):
     np.testing.assert_allclose(widened.curves.modes(), whole.curves.modes(), atol=2e-3)
 
 
-def test_sketches_are_as_far_apart_as_pictures():
+def test_sketches_keep_distances_of_images():
     rng = np.random.default_rng(0)
     sketches = Sketches(3 * 40 * 60)
     pictures = rng.random((12, 3, 40, 60), np.float32) * (rng.random((12, 1, 40, 60)) < 0.1)
@@ -210,7 +210,7 @@ def test_sketches_are_as_far_apart_as_pictures():
 
 
 def fast_speck():
-    """A speck of 1 pixel that crosses a wide picture, 7 pixels to a quarter of a frame, over a still ground."""
+    """A speck of 1 pixel that crosses a wide frame at 7 pixels per quarter of a frame, over a static background."""
     soft = soft_model(size=(24, 200))
     num = soft.num_gaussians
     first, second = np.arange(num) == 0, np.arange(num) == 1
@@ -227,19 +227,19 @@ def fast_speck():
     return dataclasses.replace(soft, splats=splats)
 
 
-def test_a_small_fast_thing_is_found_between_the_coarse_nodes():
-    """A speck that is somewhere else at every coarse node: only what lies between shows it in its place."""
+def test_small_fast_object_is_found_between_coarse_nodes():
+    """The speck is at other places at all coarse nodes: only times in between match."""
     speck = fast_speck()
     truth = np.array([0.0, 0.155, 0.31, 0.47, 0.655, 0.81, 1.0])
     found = likelihood_profiles(speck, clip(truth, of=speck, scale=0.01), noise=white(0.01)).curves
     np.testing.assert_allclose(found.modes()[1:-1], truth[1:-1], atol=2e-3)
 
 
-def test_another_clip_of_the_same_place_is_told():
+def test_another_clip_of_the_same_scene_warns():
     speck = fast_speck()
     frames = clip(np.linspace(0.05, 0.95, 7), of=speck, scale=0.005)
     mean = np.median(frames, axis=0).astype(np.int16)
-    other = np.clip(mean + np.roll(frames - mean, 8, axis=1), 0, 255).astype(np.uint8)  # the speck goes elsewhere
+    other = np.clip(mean + np.roll(frames - mean, 8, axis=1), 0, 255).astype(np.uint8)  # the speck takes another path
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         likelihood_profiles(speck, other, noise=white(0.02))
@@ -247,7 +247,7 @@ def test_another_clip_of_the_same_place_is_told():
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0, np.nan, np.inf, "a", [1.0, 2.0], [1.0, -1.0, 1.0]])
-def test_factors_of_likelihoods_are_above_0(factor):
+def test_factors_of_likelihoods_are_positive(factor):
     nodes = np.linspace(0, 1, 5)
     found = ProfileCurves.from_nodes([nodes] * 3, [-nodes] * 3)
     with pytest.raises(ValueError, match="factor"):

@@ -1,4 +1,4 @@
-"""Frame times refitted: what is drawn for the bootstrap, what is left out, and what the numbers say."""
+"""Refitted frame times: bootstrap residuals, left-out frames, and statistics of the replicates."""
 
 import dataclasses
 
@@ -12,16 +12,16 @@ from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import FitConfig, FrameTimes, LearningRates, fit
 
 CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2)
-#: Whoever holds the splats learns the times alone.
+#: Learning rates with which only the frame times are fitted.
 HELD = LearningRates(0, 0, 0, 0, 0, 0, 0, 0, frame_times=4e-3)
 
 
 def passing(num_frames=7, height=24, width=40, noise=3.0):
-    """A light that crosses the picture: uint8 (num_frames, height, width, 3), noise in grey levels."""
+    """A bright spot that crosses the frame: uint8 (num_frames, height, width, 3), noise in grey levels."""
     y, x = np.mgrid[0:height, 0:width]
     place = np.linspace(0.2, 0.8, num_frames)[:, None, None] * width
-    light = np.exp(-((x - place) ** 2 + (y - height / 2) ** 2) / 30)
-    frames = np.stack([40 + 150 * light, 60 + 80 * light, 90 + 2 * x + 0 * light], -1)
+    spot = np.exp(-((x - place) ** 2 + (y - height / 2) ** 2) / 30)
+    frames = np.stack([40 + 150 * spot, 60 + 80 * spot, 90 + 2 * x + 0 * spot], -1)
     return np.clip(np.rint(frames + np.random.default_rng(5).normal(0, noise, frames.shape)), 0, 255).astype(np.uint8)
 
 
@@ -40,7 +40,7 @@ def own_times(model):
 
 
 def inner_std(curves):
-    """Standard deviations of the times whose log-likelihoods are the profiles, but for the first and the last frame."""
+    """Standard deviations of the times given their curves alone, except for the first and the last frame."""
     t = np.linspace(0, 1, 20_001)
     log = np.stack([curves[k](t[:, None])[:, 0] for k in range(1, curves.num_frames - 1)])
     weight = np.exp(log - log.max(1, keepdims=True))
@@ -48,7 +48,7 @@ def inner_std(curves):
     return np.sqrt((weight * (t - (weight @ t)[:, None]) ** 2).sum(1))
 
 
-# What is drawn
+# Bootstrap residuals
 
 
 @pytest.mark.parametrize("block", [1, 5, 16])
@@ -84,7 +84,7 @@ def test_moved_blocks_are_pieces_of_the_frame():
 
 
 @pytest.mark.parametrize("place", ["kept", "moved"])
-def test_mean_and_variance_of_what_is_drawn(place):
+def test_mean_and_variance_of_resampled_residuals(place):
     """At every pixel: z-scores of 600 draws, beyond 5 in one of 480 pixels with probability 3e-4."""
     rng = np.random.default_rng(3)
     residual = rng.normal(0, 1, (1, 20, 24)) * np.where(np.arange(24) < 12, 1.0, 3.0) + 0.4
@@ -96,7 +96,7 @@ def test_mean_and_variance_of_what_is_drawn(place):
     else:
         fourth = (residual**4).mean() - power**2
         assert np.abs(((drawn**2).mean(0) - power) / np.sqrt(fourth / 600)).max() < 5
-        assert np.abs((drawn**2).mean(0) / residual[0] ** 2 - 1).max() > 1  # power: they are not in their places
+        assert np.abs((drawn**2).mean(0) / residual[0] ** 2 - 1).max() > 1  # power: they were moved
 
 
 def test_frames_spread_around_the_models_pictures(model, frames):
@@ -114,13 +114,13 @@ def test_frames_spread_around_the_models_pictures(model, frames):
     assert np.abs(missed[inside].mean()) < 0.1 / 255
     np.testing.assert_allclose(drawn.std(0)[inside].mean(), np.abs(residual)[inside].mean(), rtol=0.02)
     one, other = draws[0][2].astype(int) - draws[1][2], draws[0][3].astype(int) - draws[1][3]
-    assert np.abs(np.corrcoef(one.ravel() != 0, other.ravel() != 0)[0, 1]) < 0.3  # each frame for itself
+    assert np.abs(np.corrcoef(one.ravel() != 0, other.ravel() != 0)[0, 1]) < 0.3  # frames are independent
 
 
-# What is left out
+# Left-out frames
 
 
-def test_merged_weights_leave_gaps():
+def test_merged_logits_keep_the_other_times():
     logits = np.random.default_rng(1).normal(0, 1, 9)
     unseen = np.array([0, 1, 0, 0, 1, 1, 0, 0, 1, 0], bool)
     kept = np.asarray(FrameTimes(merge_logits(logits, unseen)).times())
@@ -138,7 +138,7 @@ def test_every_frame_is_unseen_once(model, frames):
     assert (found.times[:, -1] == 1).all()
     assert found.by_frames
     assert found.freedom == 5
-    assert 0 < found.spread[1] < 0.6  # found in its neighbourhood, but not where it would be had it been seen
+    assert 0 < found.spread[1] < 0.6  # near its neighbors, but not at the fitted time
     np.testing.assert_array_equal(found.std[1:-1], found.std[1])
     assert found.std[0] == found.std[-1] == 0
     np.testing.assert_array_equal(found.mean[[1, 4]], found.times[0, [1, 4]])
@@ -164,7 +164,7 @@ def test_times_of_replicates(model, replicates):
     assert all(each.psnr > 25 for each in replicates)
 
 
-def test_seeds_reproduce_and_replicates_stand_alone(model, frames, replicates):
+def test_seeds_reproduce_and_replicates_are_independent(model, frames, replicates):
     how = {"replicates": 3, "steps": 40, "block": 8}
     again = list(iter_refits(model, frames, CONFIG, seed=4, first=1, **how))
     assert [each.number for each in again] == [1, 2]
@@ -180,24 +180,24 @@ def test_seeds_reproduce_and_replicates_stand_alone(model, frames, replicates):
     [{"start": "scratch"}, {"method": "order"}, {"method": "order", "start": "scratch"}, {"place": "moved"}],
     ids=str,
 )
-def test_every_way_works(model, frames, how):
+def test_every_method_works(model, frames, how):
     found = refit_frame_times(model, frames, CONFIG, replicates=2, steps=30, **how)
     assert (np.diff(found.times) > 0).all()
     assert (found.std[1:-1] > 0).all()
 
 
-def test_default_steps_are_the_end_of_the_plan(model, frames):
+def test_default_steps_are_the_end_of_the_schedule(model, frames):
     config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, target_psnr=10.0), []
     original = FitConfig(num_gaussians=150, steps=30, degree=2)
     for each in (config, original):
         how = {"replicates": 1, "method": "order", "steps": None if each is config else 30}
         steps.append(next(iter_refits(model, frames, each, **how)).times)
-    np.testing.assert_array_equal(*steps)  # 30% of 100 steps, whatever the clock and the target say
+    np.testing.assert_array_equal(*steps)  # 30% of 100 steps, independent of minutes and target
 
 
 @pytest.mark.parametrize("place", ["kept", pytest.param("moved", marks=pytest.mark.slow)])
-def test_held_splats_give_what_the_profiles_say(place):
-    """Noise that no splat has learned, and splats that stay: times spread as the likelihood of independent pixels says.
+def test_spread_with_held_splats_matches_the_profiles(place):
+    """New noise and held splats: the spread of times matches the likelihood of independent pixels.
 
     With 24 replicates of 5 times the ratio is within a fifth of 1 with probability 0.998, were they independent. Held
     back by too few steps, they spread less: that is the power of it.
@@ -214,7 +214,7 @@ def test_held_splats_give_what_the_profiles_say(place):
     assert refit_frame_times(base, noisy, config, steps=20, **how).ratio_to(std) < 0.6
 
 
-# What the numbers say
+# Statistics of replicates
 
 
 def made(times, own, unseen=None):
@@ -238,7 +238,7 @@ def test_ratio_intervals_and_spread():
     assert (found.interval(0.999) <= 1).all()
 
 
-def test_local_knows_no_smooth_warp():
+def test_local_ignores_smooth_warps():
     rng, own = np.random.default_rng(2), np.linspace(0, 1, 41)
     bump = np.sin(np.pi * own)
     warped = made(own + 0.01 * rng.normal(size=(50, 1)) * bump, own)
@@ -256,7 +256,7 @@ def test_spread_counts_frames_where_times_are_uneven():
     np.testing.assert_allclose(found.spread[1], np.std([1.1, 0.9, 1.0], ddof=1))
 
 
-def test_times_that_float32_cannot_tell_apart():
+def test_equal_float32_times_give_finite_spread():
     own = np.array([0.0, 0.5, 0.5, 1.0])
     assert np.isfinite(made(np.stack([own, own]), own).spread).all()
 
@@ -303,7 +303,7 @@ def test_settings_out_of_range(model, frames, how, told):
         ended(model, frames, **how)
 
 
-def test_videos_that_are_not_the_models(model, frames):
+def test_videos_of_other_models_are_refused(model, frames):
     with pytest.raises(ValueError, match="video: expected the 7 frames"):
         ended(model, frames[:-1])
     with pytest.raises(ValueError, match="video: expected uint8"):
@@ -327,7 +327,7 @@ def test_configs_that_do_not_fit(model, frames):
             ended(model, frames, dataclasses.replace(CONFIG, degree=3), start=start)
 
 
-def test_results_that_say_nothing(model, frames):
+def test_too_few_refits_and_wrong_arguments_raise(model, frames):
     own = own_times(model)
     one = Refit(0, own, np.zeros(7, bool), model, 30.0)
     for few in ([], [one], [one, one]):
@@ -346,7 +346,7 @@ def test_results_that_say_nothing(model, frames):
 
 @pytest.mark.slow
 def test_longer_refits_spread_more_and_order_less():
-    """What the documentation says of gauge and optimiser, on a clip large enough to show it."""
+    """The documented effects of time warps and of the optimizer, on a sufficiently large clip."""
     clip, config = passing(12, 48, 80), FitConfig(num_gaussians=800, steps=1000)
     whole = fit(clip, config).model
     spread = {}

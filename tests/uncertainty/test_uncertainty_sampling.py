@@ -1,4 +1,4 @@
-"""emcee's draws of frame times: a posterior that is known, seeds, files, and what is refused."""
+"""Sampling of frame times by emcee: known posteriors, seeds, files of draws, argument checks."""
 
 import dataclasses
 import subprocess
@@ -26,7 +26,7 @@ from foldgauss.uncertainty.posterior.laplace import laplace_approximation
 from foldgauss.uncertainty.posterior.moves import BlockSweep
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 
-#: Two of the three so near that their order ties them.
+#: Two of the three are so near that their order constrains them.
 NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
 #: A toy whose posterior is Gaussian: 0.08 apart at 10 standard deviations.
 MANY = np.linspace(0, 1, 16)[1:-1], np.full(14, 0.006)
@@ -70,7 +70,7 @@ def near():
     return sampled(toy(*NEAR))
 
 
-def test_few_frames_draw_the_known_posterior(near):
+def test_few_frames_sample_the_known_posterior(near):
     assert near.converged
     assert near.message.startswith("Converged")
     assert (near.r_hat < 1.01).all()
@@ -88,8 +88,8 @@ def test_few_frames_draw_the_known_posterior(near):
     )
 
 
-def test_a_wrong_jacobian_is_found(monkeypatch):
-    # A whole power too much of every increment, in the density that emcee sees and not in the passes.
+def test_wrong_jacobian_is_detected(monkeypatch):
+    # One power of every increment too many in the density that emcee samples, not in the exact posterior.
     right = Increments.log_prior
 
     def wrong(self, coordinates):
@@ -108,7 +108,7 @@ def test_draws_keep_their_order_and_their_ends(near):
 
 
 @pytest.mark.parametrize("concentration", [0.5, 3.0])
-def test_blocks_draw_the_known_posterior(concentration):
+def test_block_sweeps_sample_the_known_posterior(concentration):
     log_prob = toy((0.2, 0.25, 0.4, 0.42, 0.75), (0.03, 0.04, 0.03, 0.05, 0.06), concentration)
     found = sampled(log_prob, moves=BlockSweep(log_prob, block=2), walkers=16)
     assert found.converged
@@ -116,7 +116,7 @@ def test_blocks_draw_the_known_posterior(concentration):
 
 
 @pytest.mark.slow
-def test_many_frames_draw_a_gaussian():
+def test_many_frames_sample_a_gaussian():
     found = sampled(toy(*MANY, nodes=2001), steps=20_000)
     assert found.converged
     assert agrees(found)
@@ -127,12 +127,12 @@ def test_many_frames_draw_a_gaussian():
     assert worst_ks(found, [scipy.stats.norm(m, w).cdf for m, w in zip(*MANY, strict=True)]) > 1e-3
 
 
-def test_another_hill_is_reached():
-    # Two hills of the middle frame, 12 standard deviations apart, of equal mass.
+def test_both_modes_are_reached():
+    # Two modes of the middle frame, 12 standard deviations apart, of equal mass.
     nodes = np.linspace(0, 1, 401)
-    hills = np.logaddexp(-((nodes - 0.4) ** 2) / (2 * 0.015**2), -((nodes - 0.58) ** 2) / (2 * 0.015**2))
+    modes = np.logaddexp(-((nodes - 0.4) ** 2) / (2 * 0.015**2), -((nodes - 0.58) ** 2) / (2 * 0.015**2))
     flat = np.zeros_like(nodes)
-    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 3, [flat, hills, flat]), free_times(3))
+    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 3, [flat, modes, flat]), free_times(3))
     found = sampled(log_prob, moves=BlockSweep(log_prob), walkers=16)
     left = (found.draws[:, 1] < 0.5).mean()
     if found.converged:
@@ -142,8 +142,8 @@ def test_another_hill_is_reached():
 
 
 @pytest.fixture(scope="module")
-def two_hills():
-    """Of the second of three frames, of equal mass, 0.2 apart: the exact spread is 0.1, that of a hill 0.004."""
+def two_modes():
+    """The second of three frames has two equal modes, 0.2 apart: the exact spread is 0.1, that of a mode 0.004."""
     nodes = np.linspace(0, 1, 401)
 
     def about(m, w):
@@ -154,18 +154,18 @@ def two_hills():
     return FrameTimeLogProb(ProfileCurves.from_nodes([nodes] * 5, values), free_times(5))
 
 
-def test_few_frames_go_from_hill_to_hill(two_hills):
-    found = sampled(two_hills)
+def test_few_frames_change_modes(two_modes):
+    found = sampled(two_modes)
     assert found.converged
     assert agrees(found)
     assert (found.draws[:, 2] > 0.5).mean() == pytest.approx(0.5, abs=0.03)
     assert found.std()[2] == pytest.approx(found.exact.std()[2], rel=0.02)
 
 
-def test_ensembles_that_all_miss_a_hill_have_not_converged(two_hills):
-    # emcee's own moves stay where they start: tau and R-hat see nothing of the other hill.
+def test_ensembles_that_all_miss_a_mode_have_not_converged(two_modes):
+    # emcee's own moves stay at their mode: tau and R-hat do not detect the other one.
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.StretchMove(), 0.3)]
-    found = sampled(two_hills, moves=moves, steps=1500, ensembles=2)
+    found = sampled(two_modes, moves=moves, steps=1500, ensembles=2)
     assert (found.r_hat < 1.01).all()
     assert found.std()[2] < 0.005
     assert not found.converged
@@ -173,7 +173,7 @@ def test_ensembles_that_all_miss_a_hill_have_not_converged(two_hills):
     assert "emcee and the exact posterior disagree at frame 2" in found.message
 
 
-def test_how_many_frames_tell_their_time():
+def test_message_counts_identified_frames():
     log_prob = toy((0.2, 0.5, 0.8), (0.02, 5.0, 0.02))
     found = sampled(log_prob)
     assert found.converged
@@ -200,7 +200,7 @@ def test_single_frames_between_held_ones(num, frames):
     np.testing.assert_array_equal(found.free, np.flatnonzero(free))
 
 
-def test_a_low_concentration_samples_gaps_that_float64_cannot_tell():
+def test_low_concentration_samples_unresolved_gaps():
     # A thousandth of increments are below 1e-16.
     flat = [np.zeros(61)] * 16
     log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([np.linspace(0, 1, 61)] * 16, flat), free_times(16, 0.2))
@@ -217,7 +217,7 @@ def test_seeds_reproduce_to_the_bit():
     assert len({each.tobytes() for each in one.times}) == 4
 
 
-def test_too_few_steps_say_that_they_are():
+def test_too_few_steps_are_reported():
     found = sampled(toy(*NEAR), steps=200)
     assert not found.converged
     assert found.message.startswith("Not converged after 200 steps")
@@ -225,7 +225,7 @@ def test_too_few_steps_say_that_they_are():
 
 
 @pytest.mark.parametrize("blocks", [False, True])
-def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, blocks):
+def test_resumed_run_equals_an_uninterrupted_one(tmp_path, blocks):
     log_prob = toy(*NEAR)
     moves = BlockSweep(log_prob, block=2) if blocks else None
     settings = {"steps": 600, "moves": moves, "seed": 5}
@@ -238,7 +238,7 @@ def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, blocks):
     assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]
 
 
-def test_another_runs_file_is_refused(tmp_path):
+def test_file_of_another_run_is_refused(tmp_path):
     path = tmp_path / "run.h5"
     sampled(toy(*NEAR), steps=100, backend=path)
     before = path.read_bytes()
@@ -252,8 +252,8 @@ def test_another_runs_file_is_refused(tmp_path):
         sampled(toy(*NEAR), steps=100, backend=tmp_path / "text.h5")
 
 
-def test_a_folder_of_a_strangers_leads_nowhere(tmp_path):
-    """Links in the place of what is written beside a file of draws are not followed: neither at first nor later."""
+def test_symbolic_links_beside_the_draws_are_not_followed(tmp_path):
+    """Symbolic links at the paths of temporary files beside a file of draws are not followed."""
     precious, path = tmp_path / "precious", tmp_path / "draws" / "run.h5"
     path.parent.mkdir()
     precious.write_text("mine")
@@ -266,7 +266,7 @@ def test_a_folder_of_a_strangers_leads_nowhere(tmp_path):
         assert not path.is_symlink()
 
 
-def test_a_file_of_draws_has_one_run(tmp_path):
+def test_file_of_draws_has_one_writer(tmp_path):
     path, told = tmp_path / "run.h5", []
     settings = {"log_prob": toy(*NEAR), "steps": 20, "ensembles": 2, "backend": path}
 
@@ -283,12 +283,12 @@ def test_a_file_of_draws_has_one_run(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         frame_time_posterior(**settings | {"steps": 40}, progress=interrupt)
     assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
-    np.testing.assert_array_equal(sampled(**settings).times, found.times)  # whatever happens, others may go on
+    np.testing.assert_array_equal(sampled(**settings).times, found.times)  # the lock is released
     assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
 
 
-def test_a_run_of_another_process_keeps_its_file(tmp_path):
-    """Until it is gone, which leaves a file that holds nobody up."""
+def test_lock_of_another_process_is_respected(tmp_path):
+    """The lock ends with its process; the remaining file does not block others."""
     path = tmp_path / "run.h5"
     holding = (
         "import pathlib, sys, time\n"
@@ -310,7 +310,7 @@ def test_a_run_of_another_process_keeps_its_file(tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
 
 
-def test_a_run_is_known_again_by_its_numbers(tmp_path):
+def test_fingerprint_covers_settings_and_moves(tmp_path):
     path, settings = tmp_path / "run.h5", {"steps": 20, "ensembles": 2, "backend": tmp_path / "run.h5"}
     log_prob = toy(*NEAR)
     whole = sampled(log_prob, **settings, walkers=32, seed=1, thin_by=10)
@@ -319,7 +319,7 @@ def test_a_run_is_known_again_by_its_numbers(tmp_path):
     path.unlink()
     stretch, walk = emcee.moves.StretchMove(a=2.0), emcee.moves.DEMove()
     sampled(log_prob, **settings, moves=[(stretch, 0.5), (walk, 0.5)])
-    sampled(log_prob, **settings, moves=[(stretch, 0.5), (walk, 0.5)])  # the same objects, which have run
+    sampled(log_prob, **settings, moves=[(stretch, 0.5), (walk, 0.5)])  # the same objects, after a run
     others = [(emcee.moves.StretchMove(a=9.0), 0.5), (walk, 0.5)], [(stretch, 0.4), (walk, 0.6)]
     for moves in (*others, [(stretch, 0.5), (emcee.moves.DEMove(sigma=1e-3), 0.5)]):
         with pytest.raises(ValueError, match="backend"):
@@ -331,7 +331,7 @@ def test_a_run_is_known_again_by_its_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("num", [1, 2, 8, 9, 11, 12, 13])
-def test_the_walkers_that_are_chosen_are_enough(num):
+def test_default_walkers_suffice(num):
     means = np.linspace(0, 1, num + 2)[1:-1]
     found = sampled(toy(means, np.full(num, 0.2 / num), nodes=101), steps=20, ensembles=2)
     assert found.times.shape[2] % 2 == 0
@@ -376,12 +376,12 @@ def test_what_is_refused(change, word):
 
 @pytest.fixture(scope="module")
 def profiles():
-    """Of another clip."""
+    """Profiles of another clip."""
     curves = parabolas((0.3, 0.6), (0.1, 0.1), 5)  # 4 frames
     return LikelihoodProfiles(curves, FrameNoise(np.full(4, 0.02), np.ones(4)), np.ones(3), 9)
 
 
-def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, profiles):
+def test_errors_are_raised_before_rendering(tmp_path, monkeypatch, profiles):
     def drawn(*_, **__):
         raise AssertionError("pictures were drawn")
 
@@ -423,7 +423,7 @@ def test_what_is_refused_before_a_picture_is_drawn(tmp_path, monkeypatch, profil
         frame_time_posterior(log_prob=toy(*NEAR), profiles=profiles, progress=False)
 
 
-def test_what_drawn_likelihoods_refuse():
+def test_rendered_log_likelihood_checks_arguments():
     frames = clip(uneven())
     with pytest.raises(ValueError, match="noise"):
         rendered_log_likelihood(model(), frames, uneven(), "score")
@@ -438,7 +438,7 @@ def test_levels_of_intervals(near, level):
         near.interval(level)
 
 
-def test_what_is_told_of_many_frames_is_that_of_all_draws():
+def test_statistics_of_many_frames_use_all_draws():
     shape = 2, 3, 4, 150
     times = np.sort(np.random.default_rng(0).random(shape))
     flat = times.reshape(-1, 150)
@@ -449,11 +449,11 @@ def test_what_is_told_of_many_frames_is_that_of_all_draws():
 
 
 @pytest.mark.slow
-def test_draws_are_kept_twice_and_not_more():
+def test_peak_memory_is_twice_the_draws():
     num = 40
     log_prob = toy(np.linspace(0, 1, num + 2)[1:-1], np.full(num, 0.005), nodes=101)
     settings = {"steps": 400, "thin_by": 1, "ensembles": 2}
-    sampled(log_prob, **{**settings, "steps": 2})  # what is compiled
+    sampled(log_prob, **{**settings, "steps": 2})  # compilation
     tracemalloc.start()
     found = sampled(log_prob, **settings)
     peak = tracemalloc.get_traced_memory()[1]
@@ -462,7 +462,7 @@ def test_draws_are_kept_twice_and_not_more():
     assert 1.9 * kept < peak < 2.8 * kept
 
 
-def test_a_nan_in_the_density_is_an_error():
+def test_nan_in_the_density_raises():
     log_prob = toy(*NEAR)
     values = log_prob.curves.values.copy()
     values[1, 100:140] = np.nan
@@ -471,7 +471,7 @@ def test_a_nan_in_the_density_is_an_error():
         sampled(broken, steps=100)
 
 
-def test_neither_model_nor_density_is_an_error():
+def test_missing_model_and_density_raise():
     with pytest.raises(ValueError, match="model"):
         frame_time_posterior(progress=False)
 
@@ -487,7 +487,7 @@ def test_some_frames_of_a_clip():
     assert found.identified().all()
 
 
-def test_progress_is_told():
+def test_progress_is_reported():
     told = []
     settings = {"noise": white(), "steps": 20, "ensembles": 2}
     frame_time_posterior(model(), clip(uneven()), frames=[3], **settings, progress=lambda *each: told.append(each))
@@ -495,7 +495,7 @@ def test_progress_is_told():
     assert all(0 < done <= total for _, done, total in told)
 
 
-def test_arviz_has_them_all():
+def test_arviz_has_all_draws():
     found = sampled(toy(*NEAR), steps=100, ensembles=2)
     data = found.to_arviz()
     ensembles, steps, walkers, frames = found.times.shape

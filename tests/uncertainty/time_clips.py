@@ -1,4 +1,4 @@
-"""What tests of frame times share: profiles whose posterior is known, and a small model with clips of its own."""
+"""Helpers of the tests of frame times: curves with known posteriors, a small model and clips of it."""
 
 import functools
 
@@ -12,7 +12,7 @@ SIZE, NUM_FRAMES, SCALE = (24, 32), 10, 0.02
 
 
 def parabolas(means, widths, num_nodes: int = 201) -> ProfileCurves:
-    """Gaussian log-likelihoods of the times of all frames between the first and the last, which know nothing."""
+    """Gaussian log-likelihoods of the times of all frames but the first and the last, which are flat."""
     nodes, flat = np.linspace(0, 1, num_nodes), np.zeros(num_nodes)
     inner = [-((nodes - m) ** 2) / (2 * w**2) for m, w in zip(means, widths, strict=True)]
     return ProfileCurves.from_nodes([nodes] * (len(inner) + 2), [flat, *inner, flat])
@@ -34,7 +34,7 @@ def uneven(num_frames: int = NUM_FRAMES, seed: int = 3) -> np.ndarray:
 
 
 def clip(times, scale: float = SCALE, seed: int = 0, of=None) -> np.ndarray:
-    """What the model shows at `times`, with white noise, in 8 bits."""
+    """8-bit images of the model at `times`, with white noise."""
     of = model() if of is None else of
     residuals = Residuals(of, np.zeros((3, *of.size, 3), np.uint8))
     pictures = np.moveaxis(np.stack(list(residuals.render_at(times))), 1, -1)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
-from test_motion import panning
+from test_optical_flow import panning
 
 from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions

@@ -2,7 +2,7 @@ r"""The loss of 3DGS and VeGaS with its gradient, in one pass over the image.
 
 $$ L = (1 - \lambda)\,\mathrm{mean}|x - y| + \lambda\,(1 - \mathrm{mean}\,\mathrm{SSIM}(x, y)) $$
 
-SSIM: Wang et al. 2004, with the published rasterisers' choices: 11 Gaussian taps of sigma 1.5, zero padding, population
+SSIM: Wang et al. 2004, with the published rasterizers' choices: 11 Gaussian taps of sigma 1.5, zero padding, population
 covariance, data range 1. In XLA this loss costs more than the splats; here strips of rows pass through the cache once.
 """
 
@@ -53,23 +53,6 @@ def _blur(row, x):
     )
 
 
-@inline
-def _tap(k):
-    """Weight of the tap k rows away."""
-    k = abs(k)
-    if k == 0:
-        return _W0
-    if k == 1:
-        return _W1
-    if k == 2:
-        return _W2
-    if k == 3:
-        return _W3
-    if k == 4:
-        return _W4
-    return _W5
-
-
 @kernel
 def _vertical_moments(x, y, row, moments):
     """Blur x, y, x^2, y^2, x y down the columns at one row, into the padded rows of `moments` (5, ...)."""
@@ -77,7 +60,7 @@ def _vertical_moments(x, y, row, moments):
     m_x, m_y, m_xx, m_yy, m_xy = moments[0], moments[1], moments[2], moments[3], moments[4]
     moments[:] = 0.0
     for k in range(max(-RADIUS, -row), min(RADIUS, height - 1 - row) + 1):
-        tap, x_row, y_row = _tap(k), x[row + k], y[row + k]
+        tap, x_row, y_row = TAPS[abs(k)], x[row + k], y[row + k]
         for c in range(_u(width)):
             p = c + _u(RADIUS)
             a, b = x_row[c], y_row[c]
@@ -127,7 +110,7 @@ def _finish_row(x, y, row, top, blurred, scratch, scale_l1, scale_ssim, gradient
     s_mean, s_square, s_product = scratch[0], scratch[1], scratch[2]
     scratch[:] = 0.0
     for k in range(max(-RADIUS, -row), min(RADIUS, height - 1 - row) + 1):
-        tap, slot = _tap(k), row + k - top
+        tap, slot = TAPS[abs(k)], row + k - top
         by_mean, by_square, by_product = blurred[0, slot], blurred[1, slot], blurred[2, slot]
         for c in range(_u(width)):
             s_mean[c] += tap * by_mean[c]
