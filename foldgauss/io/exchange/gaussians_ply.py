@@ -22,20 +22,12 @@ from foldgauss.video.models.splats import SH_C0
 #: Depth between a Gaussian and the one behind it, in model units: some three steps of float32 at the distance of the
 #: front camera (1.4), so that viewers which sort by depth keep the order. 40,000 Gaussians are 0.016 deep.
 DEPTH_STEP = 4e-7
-
-
 #: Axes of a 3DGS file: as trained scenes have them (COLMAP: x right, y down, z away), or y up and z towards the viewer.
 AXES = ("y-down", "y-up")
-
-
 #: Degrees of spherical harmonics that viewers know as a whole, and the number of `f_rest` columns of each.
 _NUM_REST = {0: 0, 1: 9, 2: 24, 3: 45}
-
-
 #: Logits of opacity are held within: sigmoid(17) is the last below 1 in float32.
 _LOGIT_MAX = 17.0
-
-
 _SMALLEST = 1e-20  # of a standard deviation, whose logarithm must be finite
 
 

@@ -133,15 +133,6 @@ def read_header_of_kind(path: str | os.PathLike, *kinds: str) -> dict:
     return about
 
 
-def _to_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
-    """The same tree, with the splats of each model in the form that they are stored in."""
-    return _with_splats(video, to_stored)
-
-
-def _from_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
-    return _with_splats(video, from_stored)
-
-
 def _with_splats(video: VideoModel | EditedVideo, change: Callable[[Any], Any]) -> VideoModel | EditedVideo:
     if isinstance(video, VideoModel):
         return dataclasses.replace(video, splats=change(video.splats))
@@ -240,6 +231,9 @@ def _camera_skeleton(header: dict | None) -> Camera | None:
     return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
 
 
-_FORMS = {"to_stored": _to_stored, "from_stored": _from_stored}
+_FORMS = {
+    "to_stored": partial(_with_splats, change=to_stored),
+    "from_stored": partial(_with_splats, change=from_stored),
+}
 register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
 register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)

@@ -22,7 +22,7 @@ import scipy.stats
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.uncertainty.likelihood.likelihood_profiles import EXPLAINED
+from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
 from foldgauss.video.fitting.loop import FitState, fit_steps, start_from, to_model
@@ -269,18 +269,11 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
         raise invalid(
             "video", expected="frames without alpha for pixels", got=f"{video.dtype} {video.shape}", cure=cure
         )
-    left = sum(float(np.square(each, dtype=np.float64).sum()) for each in _residuals(residuals))
+    images = residuals.render_at(np.asarray(model.frame_times.times()))
+    left = sum(float(np.square(residuals.residual(k, each), dtype=np.float64).sum()) for k, each in enumerate(images))
     variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in residuals.frames) * math.prod(model.size) / 255**2
-    if left > (1 - EXPLAINED) * variation:
-        got = f"a model that explains {100 * (1 - left / variation) if variation else 0:.0f}% of their variance"
-        expected = f"frames of which the model explains {100 * EXPLAINED:.0f}%"
-        raise invalid("video", expected=expected, got=got, cure="Give the model of this video, at its size and crop.")
+    check_explained(left, variation)
     return residuals
-
-
-def _residuals(residuals: Residuals) -> Iterator[Float32[np.ndarray, "3 height width"]]:
-    for k, image in enumerate(residuals.render_at(np.asarray(residuals.model.frame_times.times()))):
-        yield residuals.residual(k, image)
 
 
 def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None) -> FitConfig:

@@ -254,7 +254,7 @@ def _density(
     for end, inner, shape in ((0, 1, shapes[0]), (-1, -2, shapes[1])):
         if grid[end] == ends[end] and shape < 2 and shape != 1 and np.isfinite(messages[end]):
             density[end] = density[inner] * (2 / shape - 1)
-    return density / _integral(grid, density)
+    return density / float(np.trapezoid(density, grid))
 
 
 def profile_grid(
@@ -494,10 +494,6 @@ def _cells(above, chance, grid, logs, masses, means, variances, power, alpha, no
             if summed > chance[i]:
                 found[i] = j
                 break
-
-
-def _integral(grid: np.ndarray, density: np.ndarray) -> float:
-    return float(np.trapezoid(density, grid))
 
 
 def _moment(grid: np.ndarray, density: np.ndarray, center: float, power: int) -> float:

@@ -109,7 +109,9 @@ def frame_time_posterior(
                 profiles = likelihood_profiles(model, video, noise=noise, on_render=_labeled(show, "images"))
             profiles = condition_on_level(level, model, video, profiles, frames, _labeled(show, "frames"))
             log_prob = frame_time_log_prob(model, frames=frames, concentration=concentration, profiles=profiles)
-        return _Run(log_prob, settings).sample_until_converged(int(steps) // int(thin_by), show, profiles)
+        run = _Run(log_prob, settings)
+        with contextlib.nullcontext() if run.file is None else contextlib.closing(run.file):
+            return run.sample_until_converged(int(steps) // int(thin_by), show, profiles)
 
 
 def _check_arguments(
@@ -177,13 +179,6 @@ class _Run:
         return sampler
 
     def sample_until_converged(self, most: int, show, profiles: LikelihoodProfiles | None) -> FrameTimePosterior:
-        try:
-            return self._sample_until_converged(most, show, profiles)
-        finally:
-            if self.file is not None:
-                self.file.close()
-
-    def _sample_until_converged(self, most: int, show, profiles: LikelihoodProfiles | None) -> FrameTimePosterior:
         done = min(sampler.iteration for sampler in self.samplers)
         goal = min(CHECK_EVERY, most)
         while True:
