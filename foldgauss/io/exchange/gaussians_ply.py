@@ -203,7 +203,7 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
     if not is_3dgs(ply):
-        got = "properties " + ", ".join(ply.names("vertex")[:20]) if ply.names("vertex") else "no element 'vertex'"
+        got = ply.describe_vertices()
         cure = "For a video use read_vegas_ply." if is_vegas(ply) else "It may be a mesh or a point cloud."
         expected = "a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3"
         raise format_error(ply.path, expected=expected, got=got, cure=cure)

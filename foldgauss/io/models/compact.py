@@ -18,7 +18,7 @@ from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_with
 from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.models import range_coder
 from foldgauss.io.models.column_contexts import ColumnContexts
-from foldgauss.io.models.model_file import ModelFileError, to_json, to_json_types
+from foldgauss.io.models.model_file import ModelFileError, model_file_error, to_json, to_json_types
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression.quantize import (
     FEATURES,
@@ -156,16 +156,9 @@ def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
         raise _unreadable(path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
     if version != VERSION:
-        raise ModelFileError(
-            str(
-                invalid(
-                    "path",
-                    expected=f"a compact model of version {VERSION}, which this program reads",
-                    got=f"version {version} in {str(path)!r}",
-                    cure="Compress the model again." if version < VERSION else "Update foldgauss.",
-                )
-            )
-        )
+        expected, got = f"a compact model of version {VERSION}, which this program reads", f"version {version} in"
+        cure = "Compress the model again." if version < VERSION else "Update foldgauss."
+        raise model_file_error("path", expected=expected, got=f"{got} {str(path)!r}", cure=cure)
     body = data[_FIXED:]
     if length > len(body) or zlib.crc32(body) != checksum:
         raise _unreadable(path, "one that is cut off or damaged (its checksum is another)")
@@ -252,7 +245,5 @@ def _check(right: bool, name: str, got: Any) -> None:
 
 
 def _unreadable(path: Path, got: str) -> ModelFileError:
-    error = invalid(
-        "path", expected="a compact model", got=f"{got}: {str(path)!r}", cure="Copy it again, or compress again."
-    )
-    return ModelFileError(str(error))
+    cure = "Copy it again, or compress again."
+    return model_file_error("path", expected="a compact model", got=f"{got}: {str(path)!r}", cure=cure)

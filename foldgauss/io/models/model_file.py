@@ -146,7 +146,7 @@ def write_tensors(
     if len(text) > _LONGEST_HEADER:
         got = f"one of {len(text):,} bytes for {len(specs):,} tensors"
         cure = "Write the clip as several files."
-        raise _error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
+        raise model_file_error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
         for array in tensors(order):
@@ -159,7 +159,7 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         key = jax.tree_util.keystr(keys, simple=True, separator=".")
         if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
-            raise _error(
+            raise model_file_error(
                 key,
                 expected="an array or a static field",
                 got=f"the plain number {leaf!r}",
@@ -168,7 +168,9 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name, which the skeleton contains
         if key in found or key == _RESERVED:
-            raise _error(key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key.")
+            raise model_file_error(
+                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
+            )
         found[key] = leaf
     return found
 
@@ -176,7 +178,7 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
     if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
-        raise _error(
+        raise model_file_error(
             key,
             expected="a real, integer or boolean array",
             got=f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}",
@@ -192,7 +194,7 @@ def _find_kind(model: Any) -> _Kind:
     for kind in _KINDS.values():
         if type(model) is kind.model_type:
             return kind
-    raise _error(
+    raise model_file_error(
         "model",
         expected="one of the registered types " + (", ".join(sorted(_KINDS)) or "(none yet)"),
         got=type(model).__name__,
@@ -207,7 +209,7 @@ def _check_described(kind: _Kind, model: Any, header: str) -> None:
     _check_tensors(described, _widen_half_precision(_get_specs(_array_leaves(model)), described), "header")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
     if have != want:
-        raise _error(
+        raise model_file_error(
             "header",
             expected=f"every static fact of the model of kind {kind.name!r}",
             got="a skeleton of another structure",
@@ -220,7 +222,7 @@ def to_json(parameter: str, value: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, sort_keys=True, default=_encode_scalar)
     except (TypeError, ValueError, RecursionError) as error:
-        raise _error(
+        raise model_file_error(
             parameter, expected="a dict that JSON can hold", got=str(error), cure="Use plain types."
         ) from error
 
@@ -274,7 +276,7 @@ def load_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]
         return kind.from_stored(filled)
     except ValueError as error:
         got = f"others in {str(path)!r} ({_one_line(error)})"
-        raise _error("path", expected="tensors that fit each other", got=got) from error
+        raise model_file_error("path", expected="tensors that fit each other", got=got) from error
 
 
 def check_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> None:
@@ -286,7 +288,7 @@ def _match_kind(path: Path, kind_name: str, header: dict, tensors: dict[str, dic
     """The kind, and the skeleton made from the header, checked against the tensors."""
     kind = _KINDS.get(kind_name)
     if kind is None:
-        raise _error(
+        raise model_file_error(
             "path",
             expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
             got=f"kind {kind_name!r} in {str(path)!r}",
@@ -295,7 +297,7 @@ def _match_kind(path: Path, kind_name: str, header: dict, tensors: dict[str, dic
     try:
         skeleton = kind.from_header(header)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        raise _error(
+        raise model_file_error(
             "path",
             expected=f"the header of a model of kind {kind.name!r}",
             got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_one_line(error)})",
@@ -355,7 +357,7 @@ def _check_version(path: Path, strings: dict[str, str]) -> None:
     if strings.get("format") != FORMAT:
         raise _unreadable_error(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
     if strings.get("version") != VERSION:
-        raise _error(
+        raise model_file_error(
             "path",
             expected=f"a model file of version {VERSION}, which this program reads",
             got=f"version {strings.get('version')} in {str(path)!r}",
@@ -396,7 +398,7 @@ def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> 
     """Raise unless the tensors have the keys, shapes and types that the header describes."""
     for key in sorted(have.keys() | want.keys()):
         if have.get(key) != want.get(key):
-            raise _error(
+            raise model_file_error(
                 f"tensor {key!r} of {where!r}",
                 expected=_spec_text(want.get(key)),
                 got=_spec_text(have.get(key)),
@@ -429,18 +431,19 @@ def open_tensors(path: Path) -> Iterator[Any]:
 
 def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
     if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
-        raise _error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
+        raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
         return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
     return np.array(array)
 
 
-def _error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
+def model_file_error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
+    """The error with the text of `invalid`."""
     return ModelFileError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
 
 
 def _unreadable_error(path: Path, got: str) -> ModelFileError:
-    return _error(
+    return model_file_error(
         "path",
         expected=f"a {FORMAT} file",
         got=f"{got}: {str(path)!r}",

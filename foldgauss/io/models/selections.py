@@ -10,7 +10,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._atomic import check_path
-from foldgauss.io.models.model_file import ModelFileError, load_model, read_header, register_model, save_model
+from foldgauss.io.models.model_file import load_model, model_file_error, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
@@ -61,7 +61,7 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     kind = read_header(path)["kind"]
     if kind != SELECTION:
         cure = "Give the file that save_selection wrote."
-        raise ModelFileError(str(invalid("path", expected="a selection", got=f"{kind!r} in {str(path)!r}", cure=cure)))
+        raise model_file_error("path", expected="a selection", got=f"{kind!r} in {str(path)!r}", cure=cure)
     record = load_model(path)
     num, cure = model.splats.num_gaussians, "Load it with the model that it was made for, unchanged."
     if len(record.mask) != num:

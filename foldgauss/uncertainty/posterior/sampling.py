@@ -81,9 +81,8 @@ def frame_time_posterior(
     `progress`: whether to show a bar, or a function of (what, done, total). `backend`: an HDF5 file to which the draws
     are written; called again with the same arguments, sampling resumes and gives the same bits.
 
-    **Memory:** 16 bytes per kept time, half of which stay allocated: ensembles x (steps / thin_by) x walkers x frames.
-    2,000 frames, 4 x 32 walkers and 1,000 kept steps take 4 GB, of which 2 GB stay. A larger `thin_by` takes less; with
-    a `backend` the first half is on disk except for one ensemble at a time.
+    **Memory:** 16 bytes per kept time (ensembles x (steps / thin_by) x walkers x frames), of which half stay allocated;
+    with a `backend` the first half is on disk except for one ensemble at a time.
 
     Raises ValueError before any image is rendered for fewer walkers than twice the frames that move at once, settings
     out of range or in conflict with each other, and a backend that cannot be written; later for a backend of another
