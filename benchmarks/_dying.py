@@ -104,10 +104,10 @@ class Plan:
 def main(arguments: list[str]) -> None:
     plan = Plan(**json.loads(arguments[0]))
     from foldgauss import cli
-    from foldgauss.cli.fitting import fit as fitting
+    from foldgauss.jobs import runner
 
     if plan.every is not None:
-        fitting.CHECKPOINT_SECONDS = plan.every
+        runner.CHECKPOINT_SECONDS = plan.every
     plan.arm()
     try:
         cli.main(arguments[1:])

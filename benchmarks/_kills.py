@@ -172,7 +172,7 @@ def _seen(target: Path, rows: list[dict[str, Any]], before: int | None) -> dict[
             except ModelFileError as error:
                 raise Wrong(f"{path.name} after a kill: {error}") from error
     if kept.exists():
-        step = read_header(kept)["header"]["step"]
+        step = read_header(kept)["header"]["counters"]["step"]
     if before is not None and kept.exists() and step < before:
         raise Wrong(f"the checkpoint went back from step {before} to {step}")
     if before is not None and not kept.exists() and not target.exists():

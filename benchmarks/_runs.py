@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._common import console, machine
+from benchmarks._common import console, describe_machine
 from foldgauss.io import Clip
 from foldgauss.io._atomic import atomic_path
 from foldgauss.video import FitConfig, VideoModel, fit, fit_steps, psnr, ssim
@@ -44,7 +44,7 @@ class Runs:
     def write(self, **more: Any) -> None:
         """The file, with `more` beside the runs."""
         if self.path is not None:
-            whole = {"setting": self.setting, "runs": self.done, "machine": machine(), **more}
+            whole = {"setting": self.setting, "runs": self.done, "machine": describe_machine(), **more}
             with atomic_path(self.path) as temporary:
                 temporary.write_text(json.dumps(whole, indent=2) + "\n")
 

@@ -26,7 +26,7 @@ import numpy as np
 import psutil
 from rich.table import Table
 
-from benchmarks._common import console, machine, parse, parser, size, whole
+from benchmarks._common import console, describe_machine, parse, parser, size, whole
 from foldgauss.io import index_video, join_segments, load_video_model, read_video, save_video_model, write_video
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.datasets import sample_clip
@@ -387,7 +387,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.json is not None:
         with atomic_path(options.json) as temporary:
             asked = {name: getattr(options, name) for name in ("frames", "size", "steps", "seconds", "seed")}
-            temporary.write_text(json.dumps({"machine": machine(), "asked": asked} | figures, indent=2) + "\n")
+            temporary.write_text(json.dumps({"machine": describe_machine(), "asked": asked} | figures, indent=2) + "\n")
 
 
 if __name__ == "__main__":

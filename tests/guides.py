@@ -45,8 +45,8 @@ from markdown_it import MarkdownIt
 from PIL import Image
 
 from foldgauss import video
-from foldgauss.cli import view as viewing
-from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.fitting import demo
+from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import datasets, export, save_video_model, write_image, write_video
 from foldgauss.video import FitConfig, fit
 
@@ -117,7 +117,7 @@ def run_page(page: str, folder: Path, monkeypatch) -> dict:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(video, "fit", _fit)
     if page != WHOLE_DEMO:
-        monkeypatch.setattr(fitting, "DEMO_CONFIG", dataclasses.replace(fitting.DEMO_CONFIG, steps=STEPS))
+        monkeypatch.setattr(demo, "CONFIG", dataclasses.replace(demo.CONFIG, steps=STEPS))
     names = {"__name__": "guide"}
     # As a reader has JAX: the suite's own rules are stricter.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):

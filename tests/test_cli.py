@@ -15,11 +15,13 @@ import pytest
 from commands import run
 
 from foldgauss import cli
-from foldgauss.cli import render as drawing
-from foldgauss.cli.app import shared as _shared
+from foldgauss.cli.fitting import demo as demonstration
 from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.shared import rendering as _shared
+from foldgauss.cli.viewing import info as drawing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
 from foldgauss.io.models.model_file import read_header
+from foldgauss.jobs import runner
 
 SIZE = (48, 64)
 QUICK = ["--gaussians", "400", "--steps", "30"]
@@ -89,7 +91,7 @@ def test_other_rates_speeds_and_times(work, tmp_path, capsys):
     assert shown("ends", "--times", "1:0:2") == [5, 0]
     capsys.readouterr()
     assert run("render", work / "model.safetensors", "--out", tmp_path / "v.mp4", "--upsample", 4, "--fps", 12) == 0
-    assert "21 frames at 12 frames a second" in capsys.readouterr().out
+    assert "21 frames at 12 frames per second" in capsys.readouterr().out
     assert read_video(tmp_path / "v.mp4").fps == pytest.approx(12)
 
 
@@ -97,10 +99,10 @@ def test_one_picture(work, tmp_path, capsys):
     """A .png takes one time, and no more."""
     model, target = work / "model.safetensors", tmp_path / "one.png"
     assert run("render", model, "--out", target) == 2
-    assert "--out: expected one picture for a .png, got 6 of them. Choose it by --times T" in capsys.readouterr().err
+    assert "--out: expected one image for a .png, got 6 images. Choose it by --times T" in capsys.readouterr().err
     assert not target.exists()
     assert run("render", model, "--out", target, "--times", "0.5", "--size", "24x32") == 0
-    assert f"{target}: the picture at time 0.5" in capsys.readouterr().out.replace("\n", "")
+    assert f"{target}: the image at time 0.5" in capsys.readouterr().out.replace("\n", "")
     own = next(load_video_model(model).frames(np.array([0.5]), (24, 32)))
     np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], own)
     assert run("render", model, "--out", target, "--times", "0.5") == 2
@@ -338,7 +340,7 @@ def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
     def missing(name):
         raise FileNotFoundError('Try: pip install "foldgauss[samples]"')
 
-    monkeypatch.setattr(fitting, "sample_clip", missing)
+    monkeypatch.setattr(demonstration, "sample_clip", missing)
     assert run("demo", "--out", tmp_path / "demo") == 2
     assert "foldgauss[samples]" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
@@ -346,7 +348,7 @@ def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
 
 def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
     """The real clip, fewer steps."""
-    monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=5000, steps=40))
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=5000, steps=40))
     assert run("demo", "--out", tmp_path) == 0
     names = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
@@ -358,8 +360,8 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
 
 
 def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
-    monkeypatch.setattr(fitting, "DEMO_FRAMES", (0, 4))
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(demonstration, "FRAMES", (0, 4))
     (tmp_path / "model.safetensors").write_bytes(b"mine")
     for record in (None, b"\xff", b"[]", b'{"psnr": [], "ssim": []}'):  # none, and none of a demo
         if record is not None:
@@ -379,14 +381,14 @@ def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
 
 
 def test_a_demo_that_was_stopped_is_replaced_by_the_next(tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "DEMO_CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
-    monkeypatch.setattr(fitting, "DEMO_FRAMES", (0, 4))
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(demonstration, "FRAMES", (0, 4))
 
     def stopped(*given):
         raise OSError("stopped")
 
     with monkeypatch.context() as patched:
-        patched.setattr(fitting, "write_video", stopped)
+        patched.setattr(demonstration, "write_video", stopped)
         assert run("demo", "--out", tmp_path) == 1
     assert (tmp_path / "model.safetensors").exists()
     assert run("demo", "--out", tmp_path) == 0
@@ -407,7 +409,7 @@ def interrupted(monkeypatch):
     """Make the fit send its own process a signal after step 40."""
 
     def arm(number):
-        steps = fitting.fit_steps
+        steps = runner.fit_steps
 
         def stepping(*arguments):
             for state, info in steps(*arguments):
@@ -415,8 +417,8 @@ def interrupted(monkeypatch):
                     os.kill(os.getpid(), number)
                 yield state, info
 
-        monkeypatch.setattr(fitting, "fit_steps", stepping)
-        return lambda: monkeypatch.setattr(fitting, "fit_steps", steps)
+        monkeypatch.setattr(runner, "fit_steps", stepping)
+        return lambda: monkeypatch.setattr(runner, "fit_steps", steps)
 
     return arm
 
@@ -461,7 +463,9 @@ def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
     assert target.read_bytes() == whole.read_bytes()
 
 
-KEEPING_EVERY_STEP = "from foldgauss.cli import fitting, main; fitting.CHECKPOINT_SECONDS = 0.0; main()"
+KEEPING_EVERY_STEP = (
+    "from foldgauss.cli import main; from foldgauss.jobs import runner; runner.CHECKPOINT_SECONDS = 0.0; main()"
+)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="SIGKILL is POSIX's; CI runs it on Linux")
@@ -487,13 +491,13 @@ def test_killed_at_any_moment_and_resumed(work, tmp_path):
 
 
 def _step_of(checkpoint):
-    return read_header(checkpoint)["header"]["step"]
+    return read_header(checkpoint)["header"]["counters"]["step"]
 
 
 def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypatch, capsys):
     target = tmp_path / "m.safetensors"
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
-    kept, save = [], fitting.save_checkpoint
+    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 0.0)
+    kept, save = [], runner.save_checkpoint
 
     def keep(path, state, **options):
         if state.step == 5:
@@ -501,7 +505,7 @@ def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypat
         kept.append(state.step)
         save(path, state, **options)
 
-    monkeypatch.setattr(fitting, "save_checkpoint", keep)
+    monkeypatch.setattr(runner, "save_checkpoint", keep)
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 0
     assert kept == [step for step in range(1, 31) if step != 5]
     assert "No space left" in capsys.readouterr().err
@@ -511,11 +515,11 @@ def test_kept_now_and_then_and_a_full_disk_is_survived(work, tmp_path, monkeypat
 def test_a_fit_kept_at_its_last_step_is_finished(work, tmp_path, monkeypatch):
     """Killed between the last step and the saving of the model."""
     target = tmp_path / "m.safetensors"
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
-    save = fitting.save_video_model
-    monkeypatch.setattr(fitting, "save_video_model", lambda *a, **k: (_ for _ in ()).throw(OSError("killed")))
+    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 0.0)
+    save = runner.save_video_model
+    monkeypatch.setattr(runner, "save_video_model", lambda *a, **k: (_ for _ in ()).throw(OSError("killed")))
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK) == 1
-    monkeypatch.setattr(fitting, "save_video_model", save)
+    monkeypatch.setattr(runner, "save_video_model", save)
     assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--resume") == 0
     assert load_video_model(target).num_frames == 6
 
@@ -532,13 +536,13 @@ def test_the_model_is_saved_before_it_is_evaluated(work, tmp_path, monkeypatch):
 
 def test_presets(work, tmp_path, monkeypatch):
     """What is given on the command line is taken from there, all else from the preset."""
-    seen, steps = [], fitting.fit_steps
+    seen, steps = [], runner.fit_steps
 
     def stepping(frames, config, state):
         seen.append(config)
         return steps(frames, config, state)
 
-    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    monkeypatch.setattr(runner, "fit_steps", stepping)
     model = tmp_path / "m.safetensors"
     common = ["fit", work / "clip.mp4", "--out", model, "--gaussians", "300", "--overwrite"]
     assert run(*common, "--preset", "paper", "--steps", "60", "--degree", "2", "--max-gaussians", "310") == 0
@@ -616,7 +620,7 @@ def test_overwrite_forgets_a_stopped_fit(work, tmp_path, interrupted, monkeypatc
     assert run("fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "80") == 1
     disarm()
     assert kept.exists()
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def killed(after):
         def stepping(*given):
@@ -626,7 +630,7 @@ def test_overwrite_forgets_a_stopped_fit(work, tmp_path, interrupted, monkeypatc
         return stepping
 
     for after in (0, 1):  # only a first step takes the place of what was kept
-        monkeypatch.setattr(fitting, "fit_steps", killed(after))
+        monkeypatch.setattr(runner, "fit_steps", killed(after))
         assert run("fit", work / "clip.mp4", "--out", target, *QUICK, "--overwrite") == 1
         assert kept.exists() == (after == 0)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from commands import run
 
-from foldgauss.cli import _checkup, doctor
-from foldgauss.cli._checkup import Trial
+from foldgauss.cli.measuring import diagnosis, doctor
+from foldgauss.cli.measuring.diagnosis import Trial
 
 WELL = [Trial("draw", True, 0.1, 2.0, "drawn"), Trial("fit", True, 0.2, 0.1, "40 dB")]
 
@@ -22,21 +22,21 @@ def well(monkeypatch):
 
 @pytest.fixture(scope="module")
 def tried():
-    return list(_checkup.trials())
+    return list(diagnosis.trials())
 
 
 def test_the_trials_go_well_here(tried):
     assert [one.name for one in tried if not one.ok] == []
-    assert len(tried) == 6
+    assert len(tried) == 4
     assert all(one.seconds < 10 for one in tried)
     decibels = [float(found[1]) for one in tried if (found := re.search(r"([\d.]+) dB", one.told))]
-    assert len(decibels) == 2
+    assert len(decibels) == 1
     assert min(decibels) > 30
 
 
 def test_a_wrong_picture_is_seen(monkeypatch):
     """Engine xla a hundredth too bright, or black, or broken."""
-    honest = _checkup.render
+    honest = diagnosis.render
 
     def spoiled(how):
         def render(*arguments, engine):
@@ -44,9 +44,9 @@ def test_a_wrong_picture_is_seen(monkeypatch):
             return how(picture) if engine == "xla" else picture
 
         drawn = {}
-        monkeypatch.setattr(_checkup, "render", render)
-        assert _checkup._tried("reference", lambda: _checkup._draw("reference", drawn)).ok
-        return _checkup._tried("xla", lambda: _checkup._draw("xla", drawn))
+        monkeypatch.setattr(diagnosis, "render", render)
+        assert diagnosis._tried("reference", lambda: diagnosis._draw("reference", drawn)).ok
+        return diagnosis._tried("xla", lambda: diagnosis._draw("xla", drawn))
 
     def broken(picture):
         raise RuntimeError("no [such] engine")
@@ -55,7 +55,7 @@ def test_a_wrong_picture_is_seen(monkeypatch):
     for how, told in (
         (lambda picture: picture + 0.01, "away from engine reference"),
         (lambda picture: 0 * picture, "empty"),
-        (lambda picture: picture * np.nan, "no number"),
+        (lambda picture: picture * np.nan, "not finite"),
         (broken, "RuntimeError: no [such] engine"),
     ):
         trial = spoiled(how)
@@ -67,7 +67,7 @@ def test_a_wrong_picture_is_seen(monkeypatch):
 def test_report(well, capsys):
     assert run("doctor") == 0
     told = capsys.readouterr().out
-    for text in ("python", "jaxlib", "usable of", "threads", "GPU", "kernels", "VP9", "H.264", "this folder"):
+    for text in ("python", "jaxlib", "usable of", "threads", "GPU"):
         assert text in told
     assert "All is well; the trials took 0.3 s, and 2.1 s more to compile" in told
 
@@ -78,7 +78,6 @@ def test_json_and_nothing_else(well, capsys):
     assert told["well"] is True
     assert told["problems"] == []
     assert told["versions"]["numpy"] == np.__version__
-    assert told["codecs"]["VP9"] == {"writes": True, "reads": True}
     assert told["machine"]["cores_usable"] >= 1
     assert [one["name"] for one in told["trials"]] == ["draw", "fit"]
     assert not [name for name, found in told.items() if isinstance(found, dict) and "unknown" in found]
@@ -92,11 +91,7 @@ def test_missing_extras_are_told_with_their_cure(well, monkeypatch, capsys):
             raise importlib.metadata.PackageNotFoundError(name)
         return known(name)
 
-    def no_clip(name):
-        raise FileNotFoundError(name)
-
     monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(_checkup, "sample_clip", no_clip)
     assert run("doctor") == 0  # extras are optional
     told = " ".join(capsys.readouterr().out.split())  # however wide the terminal was
     for extra in ("plot", "uncertainty", "numpyro", "sklearn", "samples"):
@@ -137,29 +132,17 @@ def test_nothing_that_cannot_be_found_out_breaks_it(well, monkeypatch, capsys):
     def unknown():
         raise RuntimeError("nobody knows")
 
-    for name in ("versions", "extras", "machine", "engines", "kernels", "folders", "codecs"):
-        monkeypatch.setattr(_checkup, name, unknown)
+    for name in ("versions", "extras", "machine", "engines"):
+        monkeypatch.setattr(diagnosis, name, unknown)
     run("doctor")
-    assert capsys.readouterr().out.count("nobody knows") >= 7
+    assert capsys.readouterr().out.count("nobody knows") >= 4
     run("doctor", "--json")
-    assert json.loads(capsys.readouterr().out)["codecs"] == {"unknown": "RuntimeError: nobody knows"}
-
-
-def test_a_folder_that_cannot_be_written(well, tmp_path, monkeypatch, capsys):
-    def refused(dir):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(_checkup.tempfile, "TemporaryFile", refused)
-    assert run("doctor") == 1
-    told = " ".join(capsys.readouterr().out.split())
-    assert "Permission denied" in told
-    assert "Change to another folder." in told
-    assert "Set TMPDIR" in told
+    assert json.loads(capsys.readouterr().out)["engines"] == {"unknown": "RuntimeError: nobody knows"}
 
 
 def test_threads_say_why(monkeypatch):
     monkeypatch.delenv("FOLDGAUSS_NUM_THREADS", raising=False)
-    assert "one for each core" in _checkup.machine()["threads_because"]
+    assert "one for each core" in diagnosis.machine()["threads_because"]
     monkeypatch.setenv("FOLDGAUSS_NUM_THREADS", "3")
-    found = _checkup.machine()
+    found = diagnosis.machine()
     assert (found["threads"], found["threads_because"]) == (3, "FOLDGAUSS_NUM_THREADS says so")

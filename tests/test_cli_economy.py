@@ -22,7 +22,7 @@ def clip(tmp_path_factory):
 def test_what_pays_and_what_it_tells(clip, tmp_path, capsys):
     out = tmp_path / "model.safetensors"
     assert run("fit", clip, "--out", out, "--gaussians", 150, "--steps", 200, "--economy") == 0
-    assert "only what pays" in capsys.readouterr().out
+    assert "pruned by description length" in capsys.readouterr().out
     assert run("info", out) == 0
     told = capsys.readouterr().out
     assert "degrees" in told

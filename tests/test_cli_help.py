@@ -13,10 +13,10 @@ from commands import run
 from soft_models import soft_model
 
 from foldgauss import cli
-from foldgauss.cli.app.application import app, loaded
-from foldgauss.cli.app.help import EXAMPLES
+from foldgauss.cli.app.application import app, load_commands
+from foldgauss.cli.app.examples import EXAMPLES
 from foldgauss.cli.app.registry import COMMANDS
-from foldgauss.cli.app.shared import TIME_LEFT
+from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io import save_video_model, write_video
 
 #: Of a terminal; Typer's help and ours go by it.
@@ -25,7 +25,7 @@ WIDTHS = (80, 160)
 
 def commands() -> dict[str, object]:
     """Every command by its name as it is typed, groups too."""
-    every = loaded()
+    every = load_commands()
     found = {"": typer.main.get_command(app)}
     for name, command in every.items():
         found[name] = command
@@ -69,16 +69,16 @@ def test_help_shows_options_defaults_and_examples(name, width, capsys, monkeypat
 
 
 def test_the_list_of_commands_says_what_each_says_of_itself():
-    assert sorted(loaded()) == sorted(COMMANDS)
-    for name, command in loaded().items():
-        assert command.help.partition("\n\n")[0] == COMMANDS[name].what
+    assert sorted(load_commands()) == sorted(COMMANDS)
+    for name, command in load_commands().items():
+        assert command.help.partition("\n\n")[0] == COMMANDS[name].summary
 
 
 def test_defaults_are_told_in_brackets(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert run("fit", "--help") == 0
     told = capsys.readouterr().out
-    for text in ("[default: standard]", "[default: 1/255, or what was fitted with]", "in this folder]"):
+    for text in ("[default: standard]", "[default: 1/255, or as fitted]", "in this folder]"):
         assert text in told
 
 
@@ -226,4 +226,4 @@ def test_bars_tell_the_time_left():
     sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.rglob("*.py")}
     bars = [name for name, text in sources.items() if "BarColumn(" in text]
     assert bars
-    assert all("TIME_LEFT" in sources[name] for name in bars)
+    assert all("TIME_LEFT" in sources[name] or "seconds_left" in sources[name] for name in bars)

@@ -13,9 +13,9 @@ import pytest
 from commands import run
 from rich.console import Console
 
-import foldgauss.jobs.fitting as fitting
-from foldgauss.cli.fitting import jobs_view as _jobs_view
-from foldgauss.cli.fitting import many
+import foldgauss.jobs.runner as fitting
+from foldgauss.cli.fitting import fit_many as many
+from foldgauss.cli.fitting import job_progress as _jobs_view
 from foldgauss.io import load_video_model, read_video, write_image, write_video
 from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Progress
@@ -91,9 +91,9 @@ class Stopping:
     """Sends a signal to this process once a segment tells of itself for the second time."""
 
     def __init__(self, monkeypatch, name):
-        self.name, self.seen, self.watch = name, 0, _jobs_view._View.watch
-        monkeypatch.setattr(fitting, "TELL_SECONDS", 0.0)
-        monkeypatch.setattr(_jobs_view._View, "watch", lambda view, share: self(view, share))
+        self.name, self.seen, self.watch = name, 0, _jobs_view._View.update
+        monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
+        monkeypatch.setattr(_jobs_view._View, "update", lambda view, share: self(view, share))
 
     def __call__(self, view, share: Progress):
         self.watch(view, share)
@@ -113,7 +113,7 @@ def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole,
     assert run("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2") == 2  # not with other options
     assert "segment_seconds=1.5" in capsys.readouterr().err
     assert run("fit", long_clip, "--out", target, *SEGMENTS, "--resume") == 0
-    assert "taken up: 1 of 3 segments done, 1 begun" in capsys.readouterr().err
+    assert "continuing: 1 of 3 segments done, 1 begun" in capsys.readouterr().err
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()
 
@@ -162,12 +162,12 @@ def test_what_is_begun_anew_and_stopped_is_not_begun_anew_again(long_clip, whole
     target.write_bytes(b"of before")
     words = ("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite")
     stopped(monkeypatch, "segment 1", *words)
-    assert "Give the same command again with --resume added to go on." in capsys.readouterr().err
+    assert "Give the same command again with --resume added to continue." in capsys.readouterr().err
     stamp = (folder / "segment-0000.safetensors").stat().st_mtime_ns
     assert run("fit", tmp_path / "misspelt.mp4", *words[2:]) == 2
     assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
     stopped(monkeypatch, "segment 2", *words, "--resume")
-    assert "Give the same command again to go on." in capsys.readouterr().err
+    assert "Give the same command again to continue." in capsys.readouterr().err
     assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
     assert run(*words, "--resume", "--quiet") == 0
     assert target.read_bytes() == whole.read_bytes()
@@ -233,7 +233,7 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, c
     out = tmp_path / "models"
     assert run("fit-many", clips, "--out", out, *QUICK) == 1
     told = capsys.readouterr()
-    assert "left alone, no clips: notes.txt" in told.out
+    assert "skipped, not clips: notes.txt" in told.out
     assert "3 models in" in told.out
     assert "1 failed" in told.out
     assert "failed: broken.mp4: path: expected a video file" in told.err
@@ -256,7 +256,7 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeyp
     assert "of other settings" in capsys.readouterr().err
     shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
     assert run("fit-many", own, "--out", out, *QUICK) == 0
-    assert "4 clips, 3 of them done before" in capsys.readouterr().out
+    assert "4 clips, 3 of them done already" in capsys.readouterr().out
     assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
     assert summary_of(out)["failed"] == 0
     assert run("fit-many", own, "--out", out, *QUICK[:-1], "2", "--overwrite", "--quiet") == 0
@@ -283,7 +283,7 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
     other = (*QUICK[:-1], "2")
     stopped(monkeypatch, "clip1.mp4", "fit-many", clips, "--out", out, *other, "--overwrite")
-    assert "Give the command again without --overwrite to go on." in capsys.readouterr().err
+    assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
     assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
     assert "exists, of other settings" in capsys.readouterr().err
     kept = out / "records" / "clip1.safetensors.checkpoint"
@@ -291,7 +291,7 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
     assert kept.read_bytes() == before
     assert run("fit-many", clips, "--out", out, *other) == 1
-    assert "4 clips, 1 of them done before" in capsys.readouterr().out
+    assert "4 clips, 1 of them done already" in capsys.readouterr().out
     assert (out / "clip0.safetensors").stat().st_mtime_ns == stamp
     assert {load_video_model(path).degree for path in out.glob("*.safetensors")} == {2}
 
@@ -335,9 +335,9 @@ def test_names_are_shown_as_they_are(monkeypatch):
     """In a bar, too, brackets are no commands for a colour."""
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
     monkeypatch.setattr(_jobs_view, "err", console)
-    with _jobs_view._shown("clips", 2, "bar") as view:
-        view.watch(Progress("[red]one.mp4", 0.5, 30.0, 3, 40, 1.0, 1.0))
-        view.progress.refresh()
+    with _jobs_view._open_view("clips", 2, "bar") as view:
+        view.update(Progress("[red]one.mp4", 0.5, 30.0, 3, 40, 1.0, 1.0))
+        view.bars.refresh()
     assert "[red]one.mp4" in console.file.getvalue()
 
 
@@ -353,16 +353,16 @@ def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
 
 def test_of_very_many_clips_the_table_shows_none(capsys):
     """Rows of more than a screen or two help nobody: the summary has them."""
-    from foldgauss.cli.fitting.many import MOST_ROWS, _print_table
+    from foldgauss.cli.fitting.fit_many import MAX_ROWS, _print_table
     from foldgauss.jobs import FitJob, Outcome
     from foldgauss.video import FitConfig
 
     record = {"num_frames": 8, "size": [24, 32], "mean_psnr": 30.0, "mean_ssim": 0.9, "num_gaussians": 40}
     record |= {"file_bytes": 1234, "seconds": 1.5}
-    jobs = [FitJob(f"clip{k}.mp4", "", str(k), FitConfig()) for k in range(MOST_ROWS + 1)]
+    jobs = [FitJob(f"clip{k}.mp4", "", str(k), FitConfig()) for k in range(MAX_ROWS + 1)]
     _print_table("models", [Outcome(job, record) for job in jobs[:-1]] + [Outcome(jobs[-1], failure="broken")])
     told = capsys.readouterr().out
     assert "clip3.mp4" not in told
-    assert f"{MOST_ROWS} models in models, 30.00 dB in the mean, 90 s of fitting; 1 failed" in told
+    assert f"{MAX_ROWS} models in models, mean PSNR 30.00 dB, 90 s of fitting; 1 failed" in told
     _print_table("models", [Outcome(dataclasses.replace(jobs[0]), record)])
     assert "clip0.mp4" in capsys.readouterr().out

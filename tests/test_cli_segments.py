@@ -11,7 +11,7 @@ import pytest
 from commands import run
 from soft_models import NUM, soft_model
 
-from foldgauss.cli import view as viewing
+from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, psnr, times_at
@@ -90,7 +90,9 @@ def pictures_of(path):
 
 
 def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("foldgauss.cli.app.shared.read_video", lambda *_, **__: pytest.fail("the whole clip was read"))
+    monkeypatch.setattr(
+        "foldgauss.cli.shared.clips.read_video", lambda *_, **__: pytest.fail("the whole clip was read")
+    )
     assert run("evaluate", here, work / "clip", "--json", tmp_path / "scores.json") == 0
     said = told(capsys)
     clip = read_video(work / "clip", frames=(2, 20))

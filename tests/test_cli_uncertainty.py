@@ -13,8 +13,8 @@ import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
-from foldgauss.cli import uncertainty as command
-from foldgauss.cli._profiles_file import keep_evidence
+from foldgauss.cli.measuring import uncertainty as command
+from foldgauss.cli.measuring.profiles_file import keep_evidence
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.uncertainty import likelihood_profiles
 from foldgauss.uncertainty.posterior.draws_file import lock_draws

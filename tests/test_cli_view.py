@@ -15,7 +15,7 @@ import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, write_both
 
-from foldgauss.cli import view as viewing
+from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import edit
 
@@ -138,7 +138,7 @@ def test_wrong_use_is_told(work, tmp_path, capsys):
         (["export", model, "--format", "html", "--out", out, "--times", "0.5"], 2, "--times: "),
         (["export", model, "--format", "ply", "--out", tmp_path / "a.ply", "--original", out], 2, "--original: "),
         (["export", late, "--format", "html", "--out", out], 1, "foldgauss render"),
-        (["view", late, "--no-browser"], 1, "edits that no folded model holds"),
+        (["view", late, "--no-browser"], 1, "edits that no folded model represents"),
         (["view", tmp_path / "none.fgz"], 2, "none.fgz"),
         (["view", model, "--original", tmp_path / "none.mp4", "--no-browser"], 2, "none.mp4"),
     ):

@@ -14,6 +14,7 @@ from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.fitting import progress as _progress
 from foldgauss.io import read_video, write_video
 from foldgauss.io.history import read_history
+from foldgauss.jobs import runner
 
 QUICK = ["--gaussians", "300", "--steps", "20"]
 
@@ -52,22 +53,22 @@ def test_history_of_a_resumed_fit_has_each_step_once(clip, tmp_path, monkeypatch
     """Kept at step 8, killed at step 12 with half a line written."""
     target, path = tmp_path / "m.safetensors", tmp_path / "m.jsonl"
     arguments = ["fit", clip, "--out", target, *QUICK, "--history", path]
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def killed(*given):
         for state, info in steps(*given):
-            monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", -1.0 if info.step == 8 else 1e9)
+            monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", -1.0 if info.step == 8 else 1e9)
             if info.step == 13:
                 raise OSError("killed")
             yield state, info
 
-    monkeypatch.setattr(fitting, "fit_steps", killed)
+    monkeypatch.setattr(runner, "fit_steps", killed)
     assert run(*arguments) == 1
     first = read_history(path)
     assert [info.step for info in first] == list(range(1, 13))
     with open(path, "a") as file:
         file.write('{"step": 13, "pro')
-    monkeypatch.setattr(fitting, "fit_steps", steps)
+    monkeypatch.setattr(runner, "fit_steps", steps)
     assert run(*arguments, "--resume") == 0
     history = read_history(path)
     assert [info.step for info in history] == list(range(1, 21))
@@ -171,7 +172,7 @@ def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
 def test_the_clock_rings_first_soon_and_then_now_and_then(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
-    rings, rung = _progress._Clock(30.0, first=10.0), []
+    rings, rung = _progress._Timer(30.0, first=10.0), []
     for second in range(100, 200):
         now[0] = float(second)
         if rings():
@@ -180,7 +181,7 @@ def test_the_clock_rings_first_soon_and_then_now_and_then(monkeypatch):
 
 
 def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def stepping(*given):
         for state, info in steps(*given):
@@ -188,7 +189,7 @@ def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
                 signal.raise_signal(signal.SIGINT)
             yield state, info
 
-    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    monkeypatch.setattr(runner, "fit_steps", stepping)
     path = tmp_path / "h.jsonl"
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", path, "--quiet") == 1
     assert [info.step for info in read_history(path)] == list(range(1, 8))
@@ -202,7 +203,7 @@ def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monke
         raise AssertionError("went on")
         yield
 
-    monkeypatch.setattr(fitting, "fit_steps", starting)
+    monkeypatch.setattr(runner, "fit_steps", starting)
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 1
     assert f"stopped by {number.name} before the first step" in capsys.readouterr().err
     assert list(tmp_path.glob("m.*")) == []

@@ -19,12 +19,14 @@ from commands import run
 from benchmarks import _kills, _long, _outputs, _soak
 from benchmarks.memory import write_clip
 from foldgauss._runtime import kernels as _kernels
-from foldgauss.cli import uncertainty
-from foldgauss.cli.app import shared as _shared
+from foldgauss.cli.app.application import WrongUse
 from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.measuring import uncertainty
+from foldgauss.cli.shared import rendering as _shared
 from foldgauss.io import load_video_model, save_video_model, write_video
 from foldgauss.io._lock import lock_output
 from foldgauss.io.models.model_file import load_model, read_header
+from foldgauss.jobs import runner
 
 resource = pytest.importorskip("resource", reason="limits to the size of files are POSIX's; CI runs it on Linux")
 
@@ -162,7 +164,7 @@ def test_a_full_disk_costs_no_older_output_and_leaves_nothing(work, disk, capsys
 
 def filling(monkeypatch, disk, full_at, empty_at=None):
     """Fill the disk before step `full_at` is told, and empty it before `empty_at` is."""
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def stepping(*arguments):
         for state, info in steps(*arguments):
@@ -172,25 +174,25 @@ def filling(monkeypatch, disk, full_at, empty_at=None):
                 disk.empty()
             yield state, info
 
-    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    monkeypatch.setattr(runner, "fit_steps", stepping)
 
 
 def test_a_checkpoint_without_room_is_told_and_the_fit_goes_on(work, disk, monkeypatch, capsys):
     target, kept = disk.folder / "m.safetensors", disk.folder / "m.safetensors.checkpoint"
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 0.0)
     filling(monkeypatch, disk, 6, 9)
-    seen, keep = [], fitting._keep_if_possible
+    seen, keep = [], runner.Checkpoint.try_save
 
     def keeping(*arguments):
         keep(*arguments)
         load_model(kept)
-        seen.append(read_header(kept)["header"]["step"])
+        seen.append(read_header(kept)["header"]["counters"]["step"])
 
-    monkeypatch.setattr(fitting, "_keep_if_possible", keeping)
+    monkeypatch.setattr(runner.Checkpoint, "try_save", keeping)
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
     assert seen == [1, 2, 3, 4, 5, 5, 5, 5, *range(9, 31)]  # whole at any time
     told = capsys.readouterr().err
-    assert told.count("warning: the fit could not be kept at step ") == 3
+    assert told.count("warning: no checkpoint at step ") == 3
     assert f"expected free space for {str(kept)!r}" in told
     assert load_model(target).num_frames == 6
     assert set(os.listdir(disk.folder)) <= {"m.safetensors", "ballast"}
@@ -198,13 +200,13 @@ def test_a_checkpoint_without_room_is_told_and_the_fit_goes_on(work, disk, monke
 
 def test_a_model_without_room_is_written_by_resuming_to_the_bit(work, disk, monkeypatch, capsys):
     target, kept = disk.folder / "m.safetensors", disk.folder / "m.safetensors.checkpoint"
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 0.0)
     filling(monkeypatch, disk, 27)
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith(f"error: path: expected free space for {str(target)!r}")
-    assert f"The fit is kept in {kept}: --resume goes on" in told
-    assert read_header(kept)["header"]["step"] == 26
+    assert f"The fit is kept in {kept}: --resume continues" in told
+    assert read_header(kept)["header"]["counters"]["step"] == 26
     assert set(os.listdir(disk.folder)) <= {kept.name, "ballast"}
     monkeypatch.undo()
     disk.empty()
@@ -219,7 +221,7 @@ def test_scores_without_room_are_told_and_the_model_is_there(work, disk, monkeyp
         _shared, "evaluate", lambda *arguments, **options: disk.fill() or evaluate(*arguments, **options)
     )
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
-    assert f"warning: {target} is written, but its scores could not be noted" in capsys.readouterr().err
+    assert f"warning: {target} is written, but its scores could not be added" in capsys.readouterr().err
     found, whole = load_video_model(target), load_video_model(work / "model.safetensors")
     assert np.array_equal(found.render(0.3), whole.render(0.3))
     assert set(os.listdir(disk.folder)) <= {target.name, "ballast"}
@@ -270,7 +272,7 @@ def test_draws_without_room(size, what, work, small_disk, capsys):
 def before_any_work(monkeypatch):
     """A fit that comes as far as reading its clip fails the test."""
     for name in ("read_video", "fit_steps"):
-        monkeypatch.setattr(fitting, name, lambda *a, name=name, **k: pytest.fail(f"{name} was called"))
+        monkeypatch.setattr(runner, name, lambda *a, name=name, **k: pytest.fail(f"{name} was called"))
 
 
 @pytest.fixture
@@ -338,7 +340,7 @@ def test_read_only_for_every_command(work, read_only, capsys):
 def test_the_clip_may_vanish_while_it_is_fitted(work, tmp_path, monkeypatch, capsys):
     clip, target = tmp_path / "clip.mp4", tmp_path / "m.safetensors"
     shutil.copy(work / "clip.mp4", clip)
-    steps = fitting.fit_steps
+    steps = runner.fit_steps
 
     def stepping(*arguments):
         for state, info in steps(*arguments):
@@ -346,7 +348,7 @@ def test_the_clip_may_vanish_while_it_is_fitted(work, tmp_path, monkeypatch, cap
                 clip.unlink()
             yield state, info
 
-    monkeypatch.setattr(fitting, "fit_steps", stepping)
+    monkeypatch.setattr(runner, "fit_steps", stepping)
     assert run("fit", clip, "--out", target, *SMALL) == 0
     assert target.read_bytes() == (work / "model.safetensors").read_bytes()
     monkeypatch.undo()
@@ -510,7 +512,7 @@ def test_draws_go_on_where_a_kill_left_a_picture(work, tmp_path):
     (tmp_path / ".times.tmp-01ab23cd.png").write_bytes(OLDER)
     uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
     (tmp_path / "frame.png").write_bytes(OLDER)
-    with pytest.raises(_shared.WrongUse, match="without other images"):
+    with pytest.raises(WrongUse, match="without other images"):
         uncertainty._check_folder(tmp_path, work / "clip.mp4", False)
 
 

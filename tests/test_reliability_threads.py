@@ -303,7 +303,7 @@ FORKED = """
     from foldgauss.render import render
     from foldgauss.uncertainty import likelihood_profiles
     from foldgauss.video import FitConfig, compress, edit, evaluate, fit, layers
-    from foldgauss.video.models.renderer import Playback
+    from foldgauss.video.models.renderer import VideoRenderer
     from soft_models import soft_model
 
     model = soft_model()
@@ -321,7 +321,7 @@ FORKED = """
         "model.render": lambda: model.render(0.3),
         "model.at": lambda: model.at(0.3),
         "model.frames": lambda: next(model.frames()),
-        "VideoRenderer": lambda: Playback(model),
+        "VideoRenderer": lambda: VideoRenderer(model),
         "times": lambda: model.frame_times.times(),
         "fit": lambda: fit(clip, FitConfig(num_gaussians=10, steps=1)),
         "evaluate": lambda: evaluate(model, clip),
@@ -494,8 +494,8 @@ def test_an_interrupt_while_drawing_ends_with_keyboard_interrupt():
         import numpy as np
         from soft_models import soft_model
         from foldgauss._runtime.threads import run_tasks
-        from foldgauss.video.models.renderer import Playback
-        shown, size = Playback(soft_model(), (480, 960)), (480, 960)
+        from foldgauss.video.models.renderer import VideoRenderer
+        shown, size = VideoRenderer(soft_model(), (480, 960)), (480, 960)
         truth = shown.frame(0.5)
         started = threading.Event()
 

@@ -18,11 +18,11 @@ import pytest
 from commands import run
 
 from foldgauss.analysis.plot import Panel, plot_tradeoff
-from foldgauss.cli import _tradeoff as kept
-from foldgauss.cli import tradeoff as command
-from foldgauss.cli.fitting import fit as fitting
+from foldgauss.cli.measuring import tradeoff as command
+from foldgauss.cli.measuring import tradeoff_record as kept
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
 from foldgauss.io.models.video_model import read_metadata
+from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, evaluate, tradeoff
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.optical_flow import Motion
@@ -521,10 +521,8 @@ def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeyp
 
 
 def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
-    seen, steps = [], fitting.fit_steps
-    monkeypatch.setattr(
-        fitting, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config)
-    )
+    seen, steps = [], runner.fit_steps
+    monkeypatch.setattr(runner, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config))
     options = ["--ssim-fraction", 0.3, "--quarter-fraction", 0.1, "--half-fraction", 0.2]
     options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
     target = tmp_path / "m.safetensors"

@@ -325,7 +325,7 @@ def _over(x: Array, batch: tuple[int, ...]) -> Array:
 # --- one at a time: parents and values without batch --------------------------------------------------------
 
 
-def _centerd(parent, s):
+def _centered(parent, s):
     """The parent about 0 and the space coordinates s about there: integrals over tau without the offsets' rounding."""
     offset = parent.loc[: s.size]
     parent = eqx.tree_at(lambda dist: dist.loc, parent, jnp.zeros_like(parent.loc))
@@ -383,7 +383,7 @@ def _nearer(parent, s, tau):
 
 def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
     """Panels of p(s, tau) over tau, log p(s), and its estimated relative error."""
-    parent, s = _centerd(parent, s)
+    parent, s = _centered(parent, s)
     frozen, log_f = lax.stop_gradient((parent, s)), _log_joint_frozen(parent, s)
     guides, near = _guides(*frozen, log_f)
     spikes, log_unseen = crossing_panels(parent, s) if s.size == 1 else (None, jnp.asarray(-jnp.inf, s.dtype))
@@ -428,7 +428,7 @@ def _log_rounding(parent, s, near, spikes: Panels | None):
 
 
 def _modes(parent, values, panels: Panels):
-    own, s = _centerd(parent, values)
+    own, s = _centered(parent, values)
     log_f = _log_joint_frozen(own, s)
     grid = jnp.unique(panels.nodes.ravel(), size=panels.nodes.size, fill_value=REACH)
     found = find_peaks(log_f, grid, 2 * _MODES)
@@ -468,7 +468,7 @@ def _log_space_density(parent, s):
 
 def _log_space_cdf(parent, s):
     """log of p(first coordinates) P(last coordinate <= its value | the first)."""
-    parent, s = _centerd(parent, s)
+    parent, s = _centered(parent, s)
     given, frozen = s.size - 1, lax.stop_gradient((parent, s))
     keep = (*range(given), s.size)
 
@@ -497,7 +497,7 @@ def _log_space_cdf(parent, s):
 def _mixture_moments(parent, values, panels: Panels):
     """Mean and covariance of (kept, time) given the values, by the laws of total mean and covariance."""
     offset = jnp.append(parent.loc[values.size :], parent.time_loc)
-    own, s = _centerd(parent, values)
+    own, s = _centered(parent, values)
     t = own.time_loc + own.time_scale * panels.nodes
     offset = offset.at[-1].add(-own.time_loc)
     dim = parent.event_shape[0] - 1 - values.size
@@ -510,5 +510,5 @@ def _mixture_moments(parent, values, panels: Panels):
         mean_a = panels.expectation(jnp.exp(2 * at.log_scale))
         within = jnp.pad(mean_a * tril @ tril.T, ((0, 1), (0, 1)))
     mean = panels.expectation(y)
-    centerd = y - mean[None, None]
-    return offset + mean, within + panels.expectation(centerd[..., :, None] * centerd[..., None, :])
+    centered = y - mean[None, None]
+    return offset + mean, within + panels.expectation(centered[..., :, None] * centered[..., None, :])

@@ -122,8 +122,8 @@ def _fold_moments(dist, order: int):
     z = z.reshape(-1, *(1,) * dist.time_scale.ndim)
     values = expand_leaves(dist.fold, dist.time_scale.ndim + 1)(z * dist.time_scale[None])
     mean = jnp.tensordot(weights, values, axes=1)
-    centerd = values - mean[None]
-    covariance = jnp.tensordot(weights, centerd[..., :, None] * centerd[..., None, :], axes=1)
+    centered = values - mean[None]
+    covariance = jnp.tensordot(weights, centered[..., :, None] * centered[..., None, :], axes=1)
     cross = jnp.tensordot(weights, values * z[..., None], axes=1) * dist.time_scale[..., None]
     return mean, covariance, cross
 

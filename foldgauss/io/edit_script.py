@@ -36,7 +36,8 @@ from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.layering import layers
-from foldgauss.video.segmented.segmented_edit import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segmented.segmented_edit import SegmentedEdit
+from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
 
@@ -217,7 +218,7 @@ class EditScript:
             place = self._at("edits", number, **{own: key for key, own in action.named.items()})
             with place:
                 if isinstance(edits, SegmentedEdit):
-                    edits = edits.within(place)  # of what only the models tell, later
+                    edits = edits.with_error_context(place)  # of what only the models tell, later
                 edits = self._edited(edits, action, table, named)
         video = self._stacked(edits.video())
         if "camera" in self.tables:

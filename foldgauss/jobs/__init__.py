@@ -1,12 +1,15 @@
-"""Fits that outgrow one process: long clips in segments, many clips, by workers here or on a cluster.
+"""Fits as jobs: one runner for every fit, long clips in segments, many clips, and workers on this machine or a cluster.
 
-What is done is on disk, so any process may be killed: who comes next takes up what is there, with the same bits.
+A job (`FitJob`) holds all that its fit depends on, and its results are on disk: a process may be killed at any moment,
+and the next one continues to the same bits. `plan_long_fit` and `make_jobs` make jobs, `fit_job`, `run_here` and
+`run_on` run them.
 """
 
-from foldgauss.jobs.fitting import FitJob, Progress, Stopped, fit_job
-from foldgauss.jobs.long import JoinedFit, LongFit, plan_long_fit, seam_drops, segments_folder
-from foldgauss.jobs.many import find_clips, jobs_of
-from foldgauss.jobs.pool import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
+from foldgauss.jobs.clips import find_clips, make_jobs
+from foldgauss.jobs.job import FitJob
+from foldgauss.jobs.runner import Progress, Stopped, fit_job
+from foldgauss.jobs.segments import JoinedFit, LongFit, plan_long_fit, seam_drops, segments_folder
+from foldgauss.jobs.workers import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
 
 __all__ = [
     "FitJob",
@@ -19,8 +22,8 @@ __all__ = [
     "WorkerPool",
     "find_clips",
     "fit_job",
-    "jobs_of",
     "local_workers",
+    "make_jobs",
     "plan_long_fit",
     "run_here",
     "run_on",

@@ -6,9 +6,10 @@ In reading order: `models` (the model, and rendering it), `fitting` (`fit`), `se
 
 from foldgauss.video.compression.search import Compressed, compress
 from foldgauss.video.editing.chain import Edit, edit
-from foldgauss.video.editing.clock import Clock, Span
+from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
+from foldgauss.video.editing.span import Span
 from foldgauss.video.fitting.config import FitConfig, LearningRates
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
 from foldgauss.video.fitting.economy import Economy
@@ -27,7 +28,8 @@ from foldgauss.video.models.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.layering import layers
-from foldgauss.video.segmented.segmented_edit import SegmentedEdit, SegmentedSelection
+from foldgauss.video.segmented.segmented_edit import SegmentedEdit
+from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
 from foldgauss.video.selection.selectors import (
     Selection,

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli._profiles_file import keep_evidence, kept_evidence
+from foldgauss.cli.measuring.profiles_file import keep_evidence, kept_evidence
 from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.media import format_detection
 from foldgauss.io.media.format_detection import _ASF_AUDIO, _CLUSTER, _MATROSKA_AUDIO
@@ -457,7 +457,7 @@ EVIDENCE = Target(
     lambda: [_evidence()],
     _read_evidence,
     (ValueError,),
-    {"foldgauss.cli._profiles_file": ("keep_evidence", "is_evidence")},
+    {"foldgauss.cli.measuring.profiles_file": ("keep_evidence", "is_evidence")},
     lambda data: 4,
     lambda size: 2 * CONSTANT + 64 * size,
     (zip_resealed,),

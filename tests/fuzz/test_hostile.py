@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 import foldgauss
-from foldgauss.cli._profiles_file import kept_evidence
+from foldgauss.cli.measuring.profiles_file import kept_evidence
 from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
 from foldgauss.io.media.format_detection import read_shown_seconds

@@ -10,8 +10,8 @@ from random import Random
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli._tradeoff import COLUMNS, Record
-from foldgauss.cli.app.shared import WrongUse
+from foldgauss.cli.app.application import WrongUse
+from foldgauss.cli.measuring.tradeoff_record import COLUMNS, Record
 from foldgauss.io import HistoryFile, read_history, save_selection, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
@@ -316,7 +316,7 @@ TRADEOFF = Target(
     lambda: [_record()],
     lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
     (WrongUse,),
-    {"foldgauss.cli._tradeoff": (ONLY, "Record", "_check_row", "_check_rest")},
+    {"foldgauss.cli.measuring.tradeoff_record": (ONLY, "Record", "_check_row", "_check_rest")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 200 * size,
     (record_changed, json_text_changed),

@@ -276,7 +276,11 @@ MISTAKES = {  # text: line, table, and what is told
     "[[edits]]\ndo = 'vanish'\nframe = 1\ntimes = [0, 1]": (3, "[[edits]] number 1", "frame, frames, times: "),
     "[[edits]]\ndo = 'vanish'\nease = 2": (3, "[[edits]] number 1", "ease: .*a span"),
     "[[edits]]\ndo = 'multiply'\noffsets = [[0, 1]]\ndegrees = [1, 2]": (4, "[[edits]] number 1", "degrees: .*got 2"),
-    "[[edits]]\ndo = 'recolor'\nhue = 1\ngain = 2": (3, "[[edits]] number 1", "color, hue, gain: .*one way"),
+    "[[edits]]\ndo = 'recolor'\nhue = 1\ngain = 2": (
+        3,
+        "[[edits]] number 1",
+        "color, hue, gain: .*color, hue, or gain",
+    ),
     "[[edits]]\ndo = 'retime'\nstretch = 0": (3, "[[edits]] number 1", "stretch: "),
     "layers = [1]": (1, "", r"layers: .*\[\[layers\]\]"),
     "[[layers]]\nwhere = 'front'": (1, "[[layers]] number 1", "the key 'model'"),
@@ -372,12 +376,14 @@ def test_what_only_the_models_of_segments_tell_has_its_line():
     assert error(copies, long).startswith("script, line 4, [[edits]] number 1: delays: ")
     turned = THERE + "[[edits]]\ndo = 'rotate'\ndegrees = 9\n[[edits]]\ndo = 'freeze'\nselect = 'it'\nat = 5\nframe = 5"
     assert error(turned, long).startswith(
-        "script, line 7, [[edits]] number 2: selection: expected another time for all"
+        "script, line 7, [[edits]] number 2: selection: expected all Gaussians of an edit"
     )
     gone = THERE + "[[edits]]\ndo = 'vanish'\nselect = 'it'\n[[edits]]\ndo = 'move'\nselect = 'it'\noffset = [0, 1]"
     assert error(gone, long).startswith("script, line 9, [[edits]] number 2: select: expected a selection of at least")
     dark = "[[edits]]\ndo = 'recolor'\ngain = 0\n[[edits]]\ndo = 'recolor'\ncolor = [1, 0, 0]"
-    assert error(dark, long).startswith("script, line 6, [[edits]] number 2: color: expected an object with some light")
+    assert error(dark, long).startswith(
+        "script, line 6, [[edits]] number 2: color: expected an object that is not black"
+    )
     kept = "[selections.it]\nfile = 'it.selection'\n"
     assert error(kept, long) == (
         "script, line 2, [selections.it]: file: expected a model without layers or overlays, got one in segments."

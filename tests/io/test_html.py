@@ -183,7 +183,7 @@ def _two_envelopes(model):
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        (lambda m: html_page(_late(m)), "edits that no folded model holds.*foldgauss render"),
+        (lambda m: html_page(_late(m)), "edits that no folded model represents.*foldgauss render"),
         (lambda m: html_page(_two_envelopes(m)), "envelope: expected one for all"),
         (lambda m: html_page(edit(m)), r"model: expected a VideoModel or an EditedVideo.*\.video\(\)"),
         (lambda m: html_page(m, quality=0), "quality: expected a whole number from 1 to 100, got 0"),
@@ -562,7 +562,7 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
 
 def test_segments_that_no_page_holds_are_told(monkeypatch):
     late = SegmentedVideo.from_models([(0, soft_model()), (5, _late(soft_model()))])
-    with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model holds"):
+    with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model represents"):
         html_page(late)
     assert late._repr_html_() is None
     with pytest.raises(ValueError, match=r"original: expected frames uint8 .19, 40, 64, 3."):

@@ -254,7 +254,7 @@ def test_a_source_that_changes_meanwhile_is_refused(work, tmp_path, monkeypatch)
     ("chosen", "message"),
     [
         ([], "^segments: expected at least one"),
-        ([(0, "a"), (8, "b")], "got frame 8. Fit frames 7:8, too"),
+        ([(0, "a"), (8, "b")], "got frame 8. Also fit frames 7:8"),
         ([(4, "b"), (0, "a")], "begin at frame 0"),
         (["a"], r"^sources\[0\]: expected \(number of its first frame, model file\)"),
         ([("a", 0)], r"^sources\[0\]: expected the number of its first frame first"),
@@ -416,5 +416,5 @@ def test_frames_go_out_as_they_are_played(tmp_path):
 
 def test_a_page_that_cannot_be_says_of_which_segment(work):
     for model in (work / "long.safetensors", load_video_model(work / "long.safetensors")):
-        with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model holds"):
+        with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model represents"):
             html_page(model)

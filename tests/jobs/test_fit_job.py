@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from drifting import CONFIG, write_drifting
 
-import foldgauss.jobs.fitting as fitting
+import foldgauss.jobs.runner as fitting
 from foldgauss.io import index_video, load_video_model
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Stopped, fit_job
-from foldgauss.jobs.fitting import finished
+from foldgauss.jobs.job import read_record
 from foldgauss.video.fitting.economy import Economy
 
 NUM_FRAMES = 10
@@ -46,8 +46,8 @@ def test_a_job_leaves_its_model_and_its_record_alone(done):
     assert len(record["psnr"]) == NUM_FRAMES
     assert record["mean_psnr"] == pytest.approx(np.mean(record["psnr"]), abs=1e-3)
     assert record["file_bytes"] == os.path.getsize(job.target)
-    assert json.loads(job.record.read_text()) == json.loads(json.dumps(record)) == finished(job)
-    assert not job.kept.exists()
+    assert json.loads(job.record.read_text()) == json.loads(json.dumps(record)) == read_record(job)
+    assert not job.checkpoint.exists()
 
 
 class Counting:
@@ -88,7 +88,7 @@ def test_a_record_of_something_else_is_none(done, clip, tmp_path, change):
         told = json.loads(job.record.read_text())
         del told["mean_psnr"]
         other.record.write_text(json.dumps(told))
-    assert finished(other) is None
+    assert read_record(other) is None
 
 
 def stopped_after(job, step):
@@ -98,17 +98,17 @@ def stopped_after(job, step):
 
 
 def test_a_stopped_job_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "TELL_SECONDS", 0.0)
+    monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
     job, record = job_of(clip, tmp_path), done[1]
     told = []
     stopped_after(job, 5)
-    assert job.kept.exists()
+    assert job.checkpoint.exists()
     assert not Path(job.target).exists()
     again = fit_job(job, lambda progress: not told.append(progress.step))
     assert told[0] == 6
     assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
     assert {name: again[name] for name in ("psnr", "ssim")} == {name: record[name] for name in ("psnr", "ssim")}
-    assert not job.kept.exists()
+    assert not job.checkpoint.exists()
 
 
 def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatch):
@@ -136,11 +136,11 @@ def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path
 
 @pytest.mark.parametrize("damage", ["cut", "other"])
 def test_a_checkpoint_that_cannot_be_used_is_not(done, clip, tmp_path, monkeypatch, damage):
-    monkeypatch.setattr(fitting, "TELL_SECONDS", 0.0)
+    monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
     job = job_of(clip, tmp_path)
     if damage == "cut":
         stopped_after(job, 5)
-        job.kept.write_bytes(job.kept.read_bytes()[:-10])
+        job.checkpoint.write_bytes(job.checkpoint.read_bytes()[:-10])
     else:
         other = dataclasses.replace(job, config=dataclasses.replace(CONFIG, seed=1))
         stopped_after(other, 5)
@@ -178,7 +178,7 @@ def test_a_full_disk_at_a_checkpoint_costs_no_fit(done, clip, tmp_path, monkeypa
 
 def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch):
     """Two at once in one process, the second of which begins later and ends first."""
-    real, begun, joined, warned, over = fitting._steps, *(threading.Event() for _ in range(4))
+    real, begun, joined, warned, over = fitting.run_fit, *(threading.Event() for _ in range(4))
 
     def steps(job, *given):
         if job.name == "second":
@@ -193,7 +193,7 @@ def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch
             assert over.wait(60)
         return real(job, *given)
 
-    monkeypatch.setattr(fitting, "_steps", steps)
+    monkeypatch.setattr(fitting, "run_fit", steps)
     jobs = [
         dataclasses.replace(job_of(clip, tmp_path, f"{name}.safetensors"), name=name) for name in ("first", "second")
     ]
@@ -211,7 +211,7 @@ def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch
 def test_a_psnr_that_was_not_reached_is_told(clip, tmp_path):
     config = dataclasses.replace(CONFIG, economy=Economy(psnr=60.0))
     (told,) = fit_job(job_of(clip, tmp_path, config=config))["warnings"]
-    assert told.startswith("60 dB were not reached, got ")
+    assert told.startswith("60 dB was not reached, got ")
 
 
 def test_files_go_where_they_are_asked_to(clip, tmp_path):
@@ -227,11 +227,11 @@ def test_what_was_compiled_for_many_shapes_is_forgotten(monkeypatch):
     """Else a worker that goes through a thousand clips would hold programs for each."""
     cleared = []
     monkeypatch.setattr(fitting.jax, "clear_caches", lambda: cleared.append(True))
-    programs = fitting._Programs()
-    for length in [*range(fitting.SHAPES), 0, 1]:
-        programs.make_room((length, 8, 8, 3))
+    programs = fitting._CompilationCache()
+    for length in [*range(fitting.MAX_SHAPES), 0, 1]:
+        programs.add((length, 8, 8, 3))
     assert not cleared
-    programs.make_room((100, 8, 8, 3))
+    programs.add((100, 8, 8, 3))
     assert len(cleared) == 1
-    programs.make_room((0, 8, 8, 3))
+    programs.add((0, 8, 8, 3))
     assert len(cleared) == 1

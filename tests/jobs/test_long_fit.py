@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from drifting import CONFIG, SIZE, drifting, write_drifting
 
-import foldgauss.jobs.fitting as fitting
-import foldgauss.jobs.long as long
+import foldgauss.jobs.runner as fitting
+import foldgauss.jobs.segments as long
 from foldgauss.io import VideoError, index_video, load_video_model, read_video
 from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
@@ -90,11 +90,11 @@ def test_the_folder_goes_and_what_others_put_there_stays(whole, clip, tmp_path):
         Path(job.target).write_bytes(Path(made.target).read_bytes())
         job.record.write_text(made.record.read_text())
         (fit.folder / f".{Path(job.target).stem}.own-01234567.safetensors").write_bytes(b"left by a kill")
-    fit.tidy()
+    fit.clean_up()
     assert not fit.folder.exists()
     fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
     (fit.folder / "mine.txt").write_text("kept")
-    fit.tidy()
+    fit.clean_up()
     assert [entry.name for entry in fit.folder.iterdir()] == ["mine.txt"]
 
 
@@ -152,7 +152,7 @@ def test_another_clip_in_its_place_is_refused_and_the_same_one_is_not(tmp_path):
     os.utime(clip, (1, 1))
     plan_long_fit(clip, target, CONFIG, **ASKED)
     write_drifting(clip, 20, phase=1.0)
-    with pytest.raises(ValueError, match="clip: expected the clip that was begun with"):
+    with pytest.raises(ValueError, match="clip: expected the clip that the fit was started with"):
         plan_long_fit(clip, target, CONFIG, **ASKED)
 
 
@@ -244,13 +244,13 @@ def test_anew_gives_up_what_is_kept_once_the_clip_can_be_read(clip, tmp_path):
     kept = fit.folder / "segment-0000.safetensors.checkpoint"
     kept.write_bytes(b"hours")
     with pytest.raises(FileNotFoundError):
-        plan_long_fit(tmp_path / "none.mp4", target, CONFIG, **ASKED, anew=True)
+        plan_long_fit(tmp_path / "none.mp4", target, CONFIG, **ASKED, restart=True)
     (fit.folder / "mine.txt").write_text("")
-    with pytest.raises(ValueError, match=r"target: expected parts of a fit alone in .*'mine.txt' in it"):
-        plan_long_fit(clip, target, CONFIG, **ASKED, anew=True)
+    with pytest.raises(ValueError, match=r"target: expected only files of a fit in .*'mine.txt' in it"):
+        plan_long_fit(clip, target, CONFIG, **ASKED, restart=True)
     (fit.folder / "mine.txt").unlink()
     assert kept.exists()
-    changed = plan_long_fit(clip, target, CONFIG, segment_seconds=2.0, anew=True)
+    changed = plan_long_fit(clip, target, CONFIG, segment_seconds=2.0, restart=True)
     assert changed.spans != fit.spans
     assert not kept.exists()
 
@@ -271,7 +271,7 @@ def test_segments_of_a_damaged_clip_name_the_frames_that_read_video_finds(tmp_pa
     assert fit.index.num_frames < NUM_FRAMES - 2
     whole_clip = read_video(path, frames=(2, NUM_FRAMES)).frames
     for (first, stop), job in zip(fit.spans, fit.jobs, strict=True):
-        named = read_video(path, frames=tuple(job.noted["frames"])).frames
+        named = read_video(path, frames=tuple(job.metadata["frames"])).frames
         np.testing.assert_array_equal(named, whole_clip[first:stop])
 
 
@@ -285,7 +285,7 @@ def test_what_is_no_clip_leaves_nothing(tmp_path):
 def test_jobs_stop_between_two_and_within_one(clip, tmp_path):
     fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
     ended = []
-    outcomes = run_here(fit.jobs, ignored, asked_to_stop=lambda: bool(ended))
+    outcomes = run_here(fit.jobs, ignored, should_stop=lambda: bool(ended))
     ended.append(next(outcomes))
     with pytest.raises(Stopped):
         next(outcomes)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from foldgauss.io import write_image
-from foldgauss.jobs import find_clips, jobs_of
+from foldgauss.jobs import find_clips, make_jobs
 from foldgauss.video import FitConfig
 
 
@@ -44,7 +44,7 @@ def test_what_has_no_clips_is_refused_in_words(tmp_path):
 
 def test_models_of_clips_of_one_name_are_told_apart(tmp_path):
     made(tmp_path, "one.mp4", "One.avi", "two.v1.mp4")
-    jobs = jobs_of(find_clips(tmp_path).clips, tmp_path / "out")
+    jobs = make_jobs(find_clips(tmp_path).clips, tmp_path / "out")
     assert [Path(job.target).name for job in jobs] == [
         "One.avi.safetensors",
         "one.mp4.safetensors",
@@ -57,7 +57,7 @@ def test_no_two_clips_have_one_model(tmp_path):
     """The whole name of one may be the stem of another."""
     made(tmp_path, "a.mp4", "a.avi", "a.mp4.mkv", "b.mov")
     (tmp_path / "a.mp4.mkv.gif").write_bytes(b"")
-    jobs = jobs_of(find_clips(tmp_path).clips, tmp_path / "out")
+    jobs = make_jobs(find_clips(tmp_path).clips, tmp_path / "out")
     names = {job.name: Path(job.target).name for job in jobs}
     assert names["b.mov"] == "b.safetensors"
     assert names["a.mp4"] == "a.mp4.safetensors"
@@ -67,16 +67,16 @@ def test_no_two_clips_have_one_model(tmp_path):
 
 def test_a_clip_in_the_place_of_another_is_another(tmp_path):
     made(tmp_path, "one.mp4")
-    before = jobs_of(find_clips(tmp_path).clips, tmp_path)[0]
+    before = make_jobs(find_clips(tmp_path).clips, tmp_path)[0]
     (tmp_path / "one.mp4").write_bytes(b"other")
-    after = jobs_of(find_clips(tmp_path).clips, tmp_path)[0]
-    assert before.asked != after.asked
+    after = make_jobs(find_clips(tmp_path).clips, tmp_path)[0]
+    assert before.request != after.request
 
 
 def test_settings_reach_each_job(tmp_path):
     made(tmp_path, "one.mp4", "two.mp4")
     config = FitConfig(steps=7)
-    jobs = jobs_of(find_clips(tmp_path).clips, tmp_path, config, size=(8, 8), frames=(0, 3), checkpoint_seconds=2.0)
+    jobs = make_jobs(find_clips(tmp_path).clips, tmp_path, config, size=(8, 8), frames=(0, 3), checkpoint_seconds=2.0)
     assert {(job.config.steps, job.size, job.frames, job.checkpoint_seconds) for job in jobs} == {
         (7, (8, 8), (0, 3), 2.0)
     }

@@ -16,12 +16,14 @@ from foldgauss.jobs import (
     SchedulerLost,
     Stopped,
     find_clips,
-    jobs_of,
     local_workers,
-    pool,
+    make_jobs,
     run_here,
     run_on,
     running_cluster,
+)
+from foldgauss.jobs import (
+    workers as pool,
 )
 
 #: A fit that lasts, since a kill is to come in its midst.
@@ -43,7 +45,7 @@ def clips(tmp_path_factory):
 
 def jobs_into(folder, clips, config=CONFIG):
     (folder / "records").mkdir()
-    return jobs_of(clips, folder, config, checkpoint_seconds=0.0)
+    return make_jobs(clips, folder, config, checkpoint_seconds=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -83,12 +85,12 @@ def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, sa
         def mend(self, alive):
             assert alive == 0
 
-    monkeypatch.setattr(pool, "NO_WORKERS", -1.0)
+    monkeypatch.setattr(pool, "NO_WORKERS_SECONDS", -1.0)
     monkeypatch.setattr(distributed, "Event", lambda *given, **named: None)
     crew = NoCrew()
     crew.is_remote = is_remote
     with pytest.raises(SchedulerLost, match=says):
-        pool._Run(crew, [], ignored, lambda: False)._fill()
+        pool._PoolRun(crew, [], ignored, lambda: False)._fill()
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):
@@ -118,8 +120,8 @@ def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips
 def test_workers_keep_what_they_do_when_asked_to_stop(crew, clips, tmp_path):
     jobs, told = jobs_into(tmp_path, clips[1:], LASTING), []
     with pytest.raises(Stopped):
-        list(run_on(crew, jobs, told.append, asked_to_stop=lambda: bool(told)))
-    assert any(job.kept.exists() for job in jobs)
+        list(run_on(crew, jobs, told.append, should_stop=lambda: bool(told)))
+    assert any(job.checkpoint.exists() for job in jobs)
     assert not any(os.path.exists(job.target) for job in jobs)
 
 

@@ -133,7 +133,7 @@ WRONG_LAYERS = {
     "timeline": (lambda: layers(MODEL, timeline=1), "timeline: expected the number of one of 1"),
     "no number": (lambda: layers(MODEL, timeline="first"), "timeline"),
     "kind": (lambda: layers(MODEL, edit(MODEL)), r"video: expected a VideoModel .*got Edit\. End .* \.video"),
-    "aspect": (lambda: layers(MODEL, soft_model(size=(64, 64))), "layers: expected frames of one shape, 40x64"),
+    "aspect": (lambda: layers(MODEL, soft_model(size=(64, 64))), "layers: expected frames of one aspect ratio, 40x64"),
     "options": (lambda: layers(MODEL, soft_model()), "layers: expected one options for all"),
     "sum": (lambda: layers(MODEL, soft_model(options=RenderOptions(), compositing="sum")), "layers: .*compositing"),
     "camera": (

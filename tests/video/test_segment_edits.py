@@ -335,7 +335,7 @@ def test_copies_are_in_all_segments():
 
 
 def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, curve="linear"):
-    """How far along an edit over a span is at a frame position, by the words of `make_span`."""
+    """How far along an edit over a span is at a frame position, by the words of `make_frame_span`."""
     if times is not None:
         begin, end = times[0] * last, times[1] * last
     else:
@@ -467,7 +467,7 @@ def test_the_first_segment_goes_on_before_the_clip_and_the_last_behind_it():
     np.testing.assert_allclose(
         drawn(end)[13:], drawn(edit(last).select(OBJECT).retime(shift=-2 / 5).video())[3:], atol=1
     )
-    with pytest.raises(ValueError, match=r"shift: .*frames 10 to 15, got frame 8 for frame 10, which another"):
+    with pytest.raises(ValueError, match=r"shift: .*frames 10 to 15, got frame 8 for frame 10, which is in another"):
         edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=2 / steps).video()
 
 
@@ -625,19 +625,19 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
         (lambda e: e.select(times=(0.5, 2)), "times: expected .start, stop."),
         (lambda e: e.select(frame=3, color=(2, 0, 0)), "color: expected red, green and blue"),
         (lambda e: e.select(tolerance=3, frame=1), "tolerance: expected color or click"),
-        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),) * 3), frame=1), "a selection or criteria for one"),
+        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),) * 3), frame=1), "a selection or criteria"),
         (lambda e: e.select(layer=-1), "layer: expected a whole number >= 0"),
         (lambda e: e.move((1, 2, 3)), "offset: expected 2 finite numbers"),
         (lambda e: e.move((0.1, 0), frames=(3, 17)), "frames: expected .*stop <= 16"),
         (lambda e: e.move((0.1, 0), frame=3, easing=2), "when: expected one of .*got easing"),
         (lambda e: e.recolor((2, 0, 0)), "color: expected red, green and blue"),
-        (lambda e: e.recolor((1, 0, 0), hue=0.3), "expected one way to recolour"),
+        (lambda e: e.recolor((1, 0, 0), hue=0.3), "expected color, hue, or gain"),
         (lambda e: e.freeze(16), r"at: expected a frame in \[0, 15\], got 16"),
         (lambda e: e.select(color=(1, 0, 1), tolerance=0).move((0.1, 0)), "selection: expected at least one Gaussian"),
         (lambda e: e.select(color=(1, 0, 1), tolerance=0).recolor((1, 0, 0)), "selection: expected at least one"),
         (lambda e: e.vanish().move((0.1, 0)), "selection: expected at least one Gaussian"),
         (lambda e: e.opacity(0).recolor((1, 0, 0)), "selection: expected at least one Gaussian"),
-        (lambda e: e.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object with some light"),
+        (lambda e: e.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object that is not black"),
         (lambda e: e.seen_from("left"), "camera: expected a Camera"),
     ],
 )

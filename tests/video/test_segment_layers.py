@@ -180,7 +180,7 @@ def test_models_are_loaded_when_they_are_drawn():
             "videos: expected the segments of video 1, 0:7, 4:13, 10:16, got 0:16 in video 0",
         ),
         (lambda: layers(3, ground()), "video: expected a VideoModel or an EditedVideo, got int"),
-        (lambda: layers(soft_model(size=(30, 64)), ground()), "frames of one shape"),
+        (lambda: layers(soft_model(size=(30, 64)), ground()), "frames of one aspect ratio"),
         (lambda: layers(edit(soft_model()).seen_from(Camera.front(1)).video(), ground()), "videos without a camera"),
     ],
 )

@@ -314,7 +314,7 @@ def test_played_through_each_segment_is_loaded_once(way):
     assert loaded == []
     playback = VideoRenderer(clip)
     for _ in playback.frames(np.linspace(0, 1, 67)[::way]):
-        assert len(playback._prepared._ready) <= MAX_PREPARED
+        assert len(playback._prepared._kept) <= MAX_PREPARED
     assert loaded == [0, 1, 2, 3][::way]
     assert not alive()  # a stage needs no model
 
@@ -377,12 +377,12 @@ def spans(*pairs):
     [
         ([], "^segments: expected at least one"),
         ([(1, 9)], "^segments: expected the first one to begin at frame 0, got 1"),
-        ([(0, 9), (10, 20)], r"segment 1 to begin at frame 9 at the latest.*got frame 10\. Fit frames 9:10, too"),
+        ([(0, 9), (10, 20)], r"segment 1 to begin at frame 9 at the latest.*got frame 10\. Also fit frames 9:10"),
         ([(0, 9), (9, 18), (0, 20)], r"^segments: expected segment 2 to begin and to end after segment 1, 9:18"),
         ([(0, 9), (0, 12)], "to begin and to end after segment 0"),
         ([(0, 9), (2, 9)], "to begin and to end after segment 0"),
         ([(0, 9), (3, 12), (8, 20)], r"segment 2 to begin at frame 9 or later.*got frame 8.*overlap less"),
-        ([(-1, 9)], "number of a frame of the whole clip"),
+        ([(-1, 9)], "number of a frame of the clip"),
     ],
 )
 def test_segments_that_do_not_cover_a_clip_are_refused(pairs, message):

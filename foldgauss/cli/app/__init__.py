@@ -1,1 +1,1 @@
-"""The application object, the registry of commands, help, completion and signal handling."""
+"""The application: `application.app`, the `registry` of commands, help with examples, completion and error handling."""

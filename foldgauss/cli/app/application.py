@@ -1,4 +1,4 @@
-"""The application: its list of commands, each imported when it is called, and what it says things with."""
+"""The application: its commands, which are imported when one is called, its consoles and its errors."""
 
 import importlib
 import re
@@ -9,52 +9,63 @@ from rich.console import Console
 from rich.text import Text
 
 from foldgauss import __version__
+from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.interrupts import use_default_signals
 from foldgauss.cli.app.help import App, Command, Group
 from foldgauss.cli.app.registry import COMMANDS
 
-#: What a terminal obeys, but for tab and new line; and what turns the direction of writing.
+#: Control characters other than tab and newline, and those that change the writing direction.
 _CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069]")
 
 
 class WrongUse(ValueError):
-    """The command was called with arguments that cannot be right."""
+    """The command was called with invalid arguments."""
 
 
 class Stopped(Exception):
-    """The user asked a fit, or a sampler, to stop; the message says how to go on."""
+    """The user stopped a fit or a sampler; the message says how to continue."""
+
+
+def wrong_use(parameter: str, *, expected: str, got: object, cure: str = "") -> WrongUse:
+    """The error of an invalid option or argument, ready to be raised."""
+    return WrongUse(str(invalid(parameter, expected=expected, got=got, cure=cure)))
 
 
 class _Root(Group):
-    """All commands by name and first sentence, which is what lists and the Tab key show; one that is called, whole.
+    """Lists all commands by name and first sentence, and imports a command when it is called.
 
-    Whole they need JAX, Numba and OpenCV: a second or two, for a word that is completed.
+    Importing a command loads JAX, Numba and OpenCV, which takes a second or two: too long for completion.
     """
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
-        listed = {name: Command(name=name, help=known.what) for name, known in COMMANDS.items()}
+        listed = {name: Command(name=name, help=entry.summary) for name, entry in COMMANDS.items()}
         self.commands = listed | dict(self.commands)
 
     def list_commands(self, ctx) -> list[str]:
         return list(self.commands)
 
     def resolve_command(self, ctx, args: list[str]) -> Any:
-        self.commands |= loaded(args[0])
+        self.commands |= load_commands(args[0])
         return super().resolve_command(ctx, args)
 
 
-class _Plain(Console):
-    """A console on which texts move no cursor and command no terminal: some come from the files of strangers."""
+class _PlainConsole(Console):
+    """A console that replaces control characters: some texts come from files of unknown origin."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(_CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text), **options)
 
 
 app = App(cls=_Root, no_args_is_help=True, pretty_exceptions_enable=False)
-# No markup: names of files may hold brackets, and what is a code for a picture elsewhere.
-out = _Plain(markup=False, emoji=False, highlight=False)
-err = _Plain(stderr=True, markup=False, emoji=False, highlight=False)
+# Without markup and emoji codes, which file names may contain.
+out = _PlainConsole(markup=False, emoji=False, highlight=False)
+err = _PlainConsole(stderr=True, markup=False, emoji=False, highlight=False)
+
+
+def warn(text: str) -> None:
+    """Print a warning, on one line."""
+    err.print(f"warning: {text}", soft_wrap=True)
 
 
 def _show_version(wanted: bool) -> None:
@@ -72,13 +83,13 @@ def root(
 ) -> None:
     """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit.
 
-    `foldgauss COMMAND --help` tells all of a command, with examples.
+    `foldgauss COMMAND --help` describes a command, with examples.
     """
-    del debug, version  # read by `main`, before typer runs, and by the callback
+    del debug, version  # read by `main` before typer runs, and by the callback
 
 
-def loaded(*names: str) -> dict[str, Any]:
-    """The commands by name, these imported, or all where none is named; there may be none of such a name."""
+def load_commands(*names: str) -> dict[str, Any]:
+    """All commands by name; those named, or all if none is, are imported. Unknown names are ignored."""
     with use_default_signals():
         for name in names or COMMANDS:
             if name in COMMANDS:
@@ -86,8 +97,8 @@ def loaded(*names: str) -> dict[str, Any]:
     return typer.main.get_command(app).commands
 
 
-def as_option(text: str) -> str:
-    """An error about a setting, as one about its option: num_gaussians is --gaussians."""
+def name_option(text: str) -> str:
+    """The message of an error about a setting, with the name of its option: num_gaussians becomes --gaussians."""
     name, colon, rest = text.partition(":")
     name = name.replace("num_gaussians", "gaussians").replace("economy.psnr", "smallest_at_psnr")
     return f"--{name.replace('_', '-')}{colon}{rest}"

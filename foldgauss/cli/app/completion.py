@@ -1,4 +1,4 @@
-"""What the Tab key offers: names of presets and formats, and files of the right kind."""
+"""Shell completion of option values: choices, lists of choices, and files by suffix."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -11,11 +11,12 @@ from foldgauss.io.models.video_model import MODEL_SUFFIX
 
 Completion = Callable[[str], list[str]]
 
-#: Names that clips have; what else OpenCV reads can be typed.
+#: Suffixes of clips that are completed; others that OpenCV reads can be typed.
 CLIP_SUFFIXES = (".mp4", ".webm", ".mov", ".mkv", ".avi", ".m4v", ".y4m", *ANIMATION_SUFFIXES, *IMAGE_SUFFIXES)
 
 
-def among(choices: Iterable[str]) -> Completion:
+def complete_choice(choices: Iterable[str]) -> Completion:
+    """Completes one of the choices."""
     names = tuple(choices)
 
     def complete(incomplete: str) -> list[str]:
@@ -24,8 +25,8 @@ def among(choices: Iterable[str]) -> Completion:
     return complete
 
 
-def lists_of(choices: Iterable[str]) -> Completion:
-    """Lists with commas, each name once."""
+def complete_list(choices: Iterable[str]) -> Completion:
+    """Completes comma-separated lists of the choices, each at most once."""
     names = tuple(choices)
 
     def complete(incomplete: str) -> list[str]:
@@ -35,19 +36,19 @@ def lists_of(choices: Iterable[str]) -> Completion:
     return complete
 
 
-def files(*suffixes: str) -> Completion:
-    """Files with these endings, and folders, which may hold some."""
+def complete_files(*suffixes: str) -> Completion:
+    """Completes files with these suffixes, and folders."""
 
     def complete(incomplete: str) -> list[str]:
-        found = _found(incomplete, suffixes)
-        if len(found) == 1 and found[0].endswith(os.sep):  # or the shell would end the word here
-            return _found(found[0], suffixes) or found
+        found = _find_files(incomplete, suffixes)
+        if len(found) == 1 and found[0].endswith(os.sep):  # otherwise the shell ends the word here
+            return _find_files(found[0], suffixes) or found
         return found
 
     return complete
 
 
-def _found(incomplete: str, suffixes: tuple[str, ...]) -> list[str]:
+def _find_files(incomplete: str, suffixes: tuple[str, ...]) -> list[str]:
     folder, start = os.path.split(incomplete)
     try:
         entries = sorted(Path(os.path.expanduser(folder) or ".").iterdir())
@@ -59,5 +60,5 @@ def _found(incomplete: str, suffixes: tuple[str, ...]) -> list[str]:
     return folders + [text for text, entry in written if entry.suffix.lower() in suffixes and entry.is_file()]
 
 
-model_files = files(MODEL_SUFFIX, COMPACT_SUFFIX)
-clip_files = files(*CLIP_SUFFIXES)
+complete_models = complete_files(MODEL_SUFFIX, COMPACT_SUFFIX)
+complete_clips = complete_files(*CLIP_SUFFIXES)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while something long is done: noted, for a place where it can be left."""
+"""SIGINT and SIGTERM during long work: noted, so that it stops between two steps."""
 
 import dataclasses
 import signal
@@ -9,32 +9,32 @@ from foldgauss.cli.app.application import Stopped
 
 
 @dataclasses.dataclass
-class Asked:
-    """The signal that asked a fit to stop; and whether it had taken a step by then, which must not be cut in half."""
+class StopRequest:
+    """The name of the signal that asked to stop, and whether a step is done: later steps must not be interrupted."""
 
-    name: str = ""
+    signal: str = ""
     stepping: bool = False
 
 
 @contextmanager
-def noted_signals() -> Iterator[Asked]:
-    """Note SIGINT and SIGTERM, for the end of a step; before the first step they stop at once, as a second SIGINT."""
-    asked, before = Asked(), {}
+def note_signals() -> Iterator[StopRequest]:
+    """Note SIGINT and SIGTERM, for the end of a step; before the first step, or a second time, they stop at once."""
+    request, before = StopRequest(), {}
 
     def note(number, frame) -> None:
-        asked.name = asked.name or signal.Signals(number).name
+        request.signal = request.signal or signal.Signals(number).name
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        if not asked.stepping:
+        if not request.stepping:
             raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
         before[number] = signal.signal(number, note)
     try:
-        yield asked
+        yield request
     except KeyboardInterrupt as error:
-        if asked.stepping:
+        if request.stepping:
             raise
-        raise Stopped(f"stopped by {asked.name} before the first step.") from error
+        raise Stopped(f"stopped by {request.signal} before the first step.") from error
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

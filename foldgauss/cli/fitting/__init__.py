@@ -1,1 +1,1 @@
-"""The commands that fit: `fit`, `fit-many`, long clips in segments, their options and progress displays."""
+"""The commands that fit models: `fit`, `fit-many` and `demo`, their options, workers and progress display."""

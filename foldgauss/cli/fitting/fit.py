@@ -1,46 +1,15 @@
-"""The commands that fit: `demo` and `fit`."""
+"""The command `fit`."""
 
-import json
-import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
 
-from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import num_threads
-from foldgauss.cli.app.shared import (
-    Frames,
-    NewClip,
-    Overwrite,
-    Size,
-    Stopped,
-    WrongUse,
-    app,
-    as_option,
-    describe_source,
-    err,
-    evaluate_with_progress,
-    figures_of,
-    fingerprint,
-    named_after,
-    out,
-    parse_frames,
-    parse_size,
-    print_figures,
-    refuse_existing,
-    refuse_foreign,
-    refuse_input,
-    scores_of,
-    tell_of,
-    write_json,
-)
-from foldgauss.cli.app.signals import noted_signals
-from foldgauss.cli.fitting.jobs_view import WorkerOptions
-from foldgauss.cli.fitting.long import fit_in_segments
+from foldgauss.cli.app.application import Stopped, WrongUse, app, err, name_option, out, warn, wrong_use
+from foldgauss.cli.app.signals import note_signals
 from foldgauss.cli.fitting.options import (
     PROGRESS,
     CheckpointSeconds,
@@ -50,81 +19,30 @@ from foldgauss.cli.fitting.options import (
     SegmentSeconds,
     Threads,
     Workers,
+    choose_display,
     fit_options,
-    manner_of,
 )
-from foldgauss.cli.fitting.progress import Manner, Observer, previewing, print_json, watching
+from foldgauss.cli.fitting.progress import Display, Observer, display_progress, print_json, save_previews
+from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments
+from foldgauss.cli.fitting.workers import WorkerOptions
+from foldgauss.cli.shared.arguments import Frames, NewClip, Overwrite, Size, parse_frames, parse_size
+from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_input
+from foldgauss.cli.shared.rendering import evaluate_with_progress
+from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
 from foldgauss.io._atomic import OutputError, check_writable
 from foldgauss.io._lock import lock_output
-from foldgauss.io.datasets import sample_clip
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.contact_sheet import make_comparison_sheet
-from foldgauss.io.media.video_reading import read_video
-from foldgauss.io.media.video_writing import write_image, write_video
-from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
-from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name, save_video_model
-from foldgauss.jobs.fitting import CHECKPOINT_SECONDS
-from foldgauss.jobs.long import kept_seconds
+from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
+from foldgauss.jobs.job import FitJob
+from foldgauss.jobs.runner import FitRun, clip_warnings, missed_psnr, run_fit
+from foldgauss.jobs.runner import Stopped as FitStopped
+from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
-from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, running_psnr, to_model
+from foldgauss.video.fitting.loop import FitInfo
+from foldgauss.video.fitting.state import FitState, running_psnr
 from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
-
-DEMO_SIZE, DEMO_FRAMES = (160, 320), (0, 24)
-DEMO_RECORD = "metrics.json"
-DEMO_FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", DEMO_RECORD}
-DEMO_CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
-
-
-@app.command()
-def demo(
-    out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
-) -> None:
-    """Fit 24 frames of the clip Bunny and show what comes out.
-
-    The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files in it is
-    left alone.
-    """
-    refuse_foreign(out_dir, DEMO_FILES, "demo", record=DEMO_RECORD, known=_is_demos(out_dir / DEMO_RECORD))
-    clip = read_video(sample_clip("bunny"), frames=DEMO_FRAMES, size=DEMO_SIZE)
-    make_folder(out_dir)
-    out.print(f"Bunny, frames 0 to {DEMO_FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
-    with watching(manner_of(), err) as observe:
-        state, info = _run_fit(clip.frames, DEMO_CONFIG, observe)
-    model = to_model(state, DEMO_CONFIG, clip.size, clip.fps)
-    pictures: list[np.ndarray] = []
-    scores = evaluate_with_progress(model, clip.frames, pictures.append)
-    figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
-    frames = {"psnr": scores.psnr, "ssim": scores.ssim}
-    write_json(out_dir / DEMO_RECORD, figures | frames)  # first: whatever stops this demo, the next may replace it
-    path = save_video_model(
-        out_dir / "model.safetensors", model, metadata=describe_source(clip, DEMO_CONFIG.seed) | scores_of(scores)
-    )
-    figures["file_bytes"] = path.stat().st_size
-    write_video(out_dir / "reconstruction.mp4", pictures, clip.fps)
-    shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
-    captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
-    picture = make_comparison_sheet([clip.frames[k] for k in shown], [pictures[k] for k in shown], captions)
-    write_image(out_dir / "comparison.png", picture)
-    write_json(out_dir / DEMO_RECORD, figures | frames)
-    print_figures("Demo", figures)
-    for name, what in (
-        ("comparison.png", "original, reconstruction and error side by side"),
-        ("reconstruction.mp4", "plays in any browser (VP9)"),
-        ("model.safetensors", "the model: try `foldgauss render` on it with --upsample 4"),
-        (DEMO_RECORD, "the figures above, and by frame"),
-    ):
-        out.print(f"  {out_dir / name}  {what}", soft_wrap=True)
-
-
-def _is_demos(path: Path) -> bool:
-    """Whether it is the record of a demo."""
-    try:
-        kept = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(kept, dict) and kept.keys() >= {"fit_seconds", "psnr", "ssim"}
 
 
 @app.command()
@@ -142,22 +60,20 @@ def fit(
     overwrite: Overwrite = False,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on from where a stopped fit was kept.", rich_help_panel=PROGRESS),
+        typer.Option("--resume", help="Continue a stopped fit from its checkpoint.", rich_help_panel=PROGRESS),
     ] = False,
     history: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE.jsonl",
-            help="Write every step's figures here as it is done; FILE.png: the curves.",
+            help="Write the figures of every step here, and their curves to FILE.png.",
             rich_help_panel=PROGRESS,
         ),
     ] = None,
     preview: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.png",
-            help="Keep a picture of the running fit here, new every 10 s.",
-            rich_help_panel=PROGRESS,
+            metavar="FILE.png", help="Write a preview image here, renewed every 10 s.", rich_help_panel=PROGRESS
         ),
     ] = None,
     checkpoint_seconds: CheckpointSeconds = None,
@@ -168,120 +84,131 @@ def fit(
     quiet: Quiet = False,
     log_json: LogJson = False,
 ) -> None:
-    """Fit a model to a clip; the first of its budgets ends it.
+    """Fit a model to a clip; the first of its budgets ends the fit.
 
-    A stopped fit is kept and goes on with --resume. A long clip is fitted in segments, by several workers if asked.
+    A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
+    workers.
     """
-    target = named_after(video, MODEL_SUFFIX) if out_path is None else out_path
+    target = name_after(video, MODEL_SUFFIX) if out_path is None else out_path
     refuse_input(target, "clip", video)
     try:
         check_model_name(target, "out")
     except ValueError as error:
-        raise WrongUse(as_option(str(error))) from error
-    kept = target.with_name(f"{target.name}.checkpoint")
-    manner = manner_of(quiet, log_json)
-    hands = WorkerOptions(workers, scheduler, threads)
-    context.with_resource(lock_output(target, own=(kept,)))
+        raise WrongUse(name_option(str(error))) from error
+    job = FitJob(
+        video.name,
+        str(video),
+        str(target),
+        config,
+        parse_size(size),
+        parse_frames(frames),
+        checkpoint_seconds=checkpoint_seconds,
+    )
+    display = choose_display(quiet, log_json)
+    options = WorkerOptions(workers, scheduler, threads)
+    context.with_resource(lock_output(target, own=(job.checkpoint,)))
     refuse_existing(target, overwrite)
-    begun = kept_seconds(target) is not None and not kept.exists() and (resume or not overwrite)
+    begun = read_segment_seconds(target) is not None and not job.checkpoint.exists() and (resume or not overwrite)
     if begun or not (segment_seconds is None and workers is None and scheduler is None):
         for option, path in (("--history", history), ("--preview", preview)):
             if path is not None:
                 raise WrongUse(f"{option}: expected a fit in one piece, got one in segments. Leave it out.")
-        parsed = {"size": parse_size(size), "frames": parse_frames(frames)}
-        how = {
-            "segment_seconds": segment_seconds,
-            "hands": hands,
-            "checkpoint_seconds": checkpoint_seconds,
-        }
-        fit_in_segments(video, target, config, manner, resume=resume, overwrite=overwrite, **parsed, **how)
+        fit_in_segments(job, display, options, segment_seconds=segment_seconds, resume=resume, overwrite=overwrite)
         return
     curves = _check_records(target, video, history, preview, overwrite or resume)
-    if kept.exists() and not (resume or overwrite):
-        raise WrongUse(f"--out: a stopped fit is kept in {kept}. Go on with --resume, or start anew with --overwrite.")
-    if resume and not kept.exists():
-        raise WrongUse(f"--resume: expected a stopped fit in {kept}, got none. Start it without --resume.")
-    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
+    if job.checkpoint.exists() and not (resume or overwrite):
+        cure = "Continue it with --resume, or start over with --overwrite."
+        raise WrongUse(f"--out: a stopped fit has a checkpoint, {job.checkpoint}. {cure}")
+    if resume and not job.checkpoint.exists():
+        raise WrongUse(f"--resume: expected a stopped fit in {job.checkpoint}, got none. Start it without --resume.")
+
+    @contextmanager
+    def observe(clip: Clip, state: FitState | None) -> Iterator[Observer]:
+        _print_plan(clip, config, display)
+        recorded = None
+        if history is not None:
+            recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
+        previews = None if preview is None else save_previews(preview, clip, config)
+        with (
+            display_progress(display, err, history=recorded, preview=previews) as show,
+            stop_on_signals(show, job.checkpoint) as observer,
+        ):
+            yield observer
+
+    run = run_fit(
+        job,
+        observe,
+        resume="required" if resume else "never",
+        on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
+    )
     try:
-        choose_engine(clip.frames, config)
-    except ValueError as error:
-        raise WrongUse(as_option(str(error))) from error
-    _say_clip(clip, config, manner)
-    source = fingerprint(clip)
-    state = load_checkpoint(kept, config=config, source=source) if resume else None
-
-    def keep(state: FitState) -> None:
-        save_checkpoint(kept, state, config=config, source=source)
-
-    def begin() -> None:
-        if overwrite and not resume:
-            kept.unlink(missing_ok=True)  # or a --resume after this fit would go on with the one before
-
-    recorded = None
-    if history is not None:
-        recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
-    previews = None if preview is None else previewing(preview, clip, config)
-    with watching(manner, err, history=recorded, preview=previews) as observe:
-        state, info = _run_fit(clip.frames, config, observe, state, keep, begin, seconds=checkpoint_seconds)
-    model = to_model(state, config, clip.size, clip.fps)
-    about = noted(clip, config.seed, frames)
-    try:
-        save_video_model(target, model, metadata=about)  # at once: what comes now may be stopped
+        run.save()  # at once: the evaluation may be interrupted
     except OSError as error:
-        raise _unsaved(error, keep, state, kept) from error
+        raise _explain_unsaved(error, job.checkpoint) from error
     try:
         if history is not None:
-            _draw_curves(curves, history)
-        scores = evaluate_with_progress(model, clip.frames, shown=manner in ("bar", "lines"))
+            _save_curves(curves, history)
+        scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
     except KeyboardInterrupt:
-        _keep_if_possible(keep, state)
-        if kept.exists():
-            text = f"{target} is written, its scores are not measured yet: add --resume --overwrite for them."
+        if job.checkpoint.exists():
+            text = f"{target} is written, without its scores: add --resume --overwrite to measure them."
             err.print(text, soft_wrap=True)
         raise
     try:
-        save_video_model(target, model, metadata=about | scores_of(scores))
-    except OSError as error:  # of the second write; the model is there
-        err.print(f"warning: {target} is written, but its scores could not be noted in it: {error}", soft_wrap=True)
-    kept.unlink(missing_ok=True)
-    smallest_at_psnr = None if config.economy is None else config.economy.psnr
-    if smallest_at_psnr is not None and info.stopped_by != "smallest_at_psnr":
-        got = f"{scores.mean_psnr:.2f} dB after {info.step:,} steps"
-        err.print(
-            f"warning: --smallest-at-psnr: {smallest_at_psnr:g} dB was not reached, got {got}. "
-            "Give more --steps, or more --gaussians at the start.",
-            soft_wrap=True,
-        )
-    figures = figures_of(model, scores) | {"fit_seconds": round(info.seconds, 2), "steps": info.step}
-    figures |= {"stopped_by": info.stopped_by, "file_bytes": target.stat().st_size}
-    if manner == "json":
-        with suppress(OSError):  # nobody listens any more, but the model is there
-            print_json("done", {"model": str(target)} | figures)
-    elif manner != "quiet":
-        print_figures(str(target), figures)
+        run.save(scores)
+    except OSError as error:  # the model is there from the first time
+        warn(f"{target} is written, but its scores could not be added: {error}")
+    job.checkpoint.unlink(missing_ok=True)
+    for text in missed_psnr(config, scores.mean_psnr, run.info):
+        warn(f"--smallest-at-psnr: {text} Give more --steps, or more --gaussians at the start.")
+    figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
+    _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
 
 
-def noted(clip: Clip, seed: int, frames: str | None) -> dict[str, Any]:
-    """What `fit` notes in a model's file, but for its scores."""
-    return describe_source(clip, seed) | {"frames": parse_frames(frames)}
+def summarize_fit(info: FitInfo) -> dict[str, float]:
+    """Duration and steps of a fit, as results show them."""
+    return {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+
+
+@contextmanager
+def stop_on_signals(show: Observer, checkpoint: Path | None = None) -> Iterator[Observer]:
+    """An observer that shows each step and stops the fit after one during which SIGINT or SIGTERM arrived.
+
+    A stopped or diverged fit raises `cli.Stopped`, which says how to continue if there is a `checkpoint`.
+    """
+    with note_signals() as request:
+
+        def observe(state: FitState, info: FitInfo) -> bool:
+            request.stepping = True
+            show(state, info)
+            return bool(request.signal)
+
+        try:
+            yield observe
+        except FitStopped as error:
+            hint = "; nothing was saved" if checkpoint is None else "; add --resume to continue"
+            raise Stopped(f"{error} by {request.signal}{hint}.") from error
+        except FitDiverged as error:
+            if checkpoint is None or error.state is None:
+                raise Stopped(str(error)) from error
+            hint = "--resume continues from its checkpoint, with --on-divergence back-off at lower learning rates."
+            raise Stopped(f"{error} {hint}") from error
 
 
 def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
-    """Refuse places for the history, its curves and the preview that cannot be right; returns that of the curves."""
+    """Refuse invalid paths of the history, its curves and the preview; returns that of the curves."""
     curves = Path() if history is None else history.with_suffix(".png")
-    asked = {"--history": (history, ".jsonl"), "--preview": (preview, ".png")}
-    for option, (path, suffix) in asked.items():
+    for option, path, suffix in (("--history", history, ".jsonl"), ("--preview", preview, ".png")):
         if path is not None and path.suffix != suffix:
-            raise WrongUse(str(invalid(option, expected=f"a name ending in {suffix}", got=path)))
+            raise wrong_use(option, expected=f"a name ending in {suffix}", got=path)
     places = [("--history", history), ("--history", None if history is None else curves), ("--preview", preview)]
     taken = {target.resolve(), video.resolve()}
     for option, path in places:
         if path is None:
             continue
         if video.is_dir() and path.resolve().parent == video.resolve():
-            raise WrongUse(
-                f"{option}: expected a place outside the clip's folder, got {path}: it would be a frame there."
-            )
+            cure = "It would be a frame there."
+            raise wrong_use(option, expected="a place outside the clip's folder", got=path, cure=cure)
         if path.resolve() in taken:
             raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
         taken.add(path.resolve())
@@ -290,125 +217,58 @@ def _check_records(target: Path, video: Path, history: Path | None, preview: Pat
     return curves
 
 
-def make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
-    check_writable(path / "model.safetensors")
+def _explain_unsaved(error: OSError, checkpoint: Path) -> OutputError:
+    """The error of a model that cannot be written, with how to continue."""
+    if not checkpoint.exists():
+        return OutputError(f"{error} There was no room for a checkpoint either: the fit is lost.")
+    return OutputError(f"{error} The fit is kept in {checkpoint}: --resume continues it, and writes the model.")
 
 
-def _run_fit(
-    frames: np.ndarray,
-    config: FitConfig,
-    observe: Observer,
-    resumed: FitState | None = None,
-    keep: Callable[[FitState], object] | None = None,
-    begin: Callable[[], object] = lambda: None,
-    *,
-    seconds: float | None = None,
-) -> tuple[FitState, FitInfo]:
-    """Run the fit; `observe` sees each step, `keep` is called now and then, and before leaving on a signal.
-
-    `begin` is called once there is a first step, and so something in place of what was there before.
-    """
-    try:
-        return _watched_steps(fit_steps(frames, config, resumed), observe, keep, begin, seconds)
-    except FitDiverged as error:
-        raise _diverged(error, keep) from error
-
-
-def _watched_steps(
-    steps: Iterator[tuple[FitState, FitInfo]],
-    observe: Observer,
-    keep: Callable[[FitState], object] | None,
-    begin: Callable[[], object],
-    seconds: float | None,
-) -> tuple[FitState, FitInfo]:
-    """The last of the steps; a signal ends them, once what is done is kept."""
-    with noted_signals() as asked:
-        kept_at = time.monotonic()
-        for state, info in steps:
-            if not asked.stepping:
-                asked.stepping = True
-                begin()
-            observe(state, info)  # first: what is kept at a step is in the history
-            if keep is not None and time.monotonic() - kept_at > (CHECKPOINT_SECONDS if seconds is None else seconds):
-                _keep_if_possible(keep, state)
-                kept_at = time.monotonic()
-            if asked.name and info.progress < 1:
-                raise _stopped(asked.name, state, info, keep)
-    return state, info
-
-
-def _diverged(error: FitDiverged, keep: Callable[[FitState], object] | None) -> Stopped:
-    """Keep what was sound, and say so."""
-    if keep is None or error.state is None:
-        return Stopped(str(error))
-    keep(error.state)
-    return Stopped(f"{error} It is kept: --resume goes on from there, with --on-divergence back-off at lower rates.")
-
-
-def _keep_if_possible(keep: Callable[[FitState], object], state: FitState) -> None:
-    """A full disk now is no reason to lose the fit: say so, and go on."""
-    try:
-        keep(state)
-    except OSError as error:
-        err.print(f"warning: the fit could not be kept at step {state.step}: {error}", soft_wrap=True)
-
-
-def _unsaved(error: OSError, keep: Callable[[FitState], object], state: FitState, kept: Path) -> OutputError:
-    """The fit is done, its model cannot be written: keep the fit if that can be, and say how to go on."""
-    _keep_if_possible(keep, state)
-    if not kept.exists():
-        return OutputError(f"{error} There was no room to keep the fit either: it is lost.")
-    return OutputError(f"{error} The fit is kept in {kept}: --resume goes on from there, and writes the model.")
-
-
-def _stopped(name: str, state: FitState, info: FitInfo, keep: Callable[[FitState], object] | None) -> Stopped:
-    """Keep the fit and say how to go on."""
-    if keep is None:
-        return Stopped(f"stopped by {name} after step {info.step}; nothing was kept.")
-    keep(state)
-    return Stopped(f"stopped by {name} after step {info.step}; add --resume to go on from there.")
-
-
-def _draw_curves(path: Path, history: Path) -> None:
-    """The fit is done by now: what goes wrong with its curves is told, no more."""
+def _save_curves(path: Path, history: Path) -> None:
+    """Plot the history; an error is only a warning, since the fit is finished."""
     try:
         write_curves(path, read_history(history))
     except (ImportError, OSError, ValueError) as error:
-        err.print(f"warning: no curves in {path}: {error}", soft_wrap=True)
+        warn(f"no curves in {path}: {error}")
 
 
-def _say_clip(clip: Clip, config: FitConfig, manner: Manner) -> None:
+def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
+    try:
+        engine = choose_engine(clip.frames, config)
+    except ValueError as error:
+        raise WrongUse(name_option(str(error))) from error
     height, width = clip.size
-    tell_of(clip)
+    for text in clip_warnings(clip):
+        warn(f"{clip.source}: {text}")
     num = chosen_num_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.batch_size < clip.num_frames:
-        err.print(
-            f"warning: --steps: {steps:,} steps see {steps * config.batch_size:,} of {clip.num_frames:,} frames; the "
-            "others stay as they start, and look faint.",
-            soft_wrap=True,
+        warn(
+            f"--steps: {steps:,} steps use {steps * config.batch_size:,} of {clip.num_frames:,} frames; the others "
+            "keep their initial Gaussians, which look faint."
         )
-    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
-    plan = " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
-    if config.economy is not None:
-        wanted = config.economy.psnr
-        plan += ", only what pays" if wanted is None else f", the smallest at {wanted:g} dB"
-    if manner == "json":
+    if display == "json":
         about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
         print_json("start", about | {"num_gaussians": num, "degree": config.degree, "threads": num_threads()})
-    if manner in ("json", "quiet"):
+    if display in ("json", "quiet"):
         return
+    plan = describe_budgets(config, steps)
+    if config.economy is not None:
+        psnr = config.economy.psnr
+        plan += ", pruned by description length" if psnr is None else f", the smallest at {psnr:g} dB"
     growing = "" if config.growth is None else " at the start"
-    engine = choose_engine(clip.frames, config)
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
-    number = "1 frame" if clip.num_frames == 1 else f"{clip.num_frames} frames"
     out.print(
-        f"{clip.source}: {number} of {height}x{width}{' with alpha' if clip.has_alpha else ''}, "
-        f"{num:,} Gaussians of degree {config.degree}{growing}, "
+        f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
+        f"{' with alpha' if clip.has_alpha else ''}, {num:,} Gaussians of degree {config.degree}{growing}, "
         f"{plan}, {computed}",
         soft_wrap=True,
     )
+
+
+def _print_results(run: FitRun, display: Display, figures: dict[str, float]) -> None:
+    if display == "json":
+        with suppress(OSError):  # standard output is closed, but the model is there
+            print_json("done", {"model": run.job.target} | figures)
+    elif display != "quiet":
+        print_figures(run.job.target, figures)

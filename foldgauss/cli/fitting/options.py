@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import typer
 
 from foldgauss._runtime.settings import setting_of, type_of
-from foldgauss.cli.app.application import WrongUse, as_option, err
-from foldgauss.cli.app.completion import among
-from foldgauss.cli.app.shared import AlphaCutoff, SupportRadius, TransmittanceStop, with_constants
-from foldgauss.cli.fitting.progress import Manner
+from foldgauss.cli.app.application import WrongUse, err, name_option
+from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.fitting.progress import Display
+from foldgauss.cli.shared.arguments import AlphaCutoff, SupportRadius, TransmittanceStop, override_constants
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 from foldgauss.video.fitting.economy import Economy
 
@@ -25,7 +25,7 @@ Preset = Annotated[
     str,
     typer.Option(
         help=f"Preset that other options modify: {', '.join(PRESETS)} (the published configuration, slow).",
-        autocompletion=among(PRESETS),
+        autocompletion=complete_choice(PRESETS),
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.", rich_help_panel=PROGRESS)]
@@ -100,9 +100,9 @@ def config_from_options(preset: str, *, economy: bool, **options: Any) -> FitCon
             changes["economy"] = Economy(**pruning)
         config = FitConfig.preset(preset, **changes)
     except ValueError as error:
-        raise WrongUse(as_option(str(error))) from error
-    constants = {name: given[name] for name in _CONSTANTS if name in given}
-    return dataclasses.replace(config, options=with_constants(config.options, **constants))
+        raise WrongUse(name_option(str(error))) from error
+    constants = (options[name] for name in _CONSTANTS)
+    return dataclasses.replace(config, options=override_constants(config.options, *constants))
 
 
 def fit_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -141,7 +141,7 @@ def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
         about.option,
         help=f"{about.help}{'' if is_flag else _default(field)}.",
         rich_help_panel=PANELS[about.group],
-        autocompletion=among(about.choices) if about.choices else None,
+        autocompletion=complete_choice(about.choices) if about.choices else None,
     )
     annotation = Annotated[bool if is_flag else kind | None, option]
     return inspect.Parameter(name, _KIND, default=False if is_flag else None, annotation=annotation)
@@ -159,7 +159,7 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else f"{value}"
 
 
-def manner_of(quiet: bool = False, log_json: bool = False) -> Manner:
+def choose_display(quiet: bool = False, log_json: bool = False) -> Display:
     """How progress is displayed: as the options say, otherwise a bar on a terminal and lines in a log."""
     if quiet and log_json:
         raise WrongUse("--quiet: expected one of --quiet and --log-json, got both. Leave one out.")

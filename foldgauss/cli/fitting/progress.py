@@ -1,4 +1,4 @@
-"""What a running fit shows and leaves behind: a bar, lines, JSON, its history, a preview. Observers, one per noun."""
+"""Observers of a running fit: a bar, lines in a log, JSON, its history, a preview."""
 
 import json
 import time
@@ -16,38 +16,39 @@ from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.contact_sheet import make_comparison_sheet
 from foldgauss.io.media.video_writing import write_image
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.loop import FitInfo, FitState, to_model
+from foldgauss.video.fitting.loop import FitInfo
+from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.metrics import psnr
 from foldgauss.video.models.renderer import VideoRenderer
 
 Observer = Callable[[FitState, FitInfo], None]
-Manner = Literal["bar", "lines", "json", "quiet"]
+Display = Literal["bar", "lines", "json", "quiet"]
 
 BAR_SECONDS = 0.1
-#: In a log file a line now and then tells that a fit lives; the first one soon, since it may be misspelt.
+#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
 FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
 JSON_SECONDS = 1.0
 PREVIEW_SECONDS = 10.0
 
 
 @contextmanager
-def watching(
-    manner: Manner, console: Console, *, history: HistoryFile | None = None, preview: Observer | None = None
+def display_progress(
+    display: Display, console: Console, *, history: HistoryFile | None = None, preview: Observer | None = None
 ) -> Iterator[Observer]:
-    """One observer that shows the fit in the given `manner` and writes its `history` and `preview`.
+    """One observer that displays the fit and writes its `history` and `preview`.
 
-    Bar, lines and warnings go to `console`, JSON to standard output. None but the bar may end the fit: the first error
-    of an observer that writes is told, and that one is left out from then on.
+    Bar, lines and warnings go to `console`, JSON to standard output. An error of an observer that writes does not end
+    the fit: it is printed, and that observer is no longer called.
     """
     with ExitStack() as stack:
-        observers = [] if history is None else [_forgiven(stack.enter_context(history), "history", console)]
-        observers += [] if preview is None else [_forgiven(preview, "preview", console)]
-        if manner == "bar":
+        observers = [] if history is None else [_stop_on_error(stack.enter_context(history), "history", console)]
+        observers += [] if preview is None else [_stop_on_error(preview, "preview", console)]
+        if display == "bar":
             observers.append(stack.enter_context(_bar(console)))
-        elif manner == "lines":
+        elif display == "lines":
             observers.append(_lines(console))
-        elif manner == "json":
-            observers.append(_forgiven(_json_lines(), "progress", console))
+        elif display == "json":
+            observers.append(_stop_on_error(_json_lines(), "progress", console))
 
         def observe(state: FitState, info: FitInfo) -> None:
             for one in observers:
@@ -61,27 +62,27 @@ def print_json(event: str, figures: dict) -> None:
     print(json.dumps({"event": event} | figures), flush=True)
 
 
-def previewing(path: Path, clip: Clip, config: FitConfig) -> Observer:
-    """Keeps original, reconstruction and error of the clip's middle frame in `path`, a PNG that is always whole.
+def save_previews(path: Path, clip: Clip, config: FitConfig) -> Observer:
+    """Writes original, reconstruction and error of the clip's middle frame to `path`, a PNG that is always complete.
 
     Written at the first step, every 10 s, and at the last step.
     """
-    rings, k = _Clock(PREVIEW_SECONDS, first=0.0), clip.num_frames // 2
-    original = clip.frames[k, ..., :3]  # over black, where there is alpha
+    is_due, k = _Timer(PREVIEW_SECONDS, first=0.0), clip.num_frames // 2
+    original = clip.frames[k, ..., :3]  # over black
 
     def observe(state: FitState, info: FitInfo) -> None:
-        if not (rings() or info.progress >= 1):
+        if not (is_due() or info.progress >= 1):
             return
         model = to_model(state, config, clip.size, clip.fps)
-        picture = VideoRenderer(model).frame(np.asarray(model.frame_times.times())[k])
-        caption = f"frame {k}, step {info.step}, {psnr(original, picture):.1f} dB"
-        write_image(path, make_comparison_sheet([original], [picture], [caption]))
+        image = VideoRenderer(model).frame(np.asarray(model.frame_times.times())[k])
+        caption = f"frame {k}, step {info.step}, {psnr(original, image):.1f} dB"
+        write_image(path, make_comparison_sheet([original], [image], [caption]))
 
     return observe
 
 
-class _Clock:
-    """Tells whether it is time again: every so many seconds, at first after `first`."""
+class _Timer:
+    """True every so many `seconds`, for the first time after `first`."""
 
     def __init__(self, seconds: float, first: float):
         self.seconds, self.next = seconds, time.monotonic() + first
@@ -94,11 +95,11 @@ class _Clock:
         return True
 
 
-def _forgiven(observe: Observer, what: str, console: Console) -> Observer:
-    """A full disk, or a model that cannot be drawn, is no reason to lose the fit: say so once, and go on without."""
+def _stop_on_error(observe: Observer, what: str, console: Console) -> Observer:
+    """An observer whose first error, as of a full disk, is printed, and which is not called again."""
     broken = False
 
-    def forgiven(state: FitState, info: FitInfo) -> None:
+    def observe_until_error(state: FitState, info: FitInfo) -> None:
         nonlocal broken
         if broken:
             return
@@ -108,20 +109,20 @@ def _forgiven(observe: Observer, what: str, console: Console) -> Observer:
             broken = True
             console.print(f"warning: no more {what} from step {info.step} on: {error}", soft_wrap=True)
 
-    return forgiven
+    return observe_until_error
 
 
 class _FitColumn(ProgressColumn):
-    """Step, loss, PSNR, Gaussians and time left of a fit."""
+    """Step, loss, PSNR, number of Gaussians and time left of a fit."""
 
     def render(self, task) -> str:
         info: FitInfo | None = task.fields.get("info")
         if info is None:
             return "following the motion, compiling" if not task.finished else ""
-        return _told(info)
+        return _describe(info)
 
 
-def _told(info: FitInfo) -> str:
+def _describe(info: FitInfo) -> str:
     left = f"{info.seconds_left:.0f} s left" if 0 < info.seconds_left < np.inf else ""
     return f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  {info.num_gaussians:,} Gaussians  {left}"
 
@@ -129,10 +130,10 @@ def _told(info: FitInfo) -> str:
 @contextmanager
 def _bar(console: Console) -> Iterator[Observer]:
     with Progress(TextColumn("Fitting"), BarColumn(bar_width=12), _FitColumn(), console=console) as progress:
-        task, rings = progress.add_task("fit", total=1.0), _Clock(BAR_SECONDS, first=0.0)
+        task, is_due = progress.add_task("fit", total=1.0), _Timer(BAR_SECONDS, first=0.0)
 
         def observe(state: FitState, info: FitInfo) -> None:
-            if rings() or info.progress >= 1:
+            if is_due() or info.progress >= 1:
                 progress.update(task, completed=info.progress, info=info)
 
         yield observe
@@ -140,20 +141,20 @@ def _bar(console: Console) -> Iterator[Observer]:
 
 def _lines(console: Console) -> Observer:
     """Plain lines for a log: after 10 s, every 30 s, and at the end."""
-    rings = _Clock(LINE_SECONDS, first=FIRST_LINE_SECONDS)
+    is_due = _Timer(LINE_SECONDS, first=FIRST_LINE_SECONDS)
 
     def observe(state: FitState, info: FitInfo) -> None:
-        if rings() or info.progress >= 1:
-            console.print(f"Fitting {info.progress:4.0%}  {_told(info)}".rstrip(), soft_wrap=True)
+        if is_due() or info.progress >= 1:
+            console.print(f"Fitting {info.progress:4.0%}  {_describe(info)}".rstrip(), soft_wrap=True)
 
     return observe
 
 
 def _json_lines() -> Observer:
-    rings = _Clock(JSON_SECONDS, first=0.0)
+    is_due = _Timer(JSON_SECONDS, first=0.0)
 
     def observe(state: FitState, info: FitInfo) -> None:
-        if rings() or info.progress >= 1:
+        if is_due() or info.progress >= 1:
             print_json("progress", info_line(info))
 
     return observe

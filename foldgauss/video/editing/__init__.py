@@ -1,1 +1,7 @@
-"""Edits of a video: a chain of operations, kept as overlays or baked into the model."""
+"""Edits of a fitted video: select Gaussians, change them, and get a video again.
+
+`chain.edit` starts a chain of edits (`Edit`). Edits that a folded model represents exactly are baked into its
+parameters (`bake`); all others stay overlays (`overlays`), applied to the conditioned Gaussians of each frame, with
+spans and clocks for their timing (`span`, `clock`). `edited_video.EditedVideo` holds layers with their overlays and
+renders them.
+"""

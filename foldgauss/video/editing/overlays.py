@@ -1,7 +1,7 @@
-"""Overlays: edits that act on the conditioned Gaussians of each time, where no folded model could hold them.
+"""Overlays: edits of the conditioned Gaussians at each time, for what no folded model represents.
 
-An overlay is a mask over a model's Gaussians, a span of time and a few plain numbers. It is given the selected ones
-that are alive at a time and returns them changed; all others stay as they are, to the bit.
+An overlay is a mask over a model's Gaussians, a span of time and a few parameters. It takes the selected Gaussians that
+are alive at a time and returns them changed; all others stay the same to the bit.
 """
 
 import dataclasses
@@ -18,22 +18,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.render import Gaussians3D, Triangles
-from foldgauss.video.editing.clock import Clock, Span, check_number, check_numbers
+from foldgauss.video.editing.arguments import check_number, check_numbers
+from foldgauss.video.editing.clock import Clock
+from foldgauss.video.editing.span import Span
 
-#: What each channel brings to lightness: Rec. 709.
+#: Luminance of red, green and blue: Rec. 709.
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
-#: Below this an object's lightness says nothing of its shading.
-MIN_LIGHTNESS = 1e-4
 IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 
 
 @dataclasses.dataclass(frozen=True)
 class SelectedGaussians:
-    """Gaussians at one time, as an edit sees them: the selected ones alive then, in array order, in model space.
+    """The selected Gaussians that are alive at one time, in array order and model space: the input of an edit.
 
-    **Shapes:** `index` (num,), their numbers in the model; `mean` (num, dim), x right and y down (and z away); `factor`
-    (num, dim, 2), any F with covariance F F^T; `opacity` (num,) in [0, 1]; `color` (num, 3), not below 0. dim is 2, and
-    3 once an edit has placed Gaussians of the model in space. NumPy arrays.
+    **Shapes:** `index` (num,), their indices in the model; `mean` (num, dim), x right, y down (and z away); `factor`
+    (num, dim, 2), any F with covariance F F^T; `opacity` (num,) in [0, 1]; `color` (num, 3), >= 0. dim is 2, or 3 once
+    an edit has moved Gaussians of the model into 3D space. NumPy arrays.
 
     **Units:** the frame's centre is the origin and its longer side 1.
 
@@ -51,9 +51,9 @@ class SelectedGaussians:
 
     @property
     def center(self) -> Float[np.ndarray, " dim"]:
-        """Their own centre: the mean of the means, weighted by opacity times area.
+        """Their center: the mean of the means, weighted by opacity times area.
 
-        By area too, since Gaussians far from their own time are small and must not pull: the centre then moves evenly.
+        The weights include the area since Gaussians far from their own time are small; so the center moves smoothly.
         """
         weights = self.opacity * _areas(self.factor)
         if not weights.sum() > 0:
@@ -61,7 +61,7 @@ class SelectedGaussians:
         return np.einsum("n,nd->d", weights, self.mean, dtype=np.float64) / weights.sum(dtype=np.float64)
 
     def in_space(self) -> "SelectedGaussians":
-        """The same with dim 3: in the plane z = 0 where they were flat."""
+        """The same Gaussians with dim 3; those with dim 2 are put in the plane z = 0."""
         if self.mean.shape[1] == 3:
             return self
         mean = np.concatenate([self.mean, np.zeros_like(self.mean[:, :1])], 1)
@@ -70,7 +70,7 @@ class SelectedGaussians:
 
 
 def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, " num"]:
-    """Of the parallelograms that the two columns span, in the plane or in space."""
+    """Areas of the parallelograms spanned by the two columns, in two or three dimensions."""
     first, second = np.moveaxis(factor, (2, 1), (0, 1))
     pairs = [(0, 1)] if len(first) == 2 else [(1, 2), (2, 0), (0, 1)]
     crosses = [first[i] * second[j] - first[j] * second[i] for i, j in pairs]
@@ -78,7 +78,7 @@ def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, " num"]:
 
 
 def _map_factors(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray, "num dim 2"]) -> np.ndarray:
-    """A F for many F, as one product of matrices."""
+    """A F for each F, as one matrix product."""
     columns = np.swapaxes(factor, 1, 2)
     rows = columns.reshape(-1, len(matrix)) @ matrix.T.astype(np.float32)
     return np.swapaxes(rows.reshape(columns.shape), 1, 2)
@@ -87,7 +87,8 @@ def _map_factors(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray,
 class AbstractOverlay(eqx.Module):
     """An edit of the conditioned Gaussians.
 
-    To extend: fields beside `mask` are static, plain and hashable; checked when made; and `kind` stands in `KINDS`.
+    A subclass has static, hashable fields beside `mask`, checks them in `__check_init__`, and is listed in `KINDS` if
+    it can be saved.
 
     **Shapes:** `mask` bool (num_gaussians,).
     """
@@ -97,22 +98,22 @@ class AbstractOverlay(eqx.Module):
 
     @abstractmethod
     def __call__(self, gaussians: SelectedGaussians, t: float, progress: float) -> SelectedGaussians:
-        """The selected Gaussians of time t, `progress` of the way from untouched to edited."""
+        """The selected Gaussians of time t, edited with progress in [0, 1]: 0 is unchanged, 1 fully edited."""
 
     def progress(self, t: float) -> float:
-        """How far along it is at time t."""
+        """The progress of the edit at time t."""
         return 1.0 if self.span is None else self.span.progress(t)
 
 
 class Affine(AbstractOverlay):
-    r"""An affine map of the plane about a point, or about the selection's own centre at each time.
+    r"""An affine map of the plane about a point, or about the selection's own center at each time.
 
     $$ m' = c + A (m - c) + b, \quad F' = A F, \quad A = R(\theta) S $$
 
-    On the way, at progress s, the angle is s theta, S is I + s (S - I) and the offset s b: turns keep their sense, and
-    nothing shrinks that does not in the end, unless it is mirrored. What is placed in space keeps its depth.
+    At progress s the angle is s theta, the symmetric part I + s (S - I) and the offset s b: so rotations keep their
+    direction, and sizes change monotonically unless the map mirrors. Gaussians in 3D space keep their depth.
 
-    **Units:** `angle` in radians, x towards y, so clockwise as one sees it; `offset` and `about` model space.
+    **Units:** `angle` in radians from x to y, which is clockwise on the screen; `offset` and `about` model space.
     """
 
     mask: Bool[np.ndarray, " num_gaussians"]
@@ -132,11 +133,11 @@ class Affine(AbstractOverlay):
         if len(self.stretch) != 2 or self.stretch[0][1] != self.stretch[1][0]:
             raise invalid("stretch", expected="a symmetric 2x2 matrix", got=self.stretch)
         if np.linalg.det(self.stretch) == 0:
-            raise invalid("stretch", expected="a matrix that can be undone", got=self.stretch, cure="See vanish().")
+            raise invalid("stretch", expected="an invertible matrix", got=self.stretch, cure="See vanish().")
 
     @property
     def is_translation(self) -> bool:
-        """Whether it shifts and does nothing else."""
+        """Whether it is a translation."""
         return self.angle == 0 and self.stretch == IDENTITY
 
     @property
@@ -145,7 +146,7 @@ class Affine(AbstractOverlay):
         return self.is_translation and self.offset == (0.0, 0.0)
 
     def matrix(self, progress: float = 1.0) -> Float[np.ndarray, "2 2"]:
-        """A at that progress."""
+        """The matrix A at a progress."""
         cos, sin = np.cos(progress * self.angle), np.sin(progress * self.angle)
         return np.array([[cos, -sin], [sin, cos]]) @ (np.eye(2) + progress * (np.array(self.stretch) - np.eye(2)))
 
@@ -157,14 +158,29 @@ class Affine(AbstractOverlay):
             return dataclasses.replace(gaussians, mean=gaussians.mean + move.astype(np.float32))
         matrix = np.eye(dim)
         matrix[:2, :2] = self.matrix(progress)
-        centre = gaussians.center[:2] if self.about is None else np.array(self.about)
-        move[:2] = centre - matrix[:2, :2] @ centre + shift
+        center = gaussians.center[:2] if self.about is None else np.array(self.about)
+        move[:2] = center - matrix[:2, :2] @ center + shift
         mean = gaussians.mean @ matrix.T.astype(np.float32) + move.astype(np.float32)
         return dataclasses.replace(gaussians, mean=mean, factor=_map_factors(matrix, gaussians.factor))
 
 
+def polar_decompose(
+    matrix: Float[np.ndarray, "2 2"],
+) -> tuple[float, tuple[tuple[float, float], tuple[float, float]]]:
+    """Angle of R and symmetric part S of A = R S; R is a rotation, so S mirrors where A does."""
+    if np.array_equal(matrix, matrix.T) and np.trace(matrix) >= 0:
+        return 0.0, tuple(map(tuple, matrix.tolist()))  # exactly A
+    left, sizes, right = np.linalg.svd(matrix)
+    flip = np.diag([1.0, np.sign(np.linalg.det(left @ right))])
+    turn = left @ flip @ right
+    stretch = right.T @ (flip * sizes) @ right
+    cross = float(stretch[0, 1])
+    rows = ((float(stretch[0, 0]), cross), (cross, float(stretch[1, 1])))
+    return float(np.arctan2(turn[1, 0], turn[0, 0])), rows
+
+
 class Opacity(AbstractOverlay):
-    """Opacity times `factor`, held at 1; outside the span times `before`, on the way between the two."""
+    """Opacity times a factor, clipped at 1: `before` at progress 0, `factor` at progress 1, interpolated between."""
 
     mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
@@ -182,15 +198,15 @@ class Opacity(AbstractOverlay):
 
 
 def is_active(overlay: AbstractOverlay, progress: float) -> bool:
-    """Whether an overlay changes anything at that progress: at 0 only what is hidden outside its span does."""
+    """Whether an overlay changes anything at a progress; at 0 only an `Opacity` with `before` other than 1 does."""
     return progress > 0 or (isinstance(overlay, Opacity) and overlay.before != 1)
 
 
 class Recolor(AbstractOverlay):
-    """A linear map of colours, or a hue: c' = max(M c + b, 0), on the way c + s (c' - c).
+    """A linear map of colours c' = max(M c + b, 0), applied as c + s (c' - c) at progress s, or a new hue.
 
-    With `hue` in turns (0 red, 1/3 green, 2/3 blue) lightness (Rec. 709) and colourfulness, the distance from grey, are
-    kept and the direction is that of the pure hue.
+    `hue` is in turns (0 red, 1/3 green, 2/3 blue); it is set before the linear map. Lightness (Rec. 709) and the
+    distance from grey are kept.
     """
 
     mask: Bool[np.ndarray, " num_gaussians"]
@@ -208,7 +224,7 @@ class Recolor(AbstractOverlay):
             check_number("hue", self.hue)
 
     def map_colors(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
-        """The colours when it has wholly acted, float64."""
+        """The colours at progress 1, float64."""
         color = np.asarray(color, np.float64)
         if self.hue is not None:
             color = _with_hue(color, self.hue)
@@ -227,13 +243,12 @@ def _with_hue(color: Float[np.ndarray, "num 3"], hue: float) -> Float[np.ndarray
 
 
 class Place(AbstractOverlay):
-    """A motion in space: the selection, flat in its picture, is turned about a point and moved in depth.
+    """A rigid motion in 3D space: the flat selection is rotated about a point of the image plane and moved in depth.
 
-    Seen by the video's camera, the front one by default: depth makes it smaller (away, > 0) or larger, turns show it in
-    perspective.
+    The video's camera (by default the front camera) shows it in perspective; depth > 0 is away from the viewer.
 
     **Units:** `rotation` is an axis times an angle in radians, about x (right), y (down), z (away from the viewer);
-    `depth` model space; `about` (x, y), or None for the selection's own centre.
+    `depth` model space; `about` (x, y), or None for the selection's own center.
 
     **Source:** MiraGe, flat Gaussians in space; VeGaS eq:mirage.
     """
@@ -254,30 +269,27 @@ class Place(AbstractOverlay):
         gaussians = gaussians.in_space()
         mean, factor, move = gaussians.mean, gaussians.factor, np.array([0, 0, progress * self.depth])
         if any(self.rotation):
-            centre = gaussians.center if self.about is None else np.array([*self.about, 0.0])
+            center = gaussians.center if self.about is None else np.array([*self.about, 0.0])
             turn = scipy.spatial.transform.Rotation.from_rotvec(progress * np.array(self.rotation)).as_matrix()
-            mean, factor, move = (
-                mean @ turn.T.astype(np.float32),
-                _map_factors(turn, factor),
-                move + centre - turn @ centre,
-            )
+            mean, factor = mean @ turn.T.astype(np.float32), _map_factors(turn, factor)
+            move = move + center - turn @ center
         return dataclasses.replace(gaussians, mean=mean + move.astype(np.float32), factor=factor)
 
 
 class GaussianFunction(AbstractOverlay):
-    """Any function of the conditioned Gaussians and the time. It cannot be saved."""
+    """A function of the conditioned Gaussians and the time. It cannot be saved."""
 
     mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     function: Callable[[SelectedGaussians, float], SelectedGaussians] = eqx.field(static=True)
 
     def __call__(self, gaussians, t, progress):
-        after = _checked_result(gaussians, self.function(gaussians, t))
-        return after if progress == 1 else _between(gaussians, after, progress)
+        after = _check_result(gaussians, self.function(gaussians, t))
+        return after if progress == 1 else _interpolate(gaussians, after, progress)
 
 
 class TriangleFunction(AbstractOverlay):
-    """Any function of the Gaussians' triangles: vertices (num, 3, 3) and the time to vertices. It cannot be saved.
+    """A function of the Gaussians' triangles: from vertices (num, 3, 3) and time to vertices. It cannot be saved.
 
     Source: GaMeS; VeGaS eq:traingle_face.
     """
@@ -287,74 +299,74 @@ class TriangleFunction(AbstractOverlay):
     function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
 
     def __call__(self, gaussians, t, progress):
-        solid, room = gaussians.in_space(), padded_size(len(gaussians))
-        vertices = np.asarray(_to_faces(pad_rows(solid.mean, room), pad_rows(solid.factor, room)))[: len(solid)]
-        given = vertices.copy()  # theirs to write to
-        moved = _checked_vertices(self.function(given, t), vertices.shape)
+        flat, size = gaussians.in_space(), padded_size(len(gaussians))
+        vertices = np.asarray(_to_triangles(pad_rows(flat.mean, size), pad_rows(flat.factor, size)))[: len(flat)]
+        moved = _check_vertices(self.function(vertices.copy(), t), vertices.shape)  # a copy: it may write to it
         if np.array_equal(moved, vertices):
             return gaussians
         moved = vertices + progress * (moved - vertices)
-        mean, factor = (np.array(leaf)[: len(solid)] for leaf in _from_faces(pad_rows(moved, room)))
-        _check_spanned(moved, factor)
+        mean, factor = (np.array(leaf)[: len(flat)] for leaf in _from_triangles(pad_rows(moved, size)))
+        _check_areas(factor)
         if gaussians.mean.shape[1] == 2 and not moved[..., 2].any():
             mean, factor = mean[:, :2], factor[:, :2]
         return dataclasses.replace(gaussians, mean=mean, factor=factor)
 
 
-_SMALLEST_ROOM = 1024
+_MIN_PADDED_SIZE = 1024
 
 
 def padded_size(num: int) -> int:
-    """The size that code is compiled for where there are `num`: powers of two, so that few are."""
-    return max(_SMALLEST_ROOM, 1 << (num - 1).bit_length())
+    """The number of rows that `num` rows are padded to: a power of two, so that compiled code is reused."""
+    return max(_MIN_PADDED_SIZE, 1 << (num - 1).bit_length())
 
 
-def pad_rows(array: np.ndarray, room: int) -> Float[np.ndarray, "room ..."]:
-    """`array` with `room` rows, float32: those behind are 0, or unit matrices, which are sound factors and faces."""
-    wide = np.empty((room, *array.shape[1:]), np.float32)
-    wide[: len(array)] = array
-    wide[len(array) :] = np.eye(*array.shape[1:]) if array.ndim == 3 else 0.0
-    return wide
+def pad_rows(array: np.ndarray, size: int) -> Float[np.ndarray, "size ..."]:
+    """`array` with `size` rows, float32: padded by 0, or by unit matrices, which are valid factors and triangles."""
+    padded = np.empty((size, *array.shape[1:]), np.float32)
+    padded[: len(array)] = array
+    padded[len(array) :] = np.eye(*array.shape[1:]) if array.ndim == 3 else 0.0
+    return padded
 
 
 @jax.jit
-def _to_faces(mean: Float[Array, "num 3"], factor: Float[Array, "num 3 2"]) -> Float[Array, "num 3 3"]:
-    """V = [m, m + s1 r1, m + s2 r2]; only the two axes in the plane are looked at."""
+def _to_triangles(mean: Float[Array, "num 3"], factor: Float[Array, "num 3 2"]) -> Float[Array, "num 3 3"]:
+    """V = [m, m + s1 r1, m + s2 r2], from the two axes of the flat Gaussian."""
     third = jnp.zeros_like(factor[..., :1])
-    solid = Gaussians3D(mean, jnp.concatenate([factor, third], -1), mean[:, 0], mean)
-    return Triangles.from_gaussians(solid).vertices
+    flat = Gaussians3D(mean, jnp.concatenate([factor, third], -1), mean[:, 0], mean)
+    return Triangles.from_gaussians(flat).vertices
 
 
 @jax.jit
-def _from_faces(vertices: Float[Array, "num 3 3"]) -> tuple[Float[Array, "num 3"], Float[Array, "num 3 2"]]:
-    solid = Triangles.from_vertices(vertices, vertices[:, 0, 0], vertices[:, 0]).to_gaussians()
-    return solid.mean, solid.factor[..., :2]
+def _from_triangles(vertices: Float[Array, "num 3 3"]) -> tuple[Float[Array, "num 3"], Float[Array, "num 3 2"]]:
+    flat = Triangles.from_vertices(vertices, vertices[:, 0, 0], vertices[:, 0]).to_gaussians()
+    return flat.mean, flat.factor[..., :2]
 
 
-def _checked_vertices(vertices: object, shape: tuple[int, ...]) -> Float[np.ndarray, "num 3 3"]:
+def _check_vertices(vertices: object, shape: tuple[int, ...]) -> Float[np.ndarray, "num 3 3"]:
     array = np.asarray(vertices)
     if array.shape != shape or array.dtype.kind not in "fiu":
-        raise invalid("vertices", expected=f"numbers of shape {shape} again", got=f"{array.dtype} {array.shape}")
+        raise invalid("vertices", expected=f"numbers of shape {shape}", got=f"{array.dtype} {array.shape}")
     if not np.isfinite(array).all():
-        got = f"{int((~np.isfinite(array)).any((1, 2)).sum())} faces that have none"
+        got = f"NaN or infinity in {int((~np.isfinite(array)).any((1, 2)).sum())} triangles"
         raise invalid("vertices", expected="finite numbers", got=got)
     return array
 
 
-def _check_spanned(vertices: Float[np.ndarray, "num 3 3"], factor: Float[np.ndarray, "num 3 2"]) -> None:
-    flat = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
-    if flat.size:
-        got = f"{flat.size} without area, the first at index {flat[0]}"
+def _check_areas(factor: Float[np.ndarray, "num 3 2"]) -> None:
+    collinear = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
+    if collinear.size:
+        got = f"{collinear.size} without area, the first at index {collinear[0]}"
         cure = "Move a vertex off the line through the other two."
-        raise invalid("vertices", expected="faces whose three vertices span a plane", got=got, cure=cure)
+        raise invalid("vertices", expected="triangles whose three vertices span a plane", got=got, cure=cure)
 
 
-def _checked_result(before: SelectedGaussians, after: object) -> SelectedGaussians:
+def _check_result(before: SelectedGaussians, after: object) -> SelectedGaussians:
     if not isinstance(after, SelectedGaussians):
         cure = "Return dataclasses.replace(gaussians, ...)."
         raise invalid("function", expected="SelectedGaussians back", got=type(after).__name__, cure=cure)
     if after.index is not before.index and not np.array_equal(after.index, before.index):
-        raise invalid("function", expected="the same Gaussians", got="others", cure="Set opacities to 0 to hide some.")
+        cure = "Set opacities to 0 to hide some."
+        raise invalid("function", expected="the same Gaussians", got="other indices", cure=cure)
     num, dim = len(before), np.shape(after.mean)[-1] if np.ndim(after.mean) else 0
     shapes = {"mean": (num, dim), "factor": (num, dim, 2), "opacity": (num,), "color": (num, 3)}
     for name, shape in shapes.items():
@@ -367,11 +379,11 @@ def _checked_result(before: SelectedGaussians, after: object) -> SelectedGaussia
         or np.max(after.opacity, initial=0) > 1
         or np.min(after.color, initial=0) < 0
     ):
-        raise invalid("function", expected="opacity in [0, 1] and color >= 0", got="numbers outside")
+        raise invalid("function", expected="opacity in [0, 1] and color >= 0", got="numbers outside of that")
     return after
 
 
-def _between(before: SelectedGaussians, after: SelectedGaussians, progress: float) -> SelectedGaussians:
+def _interpolate(before: SelectedGaussians, after: SelectedGaussians, progress: float) -> SelectedGaussians:
     if before.mean.shape != np.shape(after.mean):
         before, after = before.in_space(), after.in_space()
     mixed = {}
@@ -382,21 +394,21 @@ def _between(before: SelectedGaussians, after: SelectedGaussians, progress: floa
 
 
 class Retiming(eqx.Module):
-    """Gaussians with a clock of their own, over a span or always: where progress is s, t + s (clock(t) - t)."""
+    """Gaussians with their own clock, over a span or always: at progress s their time is t + s (clock(t) - t)."""
 
     mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
     clock: Clock = eqx.field(static=True)
 
     def own_time(self, t: float) -> float:
-        """The time by which the Gaussians are conditioned at time t."""
+        """The time at which the Gaussians are conditioned at the video's time t."""
         progress = 1.0 if self.span is None else self.span.progress(t)
-        if progress in (0, 1):  # to the bit
+        if progress in (0, 1):  # exactly
             return self.clock(t) if progress else t
         return t + progress * (self.clock(t) - t)
 
 
-#: What can be written down, by name.
+#: The edits that can be saved, by their names in files.
 KINDS: dict[str, type[eqx.Module]] = {
     "affine": Affine,
     "opacity": Opacity,
@@ -407,21 +419,21 @@ KINDS: dict[str, type[eqx.Module]] = {
 
 
 def describe_overlay(overlay: eqx.Module) -> dict:
-    """All of an overlay but its mask, in JSON's terms. Raises ValueError for functions, which cannot be written."""
+    """An overlay without its mask as JSON values. Raises ValueError for functions, which cannot be saved."""
     names = {kind: name for name, kind in KINDS.items()}
     if type(overlay) not in names:
-        cure = "Save what was before it, and apply the function again to what is loaded; or write the pictures."
-        raise invalid("overlays", expected="edits that can be written down", got=type(overlay).__name__, cure=cure)
-    fields = {name: getattr(overlay, name) for name in _plain_fields(type(overlay))}
+        cure = "Save the video without it and apply the function again after loading; or write a video file."
+        raise invalid("overlays", expected="edits that can be saved", got=type(overlay).__name__, cure=cure)
+    fields = {name: getattr(overlay, name) for name in _field_names(type(overlay))}
     fields = {name: dataclasses.asdict(x) if isinstance(x, Span | Clock) else x for name, x in fields.items()}
     return {"kind": names[type(overlay)], **fields}
 
 
 def restore_overlay(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
-    """The inverse of `describe_overlay`. Raises ValueError, KeyError or TypeError for what describes no overlay."""
+    """The inverse of `describe_overlay`. Raises ValueError, KeyError or TypeError for an invalid description."""
     check_one_of("kind", description["kind"], tuple(KINDS))
     kind = KINDS[description["kind"]]
-    fields = {name: _tuples(description[name]) for name in _plain_fields(kind)}
+    fields = {name: _to_tuples(description[name]) for name in _field_names(kind)}
     if fields["span"] is not None:
         fields["span"] = Span(**fields["span"])
     if "clock" in fields:
@@ -429,13 +441,13 @@ def restore_overlay(description: dict, mask: Bool[np.ndarray, " num_gaussians"])
     return kind(mask=mask, **fields)
 
 
-def _plain_fields(kind: type) -> list[str]:
+def _field_names(kind: type) -> list[str]:
     return [field.name for field in dataclasses.fields(kind) if field.name != "mask"]
 
 
-def _tuples(value: Any) -> Any:
+def _to_tuples(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(map(_tuples, value))
+        return tuple(map(_to_tuples, value))
     if isinstance(value, dict):
-        return {name: _tuples(part) for name, part in value.items()}
+        return {name: _to_tuples(part) for name, part in value.items()}
     return value

@@ -1,204 +1,126 @@
-"""Edits of a clip in segments: one chain, whose calls each segment's model goes through when it is loaded."""
+"""Chains of edits of a video in segments: the calls are recorded and replayed on each segment when it is loaded."""
 
 import dataclasses
 import functools
 import inspect
-import operator
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float32
+from jaxtyping import ArrayLike
 
-from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
+from foldgauss._runtime.checks import check_signature, invalid, is_integer
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.editing.chain import Edit, When, check_color, edit, mean_lightness, start_chain
+from foldgauss.video.editing.arguments import check_color, check_select_arguments, missing_attribute
+from foldgauss.video.editing.bake import mean_lightness
+from foldgauss.video.editing.chain import Edit, edit, start_chain
 from foldgauss.video.editing.clip_window import ClipWindow
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.editing.overlays import LUMINANCE_WEIGHTS
+from foldgauss.video.editing.span import When
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.criteria import CriteriaEvaluator
+from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
-from foldgauss.video.selection.contributions import Contributions, render_matte
-from foldgauss.video.selection.regions import region_from_box, region_from_mask, region_from_polygon, resolve_frames
-from foldgauss.video.selection.selectors import (
-    THRESHOLD,
-    Selection,
-    by_box,
-    by_click,
-    by_color,
-    by_mask,
-    by_polygon,
-    by_time,
-    list_criteria,
-    select,
-)
+from foldgauss.video.selection.selectors import Selection, list_criteria, select
 
-#: A pixel of a shared frame shows the object where this share of its light is the object's.
-_SHOWN = 0.5
-
-_Mask = Bool[np.ndarray, " num_gaussians"]
-_Picture = Bool[np.ndarray, "height width"]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class SegmentedSelection:
-    """Sets of Gaussians of a `SegmentedVideo`, one for each segment, with the operations of sets that `Selection` has.
-
-    Made by `edit(video).select(...).selection`.
-
-    **Example:** `edit(video).select(ball - shadow).vanish()`.
-
-    **Raises:** ValueError for what is no selection, and for sets of videos with other segments.
-    """
-
-    parts: tuple[Selection, ...]
-
-    def __post_init__(self) -> None:
-        parts = tuple(self.parts)
-        wrong = next((part for part in parts if not isinstance(part, Selection)), None)
-        if not parts or wrong is not None:
-            raise invalid("parts", expected="a Selection for each segment", got=short_repr(wrong) if parts else "none")
-        object.__setattr__(self, "parts", parts)
-
-    @property
-    def num_gaussians(self) -> int:
-        """Gaussians of all segments, selected or not."""
-        return sum(part.num_gaussians for part in self.parts)
-
-    def __len__(self) -> int:
-        return sum(map(len, self.parts))
-
-    def __or__(self, other: "SegmentedSelection") -> "SegmentedSelection":
-        return self._with(other, operator.or_)
-
-    def __and__(self, other: "SegmentedSelection") -> "SegmentedSelection":
-        return self._with(other, operator.and_)
-
-    def __sub__(self, other: "SegmentedSelection") -> "SegmentedSelection":
-        return self._with(other, operator.sub)
-
-    def __xor__(self, other: "SegmentedSelection") -> "SegmentedSelection":
-        return self._with(other, operator.xor)
-
-    def __invert__(self) -> "SegmentedSelection":
-        return SegmentedSelection(tuple(~part for part in self.parts))
-
-    def __eq__(self, other: object) -> bool:
-        return self.parts == other.parts if isinstance(other, SegmentedSelection) else NotImplemented
-
-    def __repr__(self) -> str:
-        return f"SegmentedSelection({len(self):,} of {self.num_gaussians:,} in {len(self.parts)} segments)"
-
-    def _with(self, other: "SegmentedSelection", combine: Callable[[Selection, Selection], Selection]):
-        if not isinstance(other, SegmentedSelection):
-            raise TypeError(f"expected a SegmentedSelection, got {type(other).__name__}.")
-        if len(other.parts) != len(self.parts):
-            expected, got = f"a selection in {len(self.parts)} segments", f"one in {len(other.parts)}"
-            raise invalid("selection", expected=expected, got=got, cure="Is it another video's?")
-        return SegmentedSelection(tuple(map(combine, self.parts, other.parts)))
+#: The methods that may change the number or the order of the Gaussians, or hide some of them.
+_CHANGE_INDICES = ("multiply", "vanish", "opacity", "to_front", "to_back")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Call:
-    """A call of the chain: `act` takes a segment's `Edit` and the segment's number.
+    """A recorded call: `act(edit, number)` applies it to the `Edit` of a segment.
 
-    Where nothing is selected it is left out, unless it is `for_all`. `place`: what its errors are told within.
+    It is skipped for an empty selection, unless `always`. Errors are raised within `context`.
     """
 
     act: Callable[[Edit, int], Edit]
-    place: AbstractContextManager
-    for_all: bool = False
+    context: AbstractContextManager
+    always: bool = False
 
 
 def _record_method(name: str) -> Callable[..., "SegmentedEdit"]:
-    """A method of `Edit` as one of the chain for all segments."""
+    """A method of `SegmentedEdit` that records a call of the method of `Edit`."""
 
     @functools.wraps(getattr(Edit, name))
-    def recorded(self: "SegmentedEdit", *args: Any, **named: Any) -> "SegmentedEdit":
-        return self._then(name, args, named)
+    def method(self: "SegmentedEdit", *args: Any, **kwargs: Any) -> "SegmentedEdit":
+        return self._record(name, args, kwargs)
 
-    return recorded
+    return method
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SegmentedEdit:
-    """A video in segments being edited as one, with the methods of `Edit`. Each method gives a new one.
+    """A video in segments being edited as one, with the methods of `Edit`. Each method returns a new chain.
 
-    The calls are kept, and each segment's model goes through them when it is loaded: `video()` loads them one after
-    another, and so does what `video()` gives whenever it is drawn or saved. What a call leaves alone, such as segments
-    outside its span, keeps its bits.
+    The calls are recorded and replayed on each segment's model when it is loaded: by `video()`, one after another, and
+    whenever the edited video is rendered or saved. Segments that a call does not apply to, such as those outside its
+    span, stay the same to the bit.
 
-    - Frames and times, of spans, clocks, cameras and functions, are those of the whole clip; an edit eased over a seam
-      is as far along in both segments.
-    - What is selected by place (`mask=`, `box=`, `polygon=`, `click=`) is asked of the segments that hold the frames
-      named, and carried on from segment to segment: what it shows on the shared frames, at least half of a pixel's
-      light, is the neighbour's mask for these frames. Across a cut, where no frame is shared, nothing is carried, nor
-      with `follow=False`. `color=` and times are asked of every segment.
-    - Objects go by clocks (`retime`, `freeze`, `delays=`) within a segment only: one that had to be shown as another
-      segment has it is refused.
+    - Frames and times, of spans, clocks, cameras and functions, are those of the whole clip; at a seam an eased edit
+      has the same progress in both segments.
+    - Regions (`mask=`, `box=`, `polygon=`, `click=`) are evaluated on the segments that have the frames named, and
+      propagated from segment to segment: where the selection contributes at least half of a pixel of a shared frame,
+      that pixel is in the neighbour's mask. There is no propagation across a cut, where no frame is shared, nor with
+      `follow=False`. `color=` and times are evaluated on every segment.
+    - Clocks (`retime`, `freeze`, `delays=`) work within one segment only: a clock that would show frames of another
+      segment raises ValueError.
 
     **Units:** as `Edit`. **Example:** `edit(video).select(box=(200, 80, 420, 260), frame=120).move((0.1, 0)).video()`
 
-    **Raises:** ValueError as `Edit`; what only the models tell (a part of what another edit takes as a whole, nobody
-    left to edit) by `video()`.
+    **Raises:** ValueError as `Edit`; what depends on the models (an edit of a part of what another edit takes as a
+    whole, an empty selection) is raised by `video()`.
     """
 
     _video: SegmentedVideo
-    _stand_in: Edit = dataclasses.field(repr=False)  # one Gaussian in a clip as long: what is given is checked on it
-    _steps: tuple[_Call, ...] = dataclasses.field(default=(), repr=False)
+    _stand_in: Edit = dataclasses.field(repr=False)  # of one Gaussian in a clip as long: arguments are checked on it
+    _calls: tuple[_Call, ...] = dataclasses.field(default=(), repr=False)
     _known: SegmentedSelection | None = dataclasses.field(default=None, repr=False)  # the selection, where it is known
-    _gone: bool = dataclasses.field(default=False, repr=False)  # whether nothing can be selected
-    _as_begun: bool = dataclasses.field(default=True, repr=False)  # whether all have the numbers that they began with
-    _place: AbstractContextManager = dataclasses.field(default_factory=nullcontext, repr=False)
+    _is_empty: bool = dataclasses.field(default=False, repr=False)  # whether the selection is known to be empty
+    _same_indices: bool = dataclasses.field(default=True, repr=False)  # as at the start of the chain
+    _context: AbstractContextManager = dataclasses.field(default_factory=nullcontext, repr=False)
 
     def video(self) -> SegmentedVideo:
-        """What has been made: each segment is edited again when it is loaded, so none is held in memory."""
-        load = functools.lru_cache(maxsize=MAX_PREPARED)(lambda number: self._replayed(number).video())
+        """The edited video; its segments are edited again whenever they are loaded, so none is kept in memory."""
+        load = functools.lru_cache(maxsize=MAX_PREPARED)(lambda number: self._replay(number).video())
         acted: set[int] = set()
-        made = [
-            self._segment(number, functools.partial(load, number), acted) for number in range(len(self._video.segments))
-        ]
-        for number, step in enumerate(self._steps):
+        segments = [self._edit_segment(k, functools.partial(load, k), acted) for k in self._numbers]
+        for number, call in enumerate(self._calls):
             if number not in acted:
-                with step.place:
+                with call.context:
                     _deselect_all(self._stand_in)._check_selected()
-        return SegmentedVideo(made)
+        return SegmentedVideo(segments)
 
-    def _segment(self, number: int, load: Callable[[], VideoModel | EditedVideo], acted: set[int]) -> Segment:
+    def _edit_segment(self, number: int, load: Callable[[], VideoModel | EditedVideo], acted: set[int]) -> Segment:
         segment = self._video.segments[number]
-        before = self._begun(number)
-        edited = self._through(before, number, acted)
-        if _same(edited._video, before._video):
-            return segment
-        made = edited.video()
-        facts = {name: getattr(made, name) for name in ("num_gaussians", "degree", "num_parameters")}
-        return dataclasses.replace(segment, **facts, load=load)
+        before = self._start(number)
+        after = self._replay_calls(before, number, acted)
+        return segment if _is_same(after._video, before._video) else segment.with_model(after.video(), load)
 
     def __getattr__(self, name: str) -> object:
-        """There is none; most likely `video()` was forgotten."""
-        cure = " End the chain with .video()." if name in dir(SegmentedVideo) else ""
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}.{cure}", name=name, obj=self)
+        """Raise AttributeError, with a hint for attributes of the video."""
+        raise missing_attribute(self, name, SegmentedVideo)
 
-    def within(self, place: AbstractContextManager) -> "SegmentedEdit":
-        """The same; what the calls from now on raise, also later by `video()`, is raised within a context.
+    def with_error_context(self, context: AbstractContextManager) -> "SegmentedEdit":
+        """Raise the errors of the following calls within a context, also those that `video()` raises later.
 
-        It is entered many times.
+        The context is entered many times.
         """
-        return dataclasses.replace(self, _place=place)
+        return dataclasses.replace(self, _context=context)
 
-    # ------------------------------------------------------------------------------------------------- who
+    # ------------------------------------------------------------------------------------------- selection
 
     @property
     def selection(self) -> SegmentedSelection:
-        """Who is selected now; the models are loaded for it where it is not known."""
+        """The current selection; the models are loaded if it is not known."""
         if self._known is not None:
             return self._known
-        return SegmentedSelection(tuple(self._replayed(number).selection for number in self._numbers))
+        return SegmentedSelection(tuple(self._replay(number).selection for number in self._numbers))
 
     def select(
         self,
@@ -207,58 +129,64 @@ class SegmentedEdit:
         layer: int | None = None,
         **criteria: Any,
     ) -> "SegmentedEdit":
-        """Act on these Gaussians from now on, whatever was selected before; on all without arguments.
+        """Choose the Gaussians that the next edits apply to, from all Gaussians; without arguments, all of them.
 
-        As `Edit.select`; a selection is a `SegmentedSelection`, or a function of `video()` that gives one. Criteria are
-        asked at once, of the models one after another.
+        As `Edit.select`; a selection is a `SegmentedSelection` or a function of `video()` that returns one. Criteria
+        are evaluated at once, on one model after another.
         """
-        if selection is not None and criteria:
-            got = f"{type(selection).__name__} and {', '.join(criteria)}"
-            raise invalid("selection", expected="a selection or criteria for one", got=got)
+        check_select_arguments(selection, criteria)
         if layer is not None and not is_integer(layer, 0):
             raise invalid("layer", expected="a whole number >= 0", got=layer)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
-            return self._chosen(self._answer(list_criteria(**criteria), layer))
+            return self._select_current(self._evaluator(layer).evaluate(list_criteria(**criteria)))
         if selection is None:
-            return self._selecting(lambda one, number: one.select(layer=layer), None)
+            return self._record_selection(lambda one, number: one.select(layer=layer), None)
         if callable(selection):
             check_signature("selection", selection, "video")
-            return self._chosen(self._checked(selection(self.video())))
-        self._checked(selection)
-        known = selection if self._as_begun and layer is None else None
-        return self._selecting(lambda one, number: one.select(selection.parts[number], layer=layer), known)
+            return self._select_current(self._check_selection(selection(self.video())))
+        self._check_selection(selection)
+        known = selection if self._same_indices and layer is None else None
+        return self._record_selection(lambda one, number: one.select(selection.parts[number], layer=layer), known)
 
     def select_begun(self, selection: SegmentedSelection) -> "SegmentedEdit":
-        """Act on these of the Gaussians that the chain was begun with, and on their copies: see `Edit.select_begun`."""
-        self._checked(selection)
-        known = selection if self._as_begun else None
-        return self._selecting(lambda one, number: one.select_begun(selection.parts[number]), known)
+        """Select from the Gaussians at the start of the chain, together with their copies: see `Edit.select_begun`."""
+        self._check_selection(selection)
+        known = selection if self._same_indices else None
+        return self._record_selection(lambda one, number: one.select_begun(selection.parts[number]), known)
 
-    def _chosen(self, selection: SegmentedSelection) -> "SegmentedEdit":
-        """With these of the Gaussians of now."""
-        return self._selecting(
+    def _select_current(self, selection: SegmentedSelection) -> "SegmentedEdit":
+        """Select from the current Gaussians."""
+        return self._record_selection(
             lambda one, number: dataclasses.replace(one, selection=selection.parts[number]), selection
         )
 
-    def _selecting(self, act: Callable[[Edit, int], Edit], known: SegmentedSelection | None) -> "SegmentedEdit":
-        step = _Call(act, self._place, for_all=True)
-        return dataclasses.replace(self, _steps=(*self._steps, step), _known=known, _gone=False)
+    def _record_selection(self, act: Callable[[Edit, int], Edit], known: SegmentedSelection | None) -> "SegmentedEdit":
+        call = _Call(act, self._context, always=True)
+        return dataclasses.replace(self, _calls=(*self._calls, call), _known=known, _is_empty=False)
 
-    def _checked(self, selection: object) -> SegmentedSelection:
+    def _check_selection(self, selection: object) -> SegmentedSelection:
         if not isinstance(selection, SegmentedSelection):
             cure = "edit(video).select(...).selection is one."
             raise invalid("selection", expected="a SegmentedSelection", got=type(selection).__name__, cure=cure)
-        if len(selection.parts) != len(self._video.segments):
-            expected, got = f"one in {len(self._video.segments)} segments", f"one in {len(selection.parts)}"
-            raise invalid("selection", expected=expected, got=got, cure="Is it another video's?")
+        selection.check_segments(len(self._video.segments))
         return selection
+
+    def _evaluator(self, layer: int | None) -> CriteriaEvaluator:
+        stand_in = self._stand_in._video.layers[0].model
+        return CriteriaEvaluator(self._video.segments, stand_in, self._replay, self._select_none, layer)
+
+    def _select_none(self, number: int) -> Selection:
+        """The empty selection of a segment; its model is loaded only if the number of Gaussians may have changed."""
+        if self._same_indices:
+            return Selection(np.zeros(self._video.segments[number].num_gaussians, bool))
+        return _deselect_all(self._replay(number)).selection
 
     @property
     def _numbers(self) -> range:
         return range(len(self._video.segments))
 
-    # ------------------------------------------------------------------------------------------------ what
+    # ----------------------------------------------------------------------------------------------- edits
 
     move, scale, rotate, transform = map(_record_method, ("move", "scale", "rotate", "transform"))
     multiply, vanish, opacity = map(_record_method, ("multiply", "vanish", "opacity"))
@@ -267,262 +195,78 @@ class SegmentedEdit:
     apply, apply_triangles, seen_from = map(_record_method, ("apply", "apply_triangles", "seen_from"))
 
     @functools.wraps(Edit.recolor)
-    def recolor(self, color: ArrayLike | None = None, **given: Any) -> "SegmentedEdit":
-        """As `Edit.recolor`: by the mean lightness of the selection in all segments."""
+    def recolor(self, color: ArrayLike | None = None, **kwargs: Any) -> "SegmentedEdit":
+        """As `Edit.recolor`; the mean lightness is that of the selection in all segments."""
         if color is None:
-            return self._then("recolor", (), given)
-        self._try("recolor", (color,), given)
-        light = [one._light() for one in map(self._replayed, self._numbers) if len(one.selection)]
-        if not light:
+            return self._record("recolor", (), kwargs)
+        self._try("recolor", (color,), kwargs)
+        sums = [one._sum_lightness() for one in map(self._replay, self._numbers) if len(one.selection)]
+        if not sums:
             _deselect_all(self._stand_in)._check_selected()
-        when = {name: value for name, value in given.items() if name in When.__annotations__}
+        when = {name: value for name, value in kwargs.items() if name in When.__annotations__}
         matrix = np.outer(check_color(color), LUMINANCE_WEIGHTS)
-        return self._then("recolor", (), {"gain": 1 / mean_lightness(light), "matrix": matrix, **when})
+        return self._record("recolor", (), {"gain": 1 / mean_lightness(sums), "matrix": matrix, **when})
 
-    def _then(self, name: str, args: Sequence[Any], named: dict[str, Any]) -> "SegmentedEdit":
-        """With one more call of a method of `Edit`."""
-        after = self._try(name, args, named)
-        step = _Call(lambda one, number: getattr(one, name)(*args, **named), self._place, for_all=name == "seen_from")
-        keeps = name not in ("multiply", "vanish", "opacity", "to_front", "to_back")
+    def _record(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> "SegmentedEdit":
+        """Check a call of a method of `Edit`, and add it to the chain."""
+        after = self._try(name, args, kwargs)
+        call = _Call(lambda one, number: getattr(one, name)(*args, **kwargs), self._context, name == "seen_from")
+        keeps_indices = name not in _CHANGE_INDICES
         return dataclasses.replace(
             self,
-            _steps=(*self._steps, step),
-            _known=self._known if keeps else None,
-            _gone=self._gone or not len(after.selection),
-            _as_begun=self._as_begun and keeps,
+            _calls=(*self._calls, call),
+            _known=self._known if keeps_indices else None,
+            _is_empty=self._is_empty or not len(after.selection),
+            _same_indices=self._same_indices and keeps_indices,
         )
 
-    def _try(self, name: str, args: Sequence[Any], named: dict[str, Any]) -> Edit:
-        """What is given, checked; warnings are told as if of the caller's caller."""
-        nobody = self._gone or (self._known is not None and not len(self._known))
-        trial = _deselect_all(self._stand_in) if nobody else self._stand_in
-        with warnings.catch_warnings(record=True) as told:
+    def _try(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Edit:
+        """Make a call on the stand-in, to check its arguments; its warnings are raised for the user's line."""
+        is_empty = self._is_empty or (self._known is not None and not len(self._known))
+        trial = _deselect_all(self._stand_in) if is_empty else self._stand_in
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            after = getattr(trial, name)(*args, **named)
-        for warning in told:
+            after = getattr(trial, name)(*args, **kwargs)
+        for warning in caught:
             warnings.warn(warning.message, stacklevel=4)
-        return dataclasses.replace(after, selection=after.selection - after.selection) if nobody else after
+        return _deselect_all(after) if is_empty else after
 
-    def _replayed(self, number: int) -> Edit:
-        """A segment, loaded, after all calls."""
-        return self._through(self._begun(number), number, set())
+    def _replay(self, number: int) -> Edit:
+        """Load a segment and replay all calls on it."""
+        return self._replay_calls(self._start(number), number, set())
 
-    def _begun(self, number: int) -> Edit:
+    def _start(self, number: int) -> Edit:
         segment = self._video.segments[number]
         model = segment.model
         times = np.asarray(model.frame_times.times(), np.float64)
         return start_chain(as_edited(model), ClipWindow(times, segment.first, self._video.num_frames))
 
-    def _through(self, one: Edit, number: int, acted: set[int]) -> Edit:
-        """After all calls; the numbers of those that had something to act on go to `acted`."""
-        for count, step in enumerate(self._steps):
-            if not (step.for_all or len(one.selection)):
+    def _replay_calls(self, one: Edit, number: int, acted: set[int]) -> Edit:
+        """The chain of a segment after all calls; the numbers of the calls that were not skipped go to `acted`."""
+        for count, call in enumerate(self._calls):
+            if not (call.always or len(one.selection)):
                 continue
-            with step.place, warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # they were told when it was called
-                one = step.act(one, number)
+            with call.context, warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they were raised when the call was recorded
+                one = call.act(one, number)
             acted.add(count)
         return one
 
-    # ---------------------------------------------------------------------------------- what criteria find
 
-    def _answer(
-        self, asked: list[tuple[Callable[..., Selection], dict[str, Any]]], layer: int | None
-    ) -> SegmentedSelection:
-        """The answers to all criteria, intersected: those by place first, so that the others need ask fewer models."""
-        found: SegmentedSelection | None = None
-        for function, named in sorted(asked, key=lambda question: question[0] in (by_color, by_time)):
-            if function in (by_color, by_time):
-                answer = self._by_themselves(function, named, layer, found)
-            else:
-                answer = _RegionQuery(self, function, named, layer).selection()
-            found = answer if found is None else found & answer
-        return found
-
-    def _by_themselves(
-        self, function: Callable[..., Selection], named: dict[str, Any], layer: int | None, among: Any
-    ) -> SegmentedSelection:
-        """Asked of each segment alone: by colour, or by time."""
-        spans = None if function is by_color else self._positions(**named)
-        parts = []
-        for number, segment in enumerate(self._video.segments):
-            if among is not None and not len(among.parts[number]):
-                parts.append(among.parts[number])
-            elif spans is not None and not _reaches(spans, segment):
-                parts.append(self._nothing(number))
-            else:
-                one = self._replayed(number)
-                own = named if spans is None else _own_times(spans, segment, one._window, named)
-                parts.append(_evaluate_by_layer(one, layer, lambda model, _, own=own: function(model, **own)))
-        return SegmentedSelection(tuple(parts))
-
-    def _nothing(self, number: int) -> Selection:
-        """Of a segment; its model is loaded only where it must be to know how many Gaussians there are now."""
-        if self._as_begun:
-            return Selection(np.zeros(self._video.segments[number].num_gaussians, bool))
-        return _empty_selection(self._replayed(number))
-
-    def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
-        """First and last frame position, of times, or the range of frames."""
-        if times is None:
-            return resolve_frames(_model(self._stand_in), frame, frames)
-        pair = np.asarray(times)
-        if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
-            raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
-        return tuple(float(t) * (self._video.num_frames - 1) for t in pair)
-
-
-def _reaches(spans: Any, segment: Segment) -> bool:
-    """Whether a range of frames, or first and last position, has something of a segment."""
-    first, last = (spans.start, spans.stop - 1) if isinstance(spans, range) else spans
-    return first <= segment.stop - 1 and segment.first <= last
-
-
-def _own_times(spans: Any, segment: Segment, part: ClipWindow, named: dict[str, Any]) -> dict[str, Any]:
-    """What `by_time` is asked of a segment that is reached."""
-    if isinstance(spans, range):
-        first, stop = max(spans.start, segment.first), min(spans.stop, segment.stop)
-        return {"frames": (first - segment.first, stop - segment.first), "alive": named["alive"]}
-    if part.is_whole:
-        return named
-    ends = np.clip(spans, part.first, part.last) - part.first
-    times = np.interp(ends, np.arange(len(part.times)), part.times)
-    return {"times": tuple(np.clip(times, 0.0, 1.0).tolist()), "alive": named["alive"]}
-
-
-class _RegionQuery:
-    """The answer to a question that names frames: asked where these are, carried over shared frames elsewhere."""
-
-    def __init__(
-        self, edits: SegmentedEdit, function: Callable[..., Selection], named: dict[str, Any], layer: int | None
-    ):
-        self._edits, self._function, self._named, self._layer = edits, function, named, layer
-        self._segments = edits._video.segments
-        stand_in = _model(edits._stand_in)
-        where = {"frame": named["frame"], "frames": named.get("frames")}
-        if function is by_click:
-            self._frames = tuple(resolve_frames(stand_in, **where))
-        else:
-            regions = {
-                by_mask: (region_from_mask, "mask"),
-                by_box: (region_from_box, "box"),
-                by_polygon: (region_from_polygon, "polygon"),
-            }
-            make, name = regions[function]
-            self._region = make(stand_in, named[name], **where)
-            self._frames = self._region.frames
-        #: By segment and layer: what the neighbours show of it, by frames of the clip.
-        self._shown: dict[int, list[dict[int, _Picture]]] = {}
-
-    def selection(self) -> SegmentedSelection:
-        """In all segments: those next to the asked ones first, so that each hears of all that know more."""
-        asked = [number for number in self._edits._numbers if self._held(number)]
-        waiting, found = deque(asked), {}
-        reached = set(asked)
-        while waiting:
-            number = waiting.popleft()
-            one = self._edits._replayed(number)
-            found[number] = self._asked(one, number) if number in asked else self._from_neighbours(one, number)
-            for other in self._next_to(number):
-                if other in found or other in asked or not self._named.get("follow", True):
-                    continue
-                if len(found[number]) or number in asked:  # that it is not there is known there, too
-                    self._show(one, found[number], number, other)
-                if len(found[number]) and other not in reached:
-                    reached.add(other)
-                    waiting.append(other)
-        parts = (found[k] if k in found else self._edits._nothing(k) for k in self._edits._numbers)
-        return SegmentedSelection(tuple(parts))
-
-    def _held(self, number: int) -> list[int]:
-        """Which of the frames named a segment has."""
-        segment = self._segments[number]
-        return [k for k in self._frames if segment.first <= k < segment.stop]
-
-    def _next_to(self, number: int) -> Iterable[int]:
-        return (other for other in (number - 1, number + 1) if 0 <= other < len(self._segments))
-
-    def _asked(self, one: Edit, number: int) -> Selection:
-        first, held = self._segments[number].first, self._held(number)
-        own = {name: value for name, value in self._named.items() if name not in ("frame", "frames")}
-        if self._function is by_click:
-            own["frame"] = held[0] - first
-        elif self._function is by_mask:
-            own["mask"] = {k - first: _share(self._region.at(k)) for k in held}
-            if not any(mask.any() for mask in own["mask"].values()):
-                return _empty_selection(one)
-        else:
-            own["frames"] = (held[0] - first, held[-1] + 1 - first)
-        return _evaluate_by_layer(one, self._layer, lambda model, _: self._function(model, **own))
-
-    def _show(self, one: Edit, found: Selection, number: int, other: int) -> None:
-        """What is found in a segment, as masks of the frames that it shares with a neighbour."""
-        here, there = self._segments[number], self._segments[other]
-        layers, masks = one._video.layers, dataclasses.replace(one, selection=found)._parts()
-        by_layer = self._shown.setdefault(other, [{} for _ in layers])
-        for layer, mask, pictures in zip(layers, masks, by_layer, strict=False):
-            lit = Contributions(layer.model) if mask.any() else None
-            for k in range(max(here.first, there.first), min(here.stop, there.stop)):
-                if lit is None:
-                    pictures[k] = np.zeros(layer.model.size, bool)
-                else:
-                    pictures[k] = render_matte(lit, mask, float(one._window.times[k - here.first])) >= _SHOWN
-
-    def _from_neighbours(self, one: Edit, number: int) -> Selection:
-        first, shown = self._segments[number].first, self._shown[number]
-        num_layers = len(one._video.layers)
-        if len(shown) != num_layers:
-            expected = f"{len(shown)} layers, as its neighbour has"
-            raise invalid(f"segments[{number}]", expected=expected, got=num_layers)
-        threshold = self._named.get("threshold", THRESHOLD)
-
-        def ask(model: VideoModel, layer: int) -> Selection:
-            masks = {k - first: picture for k, picture in shown[layer].items()}
-            if not any(mask.any() for mask in masks.values()):
-                return Selection.none(model)
-            return by_mask(model, masks, threshold=threshold)
-
-        return _evaluate_by_layer(one, self._layer, ask)
-
-
-def _share(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
-    """Without what resizing leaves beyond [0, 1]."""
-    return np.clip(mask, 0.0, 1.0)
-
-
-def _evaluate_by_layer(one: Edit, layer: int | None, function: Callable[[VideoModel, int], Selection]) -> Selection:
-    """What each layer's model answers, or layer number `layer` alone."""
-    numbers = one._layer_numbers(layer)
-    masks = [
-        function(own.model, number).mask if number in numbers else np.zeros(own.num_gaussians, bool)
-        for number, own in enumerate(one._video.layers)
-    ]
-    return Selection(np.concatenate(masks))
-
-
-def _model(one: Edit) -> VideoModel:
-    """Of the only layer."""
-    return one._video.layers[0].model
-
-
-def _same(one: EditedVideo, other: EditedVideo) -> bool:
-    """Whether nothing was edited: what is, is another object."""
+def _is_same(one: EditedVideo, other: EditedVideo) -> bool:
+    """Whether nothing was edited: an edited layer or camera is another object."""
     pairs = zip(one.layers, other.layers, strict=True)
-    return one.camera is other.camera and all(own is before for own, before in pairs)
-
-
-def _empty_selection(one: Edit) -> Selection:
-    return one.selection - one.selection
+    return one.camera is other.camera and all(layer is before for layer, before in pairs)
 
 
 def _deselect_all(one: Edit) -> Edit:
-    return dataclasses.replace(one, selection=_empty_selection(one))
+    return dataclasses.replace(one, selection=one.selection - one.selection)
 
 
 @edit.register
 def _(video: SegmentedVideo) -> SegmentedEdit:
-    """One Gaussian, there throughout, of a grey that can be recoloured, stands in for all."""
-    leaves = {
+    """Start with a stand-in of one grey Gaussian that is always alive."""
+    shapes = {
         "loc": (1, 2),
         "log_scale": (1, 2),
         "angle_logit": (1,),
@@ -532,10 +276,9 @@ def _(video: SegmentedVideo) -> SegmentedEdit:
         "opacity_logit": (1,),
         "color_dc": (1, 3),
     }
-    splats = FoldedSplats(
-        **{name: np.zeros(shape, np.float32) for name, shape in leaves.items()}, envelope=TimeLikelihood(2.0)
-    )
+    leaves = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    splats = FoldedSplats(**leaves, envelope=TimeLikelihood(2.0))
     times = FrameTimes.uniform(video.num_frames)
     model = VideoModel(splats, times, video.size, video.fps, video.options, video.compositing)
-    part = ClipWindow(np.arange(video.num_frames) / max(video.num_frames - 1, 1), 0, video.num_frames)
-    return SegmentedEdit(video, start_chain(as_edited(model), part))
+    window = ClipWindow(video.frame_times.times(), 0, video.num_frames)
+    return SegmentedEdit(video, start_chain(as_edited(model), window))

@@ -15,8 +15,11 @@ from rich.table import Table
 
 from foldgauss._runtime.checks import is_integer, is_within, short_repr
 from foldgauss._runtime.machine import describe_machine
+from foldgauss._runtime.settings import setting_of
 from foldgauss.analysis.plot import Panel
-from foldgauss.cli.app.shared import WrongUse, err, out, write_json
+from foldgauss.cli.app.application import WrongUse, out, warn
+from foldgauss.cli.fitting.options import CONFIG_FIELDS
+from foldgauss.cli.shared.tables import write_json
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.render import RenderOptions
@@ -26,19 +29,7 @@ from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Poin
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
 #: Options of `fit` by field of `FitConfig`, and of `fit` and `evaluate` by constant of `RenderOptions`.
-_FIT_FIELDS = (
-    "steps",
-    "degree",
-    "batch_size",
-    "power",
-    "compositing",
-    "ssim_fraction",
-    "quarter_fraction",
-    "half_fraction",
-)
-FIT_OPTIONS = {"num_gaussians": "--gaussians"} | {
-    name: f"--{name.replace('_', '-')}" for name in (*_FIT_FIELDS, "seed")
-}
+FIT_OPTIONS = {field.name: setting_of(field).option for field in CONFIG_FIELDS.values()}
 #: Those without a number: it is there, or it is not.
 FLAGS = {"economy": "--economy"}
 DRAW_OPTIONS = {
@@ -239,7 +230,7 @@ def report(record: Record, made: list[Point], left: list[Skipped], clock: str) -
             folder / PLOT, panels, [row["psnr"] for row in rows], [(point.axis, point.value) for point in made]
         )
     except ImportError as error:
-        err.print(f"warning: no plot in {folder / PLOT}: {error}", soft_wrap=True)
+        warn(f"no plot in {folder / PLOT}: {error}")
     _print_rows(rows, record.fronts, CLOCKS[clock])
     _print_fronts(rows, names, record.fronts)
 

@@ -15,27 +15,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss import __version__
 from foldgauss._runtime.checks import invalid
-from foldgauss.cli._profiles_file import is_evidence, keep_evidence, kept_evidence
-from foldgauss.cli.app.completion import among
-from foldgauss.cli.app.shared import (
-    TIME_LEFT,
-    FittedClip,
-    ModelFile,
-    Overwrite,
-    Stopped,
-    WrongUse,
-    app,
-    clip_of_model,
-    err,
-    fingerprint,
-    named_after,
-    out,
-    refuse_segments,
-)
+from foldgauss.cli.app.application import Stopped, WrongUse, app, err, out, warn, wrong_use
+from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.measuring.profiles_file import is_evidence, keep_evidence, kept_evidence
+from foldgauss.cli.shared.arguments import FittedClip, ModelFile, Overwrite
+from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
+from foldgauss.cli.shared.outputs import name_after
+from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.io.provenance import fingerprint
 from foldgauss.uncertainty import LikelihoodProfiles, frame_time_log_prob, frame_time_posterior, likelihood_profiles
 from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
@@ -87,14 +78,14 @@ def uncertainty_command(
         str,
         typer.Option(
             help=f"What of the residuals counts: {', '.join(NOISES)}; see docs/uncertainty.md.",
-            autocompletion=among(NOISES),
+            autocompletion=complete_choice(NOISES),
         ),
     ] = "score",
     level: Annotated[
         str,
         typer.Option(
             help="What is given: splats, all of them; colors: all but their colours, which takes longer.",
-            autocompletion=among(LEVELS),
+            autocompletion=complete_choice(LEVELS),
         ),
     ] = "splats",
     concentration: Annotated[
@@ -106,7 +97,7 @@ def uncertainty_command(
     seed: Annotated[int, typer.Option(help="Seed of all draws.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Say how sure the frame times are, given the splats.
+    """Estimate the uncertainty of the frame times, given the splats.
 
     Tells error bars of every frame, duplicated and dropped frames, and whether sampling has converged. A run that was
     stopped goes on when called again with the same arguments; more --steps go on from fewer.
@@ -114,22 +105,22 @@ def uncertainty_command(
     for name in ("matplotlib", "emcee", "h5py", "h5netcdf", "arviz"):
         import_optional(name)
     if noise not in NOISES:
-        raise WrongUse(str(invalid("--noise", expected="one of " + ", ".join(NOISES), got=noise)))
+        raise wrong_use("--noise", expected="one of " + ", ".join(NOISES), got=noise)
     if level not in LEVELS:
-        raise WrongUse(str(invalid("--level", expected="one of " + ", ".join(LEVELS), got=level)))
-    out_dir = named_after(model_path, "-uncertainty") if out_dir is None else out_dir
+        raise wrong_use("--level", expected="one of " + ", ".join(LEVELS), got=level)
+    out_dir = name_after(model_path, "-uncertainty") if out_dir is None else out_dir
     _check_folder(out_dir, video, overwrite)
     wanted = _parse_only(only)
     refuse_segments(model_path)
     model = load_video_model(model_path)
     if not isinstance(model, VideoModel):
         cure = "Take the model that was edited, and the clip that it was fitted to."
-        raise WrongUse(str(invalid("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)))
-    clip = clip_of_model(model, model_path, video, frames, as_many=False)
+        raise wrong_use("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)
+    clip = read_fitted_clip(model, model_path, video, frames, same_number=False)
     if clip.num_frames != model.num_frames and read_origin(model_path).get("clip") == Path(clip.source).name:
         expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
         cure = "To draw the times of some of them: --only A:B."
-        raise WrongUse(str(invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)))
+        raise wrong_use("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
     key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
     context.with_resource(_made_folder(out_dir))
@@ -144,7 +135,7 @@ def uncertainty_command(
     with _bars() as bars:
         if profiles is not None:
             for note in profiles.notes:
-                err.print(f"warning: {note}", soft_wrap=True)
+                warn(f"{note}")
         else:
             profiles = _evidence(model, clip, noise, level, wanted, bars)
             keep_evidence(out_dir / EVIDENCE, key, profiles)
@@ -165,25 +156,25 @@ def _parse_only(text: str | None) -> list[int] | None:
         first, colon, last = part.strip().partition(":")
         if not first.isdecimal() or (colon and not last.isdecimal()) or (colon and int(last) - int(first) > 100_000):
             expected = "frames as 3,5,10:20 (20 not included)"
-            raise WrongUse(str(invalid("--only", expected=expected, got=repr(text))))
+            raise wrong_use("--only", expected=expected, got=repr(text))
         found += range(int(first), int(last)) if colon else [int(first)]
     if not found:
-        raise WrongUse(str(invalid("--only", expected="at least one frame", got=repr(text))))
+        raise wrong_use("--only", expected="at least one frame", got=repr(text))
     return sorted(set(found))
 
 
 def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     """Refuse a folder that cannot be right, before any work; it is made when there is something to put into it."""
     if folder.exists() and not folder.is_dir():
-        raise WrongUse(str(invalid("--out", expected="a folder", got=f"the file {folder}")))
+        raise wrong_use("--out", expected="a folder", got=f"the file {folder}")
     if video.is_dir() and folder.resolve() == video.resolve():
         cure = "Pictures would be frames there."
-        raise WrongUse(str(invalid("--out", expected="a folder other than the clip's", got=folder, cure=cure)))
+        raise wrong_use("--out", expected="a folder other than the clip's", got=folder, cure=cure)
     shown = [path for path in folder.glob("*") if not path.name.startswith(".")]  # not what a kill left of a picture
     images = [path for path in shown if path.suffix.lower() in IMAGES and path.name not in PICTURES]
     if images:
         cure = "Pictures would be frames there."
-        raise WrongUse(str(invalid("--out", expected="a folder without other images", got=folder, cure=cure)))
+        raise wrong_use("--out", expected="a folder without other images", got=folder, cure=cure)
     there = [name for name in FILES if (folder / name).exists()]
     if (folder / EVIDENCE).exists() and not is_evidence(folder / EVIDENCE):  # a run that was killed may leave its own
         there.append(EVIDENCE)
@@ -256,7 +247,7 @@ def _no_other_run() -> Iterator[None]:
 def _of_another(path: Path) -> WrongUse:
     cure = "Choose another folder, or add --overwrite to give them up."
     expected = "the draws of this model, clip and settings"
-    return WrongUse(str(invalid("--out", expected=expected, got=f"others in {path}", cure=cure)))
+    return wrong_use("--out", expected=expected, got=f"others in {path}", cure=cure)
 
 
 def _damaged(path: Path) -> WrongUse:
@@ -377,4 +368,4 @@ def _write_netcdf(path: Path, posterior: FrameTimePosterior) -> None:
 def _tell(folder: Path, posterior: FrameTimePosterior) -> None:
     out.print((folder / "summary.md").read_text(), soft_wrap=True)
     if not posterior.converged:
-        err.print(f"warning: {posterior.message} The draws so far are in {folder}.", soft_wrap=True)
+        warn(f"{posterior.message} The draws so far are in {folder}.")

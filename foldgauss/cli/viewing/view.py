@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from foldgauss._runtime.checks import invalid
-from foldgauss.cli.app.shared import ModelFile, WrongUse, app, clip_of_model, err, out
-from foldgauss.cli.edit import Original, OriginalQuality
+from foldgauss.cli.app.application import app, err, out, wrong_use
+from foldgauss.cli.shared.arguments import ModelFile, Original, OriginalQuality
+from foldgauss.cli.shared.clips import read_fitted_clip
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.io.page.player_page import QUALITY, html_page, warn_of_size
 
@@ -30,7 +30,7 @@ def view_command(
     """
     frames = None
     if original is not None:
-        frames = clip_of_model(load_video_model(model_path), model_path, original, None)
+        frames = read_fitted_clip(load_video_model(model_path), model_path, original, None)
     with err.status("Making the page"):
         page = html_page(model_path, original=frames, quality=original_quality)
     warn_of_size(page, original is not None)
@@ -38,12 +38,8 @@ def view_command(
         server = _Server(page.encode(), port)
     except OSError as error:
         expected, got = "a port that is free", f"{port} ({error.strerror})"
-        raise WrongUse(
-            str(
-                invalid(
-                    "--port", expected=expected, got=got, cure="Take another, or leave the option out for a free one."
-                )
-            )
+        raise wrong_use(
+            "--port", expected=expected, got=got, cure="Take another, or leave the option out for a free one."
         ) from error
     with server:
         out.print(f"{model_path.name}, {len(page) / 1e6:.1f} MB, until Ctrl-C at {server.url}", soft_wrap=True)

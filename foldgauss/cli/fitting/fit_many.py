@@ -1,4 +1,4 @@
-"""The command that fits many clips: `fit-many`."""
+"""The command `fit-many`."""
 
 import os
 import time
@@ -8,19 +8,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from foldgauss.cli.app.application import WrongUse, as_option, err, out
-from foldgauss.cli.app.completion import files
-from foldgauss.cli.app.shared import (
-    Frames,
-    Overwrite,
-    Size,
-    app,
-    parse_frames,
-    parse_size,
-    write_json,
-)
-from foldgauss.cli.fitting.fit import make_folder
-from foldgauss.cli.fitting.jobs_view import WorkerOptions, run_jobs, tell_json
+from foldgauss.cli.app.application import WrongUse, app, name_option, out, warn
+from foldgauss.cli.app.completion import complete_files
+from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import (
     CheckpointSeconds,
     LogJson,
@@ -28,20 +18,37 @@ from foldgauss.cli.fitting.options import (
     Scheduler,
     Threads,
     Workers,
+    choose_display,
     fit_options,
-    manner_of,
 )
+from foldgauss.cli.fitting.segments import print_failures
+from foldgauss.cli.fitting.workers import WorkerOptions
+from foldgauss.cli.shared.arguments import Frames, Overwrite, Size, parse_frames, parse_size
+from foldgauss.cli.shared.outputs import make_folder
+from foldgauss.cli.shared.tables import format_count, write_json
 from foldgauss.io._lock import lock_output
-from foldgauss.jobs import FitJob, Outcome, find_clips, jobs_of
-from foldgauss.jobs.fitting import begin, begun, finished
-from foldgauss.jobs.many import RECORDS
+from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
+from foldgauss.jobs.clips import RECORDS
+from foldgauss.jobs.job import read_record, read_request, write_request
 from foldgauss.video.fitting.config import FitConfig
 
 SUMMARY = "summary.json"
-#: The summary is written anew no more often: there may be thousands of clips.
+#: Seconds between two writes of the summary: there may be thousands of clips.
 SUMMARY_SECONDS = 5.0
-#: Above, the table shows failures alone; the summary has all.
-MOST_ROWS = 60
+#: With more clips, the table shows no rows; the summary has all.
+MAX_ROWS = 60
+#: Fields of a record that the summary shows.
+_FIGURES = (
+    "num_frames",
+    "size",
+    "num_gaussians",
+    "mean_psnr",
+    "mean_ssim",
+    "seconds",
+    "steps",
+    "file_bytes",
+    "warnings",
+)
 
 
 @app.command(name="fit-many")
@@ -51,7 +58,7 @@ def fit_many(
     folder: Annotated[
         Path,
         typer.Argument(
-            metavar="FOLDER", help="Folder with video files, and folders of images.", autocompletion=files()
+            metavar="FOLDER", help="Folder with video files, and folders of images.", autocompletion=complete_files()
         ),
     ],
     config: FitConfig,
@@ -69,13 +76,13 @@ def fit_many(
     quiet: Quiet = False,
     log_json: LogJson = False,
 ) -> None:
-    """Fit a model to each clip of a folder; those that cannot be fitted are listed.
+    """Fit a model to each clip of a folder, and list those that fail.
 
-    Models go to DIR under the clips' names, what became of each to DIR/summary.json. Given again, the command does what
-    is left, from where stopped fits were kept. It exits with 1 where a clip failed.
+    Models go to DIR under the clips' names, results to DIR/summary.json. Given again, the command continues with what
+    is left, from checkpoints of stopped fits. The exit code is 1 if a clip failed.
     """
-    manner = manner_of(quiet, log_json)
-    hands = WorkerOptions(workers, scheduler, threads)
+    display = choose_display(quiet, log_json)
+    options = WorkerOptions(workers, scheduler, threads)
     found = find_clips(folder)
     out_dir = Path(f"{folder.resolve().name}-models") if out_dir is None else out_dir
     if out_dir.exists() and out_dir.resolve() == folder.resolve():
@@ -84,20 +91,25 @@ def fit_many(
     make_folder(out_dir / RECORDS)
     context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))
     try:
-        how = {"size": parse_size(size), "frames": parse_frames(frames), "checkpoint_seconds": checkpoint_seconds}
-        jobs = jobs_of(found.clips, out_dir, config, **how)
+        jobs = make_jobs(
+            found.clips,
+            out_dir,
+            config,
+            size=parse_size(size),
+            frames=parse_frames(frames),
+            checkpoint_seconds=checkpoint_seconds,
+        )
     except ValueError as error:
-        raise WrongUse(as_option(str(error))) from error
-    _make_room(jobs, overwrite)
-    before = sum(finished(job) is not None for job in jobs)
-    if manner in ("bar", "lines"):
-        done = f", {before} of them done before" if before else ""
-        out.print(f"{folder}: {_number(len(jobs), 'clip')}{done}, by {hands}", soft_wrap=True)
+        raise WrongUse(name_option(str(error))) from error
+    _prepare_outputs(jobs, overwrite)
+    before = sum(read_record(job) is not None for job in jobs)
+    if display in ("bar", "lines"):
+        done = f", {before} of them done already" if before else ""
+        out.print(f"{folder}: {format_count(len(jobs), 'clip')}{done}, by {options}", soft_wrap=True)
         if found.others:
             names = ", ".join(entry.name for entry in found.others[:3]) + (", ..." if len(found.others) > 3 else "")
-            out.print(f"left alone, no clips: {names}", soft_wrap=True)
+            out.print(f"skipped, not clips: {names}", soft_wrap=True)
     ended: dict[str, Outcome] = {}
-
     written = -SUMMARY_SECONDS
 
     def on_end(outcome: Outcome) -> None:
@@ -105,71 +117,53 @@ def fit_many(
         ended[outcome.job.target] = outcome
         if len(ended) == len(jobs) or time.monotonic() - written > SUMMARY_SECONDS:
             try:
-                _summarise(out_dir, jobs, ended)
-            except OSError as error:  # a full disk now is no reason to lose the fits
-                err.print(f"warning: {error}", soft_wrap=True)
+                _write_summary(out_dir, jobs, ended)
+            except OSError as error:  # a full disk must not end the fits
+                warn(str(error))
             written = time.monotonic()
 
     again = "Give the command again without --overwrite" if overwrite else "Give the same command again"
-    with hands.crew() as crew:
-        outcomes = run_jobs(jobs, "clips", manner, crew, cure=f"{again} to go on.", on_end=on_end)
+    with options.open_pool() as pool:
+        outcomes = run_jobs(jobs, "clips", display, pool, cure=f"{again} to continue.", on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
-    if manner == "json":
-        tell_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
-    elif manner != "quiet":
+    if display == "json":
+        emit_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
+    elif display != "quiet":
         _print_table(str(out_dir), outcomes)
-    for outcome in failed:
-        err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
+    print_failures(failed)
     if failed:
         raise typer.Exit(1)
 
 
-def _number(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
+def _prepare_outputs(jobs: list[FitJob], overwrite: bool) -> None:
+    """Refuse existing models and checkpoints of another request, or remove them with `overwrite`.
 
-
-def _make_room(jobs: list[FitJob], overwrite: bool) -> None:
-    """Refuse models and stopped fits that are there and are not of what is asked for, or give them up.
-
-    What is asked is noted for each clip: given again, the command may replace what stood there when it was begun.
+    The request of each clip is written, so that the same command, given again, may replace what it found here.
     """
-    waiting = jobs if overwrite else [job for job in jobs if finished(job) is None]
+    waiting = jobs if overwrite else [job for job in jobs if read_record(job) is None]
     for job in [] if overwrite else waiting:
-        before = begun(job)
-        if before == job.asked:
+        before = read_request(job)
+        if before == job.request:
             continue
-        for path in (job.target, job.kept):
-            mine = before is None and job.kept.exists()
+        for path in (job.target, job.checkpoint):
+            mine = before is None and job.checkpoint.exists()
             if os.path.exists(path) and not mine:
                 raise WrongUse(
                     f"--out: {path} exists, of other settings or another clip. Remove it, choose another folder, or "
-                    "add --overwrite, which begins all anew."
+                    "add --overwrite, which starts over."
                 )
     for job in waiting:
         if overwrite:
-            job.kept.unlink(missing_ok=True)
-        if overwrite or begun(job) != job.asked:
-            begin(job)
+            job.checkpoint.unlink(missing_ok=True)
+        if overwrite or read_request(job) != job.request:
+            write_request(job)
 
 
-def _summarise(out_dir: Path, jobs: list[FitJob], ended: dict[str, Outcome]) -> None:
-    """What became of each so far, as JSON; of those that are not done yet, nothing."""
+def _write_summary(out_dir: Path, jobs: list[FitJob], ended: dict[str, Outcome]) -> None:
+    """Write the results of the clips that ended so far, as JSON."""
     rows = [_row(ended[job.target]) for job in jobs if job.target in ended]
     failed = sum("failure" in row for row in rows)
     write_json(out_dir / SUMMARY, {"clips": len(jobs), "done": len(rows) - failed, "failed": failed, "each": rows})
-
-
-_FIGURES = (
-    "num_frames",
-    "size",
-    "num_gaussians",
-    "mean_psnr",
-    "mean_ssim",
-    "seconds",
-    "steps",
-    "file_bytes",
-    "warnings",
-)
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
@@ -184,7 +178,7 @@ def _print_table(title: str, outcomes: list[Outcome]) -> None:
     table = Table(Column("clip", overflow="fold"), title=title)
     for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds"):
         table.add_column(name, justify="right", no_wrap=True)
-    if len(outcomes) <= MOST_ROWS:
+    if len(outcomes) <= MAX_ROWS:
         for outcome in outcomes:
             if outcome.failure is not None:
                 table.add_row(outcome.job.name, "failed")
@@ -196,8 +190,8 @@ def _print_table(title: str, outcomes: list[Outcome]) -> None:
             table.add_row(outcome.job.name, frames, *figures, *rest)
         out.print(table)
     done = [outcome.record for outcome in outcomes if outcome.failure is None]
-    told = f"{_number(len(done), 'model')} in {title}"
+    text = f"{format_count(len(done), 'model')} in {title}"
     if done:
         mean, seconds = sum(one["mean_psnr"] for one in done) / len(done), sum(one["seconds"] for one in done)
-        told += f", {mean:.2f} dB in the mean, {seconds:,.0f} s of fitting"
-    out.print(f"{told}; {failed} failed" if failed else told, soft_wrap=True)
+        text += f", mean PSNR {mean:.2f} dB, {seconds:,.0f} s of fitting"
+    out.print(f"{text}; {failed} failed" if failed else text, soft_wrap=True)

@@ -15,40 +15,27 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss import __version__
-from foldgauss._runtime.checks import check_one_of, invalid, is_within
+from foldgauss._runtime.checks import check_one_of, is_within
 from foldgauss._runtime.machine import load_average
-from foldgauss.cli._tradeoff import BASE, CLOCKS, FILES, RECORD, Commands, Record, report, settings_of
-from foldgauss.cli.app.completion import among, lists_of
-from foldgauss.cli.app.shared import (
-    TIME_LEFT,
-    Frames,
-    NewClip,
-    Size,
-    Stopped,
-    WrongUse,
-    app,
-    as_option,
-    err,
-    fingerprint,
-    named_after,
-    out,
-    parse_frames,
-    parse_size,
-    refuse_foreign,
-    scores_of,
-    tell_of,
-)
-from foldgauss.cli.compress import save_compressed, save_halved
-from foldgauss.cli.fitting.fit import make_folder, noted
+from foldgauss.cli.app.application import Stopped, WrongUse, app, err, name_option, out, warn, wrong_use
+from foldgauss.cli.app.completion import complete_choice, complete_list
+from foldgauss.cli.editing.compress import save_compressed, save_halved
+from foldgauss.cli.measuring.tradeoff_record import BASE, CLOCKS, FILES, RECORD, Commands, Record, report, settings_of
+from foldgauss.cli.shared.arguments import Frames, NewClip, Size, parse_frames, parse_size
+from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
+from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
+from foldgauss.io.provenance import fingerprint
+from foldgauss.jobs.runner import clip_warnings, fit_metadata, mean_scores
 from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
-from foldgauss.video.fitting.loop import FitInfo, FitState, fit_steps, to_model
+from foldgauss.video.fitting.loop import FitInfo, fit_steps
 from foldgauss.video.fitting.optical_flow import Motion
+from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.tradeoff import (
@@ -88,7 +75,7 @@ def tradeoff_command(
         typer.Option(
             metavar="AXIS,AXIS,..",
             help=f"Which axes, of {', '.join(AXES)} [default: all].",
-            autocompletion=lists_of(AXES),
+            autocompletion=complete_list(AXES),
         ),
     ] = None,
     minutes: Annotated[
@@ -104,7 +91,7 @@ def tradeoff_command(
         str,
         typer.Option(
             help="Time to fit: wall, or cpu, the work of all cores, where others use them, too.",
-            autocompletion=among(CLOCKS),
+            autocompletion=complete_choice(CLOCKS),
         ),
     ] = "wall",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where results are kept.")] = False,
@@ -119,20 +106,21 @@ def tradeoff_command(
         chosen = tuple(AXES) if axes is None else check_axes([name.strip() for name in axes.split(",")])
         wanted = FitConfig(seed=seed)
     except ValueError as error:
-        raise WrongUse(as_option(str(error))) from error
+        raise WrongUse(name_option(str(error))) from error
     if not is_within(minutes, "(0, inf)"):
-        raise WrongUse(str(invalid("--minutes", expected="a number above 0", got=minutes)))
-    out_dir = named_after(video, "-tradeoff") if out_dir is None else out_dir
+        raise wrong_use("--minutes", expected="a number above 0", got=minutes)
+    out_dir = name_after(video, "-tradeoff") if out_dir is None else out_dir
     known = overwrite or os.path.exists(out_dir / RECORD)
     refuse_foreign(out_dir, FILES, "tradeoff", record=RECORD, known=known, cure=", or start anew with --overwrite")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
-    tell_of(clip)
+    for text in clip_warnings(clip):
+        warn(f"{clip.source}: {text}")
     make_folder(out_dir)
     own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))
     context.with_resource(lock_output(out_dir / RECORD, own=own, what="tradeoff"))
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), anew=overwrite)
-    run = _Run(clip, record, Commands(video, size, frames, out_dir), noted(clip, seed, frames))
+    run = _Run(clip, record, Commands(video, size, frames, out_dir), fit_metadata(clip, seed, parse_frames(frames)))
     base = run.planned(wanted, chosen, minutes, steps)
     made, left = plan_points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
     for one in left:
@@ -256,7 +244,7 @@ class _Run:
             else:
                 shown, spent = self._fitted(point.config, tell)
                 scores = evaluate(shown, self.clip.frames)
-                save_video_model(path, shown, metadata=self.about | scores_of(scores))
+                save_video_model(path, shown, metadata=self.about | mean_scores(scores))
             num_bytes = (self.folder / BASE if point.played is not None else path).stat().st_size
         tell("playing")
         if point.axis == "base":
@@ -308,7 +296,7 @@ class _Run:
         path = self.folder / BASE
         if not path.exists():
             model, _ = self._fitted(base, tell)
-            save_video_model(path, model, metadata=self.about | scores_of(evaluate(model, self.clip.frames)))
+            save_video_model(path, model, metadata=self.about | mean_scores(evaluate(model, self.clip.frames)))
         if self._kept is None:
             self._kept = load_video_model(path)
         return self._kept

@@ -1,4 +1,4 @@
-"""The command that looks whether all works here: `doctor`."""
+"""The command `doctor`."""
 
 import json
 from typing import Annotated, Any
@@ -7,14 +7,14 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from foldgauss.cli._checkup import NAME, Trial, facts, trials
-from foldgauss.cli.app.shared import app, err, out
+from foldgauss.cli.app.application import app, err, out
+from foldgauss.cli.measuring.diagnosis import NAME, Trial, facts, trials
 
 GREEN, RED, YELLOW = "green", "red", "yellow"
 _FOR = {
-    "samples": "clips to try things on",
-    "plot": "pictures of densities and fits",
-    "uncertainty": "how sure frame times are",
+    "samples": "sample clips",
+    "plot": "plots of densities and fits",
+    "uncertainty": "uncertainty of frame times",
     "sklearn": "the estimator",
     "numpyro": "to_numpyro",
 }
@@ -22,13 +22,12 @@ _FOR = {
 
 @app.command()
 def doctor(
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print all of it as JSON to standard output, and nothing else there.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON to standard output.")] = False,
 ) -> None:
-    """Look at what is installed and try it: some seconds, more where kernels are compiled for the first time.
+    """Check the installation: versions, devices, and a small fit.
 
-    Exit code 0: all is well. 1: something is not; what to do stands beside it.
+    It takes some seconds, more if kernels are compiled for the first time. The exit code is 0 if there are no problems;
+    otherwise 1, and each problem is printed with its remedy.
     """
     found = facts()
     if not as_json:
@@ -52,18 +51,12 @@ def doctor(
 
 
 def _problems(found: dict[str, Any], done: list[Trial]) -> list[str]:
-    """What keeps this installation from working, each with what to do. A missing extra does not."""
+    """Problems of this installation, with remedies. A missing extra is none."""
     problems = [f"{one.name}: {one.told}. {one.cure}" for one in done if not one.ok]
     missing = [name for name, version in found["versions"].items() if version is None]
     if missing:
         problems.append(f"missing: {', '.join(missing)}. pip install --upgrade {NAME}")
-    for name, state in found["folders"].items():
-        if state != "writable":
-            problems.append(f"folder ({name}) cannot be written: {state}. {_CURES.get(name, '')}".rstrip())
     return problems
-
-
-_CURES = {"here": "Change to another folder.", "temporary": "Set TMPDIR to a folder that can be."}
 
 
 def _print_facts(found: dict[str, Any]) -> None:
@@ -71,8 +64,7 @@ def _print_facts(found: dict[str, Any]) -> None:
         ("Versions", _version_rows(found["versions"])),
         ("Extras", _extra_rows(found["extras"])),
         ("Machine", _machine_rows(found["machine"])),
-        ("Drawing", _engine_rows(found["engines"]) + _kernel_rows(found["kernels"])),
-        ("Files", _folder_rows(found["folders"]) + _codec_rows(found["codecs"])),
+        ("Rendering", _engine_rows(found["engines"])),
     ):
         out.print(f"\n{title}", style="bold")
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
@@ -92,7 +84,7 @@ def _mark(color: str) -> Text:
 
 
 def _version_rows(found: dict[str, str | None]) -> list[Row]:
-    if "unknown" in found:  # as where the sources run without being installed
+    if "unknown" in found:  # as where the sources run uninstalled
         return [(YELLOW, "versions", str(found["unknown"]))]
     return [(GREEN if told else RED, name, told or "missing") for name, told in found.items()]
 
@@ -129,40 +121,13 @@ def _engine_rows(found: dict[str, Any]) -> list[Row]:
         return [(RED, "engines", found["unknown"])]
     seen = ", ".join(found["jax_devices"])
     accelerator = (
-        f"JAX sees {seen}: engine xla draws there, and fits are computed there"
+        f"JAX sees {seen}: engine xla renders there, and fits run there"
         if found["gpu"]
         else f"none that JAX sees ({seen})"
     )
     return [
         (GREEN, "engines", f"{', '.join(found['engines'])}; auto is {found['auto']}"),
         (GREEN if found["gpu"] else YELLOW, "GPU", accelerator),
-    ]
-
-
-def _kernel_rows(found: dict[str, Any]) -> list[Row]:
-    if "unknown" in found:
-        return [(YELLOW, "kernels", found["unknown"])]
-    if not found["folders"]:
-        return [(YELLOW, "kernels", "compiled anew by every run: NUMBA_CACHE_DIR names a folder to keep them in")]
-    refused = [state for state in found["folders"].values() if state not in ("writable", "not there yet")]
-    if refused:
-        return [(YELLOW, "kernels", f"cannot be kept in {refused[0]}; set NUMBA_CACHE_DIR")]
-    told = f"{found['kept']} kept from earlier runs, {found['bytes'] / 1e6:.1f} MB"
-    return [(GREEN, "kernels", told if found["kept"] else "none kept yet: the first run compiles them")]
-
-
-def _folder_rows(found: dict[str, str]) -> list[Row]:
-    titles = {"here": "this folder", "temporary": "temporary"}
-    return [(GREEN if told == "writable" else RED, titles.get(name, name), told) for name, told in found.items()]
-
-
-def _codec_rows(found: dict[str, Any]) -> list[Row]:
-    if "unknown" in found:
-        return [(YELLOW, "codecs", found["unknown"])]
-    words = {True: "yes", False: "no", None: "not known, no clip to try it on"}
-    return [
-        (GREEN if each["reads"] else YELLOW, name, f"written: {words[each['writes']]}; read: {words[each['reads']]}")
-        for name, each in found.items()
     ]
 
 

@@ -7,23 +7,11 @@ import cv2
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.application import WrongUse, app, err, out, wrong_use
 from foldgauss.cli.app.help import App
-from foldgauss.cli.app.shared import (
-    PICTURE_SUFFIX,
-    FittedClip,
-    ModelFile,
-    Overwrite,
-    Video,
-    WrongUse,
-    app,
-    clip_of_model,
-    err,
-    named_after,
-    out,
-    refuse_existing,
-    refuse_huge,
-)
+from foldgauss.cli.shared.arguments import FittedClip, ModelFile, Overwrite
+from foldgauss.cli.shared.clips import Video, read_fitted_clip
+from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.contact_sheet import make_comparison_sheet, make_contact_sheet
 from foldgauss.io.media.video_writing import write_image
@@ -37,7 +25,7 @@ PARTS, MAX_PARTS = 4, 32
 SHOWN, MAX_ROWS, LEAST_WIDTH = 3, 32, 16
 
 figure = App(no_args_is_help=True)
-app.add_typer(figure, name="figure", help="Make a labelled picture of pictures from a model: PNG.")
+app.add_typer(figure, name="figure", help="Make a labeled figure of images from a model: PNG.")
 
 Out = Annotated[
     Path | None,
@@ -60,12 +48,12 @@ def interpolation(
 ) -> None:
     """What the model shows between two frames: t, t+1/4, t+2/4, t+3/4, t+1."""
     if not 2 <= parts <= MAX_PARTS:
-        raise WrongUse(str(invalid("--parts", expected=f"a whole number from 2 to {MAX_PARTS}", got=parts)))
+        raise wrong_use("--parts", expected=f"a whole number from 2 to {MAX_PARTS}", got=parts)
     out_path = _checked_out(out_path, model_path, "interpolation", overwrite)
     model = load_video_model(model_path)
     if model.num_frames < 2:
         cure = "Between the frames of one picture lies nothing."
-        raise WrongUse(str(invalid("MODEL", expected="at least 2 frames", got=model.num_frames, cure=cure)))
+        raise wrong_use("MODEL", expected="at least 2 frames", got=model.num_frames, cure=cure)
     size, times = _size(model, width), np.asarray(model.frame_times.times())
     chosen = [_near_the_middle(model)] if at is None else _parse_at(at, model.num_frames - 1)
     for k in sorted(set(chosen)):
@@ -103,10 +91,10 @@ def reconstruction(
     size, num = _size(model, width), model.num_frames
     if size[1] > model.size[1]:
         cure = "Frames are not enlarged."
-        raise WrongUse(str(invalid("--width", expected=f"at most the model's {model.size[1]}", got=width, cure=cure)))
+        raise wrong_use("--width", expected=f"at most the model's {model.size[1]}", got=width, cure=cure)
     spread = sorted({int((k + 0.5) * num / SHOWN) for k in range(SHOWN)})
     chosen = spread if at is None else _parse_at(at, num)
-    clip = clip_of_model(model, model_path, video, frames)
+    clip = read_fitted_clip(model, model_path, video, frames)
     originals = [np.ascontiguousarray(clip.frames[k][..., :3]) for k in chosen]  # over black
     pictures = list(model.frames(np.asarray(model.frame_times.times())[chosen]))
     quality = [psnr(*pair) for pair in zip(originals, pictures, strict=True)]
@@ -118,9 +106,9 @@ def reconstruction(
 
 
 def _checked_out(path: Path | None, model_path: Path, kind: str, overwrite: bool) -> Path:
-    path = named_after(model_path, f".{kind}{PICTURE_SUFFIX}") if path is None else path
-    if path.suffix.lower() != PICTURE_SUFFIX:
-        raise WrongUse(str(invalid("--out", expected="a name ending in .png", got=path)))
+    path = name_after(model_path, f".{kind}{IMAGE_SUFFIX}") if path is None else path
+    if path.suffix.lower() != IMAGE_SUFFIX:
+        raise wrong_use("--out", expected="a name ending in .png", got=path)
     refuse_existing(path, overwrite)
     check_writable(path)
     return path
@@ -131,7 +119,7 @@ def _size(model: Video, width: int | None) -> tuple[int, int]:
     if width is None:
         return model.size
     if width < LEAST_WIDTH:
-        raise WrongUse(str(invalid("--width", expected=f"at least {LEAST_WIDTH}", got=width)))
+        raise wrong_use("--width", expected=f"at least {LEAST_WIDTH}", got=width)
     size = max(round(width * model.size[0] / model.size[1]), 1), width
     try:
         refuse_huge(size)
@@ -144,9 +132,9 @@ def _parse_at(text: str, count: int) -> list[int]:
     """Frame numbers below `count`, in the order given."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() for part in parts) or any(int(part) >= count for part in parts):
-        raise WrongUse(str(invalid("--at", expected=f"frames from 0 to {count - 1}, as 0,{count - 1}", got=text)))
+        raise wrong_use("--at", expected=f"frames from 0 to {count - 1}, as 0,{count - 1}", got=text)
     if len(parts) > MAX_ROWS:
-        raise WrongUse(str(invalid("--at", expected=f"at most {MAX_ROWS} frames", got=len(parts))))
+        raise wrong_use("--at", expected=f"at most {MAX_ROWS} frames", got=len(parts))
     return [int(part) for part in parts]
 
 

@@ -8,23 +8,14 @@ from typing import Annotated, Any
 import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from foldgauss._runtime.checks import invalid, is_within
-from foldgauss.cli.app.completion import clip_files
-from foldgauss.cli.app.shared import (
-    ModelFile,
-    Overwrite,
-    WrongUse,
-    app,
-    clip_of_model,
-    err,
-    evaluate_with_progress,
-    is_other_clip,
-    print_figures,
-    refuse_existing,
-    refuse_input,
-    refuse_segments,
-    scores_of,
-)
+from foldgauss._runtime.checks import is_within
+from foldgauss.cli.app.application import WrongUse, app, err, wrong_use
+from foldgauss.cli.app.completion import complete_clips
+from foldgauss.cli.shared.arguments import ModelFile, Overwrite
+from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
+from foldgauss.cli.shared.outputs import refuse_existing, refuse_input
+from foldgauss.cli.shared.rendering import evaluate_with_progress
+from foldgauss.cli.shared.tables import print_figures
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
@@ -35,6 +26,7 @@ from foldgauss.io.models.video_model import (
     read_origin,
     save_video_model,
 )
+from foldgauss.jobs.runner import mean_scores
 from foldgauss.video.compression.search import Compressed, compress
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
@@ -52,7 +44,7 @@ def compress_command(
         Path | None,
         typer.Argument(
             help="The clip it was fitted to: for a smaller file, and a loss that is measured.",
-            autocompletion=clip_files,
+            autocompletion=complete_clips,
         ),
     ] = None,
     max_loss_db: Annotated[float, typer.Option(help="How much of the mean PSNR it may cost, in dB.")] = 0.2,
@@ -83,9 +75,9 @@ def compress_command(
     except ValueError as error:
         raise WrongUse(str(error)) from error
     if not is_within(max_loss_db, "(0, 60]"):
-        raise WrongUse(str(invalid("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)))
+        raise wrong_use("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)
     if frames is not None and video is None:
-        raise WrongUse(str(invalid("--frames", expected="a VIDEO to take them from", got="none")))
+        raise wrong_use("--frames", expected="a VIDEO to take them from", got="none")
     refuse_input(target, "model", model_path)
     refuse_existing(target, overwrite)
     check_writable(target)
@@ -93,12 +85,12 @@ def compress_command(
     model, about = load_video_model(model_path), read_origin(model_path)
     if not isinstance(model, VideoModel):
         cure = "Compress the model before it is edited, and edit that."
-        raise WrongUse(str(invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)))
-    clip = None if video is None else clip_of_model(model, model_path, video, frames)
+        raise wrong_use("MODEL", expected="a plain model", got="one with edits", cure=cure)
+    clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
     if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
         cure = "Give that clip, or none: numbers are then rounded only."
         got = f"{str(video)!r}, which it does not show"
-        raise WrongUse(str(invalid("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)))
+        raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
     if float16:
         figures = _only_rounded(target, model, about, clip)
     else:
@@ -128,7 +120,7 @@ def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: S
     if score is None:
         return None
     scores = score(load_video_model(target))
-    save_video_model(target, small, metadata=about | scores_of(scores))
+    save_video_model(target, small, metadata=about | mean_scores(scores))
     return scores
 
 

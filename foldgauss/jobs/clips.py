@@ -1,6 +1,5 @@
-"""Many clips, a model each: which ones there are in a folder, and what their models are called."""
+"""Fits of many clips: finds the clips of a folder, and makes a job for each."""
 
-import dataclasses
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -11,48 +10,30 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths, natural_sort_key
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.video_model import MODEL_SUFFIX
-from foldgauss.jobs.fitting import FitJob
+from foldgauss.jobs.job import FitJob
 from foldgauss.video.fitting.config import FitConfig
 
-#: Names that video files have. A file of such a name is a clip, whatever is in it; others are left alone.
+#: Suffixes of video files: a file with one of them is taken for a clip, whatever its content.
 CLIP_SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".qt", ".mkv", ".webm", ".avi", ".divx", ".wmv", ".asf", ".flv", ".f4v", ".ogv", ".ogg"),
-    *(
-        ".mpg",
-        ".mpeg",
-        ".m2v",
-        ".vob",
-        ".ts",
-        ".mts",
-        ".m2ts",
-        ".3gp",
-        ".3g2",
-        ".mxf",
-        ".y4m",
-        ".mjpeg",
-        ".ivf",
-        ".nut",
-    ),
-    *ANIMATION_SUFFIXES,
+    *(".mpg", ".mpeg", ".m2v", ".vob", ".ts", ".mts", ".m2ts", ".3gp", ".3g2", ".mxf", ".y4m", ".mjpeg", ".ivf"),
+    *(".nut", *ANIMATION_SUFFIXES),
 )
-
-
-#: Folder, beside the models, for what is kept of each.
+#: Folder, beside the models, of checkpoints and records.
 RECORDS = "records"
 
 
 class FoundClips(NamedTuple):
-    """Clips of a folder in natural order, and what else is there."""
+    """The clips of a folder in natural order, and its other entries."""
 
     clips: list[Path]
     others: list[Path]
 
 
 def find_clips(folder: str | os.PathLike) -> FoundClips:
-    """Video files in `folder`, by their names, and folders of images in it; hidden ones are left out.
+    """Video files in `folder`, by their suffixes, and its folders of images; hidden entries are skipped.
 
-    A .webp beside other images is one of them; single images are no clips. Raises FileNotFoundError and ValueError for
-    what is no folder, or one without a clip.
+    Single images are not clips. Raises FileNotFoundError and ValueError unless `folder` is a folder with clips.
     """
     folder = Path(folder)
     if not folder.exists():
@@ -72,7 +53,7 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
     return FoundClips(clips, others)
 
 
-def jobs_of(
+def make_jobs(
     clips: Sequence[Path],
     out: str | os.PathLike,
     config: FitConfig | None = None,
@@ -81,28 +62,37 @@ def jobs_of(
     frames: tuple[int | None, int | None] | None = None,
     checkpoint_seconds: float | None = None,
 ) -> list[FitJob]:
-    """A job for each clip, whose model goes to `out` under the clip's name, with its extension where two are alike.
+    """A job for each clip; models go to the folder `out` under the clips' names, with suffix where stems are equal.
 
-    Checkpoints and records go to `RECORDS`, a folder in `out`, which must be there.
+    Checkpoints and records go to the folder `RECORDS` in `out`, which must exist.
     """
     out, config = Path(out).absolute(), FitConfig() if config is None else config
     jobs = []
-    for clip, stem in zip(clips, _names(clips), strict=True):
-        target = str(out / f"{stem}{MODEL_SUFFIX}")
-        job = FitJob(clip.name, str(clip.absolute()), target, config, size, frames, source=_stamp(clip))
-        jobs.append(dataclasses.replace(job, checkpoint_seconds=checkpoint_seconds, folder=str(out / RECORDS)))
+    for clip, stem in zip(clips, _unique_names(clips), strict=True):
+        job = FitJob(
+            clip.name,
+            str(clip.absolute()),
+            str(out / f"{stem}{MODEL_SUFFIX}"),
+            config,
+            size,
+            frames,
+            checkpoint_seconds=checkpoint_seconds,
+            folder=str(out / RECORDS),
+            source=_stamp(clip),
+        )
+        jobs.append(job)
     return jobs
 
 
-def _names(clips: Sequence[Path]) -> list[str]:
-    """A name of each that no other has: its stem, or all of it."""
+def _unique_names(clips: Sequence[Path]) -> list[str]:
+    """A name for each clip that no other has: its stem, or the whole name."""
     names = [_stem(clip) for clip in clips]
     while True:
         counts = Counter(name.casefold() for name in names)
         alike = [k for k, name in enumerate(names) if counts[name.casefold()] > 1 and name != clips[k].name]
         if not alike:
             return names
-        for k in alike:  # and once more, since a.mp4 beside a.avi is called as a.mp4.mkv is
+        for k in alike:  # then check again: the name a.mp4 may equal the stem of a.mp4.mkv
             names[k] = clips[k].name
 
 
@@ -111,7 +101,7 @@ def _stem(clip: Path) -> str:
 
 
 def _stamp(clip: Path) -> dict[str, list[int]]:
-    """What tells a clip from one that was put in its place: sizes and times of its file, or of its images."""
+    """Sizes and times of a clip's files, which differ if the clip was replaced."""
     try:
         files = image_paths(clip) if clip.is_dir() else [clip]
         stats = [path.stat() for path in files]

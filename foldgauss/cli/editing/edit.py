@@ -1,0 +1,135 @@
+"""The commands `edit` and `segment`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
+from foldgauss.cli.app.completion import complete_files
+from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
+from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.rendering import render_to_file
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.edit_script import read_edit_script
+from foldgauss.io.models.video_model import (
+    MODEL_SUFFIX,
+    check_model_name,
+    load_video_model,
+    read_origin,
+    save_video_model,
+)
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+
+@app.command(name="edit")
+def edit_command(
+    model_path: ModelFile,
+    script_path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SCRIPT.toml",
+            help="What to select, and what to do with it.",
+            autocompletion=complete_files(".toml"),
+        ),
+    ],
+    out_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help=f"FILE{MODEL_SUFFIX}: the edited model; a video or a folder: its pictures "
+            f"[default: MODEL.SCRIPT{MODEL_SUFFIX} in this folder].",
+        ),
+    ] = None,
+    size: Size = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Edit objects or single frames of a model by a script.
+
+    Scripts: docs/editing.md. An edited model is rendered, evaluated and edited again like any other.
+    """
+    if out_path is None:
+        out_path = name_after(model_path, f".{script_path.stem}{MODEL_SUFFIX}")
+    refuse_input(out_path, "model", model_path)
+    script = read_edit_script(script_path)
+    as_model = out_path.suffix.lower() == MODEL_SUFFIX
+    picture_size = parse_size(size)
+    if as_model and picture_size is not None:
+        raise wrong_use("--size", expected="a video or a folder as --out", got=out_path)
+    if not as_model:
+        check_image_path(out_path, others=MODEL_SUFFIX)
+        refuse_huge(picture_size)
+    if not out_path.is_dir():
+        refuse_existing(out_path, overwrite)
+        check_writable(out_path)
+    model = load_video_model(model_path)
+    if not as_model:
+        refuse_huge(picture_size or model.size)
+    edited = script.apply(model)
+    if as_model:
+        about = read_origin(model_path)
+        about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
+        if isinstance(edited, SegmentedVideo):
+            edited = _without_scores(model, edited)
+        save_video_model(out_path, edited, metadata=about)
+        kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
+        if isinstance(edited, SegmentedVideo):
+            kind = f"a model in {len(edited.segments)} segments"
+        out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
+        return
+    render_to_file(
+        edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=picture_size, overwrite=overwrite
+    )
+
+
+def _without_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
+    """The edited video; what was noted of its segments' quality is of them unedited."""
+    before = set(map(id, model.segments))
+    segments = []
+    for segment in edited.segments:
+        if id(segment) not in before:
+            kept = {name: value for name, value in segment.metadata.items() if name in ("clip", "frames")}
+            segment = dataclasses.replace(segment, metadata=kept)
+        segments.append(segment)
+    return SegmentedVideo(segments)
+
+
+@app.command(name="segment")
+def segment_command(
+    model_path: ModelFile,
+    number: Annotated[int, typer.Argument(metavar="NUMBER", help="Which, from 0; see foldgauss info.")],
+    out_path: Annotated[
+        Path | None,
+        typer.Option("--out", help=f"FILE{MODEL_SUFFIX} [default: MODEL.NUMBER{MODEL_SUFFIX} in this folder]."),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Extract one segment of a model in segments as a model of its own.
+
+    It is compressed, edited, viewed as any other; its frames are those of its span, told by foldgauss info.
+    """
+    if out_path is None:
+        out_path = name_after(model_path, f".{number}{MODEL_SUFFIX}")
+    try:
+        check_model_name(out_path, "--out")
+    except ValueError as error:
+        raise WrongUse(str(error)) from error
+    refuse_input(out_path, "model", model_path)
+    refuse_existing(out_path, overwrite)
+    check_writable(out_path)
+    video, about = load_video_model(model_path), read_origin(model_path)
+    if not isinstance(video, SegmentedVideo):
+        raise wrong_use("MODEL", expected="a model in segments", got="one of one piece")
+    if not 0 <= number < len(video.segments):
+        expected = f"a whole number from 0 to {len(video.segments) - 1}"
+        raise wrong_use("NUMBER", expected=expected, got=number)
+    segment = video.segments[number]
+    begins = (about.get("frames") or [0])[0] or 0
+    whole = {"clip": about["clip"]} if "clip" in about else {}
+    known = whole | {"frames": [begins + segment.first, begins + segment.stop]} | dict(segment.metadata)
+    save_video_model(out_path, segment.model, metadata=known)
+    told = f"segment {number}, frames {segment.first:,}:{segment.stop:,}, {segment.num_gaussians:,} Gaussians"
+    out.print(f"{out_path}: {told}", soft_wrap=True)

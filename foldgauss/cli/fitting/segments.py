@@ -1,0 +1,165 @@
+"""`fit` of a clip in segments, run by workers or by this process."""
+
+import time
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from foldgauss.cli.app.application import Stopped, WrongUse, err, name_option, out, warn
+from foldgauss.cli.fitting.job_progress import LINE_SECONDS, emit_json, run_jobs
+from foldgauss.cli.fitting.progress import Display
+from foldgauss.cli.fitting.workers import WorkerOptions
+from foldgauss.cli.shared.rendering import progress_bar
+from foldgauss.cli.shared.tables import format_count, print_figures
+from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
+from foldgauss.jobs.job import read_record
+from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+
+
+def fit_in_segments(
+    job: FitJob,
+    display: Display,
+    options: WorkerOptions,
+    *,
+    segment_seconds: float | None,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Plan the segments of the job's clip, fit them, join them and print the results; continues an unfinished fit."""
+    begun, target = time.monotonic(), Path(job.target)
+    folder = segments_folder(target)
+    if resume and not folder.is_dir():
+        raise WrongUse(f"--resume: expected a stopped fit in {folder}, got none. Start it without --resume.")
+    restart = overwrite and not resume
+    if segment_seconds is None and not restart:
+        segment_seconds = read_segment_seconds(target)
+    plan = partial(
+        plan_long_fit,
+        job.clip,
+        target,
+        job.config,
+        size=job.size,
+        frames=job.frames,
+        segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
+        checkpoint_seconds=job.checkpoint_seconds,
+        restart=restart,
+    )
+    with options.open_pool() as pool:  # first: workers start while the clip is indexed
+        fit = _plan_with_progress(plan, display)
+        _print_plan(fit, job.config, display, Path(job.clip), str(options))
+        again = f"Give the same command again{' with --resume added' if restart else ''} to continue."
+        outcomes = run_jobs(fit.jobs, "segments", display, pool, cure=again)
+    for outcome in outcomes:
+        for text in (outcome.record or {}).get("warnings", ()):
+            warn(f"{outcome.job.name}: {text}")
+    failed = [outcome for outcome in outcomes if outcome.failure is not None]
+    print_failures(failed)
+    if failed:
+        others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
+        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
+    joined = _join_with_progress(fit, outcomes, display)
+    fit.clean_up()
+    figures = _summarize(fit, joined, outcomes, job.config)
+    figures |= {"wall_seconds": round(time.monotonic() - begun, 2), "file_bytes": target.stat().st_size}
+    if display == "json":
+        emit_json("done", {"model": str(target)} | figures)
+    elif display != "quiet":
+        print_figures(str(target), figures)
+
+
+def print_failures(failed: list[Outcome]) -> None:
+    for outcome in failed:
+        err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
+
+
+def describe_budgets(config: FitConfig, steps: int | None) -> str:
+    """The budgets of a fit that are set, as "3,000 steps or 35 dB"."""
+    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
+    return " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
+
+
+def _join_with_progress(fit: LongFit, outcomes: list[Outcome], display: Display) -> JoinedFit:
+    records = {outcome.job.name: outcome.record for outcome in outcomes}
+    shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
+    with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
+        return fit.join(records, on_frame=advance)
+
+
+def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
+    records = [outcome.record for outcome in outcomes]
+    height, width = records[0]["size"]
+    figures = {
+        "mean_psnr": round(joined.mean_psnr, 3),
+        "mean_ssim": round(joined.mean_ssim, 4),
+        "lowest_psnr": round(min(joined.psnr), 3),
+        "num_segments": len(records),
+        "num_frames": fit.index.num_frames,
+        "height": height,
+        "width": width,
+        "num_gaussians": sum(record["num_gaussians"] for record in records),
+        "degree": config.degree,
+        "fit_seconds": round(sum(record["seconds"] for record in records), 2),
+    }
+    peaks = [record["peak_bytes"] for record in records]
+    if None not in peaks:
+        figures["peak_mib"] = round(max(peaks) / 2**20)
+    if joined.seam_drop is not None:
+        figures["seam_drop"] = round(joined.seam_drop, 3)
+    return figures
+
+
+def _plan_with_progress(plan: partial[LongFit], display: Display) -> LongFit:
+    """The plan, for which the whole clip is indexed once."""
+    status = err.status("Indexing the clip") if display == "bar" else None
+    count, due = 0, time.monotonic() + LINE_SECONDS
+
+    def on_frame() -> None:
+        nonlocal count, due
+        count += 1
+        if status is not None and count % 25 == 0:
+            status.update(f"Indexing the clip: {count:,} frames")
+        elif display == "lines" and time.monotonic() > due:
+            due = time.monotonic() + LINE_SECONDS
+            err.print(f"indexing the clip: {count:,} frames")
+
+    try:
+        with nullcontext() if status is None else status:
+            return plan(on_frame=on_frame)
+    except ValueError as error:
+        if str(error).startswith(("segment_seconds:", "resume:", "target:")):
+            text = name_option(str(error)).replace("--target:", "--out:", 1).replace("num_gaussians=", "gaussians=")
+            raise WrongUse(text) from error
+        raise
+
+
+def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, workers: str) -> None:
+    index = fit.index
+    if index.num_declared > index.num_frames:
+        warn(f"only {index.num_frames} of {index.num_declared} frames of {video} decode; those are used.")
+    for note in index.notes:
+        warn(f"{video}: {note}")
+    lengths = [stop - first for first, stop in fit.spans]
+    size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
+    longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
+    num = chosen_num_gaussians(longest, max(lengths), *size)
+    if display == "json":
+        about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
+        emit_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
+    if display in ("json", "quiet"):
+        return
+    done = sum(read_record(job) is not None for job in fit.jobs)
+    begun = sum(job.checkpoint.exists() for job in fit.jobs)
+    if done or begun:
+        err.print(f"continuing: {done} of {len(fit.jobs)} segments done, {begun} begun", soft_wrap=True)
+    at_cuts = sum(before[1] == after[0] for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
+    span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
+    where = f" ({at_cuts} end at cuts)" if at_cuts else ""
+    plan = describe_budgets(config, planned_steps(config, max(lengths)))
+    out.print(
+        f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
+        f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
+        f"{num:,} Gaussians of degree {config.degree} and {plan}, by {workers}",
+        soft_wrap=True,
+    )

@@ -1,0 +1,133 @@
+"""Arguments and options that several commands take, and the parsing of their texts."""
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from foldgauss.cli.app.application import WrongUse, name_option, wrong_use
+from foldgauss.cli.app.completion import complete_clips, complete_models
+from foldgauss.render import RenderOptions
+
+#: Largest number of times, which at usual rates play for an hour.
+MAX_TIMES = 100_000
+
+#: Panel of `--help` for the constants of the renderer.
+RENDERER = "Renderer"
+
+ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.", autocompletion=complete_models)]
+FittedClip = Annotated[
+    Path, typer.Argument(help="The clip that the model was fitted to.", autocompletion=complete_clips)
+]
+NewClip = Annotated[
+    Path,
+    typer.Argument(help="Video file, folder of images in natural order, or one image.", autocompletion=complete_clips),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing outputs.")]
+Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
+Frames = Annotated[
+    str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be omitted.")
+]
+FittedFrames = Annotated[
+    str | None,
+    typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that the model was fitted to]."),
+]
+Times = Annotated[
+    str | None,
+    typer.Option(
+        metavar="T,T,..|A:B:N", help="Times in [0, 1], or N times from A to B [default: those of the frames]."
+    ),
+]
+AlphaCutoff = Annotated[
+    float | None,
+    typer.Option(
+        help="Skip Gaussians where their alpha is below this [default: 1/255, or as fitted].",
+        rich_help_panel=RENDERER,
+    ),
+]
+SupportRadius = Annotated[
+    float | None,
+    typer.Option(
+        help="Skip Gaussians beyond this many standard deviations [default: none, or as fitted].",
+        rich_help_panel=RENDERER,
+    ),
+]
+TransmittanceStop = Annotated[
+    float | None,
+    typer.Option(
+        help="A pixel is finished once its transmittance is below this [default: 1e-4, or as fitted].",
+        rich_help_panel=RENDERER,
+    ),
+]
+Original = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="CLIP",
+        help="The clip that the model was fitted to, to show next to it in the player.",
+        autocompletion=complete_clips,
+    ),
+]
+OriginalQuality = Annotated[int, typer.Option(help="WebP quality of the clip's frames in the page.", min=1, max=100)]
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    height, cross, width = text.lower().partition("x")
+    if not (cross and height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
+        raise WrongUse(f"--size: expected HxW with both at least 1, as 160x320, got {text!r}.")
+    return int(height), int(width)
+
+
+def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    if not colon or any(part and not part.isdecimal() for part in (first, last)):
+        raise WrongUse(f"--frames: expected A:B with whole numbers >= 0, as 0:24, got {text!r}.")
+    return (int(first) if first else None), (int(last) if last else None)
+
+
+def parse_color(text: str) -> tuple[float, float, float]:
+    digits = text.removeprefix("#")
+    if not re.fullmatch("[0-9a-fA-F]{6}", digits):
+        raise WrongUse(f"--background: expected six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}.")
+    return tuple(byte / 255 for byte in bytes.fromhex(digits))
+
+
+def parse_times(text: str | None) -> np.ndarray | None:
+    if text is None:
+        return None
+    expected = "numbers in [0, 1] as 0,0.5,1, or first:last:count as 0:1:50"
+    try:
+        if text.count(":") == 2:
+            first, last, count = text.split(":")
+            times = np.linspace(float(first), float(last), min(int(count), MAX_TIMES + 1))
+        else:
+            times = np.array([float(part) for part in text.split(",")])
+    except ValueError as error:
+        raise wrong_use("--times", expected=expected, got=text) from error
+    if not (0 < len(times) <= MAX_TIMES and ((times >= 0) & (times <= 1)).all()):
+        raise wrong_use("--times", expected=expected, got=text)
+    return times
+
+
+def override_constants(
+    options: RenderOptions,
+    alpha_cutoff: float | None,
+    support_radius: float | None,
+    transmittance_stop: float | None,
+) -> RenderOptions:
+    """`options` with the constants that are not None. Raises WrongUse for one out of its bounds."""
+    constants = {
+        "alpha_cutoff": alpha_cutoff,
+        "support_radius": support_radius,
+        "transmittance_stop": transmittance_stop,
+    }
+    try:
+        return dataclasses.replace(options, **{name: value for name, value in constants.items() if value is not None})
+    except ValueError as error:
+        raise WrongUse(name_option(str(error).removeprefix("RenderOptions."))) from error

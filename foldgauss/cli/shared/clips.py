@@ -1,0 +1,88 @@
+"""Models and the clips that they were fitted to."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from foldgauss.cli.app.application import WrongUse, err, warn, wrong_use
+from foldgauss.cli.shared.arguments import parse_frames
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import index_video
+from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.models.segmented import is_segmented
+from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.io.provenance import has_other_frames
+from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+
+#: What a model file may contain.
+Video = VideoModel | EditedVideo | SegmentedVideo
+
+#: dB by which another clip scores worse than the one that was fitted; decoders differ by less.
+OTHER_CLIP_DB = 3.0
+
+
+def refuse_segments(model_path: Path) -> None:
+    """For commands whose model must not be in segments. Raises WrongUse, and as `load_video_model`."""
+    if is_segmented(model_path):
+        got = f"one of {len(load_video_model(model_path).segments):,} segments"
+        cure = f"Extract one: foldgauss segment {model_path} 0."
+        raise wrong_use("MODEL", expected="a model of one piece", got=got, cure=cure)
+
+
+def read_fitted_clip(
+    model: Video, model_path: Path, video: Path, frames: str | None, *, same_number: bool = True
+) -> Clip:
+    """The frames that a model was fitted to, at its size, or those given; warns if they differ from the fitted ones.
+
+    Those of a model in segments are `LazyFrames`, since the clip may be larger than memory.
+
+    Raises WrongUse, with `same_number`, for another number of frames than the model's.
+    """
+    about = read_origin(model_path)
+    kept = about.get("frames")
+    wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
+    try:
+        read = _read_lazily if isinstance(model, SegmentedVideo) else read_video
+        clip = read(video, frames=wanted, size=model.size)
+    except ValueError as error:
+        if frames is not None or not str(error).startswith("frames:"):
+            raise
+        asked = f"the clip that the model was fitted to, frames {wanted[0]}:{wanted[1]} of {about.get('clip')}"
+        raise WrongUse(f"VIDEO: expected {asked}, got {str(video)!r}, which has fewer. Give that clip.") from error
+    if same_number and clip.num_frames != model.num_frames:
+        raise WrongUse(
+            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
+            f"Give those that it was fitted to, as 0:{model.num_frames}."
+        )
+    if has_other_frames(about, clip):
+        warn(
+            f"the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
+            "another clip or range, or another version of OpenCV decoded them."
+        )
+    return clip
+
+
+def _read_lazily(video: Path, *, frames: tuple[int | None, int | None] | None, size: tuple[int, int]) -> Clip:
+    """As `read_video`, with only some frames in memory."""
+    with err.status(f"Indexing {video.name}"):
+        index = index_video(video, frames=frames, find_cuts=False)
+    lazy = LazyFrames(index, size)
+    return Clip(lazy, index.fps, index.source, index.num_declared, index.times, index.notes)
+
+
+def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float]) -> bool:
+    """Whether the model was fitted to another clip: the frames differ, and score `OTHER_CLIP_DB` less.
+
+    `measure_psnr` returns the mean PSNR, and is called only if the frames differ.
+    """
+    about = read_origin(model_path)
+    fitted = about.get("mean_psnr")
+    return fitted is not None and has_other_frames(about, clip) and measure_psnr() < fitted - OTHER_CLIP_DB
+
+
+def keep_origin(about: dict[str, Any], *names: str) -> dict[str, Any]:
+    """The entries of a model's metadata with these names."""
+    return {name: about[name] for name in names if name in about}

@@ -1,0 +1,76 @@
+"""Checks and default names of outputs, before any work is done."""
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+
+from foldgauss.cli.app.application import WrongUse, wrong_use
+from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io.media.resizing import memory_limit
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, VIDEO_SUFFIXES
+
+IMAGE_SUFFIX = ".png"
+
+
+def name_after(source: Path, ending: str) -> Path:
+    """The default name of an output: in the current folder, after its source."""
+    whole = source if source.name not in ("", "..") else source.resolve()
+    return Path(f"{whole.name if whole.is_dir() else whole.stem}{ending}")
+
+
+def refuse_huge(size: tuple[int, int] | None, option: str = "--size") -> None:
+    """Refuse images that do not fit in memory: several copies are held in floating point."""
+    if size is not None and 64 * size[0] * size[1] > memory_limit():
+        raise WrongUse(
+            f"{option}: expected an image that fits in memory, got {size[0]}x{size[1]}. Choose a smaller one."
+        )
+
+
+def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
+    if os.path.exists(path) and not overwrite:
+        raise WrongUse(f"{option}: {path} exists. Choose another path, or add --overwrite.")
+
+
+def refuse_input(path: Path, what: str, source: Path, option: str = "--out") -> None:
+    """Refuse an output in place of its own source, which an error would destroy."""
+    # os.path: a name that is too long does not exist here; creating the file reports it.
+    if os.path.exists(path) and os.path.exists(source) and path.samefile(source):
+        raise WrongUse(f"{option}: expected another file than the {what}, got {path}.")
+
+
+def refuse_foreign(
+    folder: Path, own: Collection[str], command: str, *, record: str, known: bool, cure: str = ""
+) -> None:
+    """Refuse a folder with files other than the command's `own`, which it replaces.
+
+    Files with the names of its own are the command's if its `record` is valid, which `known` states.
+    """
+    try:
+        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")}
+    except OSError:  # missing or not a folder, which creating it reports
+        return
+    foreign, expected = sorted(names - set(own)), f"--out: expected a new folder or one that a {command} wrote"
+    if foreign:
+        raise WrongUse(f"{expected}, got {folder} with {foreign[0]!r} in it. Choose another folder.")
+    if names and not known:
+        got = f"{folder} with {min(names)!r} in it, but no {record} of a {command}"
+        raise WrongUse(f"{expected}, got {got}. Choose another folder{cure}.")
+
+
+def check_image_path(path: Path, *, others: str = "", single: bool = False) -> None:
+    """Refuse a name that images cannot be written to; with `single`, FILE.png is valid, for one image."""
+    wanted = (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES, *([IMAGE_SUFFIX] if single else []))
+    if path.suffix and not path.is_dir() and path.suffix.lower() not in wanted:
+        expected = ", ".join((others, *wanted) if others else wanted) + ", or a folder without extension"
+        is_image = path.suffix.lower() == IMAGE_SUFFIX
+        cure = "One image of a model: foldgauss render MODEL --times T --out FILE.png." if is_image else ""
+        raise wrong_use("--out", expected=expected, got=path, cure=cure)
+
+
+def make_folder(path: Path) -> None:
+    """Create the folder of outputs if needed. Raises OutputError if files cannot be written there."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"--out: cannot create the folder {path} ({error.strerror}). Choose another.") from error
+    check_writable(path / "model.safetensors")

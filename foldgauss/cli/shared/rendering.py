@@ -1,0 +1,85 @@
+"""Frames of models with a progress bar: rendered to files, and evaluated."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from foldgauss.cli.app.application import err, out, wrong_use
+from foldgauss.cli.shared.clips import Video
+from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
+from foldgauss.cli.shared.tables import format_count
+from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.video_writing import MAX_GIF_FPS, write_image, write_video
+from foldgauss.video.models.background import BLACK
+from foldgauss.video.models.metrics import Evaluation, evaluate
+
+#: Columns of a progress bar after the elapsed time.
+TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
+
+
+@contextmanager
+def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], None]]:
+    """A progress bar on a terminal; yields the function that advances it."""
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, *TIME_LEFT, console=err, disable=not (shown and err.is_terminal)) as progress:
+        task = progress.add_task(title, total=total)
+        yield lambda: progress.advance(task)
+
+
+def advance_over(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
+    """The items; `advance` is called after each."""
+    for item in items:
+        yield item
+        advance()
+
+
+def evaluate_with_progress(
+    model: Video,
+    frames: np.ndarray | LazyFrames,
+    on_image: Callable[[np.ndarray], None] = lambda image: None,
+    *,
+    shown: bool = True,
+    background: tuple[float, float, float] = BLACK,
+) -> Evaluation:
+    """Scores of every frame; `on_image` receives the rendered images."""
+    with progress_bar("Evaluating", model.num_frames, shown) as advance:
+
+        def on_frame(image: np.ndarray) -> None:
+            on_image(image)
+            advance()
+
+        return evaluate(model, frames, on_frame, background=background)
+
+
+def render_to_file(
+    model: Video,
+    path: Path,
+    times: np.ndarray,
+    fps: float,
+    *,
+    size: tuple[int, int] | None = None,
+    background: tuple[float, float, float] = BLACK,
+    image_format: str = "png",
+    overwrite: bool = False,
+) -> None:
+    """Write the images at `times` as a video or to a folder, or a single image to a .png."""
+    if path.suffix.lower() == IMAGE_SUFFIX and not path.is_dir():
+        if len(times) != 1:
+            cure = "Choose it by --times T, or write to a folder (a name without extension)."
+            raise wrong_use("--out", expected="one image for a .png", got=f"{len(times):,} images", cure=cure)
+        write_image(path, next(model.frames(times, size, background=background)))
+        out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
+        return
+    most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
+    if path.suffix and not path.is_dir() and fps > most:
+        expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
+        raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
+    with progress_bar("Rendering", len(times)) as advance:
+        images = advance_over(model.frames(times, size, background=background), advance)
+        write_video(path, images, min(fps, MAX_FPS), overwrite=overwrite, image_format=image_format)
+    out.print(f"{path}: {format_count(len(times), 'frame')} at {fps:g} frames per second", soft_wrap=True)

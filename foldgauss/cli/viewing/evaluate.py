@@ -1,0 +1,95 @@
+"""The command `evaluate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from foldgauss.cli.app.application import app, out
+from foldgauss.cli.shared.arguments import (
+    AlphaCutoff,
+    FittedClip,
+    ModelFile,
+    Overwrite,
+    SupportRadius,
+    TransmittanceStop,
+    override_constants,
+)
+from foldgauss.cli.shared.clips import read_fitted_clip
+from foldgauss.cli.shared.outputs import refuse_existing, refuse_input
+from foldgauss.cli.shared.rendering import evaluate_with_progress
+from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.models.video_model import load_video_model
+from foldgauss.video.models.metrics import Evaluation
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
+from foldgauss.video.tradeoff import measure_frame_rate
+
+
+@app.command(name="evaluate")
+def evaluate_command(
+    model_path: ModelFile,
+    video: FittedClip,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the figures here, too.")
+    ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A:B",
+            help="Frames A up to, not including, B of the clip, as many as the model has "
+            "[default: those that it was fitted to].",
+        ),
+    ] = None,
+    alpha_cutoff: AlphaCutoff = None,
+    support_radius: SupportRadius = None,
+    transmittance_stop: TransmittanceStop = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare a model with its clip: PSNR and SSIM of every frame.
+
+    Of a model in segments those of each segment are shown; --json has the frames'.
+
+    Tells the size of the file, its bits per pixel and how fast it is drawn, too.
+    """
+    if json_path is not None:
+        for what, source in (("model", model_path), ("clip", video)):
+            refuse_input(json_path, what, source, "--json")
+        refuse_existing(json_path, overwrite, "--json")
+        check_writable(json_path)
+    model = load_video_model(model_path)
+    constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
+    model = model.with_options(constants)
+    clip = read_fitted_clip(model, model_path, video, frames)
+    scores = evaluate_with_progress(model, clip.frames)
+    num_bytes = model_path.stat().st_size
+    figures = summarize_scores(model, scores) | {"file_bytes": num_bytes}
+    if clip.has_alpha:
+        on_white = evaluate_with_progress(model, clip.frames, background=(1.0, 1.0, 1.0))
+        figures["mean_psnr_on_white"] = round(on_white.mean_psnr, 3)
+    figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
+    figures["frames_per_second"] = round(measure_frame_rate(model), 1)
+    if json_path is not None:
+        write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
+    _print_segments(model, scores) if isinstance(model, SegmentedVideo) else _print_frames(scores)
+    print_figures(str(model_path), figures)
+
+
+def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:
+    """A row for each segment, by the frames that it begins: those of a clip of hours are too many for a screen."""
+    table = Table("segment", "frames", "PSNR (dB)", "lowest", "SSIM")
+    stops = [segment.first for segment in model.segments[1:]] + [model.num_frames]
+    for number, (segment, stop) in enumerate(zip(model.segments, stops, strict=True)):
+        psnr, ssim = scores.psnr[segment.first : stop], scores.ssim[segment.first : stop]
+        quality = (f"{np.mean(psnr):.2f}", f"{min(psnr):.2f}", f"{np.mean(ssim):.4f}")
+        table.add_row(str(number), f"{segment.first:,}:{stop:,}", *quality)
+    out.print(table)
+
+
+def _print_frames(scores: Evaluation) -> None:
+    table = Table("frame", "PSNR (dB)", "SSIM")
+    for k, (psnr, ssim) in enumerate(zip(scores.psnr, scores.ssim, strict=True)):
+        table.add_row(str(k), f"{psnr:.2f}", f"{ssim:.4f}")
+    out.print(table)

@@ -1,0 +1,97 @@
+"""`FitJob`: a fit with all that it depends on, and the files beside its model: checkpoint and record."""
+
+import dataclasses
+import hashlib
+import json
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from foldgauss.video.fitting.config import FitConfig
+
+#: Fields of a record besides the request and the scores of each frame.
+_RECORD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}
+_RECORD |= {"file_bytes", "file_digest", "peak_bytes", "warnings"}
+#: What reading JSON that is missing, damaged or of another shape may raise.
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
+
+
+@dataclasses.dataclass(frozen=True)
+class FitJob:
+    """A fit of a clip, or of a span of one, with all that it depends on; small, and the same on every machine.
+
+    `clip` and `target` are paths that every worker can open; `size` is the (height, width) of the frames, or None;
+    `frames` the range (first, stop) of the clip, or None. With `index`, the file of a `FrameIndex`, frames are found by
+    seeking, and counted as `index.span` does. `fps` replaces the clip's frame rate. `source` identifies the clip:
+    results of another source are not reused. `metadata` is added to that of the model file. Checkpoint and record are
+    in `folder`, by default beside the model.
+    """
+
+    name: str
+    clip: str
+    target: str
+    config: FitConfig
+    size: tuple[int, int] | None = None
+    frames: tuple[int | None, int | None] | None = None
+    index: str | None = None
+    fps: float | None = None
+    checkpoint_seconds: float | None = None
+    folder: str | None = None
+    source: dict[str, Any] = dataclasses.field(default_factory=dict)
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def request(self) -> dict[str, Any]:
+        """What the results depend on, as JSON represents it: results of an equal request are reused."""
+        asked = {"config": dataclasses.asdict(self.config), "size": self.size, "frames": self.frames}
+        return json.loads(json.dumps(asked | {"source": self.source}))
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file of the running fit."""
+        return self._beside(".checkpoint")
+
+    @property
+    def record(self) -> Path:
+        """The file of what `fit_job` returns, as JSON."""
+        return self._beside(".json")
+
+    def _beside(self, ending: str) -> Path:
+        target = Path(self.target)
+        return Path(self.folder or target.parent) / f"{target.name}{ending}"
+
+
+def read_record(job: FitJob) -> dict[str, Any] | None:
+    """The record of a finished job; None if there is none, or the request or the model file differ from it.
+
+    Model files of segments are compared by digest, since segments of equal length have files of equal size.
+    """
+    try:
+        record = json.loads(job.record.read_text())
+        same = record["asked"] == job.request and os.path.getsize(job.target) == record["file_bytes"]
+        same = same and len(record["psnr"]) == len(record["ssim"]) == record["num_frames"] and record.keys() >= _RECORD
+        same = same and (job.index is None or record["file_digest"] == file_digest(job.target))
+    except _UNREADABLE:
+        return None
+    return record if same else None
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """The 16-byte BLAKE2b digest of a file, hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, partial(hashlib.blake2b, digest_size=16)).hexdigest()
+
+
+def write_request(job: FitJob) -> None:
+    """Write the request in place of the record. Not atomic: there may be thousands, and half a file reads as none."""
+    job.record.write_text(json.dumps({"asked": job.request}) + "\n")
+
+
+def read_request(job: FitJob) -> dict[str, Any] | None:
+    """The request in the job's record, finished or not; None if there is none."""
+    try:
+        asked = json.loads(job.record.read_text())["asked"]
+    except _UNREADABLE:
+        return None
+    return asked if isinstance(asked, dict) else None

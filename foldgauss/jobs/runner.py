@@ -1,0 +1,337 @@
+"""Runs one fit: reads the frames, resumes, takes the steps, writes checkpoints and the model.
+
+`run_fit` serves the command `foldgauss fit` and `fit_job`, which fits segments and many clips, here or on a worker.
+"""
+
+import dataclasses
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+
+from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import FrameIndex
+from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.video_model import save_video_model
+from foldgauss.io.provenance import describe_source, fingerprint
+from foldgauss.jobs.job import FitJob, file_digest, read_record
+from foldgauss.jobs.warning_capture import WarningCapture
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.divergence import FitDiverged
+from foldgauss.video.fitting.loop import FitInfo, fit_steps
+from foldgauss.video.fitting.state import FitState, to_model
+from foldgauss.video.models.metrics import Evaluation, evaluate
+from foldgauss.video.models.video_model import VideoModel
+
+#: Seconds between two checkpoints of a running fit, and between two reports of its progress.
+CHECKPOINT_SECONDS, REPORT_SECONDS = 30.0, 1.0
+#: Seconds that a job waits for another one of the same target: a worker that is believed dead may be about to finish.
+WAIT_SECONDS = 60.0
+#: Number of clip shapes whose compiled programs are kept.
+MAX_SHAPES = 8
+
+#: Sees every step of a fit; returns True to stop it.
+Observer = Callable[[FitState, FitInfo], bool | None]
+#: Opens the observer of a fit of these frames, from the state it resumes from, or None.
+OpenObserver = Callable[[Clip, FitState | None], AbstractContextManager[Observer]]
+#: Called with the error of a checkpoint that could not be written, and its step.
+CheckpointError = Callable[[OSError, int], None]
+
+
+class Stopped(Exception):
+    """The fit was asked to stop; its checkpoint is written."""
+
+
+# ------------------------------------------------------------------------------------------------------- one fit
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """The checkpoint file of a running fit: `config` and `source`, the frames' fingerprint, must not change."""
+
+    path: Path
+    config: FitConfig
+    source: dict[str, Any]
+    on_error: CheckpointError = lambda error, step: None
+
+    def load(self, required: bool) -> FitState | None:
+        """The state of the file; unless `required`, None if it is missing, unreadable or of another fit."""
+        try:
+            return load_checkpoint(self.path, config=self.config, source=self.source)
+        except (OSError, ValueError):
+            if required:
+                raise
+            return None
+
+    def save(self, state: FitState) -> None:
+        save_checkpoint(self.path, state, config=self.config, source=self.source)
+
+    def try_save(self, state: FitState) -> None:
+        """Save the state; a full disk must not end the fit."""
+        try:
+            self.save(state)
+        except OSError as error:
+            self.on_error(error, state.step)
+
+    def remove(self) -> None:
+        self.path.unlink(missing_ok=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class FitRun:
+    """A finished fit of a job: its frames, its model and the `info` of the last step."""
+
+    job: FitJob
+    clip: Clip
+    model: VideoModel
+    info: FitInfo
+
+    def save(self, scores: Evaluation | None = None) -> None:
+        """Write the model, with its mean scores once they are measured."""
+        metadata = fit_metadata(self.clip, self.job.config.seed, self.job.frames) | self.job.metadata
+        metadata |= {} if scores is None else mean_scores(scores)
+        save_video_model(self.job.target, self.model, metadata=metadata)
+
+
+def run_fit(
+    job: FitJob,
+    observer: OpenObserver,
+    *,
+    resume: Literal["required", "if possible", "never"] = "if possible",
+    on_checkpoint_error: CheckpointError = lambda error, step: None,
+) -> FitRun:
+    """Fit the frames of a job, from its checkpoint if it resumes; the last state is saved in the checkpoint.
+
+    With `resume` "never", the first step removes an old checkpoint. The observer is opened once the frames are read.
+    Neither the model nor a record is written: see `FitRun.save`.
+
+    Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
+    cannot be read or fitted, and for a checkpoint that is required.
+    """
+    clip = read_clip(job)
+    _COMPILED.add(clip.frames.shape)
+    checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
+    state = None if resume == "never" else checkpoint.load(required=resume == "required")
+    steps = fit_steps(clip.frames, job.config, state)
+    if resume == "never":
+        steps = _replacing(checkpoint, steps)
+    with observer(clip, state) as observe:
+        state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
+    return FitRun(job, clip, to_model(state, job.config, clip.size, clip.fps), info)
+
+
+def run_steps(
+    steps: Iterable[tuple[FitState, FitInfo]],
+    observe: Observer,
+    checkpoint: Checkpoint | None = None,
+    seconds: float | None = None,
+) -> tuple[FitState, FitInfo]:
+    """Take all steps of a fit and return the last; every so many `seconds`, and at the end, the state is saved.
+
+    Raises as `run_fit`.
+    """
+    saved = time.monotonic()
+    try:
+        for state, info in steps:
+            stop, is_last = observe(state, info), info.progress >= 1
+            if stop and not is_last:
+                if checkpoint is not None:
+                    checkpoint.save(state)
+                raise Stopped(f"stopped after step {info.step}")
+            due = time.monotonic() - saved > (CHECKPOINT_SECONDS if seconds is None else seconds)
+            if checkpoint is not None and (due or is_last):
+                checkpoint.try_save(state)
+                saved = time.monotonic()
+    except FitDiverged as error:
+        if checkpoint is not None and error.state is not None:
+            checkpoint.try_save(error.state)
+        raise
+    return state, info
+
+
+def _replacing(checkpoint: Checkpoint, steps: Iterable[tuple[FitState, FitInfo]]) -> Iterator[tuple[FitState, FitInfo]]:
+    """The steps; the first removes the checkpoint of an earlier fit, which could be resumed by mistake."""
+    for number, step in enumerate(steps):
+        if number == 0:
+            checkpoint.remove()
+        yield step
+
+
+def read_clip(job: FitJob) -> Clip:
+    """The frames of a job."""
+    if job.index is None:
+        return read_video(job.clip, frames=job.frames, size=job.size)
+    index = FrameIndex.load(job.index)
+    clip = read_indexed(index, *index.span(*job.frames), size=job.size)
+    return clip if job.fps is None else dataclasses.replace(clip, fps=job.fps)
+
+
+def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
+    """Metadata of a fitted model: its clip, the range of frames, and the seed."""
+    return describe_source(clip, seed) | {"frames": frames}
+
+
+def mean_scores(scores: Evaluation) -> dict[str, float]:
+    """The mean scores as files have them."""
+    return {"mean_psnr": round(scores.mean_psnr, 3), "mean_ssim": round(scores.mean_ssim, 4)}
+
+
+class _CompilationCache:
+    """Limits what JAX has compiled, which it never discards: some MiB for each number and size of frames."""
+
+    def __init__(self) -> None:
+        self._shapes: set[tuple[int, ...]] = set()
+        self._lock = threading.Lock()
+
+    def add(self, shape: tuple[int, ...]) -> None:
+        """Note the shape of a clip to be fitted; after `MAX_SHAPES` others, discard all compiled programs first."""
+        with self._lock:
+            if shape not in self._shapes and len(self._shapes) >= MAX_SHAPES:
+                jax.clear_caches()
+                self._shapes.clear()
+            self._shapes.add(shape)
+
+
+_COMPILED = _CompilationCache()
+
+
+# -------------------------------------------------------------------------------------------- one fit with a record
+
+
+class Progress(NamedTuple):
+    """Progress of a job: `fraction` in [0, 1], running PSNR in dB, steps, seconds spent and left, as in `FitInfo`."""
+
+    name: str
+    fraction: float
+    psnr: float
+    step: int
+    num_gaussians: int
+    seconds: float
+    seconds_left: float
+
+
+#: Receives the progress of a job and returns whether to go on.
+Report = Callable[[Progress], bool]
+
+
+class _Reporter:
+    """An observer that reports the progress of a job now and then."""
+
+    def __init__(self, name: str, report: Report):
+        self.name, self.report, self.reported = name, report, time.monotonic()
+
+    def __call__(self, state: FitState, info: FitInfo) -> bool:
+        now = time.monotonic()
+        if now - self.reported <= REPORT_SECONDS and info.step != 1 and info.progress < 1:
+            return False
+        self.reported = now
+        progress = Progress(
+            self.name, info.progress, info.psnr, info.step, info.num_gaussians, info.seconds, info.seconds_left
+        )
+        return not self.report(progress)
+
+
+def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, Any]:
+    """Run the job, or what is left of it; returns its record.
+
+    The record: `asked` (the request), `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame,
+    `mean_psnr`, `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `file_digest`,
+    `peak_bytes` (of the process, so far) and `warnings`.
+
+    Raises `Stopped` if `report` returns False; ValueError and OSError for a clip that cannot be read or fitted and
+    outputs that cannot be written; `FitDiverged` as `fit_steps`.
+    """
+    if record := read_record(job):
+        return record
+    with _lock_target(job):
+        return read_record(job) or _fit_and_record(job, report)  # the previous holder of the lock may have finished it
+
+
+@contextmanager
+def _lock_target(job: FitJob) -> Iterator[None]:
+    """Hold the lock of the target, for which a job waits a while."""
+    until = time.monotonic() + WAIT_SECONDS
+    while True:
+        holder = lock_output(Path(job.target), own=(job.checkpoint, job.record))
+        try:
+            holder.__enter__()
+            break
+        except OutputError as error:
+            if not isinstance(error.__cause__, BlockingIOError) or time.monotonic() > until:
+                raise
+            time.sleep(0.5)
+    try:
+        yield
+    finally:
+        holder.__exit__(None, None, None)
+
+
+_WARNINGS = WarningCapture()
+
+
+def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
+    with _WARNINGS.capture() as caught:
+        run = run_fit(job, lambda clip, state: nullcontext(_Reporter(job.name, report)))
+    clip, info = run.clip, run.info
+    scores = evaluate(run.model, clip.frames)
+    run.save(scores)
+    record = {
+        "asked": job.request,
+        "num_frames": clip.num_frames,
+        "size": list(clip.size),
+        "fps": clip.fps,
+        "num_gaussians": run.model.num_gaussians,
+        "psnr": [round(one, 4) for one in scores.psnr],
+        "ssim": [round(one, 5) for one in scores.ssim],
+        **mean_scores(scores),
+        "steps": info.step,
+        "seconds": round(info.seconds, 2),
+        "stopped_by": info.stopped_by,
+        "file_bytes": os.path.getsize(job.target),
+        "file_digest": file_digest(job.target),
+        "peak_bytes": peak_bytes(),
+        "warnings": [
+            *(clip_warnings(clip) if job.index is None else ()),
+            *dict.fromkeys(caught),
+            *missed_psnr(job.config, scores.mean_psnr, info),
+        ],
+    }
+    with atomic_path(job.record) as temporary:
+        temporary.write_text(json.dumps(record) + "\n")
+    job.checkpoint.unlink(missing_ok=True)
+    return record
+
+
+def missed_psnr(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]:
+    """A warning if the PSNR of `Economy` was not reached, in a list that is otherwise empty."""
+    if config.economy is None or config.economy.psnr is None or info.stopped_by == "smallest_at_psnr":
+        return []
+    return [f"{config.economy.psnr:g} dB was not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
+
+
+def clip_warnings(clip: Clip) -> list[str]:
+    """Warnings about a clip: frames that cannot be decoded, and its notes."""
+    lost = clip.num_declared - clip.num_frames
+    missing = [f"only {clip.num_frames} of {clip.num_declared} frames decode; those are used."] if lost > 0 else []
+    return [*missing, *clip.notes]
+
+
+def peak_bytes() -> int | None:
+    """The largest resident memory of this process so far; None where the system does not provide it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most

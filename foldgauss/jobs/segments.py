@@ -1,0 +1,332 @@
+"""Fits long clips in segments: the plan, one job per segment, and the joined model."""
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss.io.media.frame_index import FrameIndex, index_video
+from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.models.segmented import join_segments
+from foldgauss.io.models.video_model import load_video_model
+from foldgauss.jobs.job import FitJob, file_digest
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.models.metrics import psnr, ssim
+from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
+
+#: Default length of a segment, and number of frames that neighbors share.
+SEGMENT_SECONDS, OVERLAP = 10.0, 8
+#: Number of frames on either side of an overlap that it is compared with.
+BESIDE = 8
+_PLAN, _INDEX = "plan.json", "index.npz"
+#: How the names of unfinished files in the folder begin, and of all of a fit.
+_UNFINISHED = (".segment-", f".{Path(_PLAN).stem}.", f".{Path(_INDEX).stem}.")
+_OWN = ("segment-", _PLAN, _INDEX, *_UNFINISHED)
+
+
+@dataclasses.dataclass(frozen=True)
+class LongFit:
+    """The plan of a clip: its `index`, the `spans` [first, stop) of its segments, and the `jobs` that fit them.
+
+    Made by `plan_long_fit`. Its files are in `folder`; `join` makes one model of them.
+    """
+
+    target: Path
+    folder: Path
+    index: FrameIndex
+    spans: tuple[tuple[int, int], ...]
+    jobs: tuple[FitJob, ...]
+    metadata: dict[str, Any]
+
+    def join(
+        self,
+        records: Mapping[str, Mapping[str, Any]],
+        *,
+        on_frame: Callable[[], None] = lambda: None,
+    ) -> "JoinedFit":
+        """Write the segments as one model, once all jobs are finished; `records` by the jobs' names.
+
+        Frames that two segments share are scored as they are played. Equal segments give equal bytes. The folder
+        stays, see `clean_up`. Raises as `join_segments`, and `OutputError` if a segment's file is not as recorded.
+        """
+        for job in self.jobs:
+            if file_digest(job.target) != records[job.name]["file_digest"]:
+                got = f"a changed {job.target!r}"
+                expected, cure = f"{job.name} as it was written", "Run the same command again to fit it again."
+                raise OutputError(str(invalid("path", expected=expected, got=got, cure=cure)))
+        sources = [(first, job.target) for (first, _), job in zip(self.spans, self.jobs, strict=True)]
+        scores = [(records[job.name]["psnr"], records[job.name]["ssim"]) for job in self.jobs]
+        psnr_of, ssim_of = (_join_scores(self.spans, kind) for kind in zip(*scores, strict=True))
+        fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
+        if fades:
+            self._score_fades(_open_segments(sources), fades, psnr_of, ssim_of, on_frame)
+        if len(sources) == 1:  # an ordinary model
+            with atomic_path(self.target) as temporary:
+                shutil.copyfile(sources[0][1], temporary)
+            return JoinedFit(self.target, tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), ())
+        means = {"mean_psnr": round(float(psnr_of.mean()), 3), "mean_ssim": round(float(ssim_of.mean()), 4)}
+        join_segments(self.target, sources, metadata=self.metadata | means)
+        return JoinedFit(self.target, tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), tuple(fades))
+
+    def _score_fades(self, video: SegmentedVideo, fades, psnr_of, ssim_of, on_frame) -> None:
+        """Replace the scores of shared frames by those of the joined video."""
+        times = video.frame_times.times()
+        for first, stop in fades:
+            clip = read_indexed(self.index, *self.index.span(first, stop), size=self.jobs[0].size)
+            for k, image in enumerate(video.frames(times[first:stop]), first):
+                target = clip.over_black[k - first]
+                psnr_of[k], ssim_of[k] = psnr(target, image), ssim(target, image)
+                on_frame()
+
+    def clean_up(self) -> None:
+        """Remove this fit's files, and the folder if nothing else is in it."""
+        files = [path for job in self.jobs for path in (Path(job.target), job.checkpoint, job.record)]
+        files += [self.folder / name for name in (_INDEX, _PLAN)]
+        files += [entry for entry in self.folder.iterdir() if entry.name.startswith(_UNFINISHED)]
+        for path in files:
+            path.unlink(missing_ok=True)
+        with suppress(OSError):  # files of others
+            self.folder.rmdir()
+
+
+@dataclasses.dataclass(frozen=True)
+class JoinedFit:
+    """A joined model and its scores: `psnr` in dB and `ssim` of every frame as played; `fades`: the shared frames."""
+
+    path: Path
+    psnr: tuple[float, ...]
+    ssim: tuple[float, ...]
+    fades: tuple[tuple[int, int], ...]
+
+    @property
+    def mean_psnr(self) -> float:
+        return float(np.mean(self.psnr))
+
+    @property
+    def mean_ssim(self) -> float:
+        return float(np.mean(self.ssim))
+
+    @property
+    def seam_drop(self) -> float | None:
+        """Mean PSNR in dB by which shared frames are worse than the `BESIDE` on either side; None without any."""
+        drops = seam_drops(np.asarray(self.psnr), self.fades)
+        return float(drops.mean()) if len(drops) else None
+
+
+def seam_drops(
+    scores: Float[np.ndarray, " num_frames"], fades: Sequence[tuple[int, int]], beside: int = BESIDE
+) -> Float[np.ndarray, " fades"]:
+    """For each overlap, the mean score of `beside` frames on either side minus its own mean."""
+    drops = []
+    for first, stop in fades:
+        around = np.concatenate([scores[max(first - beside, 0) : first], scores[stop : stop + beside]])
+        drops.append(around.mean() - scores[first:stop].mean())
+    return np.array(drops)
+
+
+def _open_segments(sources: Sequence[tuple[int, str]]) -> SegmentedVideo:
+    """The segments' files as one video that loads them on demand."""
+    segments = []
+    for first, file in sources:
+        load = partial(load_video_model, file)
+        segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
+    return SegmentedVideo(segments)
+
+
+def _join_scores(spans: Sequence[tuple[int, int]], scores: Sequence[Sequence[float]]) -> np.ndarray:
+    """Scores by frame of the whole clip; shared frames take those of the later segment."""
+    whole_clip = np.zeros(spans[-1][1])
+    for (first, stop), own in zip(spans, scores, strict=True):
+        whole_clip[first:stop] = own
+    return whole_clip
+
+
+def segments_folder(target: str | os.PathLike) -> Path:
+    """The folder of the segments of `target` until they are joined."""
+    target = Path(target)
+    return target.with_name(f"{target.name}.segments")
+
+
+def plan_long_fit(
+    clip: str | os.PathLike,
+    target: str | os.PathLike,
+    config: FitConfig | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+    frames: tuple[int | None, int | None] | None = None,
+    segment_seconds: float = SEGMENT_SECONDS,
+    overlap: int = OVERLAP,
+    checkpoint_seconds: float | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+    restart: bool = False,
+) -> LongFit:
+    """Index a clip and plan its segments, or continue the plan that exists, unless `restart`.
+
+    Segments end at scene cuts near their length, `segment_seconds`; otherwise they share `overlap` frames with the
+    next. `config` is that of each segment; its `max_size_mb` is divided among them by their frames. `clip`, `size` and
+    `frames` as in `read_video`. Memory grows with the clip by some tens of bytes per frame only.
+
+    Raises ValueError for settings out of range, for a folder with the plan of other settings or another clip, and with
+    `restart` for one with other files; `VideoError`, FileNotFoundError, `OutputError`.
+
+    Example: `plan_long_fit("long.mp4", "long.safetensors").jobs`, for `run_here` or `run_on`.
+    """
+    config = FitConfig() if config is None else config
+    if not is_within(segment_seconds, "(0, 1e9]"):
+        raise invalid("segment_seconds", expected="a number of seconds > 0, at most 1e9", got=repr(segment_seconds))
+    if not is_integer(overlap, 1):
+        raise invalid("overlap", expected="a whole number of frames >= 1", got=repr(overlap))
+    clip, target = Path(clip).absolute(), Path(target).absolute()
+    folder = segments_folder(target)
+    request = {"config": dataclasses.asdict(config), "size": size, "frames": frames}
+    request = json.loads(json.dumps(request | {"segment_seconds": float(segment_seconds), "overlap": overlap}))
+    if restart:
+        _check_folder(folder)
+    plan = None if restart else _load_plan(folder, request)
+    index = _load_index(folder, plan, clip)
+    if index is None:
+        index = index_video(clip, frames=frames, on_frame=on_frame)
+        if plan is not None and plan["digest"] != index.digest:
+            cure = "Use that clip, or start over with --overwrite."
+            expected = f"the clip that the fit was started with, {plan['clip']!r}"
+            raise invalid("clip", expected=expected, got=f"other frames in {str(clip)!r}", cure=cure)
+    if plan is None or not _is_partition(plan["spans"], index.num_frames):
+        length = max(round(segment_seconds * index.fps), 2)
+        spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
+    else:
+        spans = plan["spans"]
+    if restart and folder.is_dir():
+        shutil.rmtree(folder)  # only once the clip has been read
+    _make_folder(folder)
+    index.save(folder / _INDEX)
+    kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": request, "spans": spans}
+    with atomic_path(folder / _PLAN) as temporary:
+        temporary.write_text(json.dumps(kept) + "\n")
+    metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
+    configs = _divide_size(config, spans)
+    begin = 0 if frames is None else frames[0] or 0
+    jobs = []
+    for number, (span, own) in enumerate(zip(spans, configs, strict=True)):
+        low, high = index.span(*span)  # as `read_video` counts, where damaged frames are missing
+        job = FitJob(
+            name=f"segment {number}",
+            clip=str(clip),
+            target=str(folder / f"segment-{number:04d}.safetensors"),
+            config=own,
+            size=size,
+            frames=span,
+            index=str(folder / _INDEX),
+            fps=index.fps,
+            checkpoint_seconds=checkpoint_seconds,
+            source={"digest": index.digest},
+            metadata={"clip": clip.name, "frames": [begin + low, begin + high]},
+        )
+        jobs.append(job)
+    return LongFit(target, folder, index, tuple(spans), tuple(jobs), metadata)
+
+
+def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]]) -> list[FitConfig]:
+    """The configuration of each segment: `max_size_mb` in proportion to its frames; shared frames count twice."""
+    if config.max_size_mb is None:
+        return [config] * len(spans)
+    lengths = [stop - first for first, stop in spans]
+    return [dataclasses.replace(config, max_size_mb=config.max_size_mb * one / sum(lengths)) for one in lengths]
+
+
+def _limit_overlap(overlap: int, length: int) -> int:
+    """At most a quarter of a segment, so that no frame is in three."""
+    return max(min(overlap, length // 4), 1)
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise ValueError for a folder with files other than those of a fit."""
+    if not folder.is_dir():
+        return
+    foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
+    if foreign:
+        got = f"{foreign[0]!r} in it"
+        raise invalid("target", expected=f"only files of a fit in {folder}", got=got, cure="Move it away.")
+
+
+def _is_partition(spans: Sequence[tuple[int, int]], num_frames: int) -> bool:
+    """Whether spans cover the clip in order, each frame in at most two; a plan may have been edited."""
+    if not spans or spans[0][0] != 0 or spans[-1][1] != num_frames:
+        return False
+    pairs, apart = pairwise(spans), zip(spans[:-2], spans[2:], strict=True)
+    in_order = all(one[0] < other[0] <= one[1] < other[1] for one, other in pairs)
+    return in_order and all(one[1] <= other[0] for one, other in apart)
+
+
+def read_segment_seconds(target: str | os.PathLike) -> float | None:
+    """The length of segments in the plan of an unfinished fit; None if there is none."""
+    try:
+        seconds = json.loads((segments_folder(target) / _PLAN).read_text())["asked"]["segment_seconds"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return seconds if is_within(seconds, "(0, 1e9]") else None
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"--out: cannot make the folder {folder} ({error.strerror}). Choose another place."
+        ) from error
+
+
+def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
+    """The plan in the folder; None if it cannot be read. Raises ValueError if it is that of another request."""
+    try:
+        plan = json.loads((folder / _PLAN).read_text())
+        before = plan["asked"]
+        before.get("config", {}).get("seed")
+        plan["digest"], plan["clip"]
+        plan["spans"] = [(int(first), int(stop)) for first, stop in plan["spans"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+    changed = sorted(name for name in request if request[name] != before.get(name))
+    if changed:
+        if changed == ["config"]:
+            pairs = {name: (before["config"].get(name), value) for name, value in request["config"].items()}
+            pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+        else:
+            pairs = {name: (before.get(name), request[name]) for name in changed if name != "config"}
+        raise invalid(
+            "resume",
+            expected=", ".join(f"{name}={pair[0]!r}" for name, pair in pairs.items()),
+            got=", ".join(f"{name}={pair[1]!r}" for name, pair in pairs.items()),
+            cure=f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite.",
+        )
+    return plan
+
+
+def _load_index(folder: Path, plan: dict[str, Any] | None, clip: Path) -> FrameIndex | None:
+    """The saved index, if the clip has not changed since."""
+    if plan is None or plan.get("stamp") != _stamp(clip) or plan.get("clip") != str(clip) or not clip.is_file():
+        return None
+    try:
+        index = FrameIndex.load(folder / _INDEX)
+    except (OSError, ValueError):
+        return None
+    return index if index.digest == plan["digest"] else None
+
+
+def _stamp(clip: Path) -> list[int]:
+    """Size and time of a file, which change when it is written again; less reliable for a folder."""
+    try:
+        stat = clip.stat()
+    except OSError:
+        return []
+    return [stat.st_size, stat.st_mtime_ns]

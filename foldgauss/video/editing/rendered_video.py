@@ -1,0 +1,41 @@
+"""Rendering of edited and segmented videos: the methods that both have, on top of `VideoRenderer`."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foldgauss._runtime import notebook_hooks
+from foldgauss.video.models.background import BLACK
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.video_model import check_time
+
+
+class RenderedVideo:
+    """A video rendered by `VideoRenderer`; a subclass is a `RenderableVideo`."""
+
+    def render(
+        self: Any,
+        t: float,
+        size: tuple[int, int] | None = None,
+        *,
+        background: tuple[float, float, float] = BLACK,
+    ) -> Float[np.ndarray, "height width 3"]:
+        """The image at any time t in [0, 1], values about [0, 1], over `background`; as `VideoRenderer`, in NumPy."""
+        check_time(t)
+        return np.moveaxis(VideoRenderer(self, size, background=background).image(t), 0, -1)
+
+    def frames(
+        self: Any,
+        times: np.ndarray | None = None,
+        size: tuple[int, int] | None = None,
+        *,
+        background: tuple[float, float, float] = BLACK,
+    ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
+        yield from VideoRenderer(self, size, background=background).frames(times)
+
+    def _repr_html_(self) -> str | None:
+        """The player, in a notebook; None if its page would be too large or no folded model represents the edits."""
+        return notebook_hooks.show("video", self)

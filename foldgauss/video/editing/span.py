@@ -1,0 +1,221 @@
+"""Spans: when an edit acts, and with which progress between 0 and 1."""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Sequence
+from numbers import Real
+from typing import NamedTuple, TypedDict
+
+import numpy as np
+from jaxtyping import Float
+
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss.video.editing.arguments import check_increasing, check_number, check_numbers
+
+CURVES = ("linear", "smooth")
+
+
+class When(TypedDict, total=False):
+    """When an edit acts: the keyword arguments of `make_frame_span`. None given: always."""
+
+    frame: int
+    frames: tuple[int | None, int | None]
+    times: tuple[float, float]
+    ease: float | tuple[float, float]
+    curve: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Span:
+    """An interval of time in which an edit acts, and its `progress` there, from 0 to 1.
+
+    The interval is `start` <= t < `stop`, None for no end. Inside, progress is 1, or it is interpolated between the
+    knots `times` and `values` and passed through `curve`: "linear", or "smooth", s^2 (3 - 2 s). Outside it is 0.
+    `make_frame_span` and `restrict_span` make one from frame numbers.
+
+    **Units:** model time. **Example:** `Span(0.4, 0.6).progress(0.5)  # 1.0`
+
+    **Raises:** ValueError for an empty span, knots of different lengths or not increasing, and an unknown curve.
+    """
+
+    start: float | None = None
+    stop: float | None = None
+    times: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+    curve: str = "linear"
+
+    def __post_init__(self) -> None:
+        check_one_of("curve", self.curve, CURVES)
+        for name in ("start", "stop"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, check_number(name, value))
+        if not self._first < self._last:
+            raise invalid("start, stop", expected="a start before the stop", got=f"{self.start}, {self.stop}")
+        object.__setattr__(self, "times", check_numbers("times", self.times))
+        object.__setattr__(self, "values", check_numbers("values", self.values))
+        if len(self.times) != len(self.values) or not all(is_within(value, "[0, 1]") for value in self.values):
+            raise invalid("values", expected=f"{len(self.times)} numbers in [0, 1]", got=self.values)
+        check_increasing("times", self.times)
+
+    @property
+    def _first(self) -> float:
+        return -math.inf if self.start is None else self.start
+
+    @property
+    def _last(self) -> float:
+        return math.inf if self.stop is None else self.stop
+
+    def progress(self, t: float) -> float:
+        """The progress of the edit at time t; 0 where it does not act."""
+        if not self._first <= t < self._last:
+            return 0.0
+        if not self.times:
+            return 1.0
+        s = float(np.interp(t, self.times, self.values))
+        return s if self.curve == "linear" else s * s * (3 - 2 * s)
+
+
+#: The span of an edit that acts on no frame of a segment: no video has these times.
+NEVER = Span(2.0, 3.0)
+
+
+def check_when(when: When) -> None:
+    """Raise ValueError for a name that is no keyword of `make_frame_span`."""
+    for name in when:
+        if name not in When.__annotations__:
+            near = difflib.get_close_matches(name, When.__annotations__, 1)
+            expected, cure = "one of " + ", ".join(When.__annotations__), f"Did you mean {near[0]}?" if near else ""
+            raise invalid("when", expected=expected, got=name, cure=cure)
+
+
+class FrameSpan(NamedTuple):
+    """A span in frame positions of a clip, from `begin` to `end`, infinite where it has no end.
+
+    `rise` and `fall`: the number of frames over which progress rises to 1 and falls from it.
+    """
+
+    begin: float
+    end: float
+    rise: float
+    fall: float
+    curve: str
+
+
+def make_frame_span(
+    frame_times: Float[np.ndarray, " num_frames"],
+    *,
+    frame: int | None = None,
+    frames: tuple[int | None, int | None] | None = None,
+    times: tuple[float, float] | None = None,
+    ease: float | tuple[float, float] = 0,
+    curve: str = "linear",
+) -> FrameSpan | None:
+    """The span of one frame, of frames (first, stop) or of times (start, stop); None for always.
+
+    A frame reaches half way to its neighbours: frame k covers |position - k| < 0.5, where `position` is the frame
+    number interpolated between the frame times. So the span contains its frames, every other frame stays the same to
+    the bit, and frames that are interpolated near it show the edit. `frames` includes first and excludes stop. None,
+    the first or the last frame as an end means that the span has no end there.
+
+    `ease`: the number of frames over which the edit comes in and goes out, inside the span; or one number for each.
+    Where the span has no end, there is no easing. `curve`: as in `Span`.
+
+    **Example:** `make_frame_span(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
+
+    **Raises:** ValueError for more than one of `frame`, `frames` and `times`, for values outside the clip, and for
+    `ease` without a span or longer than it.
+    """
+    knots = np.asarray(frame_times, np.float64)
+    num_given = sum(x is not None for x in (frame, frames, times))
+    check_one_of("curve", curve, CURVES)
+    if num_given > 1:
+        raise invalid("frame, frames, times", expected="one of them at most", got=f"{num_given} of them")
+    lengths = _check_ease(ease)
+    if not num_given:
+        if lengths != (0, 0):
+            raise invalid("ease", expected="a span to ease into", got=ease, cure="Give frame=, frames= or times=.")
+        return None
+    begin, end = _span_positions(knots, frame, frames, times)
+    rise, fall = (length if math.isfinite(x) else 0.0 for length, x in zip(lengths, (begin, end), strict=True))
+    first, last = max(begin, 0.0), min(end, len(knots) - 1.0)
+    if rise + fall > last - first:
+        expected = f"no more than the span's {last - first:g} frames, in and out together"
+        raise invalid("ease", expected=expected, got=f"{rise:g} and {fall:g}", cure="Make the span longer.")
+    return FrameSpan(begin, end, rise, fall, curve)
+
+
+def _span_positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
+    """The frame positions at which a span begins and ends; infinite where it has no end."""
+    last = len(knots) - 1
+    if times is not None:
+        first, stop = _check_pair("times", times)
+        if not (is_within(first, "[0, 1]") and is_within(stop, "[0, 1]") and first < stop):
+            raise invalid("times", expected="(start, stop), rising, in [0, 1]", got=times)
+        begin, end = (float(np.interp(t, knots, np.arange(last + 1))) for t in (first, stop))
+        return -math.inf if begin <= 0 else begin, math.inf if end >= last else end
+    if frame is not None:
+        if not (is_integer(frame, 0) and frame <= last):
+            raise invalid("frame", expected=f"a whole number in [0, {last}]", got=frame)
+        frames = (frame, frame + 1)
+    first, stop = _check_pair("frames", frames)
+    first, stop = 0 if first is None else first, last + 1 if stop is None else stop
+    if not (is_integer(first, 0) and is_integer(stop, 1) and first < stop <= last + 1):
+        expected = f"(first, stop), whole, 0 <= first < stop <= {last + 1}"
+        raise invalid("frames", expected=expected, got=frames, cure="None is the clip's own end.")
+    return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
+
+
+def restrict_span(
+    frame_span: FrameSpan | None, frame_times: Float[np.ndarray, " num_frames"], first: int = 0
+) -> Span | None:
+    """A clip's span in the own time of a segment whose frames, at `frame_times`, begin with the clip's frame `first`.
+
+    At the frames and between them progress is that of the clip; `NEVER` if the span contains no frame of the segment.
+    None, always, stays None.
+    """
+    if frame_span is None:
+        return None
+    knots, last = np.asarray(frame_times, np.float64), len(frame_times) - 1
+    # From here on positions count from the segment's first frame.
+    begin, end, rise, fall = frame_span.begin - first, frame_span.end - first, frame_span.rise, frame_span.fall
+    if end <= 0 or begin > last:
+        return NEVER
+    number, ends = np.arange(last + 1), (max(begin, 0.0), min(end, float(last)))
+    start = None if begin <= 0 else float(np.interp(begin, number, knots))
+    stop = None if end > last else float(np.interp(end, number, knots))
+    if not rise and not fall:
+        return Span(start, stop, curve=frame_span.curve)
+    corners = {*ends, *(x for x in (begin + rise, end - fall) if ends[0] < x < ends[1])}
+    positions = np.array(sorted(corners | set(number[(number > ends[0]) & (number < ends[1])].tolist())))
+    values = np.ones(len(positions))
+    if rise:
+        values = np.minimum(values, (positions - begin) / rise)
+    if fall:
+        values = np.minimum(values, (end - positions) / fall)
+    times = np.interp(positions, number, knots)
+    return Span(start, stop, *distinct_knots(times, np.clip(values, 0.0, 1.0)), frame_span.curve)
+
+
+def distinct_knots(
+    times: Float[np.ndarray, " num"], values: Float[np.ndarray, " num"]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Knots of a piecewise linear function, as tuples; of knots at equal times only the last one is kept."""
+    keep = np.concatenate([np.diff(times) > 0, [True]])
+    return tuple(times[keep].tolist()), tuple(values[keep].tolist())
+
+
+def _check_ease(ease: object) -> tuple[float, float]:
+    pair = ease if isinstance(ease, (tuple, list)) else (ease, ease)
+    if len(pair) != 2 or not all(isinstance(x, Real) and x >= 0 and math.isfinite(x) for x in pair):
+        raise invalid("ease", expected="a number of frames >= 0, or two of them", got=repr(ease))
+    return float(pair[0]), float(pair[1])
+
+
+def _check_pair(parameter: str, value: object) -> Sequence:
+    value = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        cure = "For one frame give frame=k." if parameter == "frames" else ""
+        raise invalid(parameter, expected="two of them, (start, stop)", got=short_repr(value), cure=cure)
+    return value

@@ -1,0 +1,208 @@
+"""Selection criteria of a video in segments: evaluated per segment, and propagated over the frames that they share."""
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.video.editing.chain import Edit
+from foldgauss.video.editing.clip_window import ClipWindow
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.segmented_selection import SegmentedSelection
+from foldgauss.video.segmented.segmented_video import Segment
+from foldgauss.video.selection.contributions import Contributions, render_matte
+from foldgauss.video.selection.regions import region_from_box, region_from_mask, region_from_polygon, resolve_frames
+from foldgauss.video.selection.selectors import (
+    THRESHOLD,
+    Selection,
+    by_box,
+    by_click,
+    by_color,
+    by_mask,
+    by_polygon,
+    by_time,
+)
+
+#: A pixel of a shared frame shows an object if at least this fraction of its color is the object's contribution.
+_MIN_CONTRIBUTION = 0.5
+
+#: A selector such as `by_mask`, and its arguments.
+Criterion = tuple[Callable[..., Selection], dict[str, Any]]
+_Image = Bool[np.ndarray, "height width"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CriteriaEvaluator:
+    """Evaluates criteria on the edited segments of a clip, on all layers or on layer number `layer` only.
+
+    `stand_in`: any model with the clip's size and number of frames, to check arguments. `replay(number)` loads and
+    edits a segment, `select_none(number)` is its empty selection.
+    """
+
+    segments: tuple[Segment, ...]
+    stand_in: VideoModel
+    replay: Callable[[int], Edit]
+    select_none: Callable[[int], Selection]
+    layer: int | None
+
+    def evaluate(self, criteria: list[Criterion]) -> SegmentedSelection:
+        """The intersection of all criteria: regions first, so that the others are evaluated on fewer segments."""
+        found: SegmentedSelection | None = None
+        for function, arguments in sorted(criteria, key=lambda criterion: criterion[0] in (by_color, by_time)):
+            if function in (by_color, by_time):
+                selection = self._evaluate_each(function, arguments, found)
+            else:
+                selection = _RegionCriterion(self, function, arguments).evaluate()
+            found = selection if found is None else found & selection
+        return found
+
+    def evaluate_segment(self, one: Edit, function: Callable[[VideoModel, int], Selection]) -> Selection:
+        """`function(model, layer number)` of the layers of one segment."""
+        numbers = one._layer_numbers(self.layer)
+        masks = [
+            function(layer.model, number).mask if number in numbers else np.zeros(layer.num_gaussians, bool)
+            for number, layer in enumerate(one._video.layers)
+        ]
+        return Selection(np.concatenate(masks))
+
+    def _evaluate_each(
+        self, function: Callable[..., Selection], arguments: dict[str, Any], within: SegmentedSelection | None
+    ) -> SegmentedSelection:
+        """By color or by time, on each segment that is not yet known to be without selected Gaussians."""
+        positions = None if function is by_color else self._positions(**arguments)
+        parts = []
+        for number, segment in enumerate(self.segments):
+            if within is not None and not len(within.parts[number]):
+                parts.append(within.parts[number])
+            elif positions is not None and not _overlaps(positions, segment):
+                parts.append(self.select_none(number))
+            else:
+                one = self.replay(number)
+                own = arguments if positions is None else _own_arguments(positions, segment, one._window, arguments)
+                parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
+        return SegmentedSelection(tuple(parts))
+
+    def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
+        """First and last frame position for `times`, else the range of frames."""
+        if times is None:
+            return resolve_frames(self.stand_in, frame, frames)
+        pair = np.asarray(times)
+        if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
+            raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
+        return tuple(float(t) * (self.stand_in.num_frames - 1) for t in pair)
+
+
+def _overlaps(positions: range | tuple[float, float], segment: Segment) -> bool:
+    """Whether frames, or the interval from a first to a last position, overlap a segment."""
+    first, last = (positions.start, positions.stop - 1) if isinstance(positions, range) else positions
+    return first <= segment.stop - 1 and segment.first <= last
+
+
+def _own_arguments(positions: Any, segment: Segment, window: ClipWindow, arguments: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of `by_time` in a segment's own frames or times."""
+    if isinstance(positions, range):
+        first, stop = max(positions.start, segment.first), min(positions.stop, segment.stop)
+        return {"frames": (first - segment.first, stop - segment.first), "alive": arguments["alive"]}
+    if window.is_whole:
+        return arguments
+    ends = np.clip(positions, window.first, window.last) - window.first
+    times = np.interp(ends, np.arange(len(window.times)), window.times)
+    return {"times": tuple(np.clip(times, 0.0, 1.0).tolist()), "alive": arguments["alive"]}
+
+
+class _RegionCriterion:
+    """A criterion that names frames: evaluated on the segments of these, propagated over shared frames to others."""
+
+    def __init__(self, context: CriteriaEvaluator, function: Callable[..., Selection], arguments: dict[str, Any]):
+        self._context, self._function, self._arguments = context, function, arguments
+        self._segments = context.segments
+        where = {"frame": arguments["frame"], "frames": arguments.get("frames")}
+        if function is by_click:
+            self._frames = tuple(resolve_frames(context.stand_in, **where))
+        else:
+            regions = {
+                by_mask: (region_from_mask, "mask"),
+                by_box: (region_from_box, "box"),
+                by_polygon: (region_from_polygon, "polygon"),
+            }
+            make, name = regions[function]
+            self._region = make(context.stand_in, arguments[name], **where)
+            self._frames = self._region.frames
+        #: By segment and layer: masks of what the neighbours show, by frames of the clip.
+        self._masks: dict[int, list[dict[int, _Image]]] = {}
+
+    def evaluate(self) -> SegmentedSelection:
+        """The selection in all segments, breadth first from those that have the frames named."""
+        named = [number for number in range(len(self._segments)) if self._named_frames(number)]
+        waiting, found = deque(named), {}
+        reached = set(named)
+        while waiting:
+            number = waiting.popleft()
+            one = self._context.replay(number)
+            found[number] = self._evaluate_named(one, number) if number in named else self._propagate(one, number)
+            for other in self._neighbours(number):
+                if other in found or other in named or not self._arguments.get("follow", True):
+                    continue
+                if len(found[number]) or number in named:  # an empty selection is information for the neighbour, too
+                    self._render_masks(one, found[number], number, other)
+                if len(found[number]) and other not in reached:
+                    reached.add(other)
+                    waiting.append(other)
+        numbers = range(len(self._segments))
+        return SegmentedSelection(tuple(found[k] if k in found else self._context.select_none(k) for k in numbers))
+
+    def _named_frames(self, number: int) -> list[int]:
+        """The frames named that a segment has."""
+        segment = self._segments[number]
+        return [k for k in self._frames if segment.first <= k < segment.stop]
+
+    def _neighbours(self, number: int) -> Iterable[int]:
+        return (other for other in (number - 1, number + 1) if 0 <= other < len(self._segments))
+
+    def _evaluate_named(self, one: Edit, number: int) -> Selection:
+        """In a segment that has some of the frames named."""
+        first, frames = self._segments[number].first, self._named_frames(number)
+        own = {name: value for name, value in self._arguments.items() if name not in ("frame", "frames")}
+        if self._function is by_click:
+            own["frame"] = frames[0] - first
+        elif self._function is by_mask:
+            own["mask"] = {k - first: np.clip(self._region.at(k), 0.0, 1.0) for k in frames}  # resizing overshoots
+            if not any(mask.any() for mask in own["mask"].values()):
+                return one.selection - one.selection
+        else:
+            own["frames"] = (frames[0] - first, frames[-1] + 1 - first)
+        return self._context.evaluate_segment(one, lambda model, _: self._function(model, **own))
+
+    def _render_masks(self, one: Edit, found: Selection, number: int, other: int) -> None:
+        """Render the selection of a segment as masks of the frames that it shares with a neighbour."""
+        here, there = self._segments[number], self._segments[other]
+        layers, selected = one._video.layers, dataclasses.replace(one, selection=found)._masks()
+        by_layer = self._masks.setdefault(other, [{} for _ in layers])
+        for layer, mask, images in zip(layers, selected, by_layer, strict=False):
+            contributions = Contributions(layer.model) if mask.any() else None
+            for k in range(max(here.first, there.first), min(here.stop, there.stop)):
+                if contributions is None:
+                    images[k] = np.zeros(layer.model.size, bool)
+                else:
+                    own_time = float(one._window.times[k - here.first])
+                    images[k] = render_matte(contributions, mask, own_time) >= _MIN_CONTRIBUTION
+
+    def _propagate(self, one: Edit, number: int) -> Selection:
+        """In a segment with none of the frames named: by the masks that its neighbours show."""
+        first, by_layer = self._segments[number].first, self._masks[number]
+        if len(by_layer) != len(one._video.layers):
+            expected = f"{len(by_layer)} layers, as its neighbour has"
+            raise invalid(f"segments[{number}]", expected=expected, got=len(one._video.layers))
+        threshold = self._arguments.get("threshold", THRESHOLD)
+
+        def select(model: VideoModel, layer: int) -> Selection:
+            masks = {k - first: image for k, image in by_layer[layer].items()}
+            if not any(mask.any() for mask in masks.values()):
+                return Selection.none(model)
+            return by_mask(model, masks, threshold=threshold)
+
+        return self._context.evaluate_segment(one, select)
