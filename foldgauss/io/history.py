@@ -76,7 +76,8 @@ def info_line(info: FitInfo) -> dict[str, Any]:
 
 def read_history(path: str | os.PathLike) -> list[FitInfo]:
     """The steps of a history file, which may belong to a running fit. Raises ValueError for another file."""
-    return [FitInfo(*(_value(line, name) for name in FitInfo._fields)) for line in _read_lines(Path(path))]
+    lines = [{name: value for name, value in line.items() if value is not None} for line in _read_lines(Path(path))]
+    return [FitInfo(*(line.get(name, _NULL.get(name)) for name in FitInfo._fields)) for line in lines]
 
 
 def write_curves(path: str | os.PathLike, history: Iterable[FitInfo]) -> Path:
@@ -91,11 +92,6 @@ def _to_json(value: Any) -> Any:
     if not isinstance(value, float):
         return value
     return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
-
-
-def _value(line: dict[str, Any], name: str) -> Any:
-    value = line.get(name)
-    return _NULL.get(name) if value is None else value
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:
