@@ -5,6 +5,7 @@ Envelopes are computed in log space: far from `time_loc` `a` underflows, `log a`
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -32,10 +33,8 @@ class AbstractEnvelope(eqx.Module):
     def leaf_ranks(self) -> tuple[int, ...]:
         """Rank of each leaf (in the order of `jax.tree.leaves`) for one envelope; the rest is batch."""
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether it depends on its leaves only; a user's function may also close over tracers."""
-        return False
+    #: Whether it depends on its leaves only; a user's function may also close over tracers.
+    is_closed: ClassVar[bool] = False
 
     @abstractmethod
     def log_a(
@@ -58,13 +57,8 @@ class Constant(AbstractEnvelope):
     **Source:** eq:cond_dens with a = 1.
     """
 
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def is_closed(self) -> bool:
-        return True
+    leaf_ranks = ()
+    is_closed = True
 
     def log_a(self, t, *, time_loc, time_scale):
         shape = jnp.broadcast_shapes(jnp.shape(t), jnp.shape(time_loc), jnp.shape(time_scale))
@@ -92,20 +86,15 @@ class TimeLikelihood(AbstractEnvelope):
     power: Float[Array, "*#batch"]
     floor: Float[Array, "*#batch"]
 
+    leaf_ranks = (0, 0)
+    is_closed = True
+
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
         if _any(self.power, lambda x: x < 0):
             raise invalid("power", expected="a number >= 0", got=power, cure="The paper's text has 1, its code 2.")
         if _any(self.floor, lambda x: (x < 0) | (x >= 1)):
             raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (0, 0)
-
-    @property
-    def is_closed(self) -> bool:
-        return True
 
     def log_a(self, t, *, time_loc, time_scale):
         t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)

@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -46,10 +47,8 @@ class AbstractFold(eqx.Module):
     def leaf_ranks(self) -> tuple[int, ...]:
         """Rank of each leaf (in the order of `jax.tree.leaves`) for one fold; the rest is batch."""
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether it depends on its leaves only; a user's function may also close over tracers."""
-        return False
+    #: Whether it depends on its leaves only; a user's function may also close over tracers.
+    is_closed: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
@@ -68,18 +67,13 @@ class ZeroFold(AbstractFold):
 
     dim: int = eqx.field(static=True)
 
+    leaf_ranks = ()
+    is_closed = True
+
     def __init__(self, dim: int):
         if not isinstance(dim, int) or dim < 1:
             raise invalid("dim", expected="an integer >= 1", got=repr(dim), cure="It is d - 1.")
         self.dim = dim
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def is_closed(self) -> bool:
-        return True
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
         check_not_forked()
@@ -104,16 +98,11 @@ class PolynomialFold(AbstractFold):
 
     coefficients: Float[Array, "*batch degree d-1"]
 
+    leaf_ranks = (2,)
+    is_closed = True
+
     def __init__(self, coefficients: ArrayLike):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (2,)
-
-    @property
-    def is_closed(self) -> bool:
-        return True
 
     @property
     def degree(self) -> int:
@@ -157,19 +146,14 @@ class SplineFold(AbstractFold):
     knots: tuple[float, ...] = eqx.field(static=True)  # static: not trained
     degree: int = eqx.field(static=True)
 
+    leaf_ranks = (2,)
+    is_closed = True
+
     def __init__(self, knots: ArrayLike, coefficients: ArrayLike, *, degree: int = 3):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "n", "Row i holds c_i")
         if not isinstance(degree, int) or degree < 0:
             raise invalid("degree", expected="an integer >= 0", got=repr(degree), cure="3 is a cubic spline.")
         self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), degree
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (2,)
-
-    @property
-    def is_closed(self) -> bool:
-        return True
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         check_not_forked()
@@ -207,6 +191,9 @@ class FourierFold(AbstractFold):
     cosine: Float[Array, "*batch order d-1"]
     period: Float[Array, "*batch"]
 
+    leaf_ranks = (2, 2, 0)
+    is_closed = True
+
     def __init__(self, sine: ArrayLike, cosine: ArrayLike, *, period: ArrayLike):
         self.sine = _coefficient_rows("sine", sine, "order", "Row k-1 holds s_k")
         self.cosine = _coefficient_rows("cosine", cosine, "order", "Row k-1 holds c_k").astype(self.sine.dtype)
@@ -218,14 +205,6 @@ class FourierFold(AbstractFold):
             )
         if not isinstance(self.period, jax.core.Tracer) and (np.asarray(self.period) <= 0).any():
             raise invalid("period", expected="positive values", got=period, cure="It is a duration.")
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (2, 2, 0)
-
-    @property
-    def is_closed(self) -> bool:
-        return True
 
     @property
     def order(self) -> int:

@@ -25,7 +25,7 @@ from foldgauss._numerics.batch import (
     common_dtype,
     ranked_leaves,
 )
-from foldgauss._numerics.factor import check_space, check_tril, marginal_tril, normalize_indices
+from foldgauss._numerics.factor import check_loc, check_matrix, check_tril, marginal_tril, normalize_indices
 from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
 from foldgauss._numerics.triangular import (
     UNROLLED_SIZE,
@@ -60,19 +60,14 @@ class Normal(eqx.Module):
     loc: Float[Array, "*#batch"]
     scale: Float[Array, "*#batch"]
 
+    event_shape = ()
+    leaf_ranks = (0, 0)
+
     def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
         dtype = common_dtype(loc, scale)
         self.loc, self.scale = align([(jnp.asarray(loc, dtype), 0), (jnp.asarray(scale, dtype), 0)])
         if validate_args:
             check_positive("scale", self.scale)
-
-    @property
-    def event_shape(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (0, 0)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -115,6 +110,8 @@ class Gaussian(eqx.Module):
     base_tril: Float[Array, "*#batch dim dim"]
     log_scale: Float[Array, "*#batch"]
 
+    leaf_ranks = (1, 2, 0)
+
     def __init__(
         self,
         loc: ArrayLike,
@@ -125,7 +122,8 @@ class Gaussian(eqx.Module):
     ):
         dtype = common_dtype(loc, scale_tril, log_scale)
         loc, tril, log_scale = (jnp.asarray(x, dtype) for x in (loc, scale_tril, log_scale))
-        check_space(loc, "scale_tril", tril)
+        check_loc(loc)
+        check_matrix("scale_tril", tril, loc.shape[-1])
         if validate_args:
             check_tril(tril)
         parts = [(loc, 1), (tril, 2), (log_scale, 0)]
@@ -136,10 +134,6 @@ class Gaussian(eqx.Module):
     @property
     def event_shape(self) -> tuple[int, ...]:
         return self.loc.shape[-1:]
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (1, 2, 0)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ space but not time, it is a mixture of integrals over time. All classes share th
 """
 
 import math
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -21,12 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from foldgauss._numerics.batch import (
-    align,
-    as_value,
-    broadcast_leaves,
-    check_event,
-)
+from foldgauss._numerics.batch import align, as_value, broadcast_leaves, check_event
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
@@ -175,7 +171,28 @@ class AbstractMixture(eqx.Module):
         return to_scipy(self)
 
 
-class FoldedMixture(AbstractMixture):
+class _WeightedMixture(AbstractMixture):
+    """A mixture that is constructed from components of the class `kind` and their weights."""
+
+    kind: eqx.AbstractClassVar[type]
+
+    def __init__(
+        self,
+        components: FoldedGaussian | Gaussian,
+        *,
+        logits: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+        validate_args: bool = True,
+    ):
+        _check_components(components, self.kind)
+        self.components, self.logits = broadcast_weights(components, logits, weights, validate_args)
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return (*(rank + 1 for rank in self.components.leaf_ranks), 1)
+
+
+class FoldedMixture(_WeightedMixture):
     """A mixture of Folded-Gaussians: `p(x) = sum_k w_k FN_k(x)`, x = (s, t), time last.
 
     **Shapes:** `components` a `FoldedGaussian` with batch shape (*batch, k); exactly one of `logits` and `weights`
@@ -195,21 +212,7 @@ class FoldedMixture(AbstractMixture):
 
     components: FoldedGaussian
     logits: Float[Array, "*batch k"]
-
-    def __init__(
-        self,
-        components: FoldedGaussian,
-        *,
-        logits: ArrayLike | None = None,
-        weights: ArrayLike | None = None,
-        validate_args: bool = True,
-    ):
-        _check_components(components, FoldedGaussian)
-        self.components, self.logits = broadcast_weights(components, logits, weights, validate_args)
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return _leaf_ranks(self)
+    kind: ClassVar[type] = FoldedGaussian
 
     def _repr_png_(self) -> bytes | None:
         """Notebook display: the density over time and space, by coordinates if there are several."""
@@ -296,7 +299,7 @@ class FoldedMixture(AbstractMixture):
         return TimePosterior(components, posterior_logits(self.log_weights, components.log_normalizer))
 
 
-class GaussianMixture(AbstractMixture):
+class GaussianMixture(_WeightedMixture):
     """A mixture of Gaussians: a `FoldedMixture` at one time.
 
     **Shapes:** `components` a `Gaussian` with batch shape (*batch, k); exactly one of `logits` and `weights`
@@ -309,21 +312,7 @@ class GaussianMixture(AbstractMixture):
 
     components: Gaussian
     logits: Float[Array, "*batch k"]
-
-    def __init__(
-        self,
-        components: Gaussian,
-        *,
-        logits: ArrayLike | None = None,
-        weights: ArrayLike | None = None,
-        validate_args: bool = True,
-    ):
-        _check_components(components, Gaussian)
-        self.components, self.logits = broadcast_weights(components, logits, weights, validate_args)
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return _leaf_ranks(self)
+    kind: ClassVar[type] = Gaussian
 
     def marginal(self, indices) -> "GaussianMixture":
         """The marginal mixture of the coordinates `indices`, as `FoldedMixture.marginal`; exact."""
@@ -418,10 +407,6 @@ def _check_components(components, kind: type) -> None:
     if components.batch_shape[-1:] in ((), (0,)):
         cure = "Give its parameters a leading dimension of k: jax.tree.map(lambda *x: jnp.stack(x), *components)."
         raise invalid("components", expected="batch shape (*batch, k)", got=components.batch_shape, cure=cure)
-
-
-def _leaf_ranks(mixture) -> tuple[int, ...]:
-    return (*(rank + 1 for rank in mixture.components.leaf_ranks), 1)
 
 
 # --- densities -----------------------------------------------------------------------------------------------

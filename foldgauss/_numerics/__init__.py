@@ -1,1 +1,1 @@
-"""Numerical helpers that know no model: batch shapes, triangular factors, safe gradients, regression, SIMD types."""
+"""Model-independent numerics: batch shapes, triangular factors, safe gradients, regression, SIMD types."""

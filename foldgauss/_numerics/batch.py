@@ -1,4 +1,4 @@
-"""Batches, dtypes and shape checks of pytrees whose every leaf has a rank of its own; the rest is batch."""
+"""Batch dimensions, dtypes and checks of modules whose `leaf_ranks` are their leaves' ranks without batch axes."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -58,7 +58,7 @@ def batch_shape_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
 
 
 def common_dtype(*inputs: ArrayLike):
-    """The float type of the arrays among the inputs; Python numbers and lists follow, they do not lead."""
+    """The float dtype of the arrays among the inputs; Python numbers and lists do not affect it."""
     check_not_forked()
     dtypes = [x.dtype for x in inputs if hasattr(x, "dtype") and not isinstance(x, float)]
     floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
@@ -68,7 +68,7 @@ def common_dtype(*inputs: ArrayLike):
 
 
 def as_value(x: ArrayLike, dtype) -> Array:
-    """A value as an array: float arrays keep their type, all else takes that of the distribution."""
+    """A value as an array: float arrays keep their dtype, others get `dtype`."""
     check_not_forked()
     own = getattr(x, "dtype", None)
     keeps = own is not None and jnp.issubdtype(own, jnp.floating) and not isinstance(x, float)
@@ -79,11 +79,11 @@ def cast(module: _ModuleT, dtype) -> _ModuleT:
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, module)
 
 
-# --- checks: shapes always, values only where there are values ----------------------------------------------
+# --- checks: of shapes always, of values unless they are traced ---------------------------------------------
 
 
 def concrete_value(x: Array) -> np.ndarray | None:
-    """The numbers, in NumPy (nothing to compile); None under tracing, where there are none to look at."""
+    """The values as a NumPy array; None under tracing."""
     return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
 
 
@@ -111,15 +111,15 @@ def check_positive(name: str, scale: Array) -> None:
 
 # --- one at a time --------------------------------------------------------------------------------------------
 
-# So many integrals are held in memory at once.
+# Batch elements that are evaluated at once, which limits memory.
 _CHUNK = 64
 
 
 @eqx.filter_jit
 def map_over_batch(function: Callable, *items):
-    """`function` of unbatched things, over all their batch dimensions together; compiled.
+    """`function` of unbatched items, mapped over all their batch dimensions; compiled.
 
-    `function` is one of a module's own: a new closure each time would be compiled each time. Each item is a module
+    `function` must be defined at module level, since a new closure would be compiled each time. Each item is a module
     with `leaf_ranks`, or a pair (array, event rank).
     """
     arrays = [ranked_leaves(x) if isinstance(x, eqx.Module) else [x] for x in items]

@@ -1,4 +1,4 @@
-"""The factor of a space covariance from whichever matrix the caller has."""
+"""The triangular factor of a space covariance from any of its representations, and checks of it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,11 +37,6 @@ def _the_one_given(given: dict[str, ArrayLike | None]) -> tuple[str, ArrayLike]:
     return present[0]
 
 
-def check_space(loc: Array, name: str, matrix: Array) -> None:
-    check_loc(loc)
-    check_matrix(name, matrix, loc.shape[-1])
-
-
 def check_loc(loc: Array) -> None:
     if loc.ndim < 1 or loc.shape[-1] < 1:
         cure = "A single space coordinate still needs its own axis."
@@ -74,23 +69,22 @@ def check_tril(tril: Array) -> None:
         raise invalid("scale_tril", expected="lower-triangular matrices", got=got, cure=cure)
     diagonal = np.diagonal(tril, axis1=-2, axis2=-1)
     if (diagonal <= 0).any():
-        got, cure = (
-            f"a least entry of {np.nanmin(diagonal)}",
-            "Flip the sign of its column: Sigma stays the same.",
+        cure = "Flip the sign of its column: Sigma stays the same."
+        raise invalid(
+            "scale_tril", expected="a positive diagonal", got=f"a least entry of {np.nanmin(diagonal)}", cure=cure
         )
-        raise invalid("scale_tril", expected="a positive diagonal", got=got, cure=cure)
 
 
 def check_and_factorize(name: str, covariance: Array, validate: bool) -> Array:
     tril, value = jnp.linalg.cholesky(covariance), concrete_value(covariance)
     if not validate or value is None:
         return tril
-    # Rounding of the user's own arithmetic is no asymmetry.
+    # Asymmetry of the size of rounding is allowed.
     tolerance = 1e3 * np.finfo(value.dtype).eps * np.abs(value).max((-1, -2), initial=0, keepdims=True)
     if (np.abs(value - np.swapaxes(value, -1, -2)) > tolerance).any():
         cure = "For a factor use scale_tril; against rounding use (C + C.T) / 2."
         raise invalid(name, expected="symmetric matrices", got="another", cure=cure)
-    # NaN in, NaN out: only a NaN of Cholesky's own is an error.
+    # NaN of the input propagates; only one that Cholesky adds is an error.
     if (np.isnan(np.asarray(tril)).any((-1, -2)) & ~np.isnan(value).any((-1, -2))).any():
         cure = "Add a small multiple of the identity, or drop a coordinate that the others determine."
         raise invalid(name, expected="positive definite matrices", got="another", cure=cure)

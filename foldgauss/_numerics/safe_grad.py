@@ -1,16 +1,15 @@
-"""Derivatives of log-densities that reach further than their dtype on the way.
+"""Derivatives of log-densities whose intermediate values overflow.
 
-Far from a component's time the slope of its log-density by space, z / sqrt(a), exceeds every floating-point number
-long before the log-density does. Where it is then multiplied by something small (a power of a short time, a tiny
-residual) the derivative asked for is an ordinary number; where it meets its own opposite, autodiff makes NaN of it.
+Far from a component's time the slope of its log-density in space, z / sqrt(a), overflows long before the log-density
+does, although its product with a small factor may be in range, and opposite infinities give NaN.
 
-So derivatives are taken plainly and, where one came out infinite or NaN, again of the log-density times root^2 for
-smaller and smaller roots, the factor put in *before* anything can overflow; what comes out is scaled back, and held at
-the largest number. Far away this costs some more evaluations, elsewhere a look at whether all is finite.
+Derivatives are therefore taken plainly and, where one is not finite, again of the log-density times root^2 for smaller
+and smaller roots, a factor applied *before* anything can overflow; the result is scaled back, and clipped to the
+largest number. Where all derivatives are finite, the only cost is the test that they are.
 
-JAX has no rule that decides on a derivative *after* its transposition and still allows forward mode (`custom_vjp` does
-not) and batches (`linear_call` does not), so there are two primitives here: `push`, forward, and `pull`, its transpose.
-Derivatives of either are a `push` of the first derivative, so all orders decide, and all of a batch together.
+JAX has no rule that acts on a derivative *after* its transposition and still supports forward mode (unlike
+`custom_vjp`) and batches (unlike `linear_call`), hence two primitives: `push`, forward, and `pull`, its transpose.
+Derivatives of either are a `push` of the first derivative, so this holds for all orders.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,29 +35,27 @@ __all__ = ["evaluate_with_safe_grad"]
 _Scaled = Callable[..., list[Array]]
 
 #: log2 of the roots, in units of the dtype's largest exponent: in float32 the factors are 2^-24, 2^-48, .. 2^-240.
-#: Neighbors are close, so that of a derivative that needs the one nothing is lost to underflow there.
+#: They are close enough that a derivative that needs one of them does not underflow there.
 _LADDER = -0.0945 * np.arange(1, 11)
 
 
 def evaluate_with_safe_grad(function: Callable[..., Array], *arrays: Array, closed: bool = True) -> Array:
-    """`function(None, *arrays)`, whose derivatives by `arrays` are true where they fit and saturate where not.
+    """`function(None, *arrays)`, whose derivatives in `arrays` are accurate where in range and saturate elsewhere.
 
-    `function(root, *arrays)` is root^2 times the same, and its derivatives overflow no sooner than root^2 times the
-    true ones do. It depends on nothing else, unless `closed` is false: then it is looked through for tracers.
-
-    A derivative that is a *sum* over points is true unless one of the points needs a root so small that the others'
-    shares underflow beside it.
+    `function(root, *arrays)` is root^2 times the same, and its derivatives overflow only where root^2 times the true
+    ones do. If `closed` is false, it may also close over tracers. A derivative that *sums* over points is inaccurate if
+    one of them needs a root so small that the terms of others underflow.
     """
     scaled = lambda root, *arrays: [function(root, *arrays)]  # noqa: E731
     captured = []
     if not closed:
-        scaled, captured = _hoisted(scaled, arrays)
-    return _far_reaching(scaled, *_alike([*arrays, *captured]))[0]
+        scaled, captured = _hoist_tracers(scaled, arrays)
+    return _far_reaching(scaled, *_unify_varying_axes([*arrays, *captured]))[0]
 
 
-def _hoisted(function: _Scaled, arrays: tuple[Array, ...]) -> tuple[_Scaled, list[Array]]:
-    """`function` with the tracers it closes over as further arguments, and those: custom derivatives lose them."""
-    one = np.ones((), jnp.result_type(*arrays))  # of NumPy: no tracer
+def _hoist_tracers(function: _Scaled, arrays: tuple[Array, ...]) -> tuple[_Scaled, list[Array]]:
+    """`function` with the tracers it closes over as further arguments, which custom derivatives would lose."""
+    one = np.ones((), jnp.result_type(*arrays))  # NumPy: not a tracer
     traced = jax.make_jaxpr(function)(one, *arrays)
     is_captured = [isinstance(x, jax.core.Tracer) for x in traced.consts]
     if not any(is_captured):
@@ -76,10 +73,10 @@ def _hoisted(function: _Scaled, arrays: tuple[Array, ...]) -> tuple[_Scaled, lis
     return hoisted, captured
 
 
-def _alike(arrays: Sequence[Array]) -> list[Array]:
-    """The arrays as varying, all of them, over the mesh axes that any of them varies over (inside `shard_map`).
+def _unify_varying_axes(arrays: Sequence[Array]) -> list[Array]:
+    """Cast all arrays to vary over the mesh axes that any of them varies over (inside `shard_map`).
 
-    Else JAX would cast within, and its transpose, a sum over devices, would stand in a branch that not all take.
+    Otherwise JAX would cast inside, and the transpose, a sum over devices, would be in a branch that not all take.
     """
     arrays = [jnp.asarray(x) for x in arrays]
     axes = frozenset().union(*map(_varying_axes, arrays))
@@ -122,77 +119,79 @@ def _strong(aval):
 # --- the derivatives -----------------------------------------------------------------------------------------
 
 
-def _pushed(*arguments: Array, function: _Scaled, moving: tuple[int, ...], avals) -> list[Array]:
+def _push_values(*arguments: Array, function: _Scaled, moving: tuple[int, ...], avals) -> list[Array]:
     """The derivatives along tangents of the arrays `moving`: arguments are all arrays, then these tangents."""
     del avals
-    return _first_finite(lambda root: _pushed_at(root, *arguments, function=function, moving=moving))
+    return _first_finite(lambda root: _push_values_at(root, *arguments, function=function, moving=moving))
 
 
-def _pushed_at(root, *arguments: Array, function: _Scaled, moving: tuple[int, ...]) -> list[Array]:
+def _push_values_at(root, *arguments: Array, function: _Scaled, moving: tuple[int, ...]) -> list[Array]:
     """root^2 times those, by plain autodiff."""
     arrays, tangents = arguments[: len(arguments) - len(moving)], arguments[len(arguments) - len(moving) :]
-    return jax.jvp(_freed(partial(function, root), arrays, moving), [arrays[i] for i in moving], list(tangents))[1]
+    return jax.jvp(
+        _restrict_arguments(partial(function, root), arrays, moving), [arrays[i] for i in moving], list(tangents)
+    )[1]
 
 
-def _pulled(*arguments: Array, function: _Scaled, moving: tuple[int, ...], count: int) -> list[Array]:
+def _pull_values(*arguments: Array, function: _Scaled, moving: tuple[int, ...], count: int) -> list[Array]:
     """The gradients by the arrays `moving`: arguments are `count` arrays, then the cotangents."""
-    return _first_finite(lambda root: _pulled_at(root, *arguments, function=function, moving=moving, count=count))
+    return _first_finite(lambda root: _pull_values_at(root, *arguments, function=function, moving=moving, count=count))
 
 
-def _pulled_at(root, *arguments: Array, function: _Scaled, moving: tuple[int, ...], count: int) -> list[Array]:
+def _pull_values_at(root, *arguments: Array, function: _Scaled, moving: tuple[int, ...], count: int) -> list[Array]:
     """root^2 times those, by plain autodiff."""
     arrays, cotangents = arguments[:count], arguments[count:]
-    free = _freed(partial(function, root), arrays, moving)
+    free = _restrict_arguments(partial(function, root), arrays, moving)
     return list(jax.vjp(free, *(arrays[i] for i in moving))[1](list(cotangents)))
 
 
-def _freed(function: Callable, arrays, moving: tuple[int, ...]) -> Callable:
+def _restrict_arguments(function: Callable, arrays, moving: tuple[int, ...]) -> Callable:
     """`function` of the arrays `moving` alone."""
     return lambda *moved: function(*(moved[moving.index(i)] if i in moving else x for i, x in enumerate(arrays)))
 
 
 def _first_finite(at: Callable[[Array | None], list[Array]]) -> list[Array]:
-    """Each number from the first root where it is finite, scaled back."""
+    """Each value from the first root where it is finite, scaled back."""
     plain = at(None)
-    missing = _missing(plain)
-    if not isinstance(missing, jax.core.Tracer):  # not compiled: then no branch need be compiled either
-        return _climbed(at, plain) if missing else plain
-    return lax.cond(missing > 0, partial(_climbed, at), lambda plain: plain, plain)
+    missing = _count_nonfinite(plain)
+    if not isinstance(missing, jax.core.Tracer):  # eager: no branch to compile
+        return _retry_with_roots(at, plain) if missing else plain
+    return lax.cond(missing > 0, partial(_retry_with_roots, at), lambda plain: plain, plain)
 
 
-def _missing(found: list[Array]) -> Array:
+def _count_nonfinite(found: list[Array]) -> Array:
     return sum(jnp.sum(~jnp.isfinite(x)) for x in found)
 
 
-def _climbed(at: Callable[[Array | None], list[Array]], plain: list[Array]) -> list[Array]:
+def _retry_with_roots(at: Callable[[Array | None], list[Array]], plain: list[Array]) -> list[Array]:
     narrowest = min((jnp.finfo(x.dtype) for x in plain), key=lambda known: known.maxexp)
     roots = np.exp2(np.round(_LADDER * narrowest.maxexp)).astype(jnp.result_type(*plain))
 
     def climb(root, found):
-        again = [_scaled_back(x, root) for x in at(root)]
+        again = [_scale_back(x, root) for x in at(root)]
         return [jnp.where(jnp.isfinite(x), x, y) for x, y in zip(found, again, strict=True)]
 
     def step(found, root):
-        return lax.cond(_missing(found) > 0, climb, lambda root, found: found, root, found), None
+        return lax.cond(_count_nonfinite(found) > 0, climb, lambda root, found: found, root, found), None
 
     if any(isinstance(x, jax.core.Tracer) for x in plain):
         found = lax.scan(step, plain, jnp.asarray(roots))[0]
-    else:  # not compiled: a scan would be, anew each time
+    else:  # eager: a scan would be compiled each time
         found = plain
         for root in roots:
-            found = climb(jnp.asarray(root), found) if _missing(found) else found
-    # An infinity that is left is one further out than all roots reach, and has its sign.
-    return [_held(x, jnp.finfo(x.dtype).max) for x in found]
+            found = climb(jnp.asarray(root), found) if _count_nonfinite(found) else found
+    # An infinity that is left is beyond the range of all roots; its sign is right.
+    return [_clip_symmetric(x, jnp.finfo(x.dtype).max) for x in found]
 
 
-def _scaled_back(x: Array, root: Array) -> Array:
-    """x / root^2, held at the largest number where x is finite."""
+def _scale_back(x: Array, root: Array) -> Array:
+    """x / root^2, clipped to the largest number where x is finite."""
     root, largest = root.astype(x.dtype), jnp.finfo(x.dtype).max
-    return jnp.where(jnp.isfinite(x), _held(_held(x / root, largest), largest * root) / root, x)
+    return jnp.where(jnp.isfinite(x), _clip_symmetric(_clip_symmetric(x / root, largest), largest * root) / root, x)
 
 
-def _held(x: Array, largest) -> Array:
-    return jnp.clip(x, -largest, largest)  # a NaN stays one
+def _clip_symmetric(x: Array, largest) -> Array:
+    return jnp.clip(x, -largest, largest)  # NaN propagates
 
 
 # --- the two primitives --------------------------------------------------------------------------------------
@@ -203,7 +202,7 @@ def _primitive(name: str, implementation: Callable, derivative: Callable, avals:
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(implementation)
-    primitive.def_abstract_eval(avals)  # known without tracing the implementation, which is long
+    primitive.def_abstract_eval(avals)  # without tracing the implementation, which is slow
     mlir.register_lowering(primitive, mlir.lower_fun(implementation, multiple_results=True))
 
     def differentiated(primals, tangents, **how):
@@ -221,14 +220,14 @@ def _pull_avals(*avals, function, moving, count):
     return [_strong(avals[i]) for i in moving]
 
 
-_push = _primitive("far_push", _pushed, _pushed_at, lambda *_, avals, **how: list(avals))
-_pull = _primitive("far_pull", _pulled, _pulled_at, _pull_avals)
+_push = _primitive("far_push", _push_values, _push_values_at, lambda *_, avals, **how: list(avals))
+_pull = _primitive("far_pull", _pull_values, _pull_values_at, _pull_avals)
 
 
 def _transposed(cotangents, *arguments, function, moving, avals):
     del avals
     count = len(arguments) - len(moving)
-    # A tangent that is known, not to be differentiated by, is left out.
+    # Tangents that are not differentiated are left out.
     wanted = [ad.is_undefined_primal(x) for x in arguments[count:]]
     if all(isinstance(x, ad.Zero) for x in cotangents):
         return [None] * len(arguments)
@@ -251,7 +250,7 @@ def _push_batched(arguments, dims, *, function, moving, avals):
 
 def _pull_batched(arguments, dims, *, function, moving, count):
     size = _batch_size(arguments, dims)
-    # Gradients per batch element are asked for, not their sum: the arrays they are taken by become a batch.
+    # Gradients are per batch element, not summed: the arrays they are taken in become batched.
     is_batched = [d is not None or i in moving or i >= count for i, d in enumerate(dims)]
     arguments = _to_front(arguments, dims, size, is_batched)
     over = _over_batch(function, is_batched[:count], size)
@@ -268,7 +267,7 @@ def _batch_size(arguments, dims) -> int:
 
 
 def _to_front(arguments, dims, size: int, is_batched: list[bool]) -> list[Array]:
-    """The batch in front of every argument that has one, or is to have one."""
+    """Move or broadcast the batch axis to the front of every argument that is to be batched."""
     arguments = map(jnp.asarray, arguments)
     return [
         jnp.moveaxis(x, d, 0) if d is not None else jnp.broadcast_to(x, (size, *x.shape)) if batched else x

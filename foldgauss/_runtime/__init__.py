@@ -1,1 +1,1 @@
-"""What the program needs from its machine: argument checks, threads, Numba kernels, signals and file locks."""
+"""Independent helpers: argument checks, settings, threads, Numba kernels, signals and file locks."""

@@ -1,4 +1,4 @@
-"""Errors that carry their cure: parameter, expected, got, what to try."""
+"""Checks of arguments, with errors that name the parameter, what was expected, what was passed, and a remedy."""
 
 import inspect
 import math
@@ -8,7 +8,7 @@ from numbers import Integral, Real
 
 
 def invalid(parameter: str, *, expected: str, got: object, cure: str = "") -> ValueError:
-    """The one shape of a value error in this package, ready to be raised."""
+    """A ValueError in this package's format, to be raised."""
     text = f"{parameter}: expected {expected}, got {got}."
     return ValueError(f"{text} {cure}" if cure else text)
 
@@ -20,7 +20,7 @@ def check_one_of(parameter: str, value: object, choices: tuple[str, ...]) -> Non
 
 
 def short_repr(value: object) -> str:
-    """For an error of one line: what is long, as a model is, is told by its type."""
+    """`repr` for an error of one line; the type's name if that is long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else type(value).__name__
 
@@ -48,10 +48,10 @@ def is_integer(value: object, least: int) -> bool:
 
 
 def check_signature(parameter: str, function: Callable, *arguments: str) -> None:
-    """Raise unless `function` can be called with so many arguments; what cannot be told is left alone."""
+    """Raise unless `function` can be called with these arguments; unknown signatures pass."""
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # some that are built in have none
+    except (TypeError, ValueError):  # some built-in functions have none
         return
     try:
         signature.bind(*arguments)

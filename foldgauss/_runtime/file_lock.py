@@ -1,4 +1,4 @@
-"""One at a time, whoever dies: the system gives a lock back with its process."""
+"""A lock file that only one process holds; the system releases it when the process ends."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,14 +8,14 @@ from filelock import FileLock, Timeout
 
 
 class LockHeld(BlockingIOError):
-    """Another holds the lock."""
+    """The lock is held already."""
 
 
 @contextmanager
 def hold_lock(file: Path) -> Iterator[None]:
-    """Hold the lock `file`, made here and removed afterwards, until the block or the process ends, however it does.
+    """Hold the lock `file`, created here and removed afterwards, until the block or the process ends.
 
-    Raises `LockHeld` at once where another holds it, of this process too, and OSError where it cannot be made.
+    Raises `LockHeld` at once if it is held, by this process too, and OSError if it cannot be created.
     """
     lock = FileLock(file, timeout=0)
     try:
@@ -26,6 +26,6 @@ def hold_lock(file: Path) -> Iterator[None]:
         yield
     finally:
         try:
-            file.unlink(missing_ok=True)  # while it is held: who opened it before finds that it is another's or none's
+            file.unlink(missing_ok=True)  # while held, so that no other process's file is removed
         finally:
             lock.release()

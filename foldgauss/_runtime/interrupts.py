@@ -9,16 +9,16 @@ from types import FrameType
 
 #: Seconds within which another SIGTERM is the same one: `timeout` sends it to a process, and then to its group.
 SAME = 5.0
-#: Exit status of a process that SIGTERM ended, as shells tell it.
+#: Exit status of a process that SIGTERM ended, as shells report it.
 TERMINATED = 128 + signal.SIGTERM
 
 
 class SigtermReceived(KeyboardInterrupt):
-    """SIGTERM, which is to leave no more behind than Ctrl-C does."""
+    """SIGTERM, raised so that the same cleanup runs as after Ctrl-C."""
 
 
 class _Answer:
-    """The first SIGTERM raises `SigtermReceived`; a later one ends the process at once, whatever it is at."""
+    """The first SIGTERM raises `SigtermReceived`; a later one ends the process at once."""
 
     def __init__(self) -> None:
         self.first: float | None = None
@@ -35,9 +35,9 @@ class _Answer:
 
 @contextmanager
 def raise_on_sigterm() -> Iterator[None]:
-    """Within, SIGTERM raises `SigtermReceived`, unless somebody else answers it; the process then exits with 143.
+    """Within, SIGTERM raises `SigtermReceived`, unless it has a handler; the process then exits with 143.
 
-    As the system ends it, what is unfinished would lie about for good.
+    The default handler would leave unfinished files behind.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
@@ -49,16 +49,15 @@ def raise_on_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        if answer.first is not None:  # however it was told meanwhile
+        if answer.first is not None:  # whatever became of the exception
             raise SystemExit(TERMINATED)
 
 
 @contextmanager
 def use_default_signals() -> Iterator[None]:
-    """Within, Ctrl-C and SIGTERM end the process as the system does, unless somebody else answers them.
+    """Within, Ctrl-C and SIGTERM end the process by the system's default, unless they have other handlers.
 
-    Nothing is open yet that would be lost; and of a KeyboardInterrupt in their midst the native libraries that are
-    being imported crash, or lose it.
+    For imports: native libraries may crash at a KeyboardInterrupt or swallow it, and no file is open yet.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""How kernels are compiled: serial, without the GIL, kept on disk where that is possible."""
+"""Compilation of Numba kernels: serial, without the GIL, cached on disk where possible."""
 
 import contextlib
 from collections.abc import Callable
@@ -14,10 +14,10 @@ inline = nb.njit(inline="always", **_OPTIONS)
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile `function` at its first call and keep the code beside its source, or in NUMBA_CACHE_DIR.
+    """Compile `function` at its first call and cache the code beside its source, or in NUMBA_CACHE_DIR.
 
-    Numba looks at the function's own file to tell whether kept code is stale: a constant from another module must be
-    handed in as an argument. Where nothing can be written, or the disk is full, code is compiled anew by every process.
+    Numba checks only the function's own file for changes: a constant from another module must be passed as an argument.
+    Where the cache cannot be written, every process compiles again.
     """
     return _compiled(function, _OPTIONS)
 
@@ -27,8 +27,8 @@ def exact_kernel(function: Callable) -> Callable:
     return _compiled(function, {"error_model": "numpy"})
 
 
-class _Kept(FunctionCache):
-    """Numba's own, but what cannot be written, on a disk that is full by now, is not kept, and that is all."""
+class _TolerantCache(FunctionCache):
+    """Numba's cache, ignoring errors of writing, such as a full disk."""
 
     def save_overload(self, *compiled: object) -> None:
         with contextlib.suppress(OSError):
@@ -37,6 +37,6 @@ class _Kept(FunctionCache):
 
 def _compiled(function: Callable, options: dict) -> Callable:
     dispatcher = nb.njit(nogil=True, **options)(function)
-    with contextlib.suppress(RuntimeError):  # no place to keep it: a read-only installation with no home
-        dispatcher._cache = _Kept(function)
+    with contextlib.suppress(RuntimeError):  # no place for the cache: a read-only installation without a home directory
+        dispatcher._cache = _TolerantCache(function)
     return dispatcher

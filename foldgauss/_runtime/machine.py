@@ -1,4 +1,4 @@
-"""What a timing depends on beside the code: the processor, its cores, the versions of what computes."""
+"""The facts that timings depend on: processor, cores, threads, load, and versions of packages."""
 
 import importlib.metadata
 import os

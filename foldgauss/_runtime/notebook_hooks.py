@@ -1,4 +1,4 @@
-"""What notebooks show of an object: functions registered by name, so that no class imports what draws it.
+"""Notebook displays of objects: functions registered by name, so that no class imports a plotting module.
 
 `foldgauss/__init__.py` registers them; a module is imported when a notebook first shows an object of its kind.
 """
@@ -15,6 +15,6 @@ def register(kind: str, location: str) -> None:
 
 
 def show(kind: str, obj: Any) -> Any:
-    """What the function registered for `kind` makes of `obj`."""
+    """Call the function registered for `kind` with `obj`."""
     module, _, function = _LOCATIONS[kind].partition(":")
     return getattr(importlib.import_module(module), function)(obj)

@@ -1,8 +1,8 @@
 """One pool of worker threads for the serial `nogil` kernels.
 
 Numba's own threading aborts after `fork` (OpenMP) and fails from two Python threads at once (workqueue).
-Plain kernels over ranges of work, handed to a pool of ours, have neither problem; since the ranges never
-depend on the number of threads, every result is the same to the bit for any number of them.
+A pool that runs serial kernels over ranges of work has neither problem, and since the ranges do not depend on the
+number of threads, results are the same to the bit for any number.
 """
 
 import os
@@ -21,7 +21,7 @@ _forked = False  # from a process in which JAX had started
 
 
 def available_cores() -> int:
-    """Cores this process may run on (its affinity, where the system tells)."""
+    """Cores this process may run on (its affinity, where the system reports it)."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not Linux
@@ -29,15 +29,15 @@ def available_cores() -> int:
 
 
 def num_threads() -> int:
-    """Threads the kernels use: what `set_num_threads` said, else FOLDGAUSS_NUM_THREADS, else the cores."""
+    """Threads the kernels use: as set by `set_num_threads`, else FOLDGAUSS_NUM_THREADS, else the number of cores."""
     if _num_threads is not None:
         return _num_threads
-    said = os.environ.get("FOLDGAUSS_NUM_THREADS")
-    if said is None:
+    setting = os.environ.get("FOLDGAUSS_NUM_THREADS")
+    if setting is None:
         return available_cores()
-    if not said.isdecimal() or int(said) < 1:
-        raise invalid("FOLDGAUSS_NUM_THREADS", expected="a whole number >= 1", got=repr(said))
-    return int(said)
+    if not setting.isdecimal() or int(setting) < 1:
+        raise invalid("FOLDGAUSS_NUM_THREADS", expected="a whole number >= 1", got=repr(setting))
+    return int(setting)
 
 
 def set_num_threads(count: int | None) -> None:
@@ -52,7 +52,7 @@ def set_num_threads(count: int | None) -> None:
 def check_not_forked() -> None:
     """Raise RuntimeError in a process that was forked from one in which JAX had started.
 
-    JAX's threads do not exist there, and what waits for them waits for ever. Our own kernels alone do work.
+    JAX's threads do not exist there, so JAX would hang; only the Numba kernels work.
     """
     if _forked:
         raise RuntimeError(
@@ -63,7 +63,7 @@ def check_not_forked() -> None:
 
 
 def _jax_has_started() -> bool:
-    """Whether JAX has threads. It has none while it is but imported, and no public way to tell."""
+    """Whether JAX has started its threads, which importing it does not; there is no public API for this."""
     bridge = sys.modules.get("jax._src.xla_bridge")
     if bridge is None:
         return False
@@ -72,7 +72,7 @@ def _jax_has_started() -> bool:
 
 
 def _begin_child() -> None:
-    """In a forked child the pool's threads do not exist: start afresh, with a lock nobody holds."""
+    """In a forked child the pool's threads do not exist: reset it, with a new lock."""
     global _pool, _lock, _forked
     _pool, _lock = None, threading.Lock()
     _forked = _forked or _jax_has_started()
@@ -83,7 +83,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _call(task: Callable[[int], object], item: int) -> None:
-    """`task(item)`; an interrupt that Numba met within its own Python code, and made a SystemError of, is one again."""
+    """`task(item)`; a KeyboardInterrupt that Numba turned into a SystemError is raised again."""
     try:
         task(item)
     except SystemError as error:
@@ -98,8 +98,7 @@ def _call(task: Callable[[int], object], item: int) -> None:
 def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:
     """Call `task(item)` for every item on the pool, or all on this thread, and wait; the first error is raised here.
 
-    Tasks must not call `run_tasks` themselves. Where no more threads can be started, since the main thread has ended or
-    the system allows no more, fewer work.
+    Tasks must not call `run_tasks`. If no more threads can be started, fewer are used.
     """
     global _pool
     items = list(items)
@@ -139,11 +138,11 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
         try:
             for _ in range(min(threads, len(items)) - 1):
                 futures.append(pool.submit(drain))
-        except RuntimeError:  # what was to start the thread may be in the queue all the same, with no future
+        except RuntimeError:  # the task may be in the queue all the same, without a future
             all_known = False
         drain()  # the calling thread works too
     finally:
-        # Not before all are done: what they read and write may be freed once this returns.
+        # Wait for all: arrays that they use may be freed once this returns.
         with guard:
             pending = iter(())
         for future in futures:

@@ -1,9 +1,9 @@
-"""What a worker of this machine does first. dask imports it by name, so it brings nothing else."""
+"""Setup of a local worker process. dask imports this module by name; it imports nothing else of the package."""
 
 import signal
 
 
 def dask_setup(worker: object) -> None:
-    """Leave Ctrl-C, which a terminal sends to all processes, to the one that gave out the jobs: it asks for an end."""
+    """Ignore Ctrl-C, which a terminal sends to all processes: the main process handles it and stops its workers."""
     del worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)

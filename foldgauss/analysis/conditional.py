@@ -1,7 +1,6 @@
-"""What leaves the family: a Folded-Gaussian without its time, or with space known and time not.
+"""Conditional and marginal distributions outside the family: time integrated out, or space given and time unknown.
 
-Given t everything is Gaussian, so all of it is a mixture over time, and time is one-dimensional: it is integrated
-numerically, adaptively around the mass (`quadrature`), with an error estimate.
+Given t they are Gaussian, so they are mixtures over time, integrated numerically with an error estimate (`quadrature`).
 """
 
 import equinox as eqx
@@ -31,25 +30,23 @@ from foldgauss.gaussian import Gaussian, condition_on_first
 __all__ = ["TimeDensity", "TimeMixture", "conditional_gaussian", "time_density", "time_mixture"]
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
-_CROSSINGS = 24  # points where the ridge comes near: looked at
-_BEST = 10  # and integrated around
-_MAXIMA = 6
+_CROSSINGS = 24  # candidate times at which the ridge comes near
+_BEST = 10  # of them, around which panels are refined
+_MAXIMA = 6  # peaks of the density around which panels are refined
 _MODES = 8
 
 
 class TimeDensity(eqx.Module):
     """The density of t given (some of) space, p(t | s) = FN(s, t) / p(s), by quadrature.
 
-    Made by `FoldedGaussian.time_given_space`.
+    Made by `FoldedGaussian.time_given_space`. A peak narrower than the spacing of floating-point times (one space
+    coordinate and a small `scale_tril` or a large |tau|) counts with its whole mass in probabilities, quantiles and
+    moments; `pdf(t)` is the density at exactly t, and may miss it.
 
-    Where time is known more narrowly than floating-point times lie apart (one space coordinate and a small `scale_tril`
-    or a large |tau|), probabilities, quantiles and moments have its mass, as an atom of sorts; `pdf(t)` has what it is
-    at the very number t, which may be next to nothing on both sides of the peak.
-
-    **Shapes:** `event_shape == ()`: values have shape (*sample, *batch). `log_normalizer` (*batch,) is log p(s).
-    It is +inf where p(s) diverges (`power (d-1) >= 2` and s on a ridge that stands still). `error_estimate` (*batch,)
-    is the estimated relative error of p(s), and so of every density and probability: large where p(s) hangs on the
-    rounding of s, `inf` where it diverges or log p(s) is -inf, of which nothing follows: quantiles and moments are NaN.
+    **Shapes:** `event_shape == ()`: values have shape (*sample, *batch). `log_normalizer` (*batch,) is log p(s),
+    +inf where p(s) diverges (`power (d-1) >= 2` and s on a static ridge). `error_estimate` (*batch,) is the estimated
+    relative error of p(s), and so of every density and probability: large where p(s) depends on the rounding of s,
+    `inf` where it diverges or log p(s) is -inf; quantiles and moments are then NaN.
 
     **Example:** `dist.time_given_space([0.3, 0.1]).mean`
 
@@ -108,7 +105,6 @@ class TimeDensity(eqx.Module):
 
     def modes(self) -> Float[Array, "*batch modes"]:
         """The local maxima of p(t | s), highest first, at most 8; NaN where there are fewer."""
-
         return map_over_batch(_modes, self.parent, (self.values, 1), self.panels)
 
     def _moments(self):
@@ -176,10 +172,9 @@ class TimeMixture(eqx.Module):
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """Estimated relative error of `pdf(x)`: that of its integrals over time.
 
-        It is large where p hangs on the rounding of x. In two and more space coordinates, far out or with a small
-        `scale_tril`, that is so for points on the curve to rounding, where the curve is narrower still: the density
-        *of this very number* is computed; that of the point meant may be greater by any factor. In one, only at a
-        turning point of the curve: anywhere else the curve passes every number on its way, at any width.
+        It is large where p depends on the rounding of x: in two or more space coordinates at points on a curve that is
+        narrower than their rounding (far from `time_loc`, or with a small `scale_tril`); in one space coordinate only
+        at a turning point of the curve.
         """
         x = self._checked(x)
         shape = jnp.broadcast_shapes(x.shape[:-1], self.batch_shape)
@@ -300,7 +295,7 @@ def time_density(parent, values: Float[Array, "*#batch d-1"]) -> TimeDensity:
 
 
 def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixture:
-    """Coordinates `kept` (and time) of a Folded-Gaussian given `values` of the space coordinates `given`."""
+    """The distribution of the space coordinates `kept` (and of time) given `values` of the coordinates `given`."""
     time = parent.event_shape[0] - 1
     ordered = parent.marginal((*given, *kept, time))
     density = time_density(parent.marginal((*given, time)), values) if given else None
@@ -308,7 +303,7 @@ def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixtur
 
 
 def conditional_gaussian(parent, values: Float[Array, "*#batch given"], t: Float[Array, "*#batch"]) -> Gaussian:
-    """The later space coordinates given t and the first ones: exact, all of it is Gaussian given t."""
+    """The Gaussian of the remaining space coordinates, given t and the first ones."""
     at = parent.condition_time(t)
     return condition_on_first(at, values) if values.shape[-1] else at
 
@@ -326,10 +321,10 @@ def _over(x: Array, batch: tuple[int, ...]) -> Array:
 
 
 def _centered(parent, s):
-    """The parent about 0 and the space coordinates s about there: integrals over tau without the offsets' rounding."""
+    """The parent and s, both centered at the parent's loc (and its time at 0), so that offsets cause no rounding."""
     offset = parent.loc[: s.size]
     parent = eqx.tree_at(lambda dist: dist.loc, parent, jnp.zeros_like(parent.loc))
-    if isinstance(parent.envelope, Constant | TimeLikelihood):  # others may know more of t than its distance
+    if isinstance(parent.envelope, Constant | TimeLikelihood):  # others may depend on t itself
         parent = eqx.tree_at(lambda dist: dist.time_loc, parent, jnp.zeros_like(parent.time_loc))
     return parent, s - offset
 
@@ -352,9 +347,9 @@ def _log_joint_frozen(parent, s):
 
 
 def _guides(parent, s, log_f):
-    """tau where mass may be: where the ridge comes near (peaks too narrow for a grid), and where the density peaks.
+    """Candidate peaks in tau: where the ridge comes near (too narrow for a grid), and peaks of the density on a grid.
 
-    And all of the former, NaN where there are fewer, by their distance from 0.
+    Also all points where the ridge comes near, by their distance from 0, NaN where there are fewer.
     """
     grid = jnp.asarray(SEARCH_GRID, s.dtype)
 
@@ -363,16 +358,16 @@ def _guides(parent, s, log_f):
         return Gaussian(here.loc, here.base_tril, validate_args=False).log_prob(_over(s, tau.shape))
 
     near = find_peaks(nearness, grid, _CROSSINGS, score=lambda tau: -(tau**2))
-    # A square tells its minimum to half the digits; the residual itself, which is linear there, to all of them.
+    # The minimum of a square is accurate to half the digits; Gauss-Newton on the residual gives all of them.
     near = lax.fori_loop(0, 3, lambda _, tau: _nearer(parent, s, tau), near)
     there = jnp.where(jnp.isnan(near), 0, near)
-    # A ridge far out is high because it is narrow: its mass goes without the factor a^(-(d-1)/2).
+    # Ranked by mass, not by density: a narrow ridge has a high density, by the factor a^(-(d-1)/2).
     mass = jnp.where(jnp.isnan(near), -jnp.inf, log_f(there) + s.size * gaussian_at(parent, there).log_scale)
     return jnp.concatenate([near[lax.top_k(mass, _BEST)[1]], find_peaks(log_f, grid, _MAXIMA)]), near
 
 
 def _nearer(parent, s, tau):
-    """A Gauss-Newton step from tau to where the ridge is nearest to s; no step that would be a long one."""
+    """A Gauss-Newton step from tau to where the ridge is nearest to s; long steps are not taken."""
     place, speed = jax.jvp(lambda tau: gaussian_at(parent, tau).loc[..., : s.size], (tau,), (jnp.ones_like(tau),))
     tril = parent.scale_tril[: s.size, : s.size]
     solve = lambda rows: lax.linalg.triangular_solve(tril, rows.T, left_side=True, lower=True)  # noqa: E731
@@ -397,10 +392,10 @@ def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
 
 
 def _log_rounding(parent, s, near, spikes: Panels | None):
-    """log of the error of p(s) from the rounding of s - c(tau), where the ridge comes as close as that.
+    """log of the error of p(s) from the rounding of s - c(tau), where the ridge comes that close.
 
-    Whitened, the residual is z and its rounding q: a factor exp(-(z - q)^2 / 2) of the density at best, an error of
-    q (z + q) at most. A spike does not know of it: its mass is where the curve passes, whatever its width.
+    For the whitened residual z with rounding q the density has a factor of at most exp(-(z - q)^2 / 2), and an error of
+    at most q (z + q). Crossings on their own panels (`spikes`) are integrated exactly and excluded.
     """
     tau = jnp.where(jnp.isnan(near), 0, near)
     eps, tril = jnp.finfo(s.dtype).eps, parent.scale_tril[: s.size, : s.size]
@@ -447,7 +442,7 @@ def _modes(parent, values, panels: Panels):
 
 
 def _same_top(log_f, found, height):
-    """Which maxima (highest first) are a higher one's, seen twice: a top flat to rounding has many of its own."""
+    """Which maxima (highest first) are duplicates of a higher one: a top that is flat up to rounding has many."""
     a, b = jnp.where(jnp.isnan(found), REACH, found)[:, None], found[None]
     eps = jnp.finfo(found.dtype).eps
     valley = log_f(0.5 * (a + b)) < height[None] - ROUNDING * eps * jnp.maximum(1, jnp.abs(height[None]))

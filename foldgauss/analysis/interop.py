@@ -26,7 +26,7 @@ def to_numpyro(dist: Any) -> "numpyro.distributions.Distribution":
     For anything here with `log_prob`, `sample`, `batch_shape` and `event_shape`. Parameters may be traced, so it
     can be built inside a model out of other sample sites; pass `validate_args=False` to the distribution there if
     its factor is assembled from them. As a *latent* site a time likelihood makes a funnel (space narrows as time
-    moves away), hard for NUTS as funnels are: sample a normal z there and use `dist.normal_to_fold(z)`.
+    moves away), which is hard for NUTS: sample a normal z there and use `dist.normal_to_fold(z)`.
 
     **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d.
 
@@ -52,7 +52,7 @@ def _numpyro_class() -> type:
         raise ImportError("to_numpyro needs numpyro: pip install 'foldgauss[numpyro]'.") from error
 
     class NumpyroDistribution(distributions.Distribution):
-        """A foldgauss distribution in numpyro's clothes."""
+        """A foldgauss distribution with numpyro's interface."""
 
         pytree_data_fields = ("base",)
 
@@ -154,7 +154,7 @@ class FrozenDistribution:
         return _numpy(_covariance(self._base))
 
     def _points(self, x):
-        """x as an array of events; a plain number is a point on the line, as in scipy."""
+        """x as an array of events; for one coordinate, numbers are points, as in scipy."""
         x = jnp.asarray(x, _dtype(self._base))
         return x[..., None] if self._event == (1,) and x.shape[-1:] != (1,) else x
 
@@ -175,8 +175,7 @@ def _numpy(x) -> np.ndarray:
 
 
 def _key(random_state):
-    draws_ints = hasattr(random_state, "integers")
-    if draws_ints:
+    if hasattr(random_state, "integers"):
         return jax.random.key(int(random_state.integers(2**31)))
     if hasattr(random_state, "randint"):
         return jax.random.key(int(random_state.randint(2**31 - 1)))
@@ -201,7 +200,7 @@ def _covariance(dist):
 
 
 def _entropy(dist):
-    """Nats; the Gaussians are written out, all else knows its own."""
+    """In nats."""
     if isinstance(dist, Normal):
         return 0.5 * np.log(2 * np.pi * np.e) + jnp.log(dist.scale)
     if isinstance(dist, Gaussian):
@@ -209,5 +208,5 @@ def _entropy(dist):
         return 0.5 * dim * np.log(2 * np.pi * np.e) + jnp.log(diagonal).sum(-1) + dim * dist.log_scale
     if not hasattr(dist, "entropy"):
         cure = "Average -logpdf over rvs."
-        raise invalid("entropy", expected="a distribution that knows its entropy", got=type(dist).__name__, cure=cure)
+        raise invalid("entropy", expected="a distribution with an entropy", got=type(dist).__name__, cure=cure)
     return dist.entropy()

@@ -1,4 +1,4 @@
-"""Moments, entropy and mode of a Folded-Gaussian: closed forms where there are any, one-dimensional rules elsewhere."""
+"""Moments, entropy and mode of a Folded-Gaussian: in closed form where one exists, else by quadrature over time."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,25 +13,12 @@ from foldgauss.fold import PolynomialFold, ZeroFold
 __all__ = ["entropy", "mean_envelope", "mean_log_envelope", "mode", "moments"]
 
 _LOG_2PI_E = float(np.log(2 * np.pi * np.e))
-# A ridge as high elsewhere as at its highest point, to this relative difference of densities, is no unique mode.
+# The mode is not unique if the density elsewhere on the ridge is as high up to this relative difference.
 _TIE = 1e-6
 
 
 def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
-    """Mean and covariance of x = (s, t).
-
-        E s = loc + E f(u),  Cov s = E[a] Sigma + Cov f(u),  Cov(s, t) = -E[f(u) u],  u ~ N(0, time_scale^2)
-
-    Exact for polynomial folds; others by a Gauss-Hermite rule of `order` nodes. `FoldedGaussian.moments` calls it.
-
-    **Shapes:** `dist` with batch (*batch,) -> (*batch, d) and (*batch, d, d), time last.
-
-    **Units:** of x, and their products.
-
-    **Example:** `moments(dist, 64)[0]  # as dist.mean`
-
-    **Source:** the laws of total mean and covariance given t.
-    """
+    """Mean (*batch, d) and covariance (*batch, d, d) of x = (s, t), time last: see `FoldedGaussian.moments`."""
     dist = broadcast_leaves(dist, dist.batch_shape)
     mean_f, cov_f, cross = _fold_moments(dist, order)
     mean = jnp.concatenate([dist.loc + mean_f, dist.time_loc[..., None]], axis=-1)
@@ -43,14 +30,7 @@ def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*
 
 
 def entropy(dist) -> Float[Array, "*batch"]:
-    """H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2: the fold has no part in it.
-
-    **Shapes:** batch (*batch,) -> (*batch,). **Units:** nats.
-
-    **Example:** `entropy(dist)  # as dist.entropy()`
-
-    **Source:** the chain rule, H(t) + H(s | t), with eq:cond_dens.
-    """
+    """Differential entropy in nats, (*batch,): see `FoldedGaussian.entropy`."""
     dist = broadcast_leaves(dist, dist.batch_shape)
     dim = dist.loc.shape[-1]
     log_det = jnp.log(jnp.diagonal(dist.scale_tril, axis1=-2, axis2=-1)).sum(-1)
@@ -59,10 +39,7 @@ def entropy(dist) -> Float[Array, "*batch"]:
 
 
 def mean_envelope(dist) -> Float[Array, "*batch"]:
-    """E[a(t)]: 1, or floor + (1 - floor) / sqrt(1 + power), or a quadrature.
-
-    **Shapes:** batch (*batch,) -> (*batch,), in (0, 1]. **Source:** eq:a_func_2d, integrated over t.
-    """
+    """E[a(t)] in (0, 1]: 1, or floor + (1 - floor) / sqrt(1 + power), or by quadrature (eq:a_func_2d)."""
     envelope = dist.envelope
     if isinstance(envelope, Constant):
         return jnp.ones_like(dist.time_loc)
@@ -72,10 +49,7 @@ def mean_envelope(dist) -> Float[Array, "*batch"]:
 
 
 def mean_log_envelope(dist) -> Float[Array, "*batch"]:
-    """E[log a(t)]: 0, or -power / 2 without a floor, or a quadrature.
-
-    **Shapes:** batch (*batch,) -> (*batch,), not above 0. **Source:** as `mean_envelope`.
-    """
+    """E[log a(t)] <= 0: 0, or -power / 2 without a floor, or by quadrature."""
     envelope = dist.envelope
     if isinstance(envelope, Constant):
         return jnp.zeros_like(dist.time_loc)
@@ -89,15 +63,7 @@ def mean_log_envelope(dist) -> Float[Array, "*batch"]:
 
 
 def mode(dist) -> Float[Array, "*batch d"]:
-    """The highest point of the density, (loc + f(0), time_loc) for the built-in envelopes, if it is the only one.
-
-    **Shapes:** batch (*batch,) -> (*batch, d), time last. **Units:** of x.
-
-    **Example:** `mode(dist)  # as dist.mode`
-
-    **Source:** the density along the ridge s = loc + f(u), eq:cond_dens.
-    **Raises:** ValueError that says whether the density has a ridge of modes, two modes, or none.
-    """
+    """The maximum of the density, (*batch, d), time last, if it is unique: see `FoldedGaussian.mode`."""
     envelope, batch = dist.envelope, dist.batch_shape
     if isinstance(envelope, Constant):
         return _ridge(dist, dist.time_loc)
@@ -156,7 +122,7 @@ def _log_envelope(dist, tau: Float[Array, " tau"]) -> Float[Array, " tau *batch"
     dist = broadcast_leaves(dist, dist.batch_shape)
     rank = dist.time_loc.ndim + 1
     tau = tau.reshape(-1, *(1,) * (rank - 1))
-    if isinstance(dist.envelope, TimeLikelihood):  # knows tau only, which t = time_loc + .. may lose in rounding
+    if isinstance(dist.envelope, TimeLikelihood):  # depends on tau only, which t = time_loc + ... may round
         zero, one = jnp.zeros_like(dist.time_loc)[None], jnp.ones_like(dist.time_scale)[None]
         return expand_leaves(dist.envelope, rank).log_a(tau, time_loc=zero, time_scale=one)
     t = dist.time_loc[None] + dist.time_scale[None] * tau
@@ -170,7 +136,7 @@ def _ridge(dist, t) -> Float[Array, "*batch d"]:
 
 
 def _refuse_no_mode(unique, envelope, dim: int) -> None:
-    """Raise where values are known and say that the mode is not unique."""
+    """Raise if concrete values show that the mode is not unique."""
     unique, power, floor = (concrete_value(x) for x in (unique, envelope.power, envelope.floor))
     if unique is None or unique.all():
         return
@@ -187,7 +153,7 @@ def _refuse_no_mode(unique, envelope, dim: int) -> None:
 
 
 def _highest_time(dist) -> Float[Array, "*batch"]:
-    """Where the ridge is highest under an envelope of the user's: searched for in tau from -40 to 40."""
+    """The time of the highest point of the ridge for any envelope, searched for in tau from -40 to 40."""
     tau, tied = map_over_batch(_highest_tau, dist)
     refused = concrete_value(tied)
     if refused is not None and refused.any():

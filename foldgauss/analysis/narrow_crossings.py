@@ -1,7 +1,7 @@
-"""Where a narrow curve passes a number: its mass in time, whatever its width.
+"""The mass in time of narrow crossings: times at which a curve of small width passes a given space coordinate.
 
-In one space coordinate a Folded-Gaussian far from its time is a curve of next to no width, which passes a given number
-within fewer times than floating point has. No sum over times sees that; in other coordinates it is smooth.
+With one space coordinate and far from `time_loc`, a crossing may be shorter than the spacing of floating-point times,
+so that quadrature over time misses it. Integrated over the standardized residual instead, it is smooth.
 """
 
 import jax
@@ -15,13 +15,13 @@ from foldgauss.analysis.quadrature import KRONROD_NODES, REACH, SEARCH_GRID, Pan
 from foldgauss.gaussian import Gaussian
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
-_TURNS = 8  # turning points of a curve up and down
+_TURNS = 8  # turning points of a curve
 _SPIKES = 12  # narrow crossings of the curve, each on its own panels
 _SPIKE_PANELS = 7  # odd: the middle is a node
 _WIDEST = 9.0  # standard deviations to each side: exp(-40) of the mass is beyond
 _NEWTON_STEPS = 6
 _STEADY = 0.02  # a crossing is narrow if speed and phi(tau) vary by no more, relative, over all of it
-ROUNDING = 64  # roundings that a solved equation may be off
+ROUNDING = 64  # tolerance of a solved equation, in epsilons
 
 
 def gaussian_at(parent, tau) -> Gaussian:
@@ -33,11 +33,10 @@ def crossing_panels(parent, s) -> tuple[Panels, Array]:
 
         p(s, tau) dtau = phi(z) phi(tau) / |dF / dtau| dz,   F(tau, z) = c(tau) + z width(tau) - s = 0
 
-    with width^2 = a Sigma. A crossing that is narrow in tau is broad and smooth in z, at any width: as a goes to 0
-    this is phi(tau) / |dc / dtau|, the mass of time over the speed of the curve. Taken are those where F is nearly
-    linear up to |z| = _WIDEST; others are broad enough for panels in tau.
+    with width^2 = a Sigma. A crossing that is narrow in tau is smooth in z at any width: as a goes to 0 its mass is
+    phi(tau) / |dc / dtau|. Crossings where F is not nearly linear up to |z| = _WIDEST are left to panels in tau.
 
-    Also log of the mass of crossings that are too many: panels in tau may find them, or not.
+    Also returns the log mass of crossings beyond _SPIKES, which panels in tau may miss.
     """
     frozen = lax.stop_gradient((parent, s))
     tau, log_unseen = _crossings(*frozen)
@@ -57,7 +56,7 @@ def crossing_panels(parent, s) -> tuple[Panels, Array]:
     at = lax.fori_loop(0, _NEWTON_STEPS, lambda _, at: newton(frozen, at, True)[0], at)
     narrow = _is_narrow(*frozen, at, z)[:, None]
     at = jnp.where(narrow, at, 0)
-    at, _ = newton((parent, s), at, narrow)  # derivatives: right to first order after one step, to third after two
+    at, _ = newton((parent, s), at, narrow)  # one step gives derivatives to first order, two to third
     at, slope = newton((parent, s), at, narrow)
     at = jnp.where(narrow, at, REACH)
     log_values = -0.5 * (z**2 + at**2) - 2 * _HALF_LOG_2PI - jnp.log(jnp.abs(slope))
@@ -65,7 +64,7 @@ def crossing_panels(parent, s) -> tuple[Panels, Array]:
     nodes, log_values = (x[:, ends.size : -1].reshape(shape) for x in (lax.stop_gradient(at), log_values))
     edges = lax.cummax(lax.stop_gradient(at)[:, : ends.size], axis=1)
     spacing = 4 * jnp.finfo(s.dtype).eps * jnp.abs(edges)
-    edges = edges.at[:, 0].add(-spacing[:, 0]).at[:, -1].add(spacing[:, -1])  # Newton's last digit
+    edges = edges.at[:, 0].add(-spacing[:, 0]).at[:, -1].add(spacing[:, -1])  # the rounding of Newton's method
     log_half = jnp.broadcast_to(jnp.where(narrow, float(np.log(half)), -jnp.inf), shape[:2])
     return Panels(edges[:, :-1], edges[:, 1:], nodes, log_half, log_values), log_unseen
 
@@ -133,7 +132,7 @@ def _is_narrow(parent, s, at, z):
     solved = jnp.abs(gap) <= ROUNDING * jnp.finfo(s.dtype).eps * size
     steady = jnp.abs(slope - slope[last]) <= _STEADY * jnp.abs(slope[last])
     near = jnp.abs(at - at[last]) * jnp.maximum(1, jnp.abs(at[last])) <= _STEADY
-    return (solved & steady & near & (slope != 0)).all(-1)  # NaN is none of it
+    return (solved & steady & near & (slope != 0)).all(-1)  # False for NaN
 
 
 def crossing_modes(parent, s, spikes: Panels):

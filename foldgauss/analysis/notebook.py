@@ -1,4 +1,4 @@
-"""What a notebook shows of a distribution or a fit: a small picture, or nothing, but never an error."""
+"""Small figures of distributions and fits for notebooks; nothing is shown where one cannot be made, never an error."""
 
 import functools
 import io
@@ -15,9 +15,9 @@ from foldgauss.analysis.plot import plot_density, plot_history
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Components drawn, the heaviest; space coordinates drawn; times and places of a picture.
+#: The largest number of components plotted; of space coordinates; points of the grid along each axis.
 _MOST, _SPACES, _GRID = 48, 3, 120
-#: Times shown, in time_scales to either side, and places, in deviations; where a path is bold.
+#: Range of time in time_scales to either side, of space in standard deviations, and of paths in time_scales.
 _REACH, _WIDE, _BOLD = 2.6, 3.0, 1.5
 _DPI, _WIDTH, _HEIGHT = 80, 3.6, 2.8
 _RED = "#d1242f"
@@ -35,14 +35,14 @@ class _Bells(NamedTuple):
 
 
 def png_or_none(draw: Callable[..., "Figure"]) -> Callable[..., bytes | None]:
-    """The figure as a PNG; None where it cannot be had: no matplotlib, numbers that are traced or not finite."""
+    """The figure as a PNG; None without matplotlib, and for values that are traced or not finite."""
 
     @functools.wraps(draw)
     def png(*arguments: Any) -> bytes | None:
         try:
             figure, file = draw(*arguments), io.BytesIO()
             figure.savefig(file, format="png", dpi=_DPI)
-        except Exception:  # a display may not break the cell that it is the display of
+        except Exception:  # a display must not break the cell
             return None
         return file.getvalue()
 

@@ -1,8 +1,8 @@
-"""One-dimensional integrals: against a normal by fixed rules, and of any log-density adaptively around its mass.
+"""One-dimensional quadrature: fixed rules for a normal weight, and an adaptive rule for any log-density.
 
-The adaptive rule is Gauss-Kronrod (7, 15) on panels that are halved where their error is largest, a fixed number
-of times, so that it compiles. It works with logarithms: neither a mass of exp(-10^6) nor a peak 1e-9 wide is lost.
-Where the panels lie is not differentiated, what they sum up to is.
+The adaptive rule is Gauss-Kronrod (7, 15), halving the panels of the largest error a fixed number of times, so that it
+compiles. It works on logarithms, so that a mass of exp(-10^6) does not underflow. Derivatives are those of the sum,
+not of the panels' edges.
 """
 
 from collections.abc import Callable
@@ -61,10 +61,10 @@ _KRONROD = np.r_[_WEIGHTS, _WEIGHTS[-2::-1]]
 _GAUSS = np.zeros(15)
 _GAUSS[1::2] = [*_GAUSS_WEIGHTS, *_GAUSS_WEIGHTS[-2::-1]]
 
-# Where an integral over tau ends: a log-density of -5e7 is behind it.
+# The range of integrals over tau: beyond, a normal log-density is below -5e7.
 REACH = 1e4
 _BASE = np.r_[-REACH, -1e3, -1e2, -40.0, -20.0, np.linspace(-10, 10, 41), 20.0, 40.0, 1e2, 1e3, REACH]
-# Peaks are looked for in steps of 0.05 where a normal has its mass, and in growing steps outside.
+# Peaks are searched for in steps of 0.05 where a normal has its mass, and in growing steps outside.
 _TAIL = np.geomspace(10, REACH, 150)
 SEARCH_GRID = np.r_[-_TAIL[::-1], np.linspace(-10, 10, 401)[1:-1], _TAIL]
 _LADDER = 20.0 * 4.0 ** -np.arange(13)  # distances of panel edges around each peak
@@ -81,7 +81,7 @@ def gauss_hermite(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def normal_rule() -> tuple[np.ndarray, np.ndarray]:
-    """The like of `gauss_hermite` for functions that are no polynomials: Gauss-Legendre on panels of width 1/4."""
+    """As `gauss_hermite`, for functions other than polynomials: Gauss-Legendre on panels of width 1/4."""
     y, weights = np.polynomial.legendre.leggauss(12)
     centers = np.arange(-12, 12, 0.25)[:, None] + 0.125
     z = (centers + 0.125 * y).ravel()
@@ -92,8 +92,8 @@ def normal_rule() -> tuple[np.ndarray, np.ndarray]:
 class Panels(eqx.Module):
     """Panels of an adaptive integral of exp(log_f), sorted, with log_f at the 15 nodes of each.
 
-    A panel may lie in another variable than x, one in which a spike of exp(log_f) is broad: `log_half` and
-    `log_values` are of that variable, `left`, `right` and `nodes` of x, where they may be one number.
+    A panel may be integrated in another variable, in which a narrow peak is smooth: `log_half` and `log_values` are of
+    that variable; `left`, `right` and `nodes` are of x, where they may coincide.
 
     **Shapes:** `left`, `right` (*batch, panels), `nodes` (*batch, panels, 15), `log_half`, the log of half a panel's
     width, (*batch, panels), `log_values` (*batch, panels, 15).
@@ -109,9 +109,7 @@ class Panels(eqx.Module):
     log_half: Float[Array, "*batch panels"]
     log_values: Float[Array, "*batch panels 15"]
 
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (1, 1, 2, 1, 2)
+    leaf_ranks = (1, 1, 2, 1, 2)
 
     @property
     def log_weights(self) -> Float[Array, "*batch panels 15"]:
@@ -138,23 +136,23 @@ class Panels(eqx.Module):
 
     @property
     def weights(self) -> Float[Array, "*batch panels 15"]:
-        """Shares of the integral: they sum to 1, as exp(log_weights - log_total) would not where log_total is large."""
+        """Fractions of the integral; their sum is 1, which exp(log_weights - log_total) misses for large log_total."""
         return jax.nn.softmax(self.log_weights, axis=(-2, -1))
 
     @property
     def probabilities(self) -> Float[Array, "*batch panels"]:
-        """Each panel's share of the integral; NaN if that is 0."""
+        """Each panel's fraction of the integral; NaN if that is 0."""
         return self.weights.sum(-1)
 
     def expectation(self, function: Float[Array, "panels 15 *event"]) -> Float[Array, "*event"]:
         """Mean of values given at `nodes` under the normalized density; one integral, not a batch."""
         weights = self.weights
-        # Far out, where no mass is, a function may overflow: 0 * inf is 0 here.
+        # Where there is no mass, a function may overflow: 0 * inf is 0 here.
         weighs = lax.expand_dims(weights > 0, range(2, function.ndim))
         return jnp.tensordot(weights, jnp.where(weighs, function, 0), axes=2)
 
     def cdf(self, x: Float[Array, ""]) -> Float[Array, ""]:
-        """Share of the integral left of x; one integral, not a batch."""
+        """Fraction of the integral left of x; one integral, not a batch."""
         # Panels without width in x are atoms: right-continuous, P(X <= x).
         index = jnp.clip(jnp.searchsorted(self.right, x, side="right"), 0, self.right.size - 1)
         probabilities = self.probabilities
@@ -203,10 +201,9 @@ def adaptive_panels(
 ) -> Panels:
     """Panels for the integral of exp(log_f) over [-REACH, REACH], fine around `guides` (see `find_peaks`).
 
-    `search` is `log_f` without derivatives, where `log_f` has parameters to be differentiated. `spikes` (panels of
-    shape (spikes, panels)) are taken over as they are, each in place of log_f from its first edge to its last.
-
-    **Shapes:** `log_f` is elementwise. **Raises:** nothing; see `diverges` for a mass that does not fall off.
+    `log_f` is elementwise. `search` is `log_f` without derivatives, if it has parameters to be differentiated. `spikes`
+    (panels of shape (spikes, panels)) replace log_f, each from its first edge to its last. See `diverges` for an
+    integral that is infinite.
     """
     search, guides = log_f if search is None else search, lax.stop_gradient(guides)
     if spikes is None:
@@ -214,7 +211,7 @@ def adaptive_panels(
         return Panels(left, right, _nodes(left, right), _log_width(left, right), log_f(_nodes(left, right)))
     holes = lax.stop_gradient((spikes.left[:, 0], spikes.right[:, -1]))
     left, right = _found_panels(search, guides, holes)
-    # Panels inside a hole give way, to its low edge, so that right edges stay sorted.
+    # Panels inside a hole shrink to its low edge, so that right edges stay sorted.
     middle = 0.5 * (left + right)[None]
     low = jnp.where((middle > holes[0][:, None]) & (middle < holes[1][:, None]), holes[0][:, None], -jnp.inf).max(0)
     left, right = (jnp.where(jnp.isneginf(low), edge, low) for edge in (left, right))
@@ -227,9 +224,9 @@ def adaptive_panels(
 
 
 def diverges(log_f: _Log, panels: Panels) -> Array:
-    """Whether the integral's mass reaches the ends of the line."""
+    """Whether the integral is infinite: the integrand does not decay towards the ends of the range."""
     ends = log_f(jnp.asarray([-REACH, REACH], panels.left.dtype)).max()
-    # e^-20 of the total at the ends, were they as wide as they are far, is no tail of a finite integral here.
+    # A finite integral has less than e^-20 of its total in ends of width REACH.
     return ends + float(np.log(REACH)) > panels.log_total - 20.0
 
 
@@ -272,7 +269,7 @@ def is_within_any(holes: tuple[Array, Array], x: Array) -> Array:
 
 
 def _found_panels(log_f: _Log, guides: Array, holes: tuple[Array, Array] | None) -> tuple[Array, Array]:
-    """Left and right edges after all halvings, sorted; none lies across an edge of a hole, where nothing is."""
+    """Left and right edges after all halvings, sorted; no panel crosses an edge of a hole, which is left out."""
     dtype = guides.dtype
     ladder = jnp.asarray(np.r_[0, _LADDER, -_LADDER], dtype)
     extra = (jnp.where(jnp.isnan(guides), 0, guides)[:, None] + ladder[None, :]).ravel()

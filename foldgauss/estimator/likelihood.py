@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
+from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss._numerics.triangular import solve_upper_matrix
 from foldgauss._runtime.checks import check_one_of, invalid
@@ -219,7 +220,7 @@ class _Data(NamedTuple):
 
 
 class _Plan(eqx.Module):
-    """The check arguments of `fit`, in the dtype of x."""
+    """The checked arguments of `fit`, in the dtype of x."""
 
     x: Float[Array, "n d"]
     weights: Float[Array, " n"]
@@ -239,8 +240,7 @@ def _make_plan(x, degree, power, floor, envelope, time, time_loc, time_scale, we
     given = _check_time(time_loc, time_scale, x.dtype)
     if given is None and time == "joint":
         _check_bounded(envelope, x.shape[1])
-    envelope = jax.tree.map(lambda leaf: leaf.astype(x.dtype) if eqx.is_inexact_array(leaf) else leaf, envelope)
-    return _Plan(x, weights, given, envelope, degree, time if given is None else "given", covariance)
+    return _Plan(x, weights, given, cast(envelope, x.dtype), degree, time if given is None else "given", covariance)
 
 
 @eqx.filter_jit
@@ -260,7 +260,7 @@ def _fit(plan: _Plan, weights: Float[Array, " n"], used: Int[Array, ""]) -> Fit:
     status = _status(data, space, used + (2 if diagonal else plan.x.shape[1]), singular_time, converged)
     result = _assemble_fit(plan, data, space, (time_loc, time_scale), status, steps, used)
     failed = (status != FitStatus.OK) & (status != FitStatus.NOT_CONVERGED)
-    return jax.tree.map(lambda leaf: _nan_where(failed, leaf), result)
+    return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, result)
 
 
 def _prepare_data(x, weights, degree: int) -> _Data:
@@ -348,10 +348,6 @@ def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
 
 def _norm(rows):
     return jnp.sqrt((rows * rows).sum(-1))
-
-
-def _nan_where(failed, leaf):
-    return jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf
 
 
 def _num_parameters(degree: int, dim: int, time: str, covariance: str) -> int:
@@ -487,7 +483,8 @@ def select_degree(
         raise invalid("options", expected="options of fit", got=", ".join(sorted(unknown)), cure="See fit.")
     plan = _make_plan(x, **(defaults | options | {"degree": _check_degree("max_degree", max_degree)}))
     if criterion == "cv":
-        scores = _cross_validate(plan, _assign_folds(plan.x, jax.random.key(0) if key is None else key))
+        key = jax.random.key(0) if key is None else key
+        scores = _cross_validate(plan, jax.random.permutation(key, jnp.arange(len(plan.x)) % _CV_FOLDS))
     else:
         scores = _penalize(plan, criterion)
     scores = np.where(np.isfinite(scores), scores, np.inf)
@@ -503,11 +500,6 @@ def _penalize(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
     dim = plan.x.shape[1] - 1
     free = jnp.array([_num_parameters(k, dim, plan.time, plan.covariance) for k in degrees], plan.x.dtype)
     return _CRITERIA[criterion](fits.log_likelihood, free, fits.num_points)
-
-
-def _assign_folds(x, key) -> Int[Array, " n"]:
-    """The cross-validation fold of each point, at random and of equal sizes."""
-    return jax.random.permutation(key, jnp.arange(x.shape[0]) % _CV_FOLDS)
 
 
 @eqx.filter_jit

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -11,7 +12,7 @@ from jaxtyping import Int
 
 from foldgauss.envelope import AbstractEnvelope
 from foldgauss.estimator.chunks import Piece
-from foldgauss.estimator.em.components import Parameters, evaluate_densities, log_likelihoods
+from foldgauss.estimator.em.components import Parameters, evaluate_densities
 from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import Points, enable_dtype, log_densities, make_blocks
 
@@ -76,7 +77,7 @@ def compute_responsibilities(params: Parameters, envelope: AbstractEnvelope, poi
 
     def of_chunk(x):
         log_density = evaluate_densities(params, envelope, x).log_density
-        total = log_likelihoods(log_density)[:, None]
+        total = jax.nn.logsumexp(log_density, axis=-1, keepdims=True)
         reached = jnp.isfinite(total)
         responsibilities = jnp.exp(log_density - jnp.where(reached, total, 0))
         return jnp.where(reached, responsibilities, jnp.exp(params.log_weights)[None])

@@ -13,7 +13,6 @@ import math
 import operator
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,7 +23,7 @@ from foldgauss._numerics.triangular import UNROLLED_SIZE
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.cholesky import inverse_lower, log_det
 
-__all__ = ["Densities", "Parameters", "change_variable", "evaluate_densities", "log_likelihoods", "to_powers"]
+__all__ = ["Densities", "Parameters", "change_variable", "evaluate_densities", "to_powers"]
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -106,8 +105,3 @@ def _evaluate_polynomial(
 
 def _add_up(terms):
     return functools.reduce(operator.add, terms)
-
-
-def log_likelihoods(log_density: Float[Array, "n k"]) -> Float[Array, " n"]:
-    """log sum_k; -inf where every term is."""
-    return jax.nn.logsumexp(log_density, axis=-1)

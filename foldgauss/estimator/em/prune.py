@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from foldgauss._numerics.regression import hermite_to_powers
 from foldgauss.envelope import AbstractEnvelope
 from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
-from foldgauss.estimator.em.components import Parameters, evaluate_densities, log_likelihoods, to_powers
+from foldgauss.estimator.em.components import Parameters, evaluate_densities, to_powers
 from foldgauss.estimator.em.loop import log_likelihood, run_em, select_best
 from foldgauss.estimator.em.statistics import Blocks, Points, SufficientStatistics, accumulate, sum_over_points
 from foldgauss.estimator.em.updates import Model, residual_scatter
@@ -110,7 +110,7 @@ def _remove_component(candidate: _Candidate, points, envelope, refit, total: flo
 
 def _lower_degrees(candidate: _Candidate, points, envelope, refit, penalty: float) -> _Candidate | None:
     """Remove a power in every component where that should lower the score; if all together do not, in the first."""
-    sums = sum_over_points(_accumulate, points, candidate.params, envelope)
+    sums = sum_over_points(accumulate, points, candidate.params, envelope)
     losses = np.asarray(_degree_losses(sums, candidate.params, candidate.model), np.float64)
     degrees, dim = np.asarray(candidate.model.degrees), candidate.params.tril.shape[-1]
     superfluous = (2 * losses < penalty * dim) & (degrees > 0) & (np.asarray(candidate.params.log_weights) > -np.inf)
@@ -131,17 +131,13 @@ def _refit_with_degrees(candidate: _Candidate, degrees: np.ndarray, refit) -> _C
     return refit(candidate.params._replace(curve=curve), model)
 
 
-def _accumulate(params: Parameters, envelope, points: Points) -> SufficientStatistics:
-    return accumulate(params, envelope, points)
-
-
 def _log_likelihoods_without(params: Parameters, envelope, points: Points) -> Float[Array, " k"]:
     """The log-likelihood without each component, up to normalizing the remaining weights."""
 
     def of_chunk(chunk):
         x, weights = chunk
         log_density = evaluate_densities(params, envelope, x).log_density
-        total = log_likelihoods(log_density)[:, None]
+        total = jax.nn.logsumexp(log_density, axis=-1, keepdims=True)
         eps = jnp.finfo(total.dtype).eps
         rest = total + jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_density - total, 0)), eps))
         return jnp.where((weights > 0)[:, None], weights[:, None] * rest, 0).sum(0)

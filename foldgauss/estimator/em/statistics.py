@@ -27,7 +27,7 @@ from foldgauss._numerics.regression import hermite_columns
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.chunks import Chunks, Piece
-from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities, log_likelihoods
+from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities
 
 __all__ = [
     "PAIRS_PER_CHUNK",
@@ -241,7 +241,7 @@ def log_densities(
     """log p(x) of every point."""
 
     def of_chunk(x):
-        return log_likelihoods(evaluate_densities(params, envelope, x).log_density)
+        return jax.nn.logsumexp(evaluate_densities(params, envelope, x).log_density, axis=-1)
 
     def of_device(chunks):
         return of_chunk(chunks[0])[None] if chunks.shape[0] == 1 else lax.map(of_chunk, chunks)

@@ -50,7 +50,7 @@ def update_components(
     else:
         time_loc, time_scale = step_times(Times(params.time_loc, params.time_scale), steps)
         time_scale = jnp.maximum(time_scale, jnp.sqrt(model.floor[-1]))
-    change, scatter = _regress(sums.gram[0], model, params.degree)
+    change, scatter, _ = _solve_regression(sums.gram[0], model, params.degree)
     curve = params.curve + jnp.einsum("kjb,kab->kja", to_powers(change), params.tril)
     curve = change_variable(curve, (params.time_loc - time_loc) / params.time_scale, time_scale / params.time_scale)
     tril = _update_factor(params.tril, scatter, sums.mass, mass, model)
@@ -59,11 +59,6 @@ def update_components(
     usable = usable & jnp.isfinite(tril).all((-2, -1)) & jnp.isfinite(curve).all((-2, -1))
     choose = lambda z, old: jnp.where(usable.reshape(-1, *[1] * (z.ndim - 1)), z, old)  # noqa: E731
     return jax.tree.map(choose, new, params)._replace(log_weights=new.log_weights), ~usable
-
-
-def _regress(gram, model: Model, degree: int) -> tuple[Float[Array, "k q+1 p"], Float[Array, "k p p"]]:
-    """The change of the curve, in Hermite polynomials and whitened space, and the residuals' scatter."""
-    return _solve_regression(gram, model, degree)[:2]
 
 
 def residual_scatter(sums: SufficientStatistics, params: Parameters, model: Model) -> Float[Array, "k p p"]:
@@ -81,7 +76,8 @@ def residual_scatter(sums: SufficientStatistics, params: Parameters, model: Mode
 
 
 def _solve_regression(gram, model: Model, degree: int):
-    """As `_regress`, and the inverse of the design's Cholesky factor, 0 for powers above a component's degree."""
+    """The change of the curve (k, q+1, p), in Hermite polynomials and whitened space; the residuals' scatter (k, p, p);
+    and the inverse of the design's Cholesky factor, 0 for powers above a component's degree."""
     active = jnp.arange(degree + 1, dtype=model.degrees.dtype)[None] <= model.degrees[:, None]
     pairs = active[:, :, None] & active[:, None]
     design = jnp.where(pairs, gram[:, : degree + 1, : degree + 1], 0)
@@ -131,7 +127,7 @@ def profile_log_likelihood(
     `gram` and `log_a` are those at the stepped times. A tied Sigma is fixed, as a single component cannot change it.
     """
     mass = jnp.where(sums.mass > 0, sums.mass, 1)
-    _, scatter = _regress(gram, model, degree)
+    _, scatter, _ = _solve_regression(gram, model, degree)
     dim = scatter.shape[-1]
     square = jnp.exp(-2 * steps[1]) * (sums.second + 2 * steps[0] * sums.first + steps[0] ** 2 * sums.mass)
     value = -0.5 * square - sums.mass * steps[1] - 0.5 * dim * log_a
