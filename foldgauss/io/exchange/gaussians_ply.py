@@ -40,10 +40,9 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
     **Shapes:** leaves of `Gaussians3D` of the Gaussians alive at t, NumPy. **Units:** model space (see
     `foldgauss.render.camera`); `depth_step` in its units too.
 
-    All Gaussians of a frame lie in one plane and occlude each other in array order. Here each is placed `depth_step`
-    behind the one before, and is larger by as much as it is farther from the front camera, so that this camera sees
-    exactly the image of the model, and programs that sort by depth blend in the model's order. From elsewhere the
-    layers shift against each other by `depth_step` times their number; 0 puts all of them into the plane.
+    Gaussians of a frame occlude each other in array order. Here each is placed `depth_step` behind the one before, and
+    enlarged in proportion to its distance from the front camera, so that this camera sees the image of the model and
+    programs that sort by depth blend in its order. 0 puts all of them into one plane.
 
     **Raises:** ValueError for a step or a time outside [0, 1].
 

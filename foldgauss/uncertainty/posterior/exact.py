@@ -106,8 +106,7 @@ def exact_posterior(curves: ProfileCurves, increments: Increments) -> ExactPoste
     evidence to 1e-2 nats for a hundred frames; for concentrations from 0.2 to 20, and likelihoods from flat to much
     narrower than the distance of frames. Worst for the smallest concentrations, whose densities are infinite beside
     frames with narrow likelihoods.
-    **Cost:** for n frames, O(n) grids at concentration 1, else about n 500^2 powers (150 frames with flat likelihoods:
-    about 1 s, and 6 s).
+    **Cost:** for n frames, O(n) grids at concentration 1, else about n 500^2 powers.
     **Raises:** ValueError if no ordered times have positive likelihood, that is, if the likelihoods of frames exceed
     exp(-740) of their maxima only in the wrong order; NaN in the curves.
     """

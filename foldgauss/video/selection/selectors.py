@@ -370,9 +370,8 @@ def by_click(
     """The object at a click: grown from the greatest contributor at the pixel (x, y) of `frame`, along its motion.
 
     A Gaussian is included if it *looks* like the pixel, to within `tolerance`, and is linked to it by a chain of such
-    neighbours, which touch and move alike in most of the frames in which they touch. The set extends through time up to
-    the cuts of the shot, and ends where the colour or the motion changes; a static background of one colour has neither
-    boundary, so intersect with a box. Gaussians visible in none of the frames examined (at most 48) are left out.
+    neighbours, which touch and move alike in most of the frames in which they touch, up to the cuts of the shot. A
+    static background of one colour has no boundary: intersect with a box. At most 48 frames are examined.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 
