@@ -223,7 +223,8 @@ class EditScript:
         video = self._stacked(edits.video())
         if "camera" in self.tables:
             with self._at("camera"):
-                video = edit(video).seen_from(_camera(self.tables["camera"], video.size)).video()
+                angles = (math.radians(self.tables["camera"].get(key, 0.0)) for key in ("azimuth", "elevation"))
+                video = edit(video).seen_from(Camera.front(video.size[0] / video.size[1]).orbit(*angles)).video()
         return video
 
     def _selected(self, video: Video, table: dict[str, Any], named: dict[str, Selected]) -> Selected:
@@ -494,11 +495,6 @@ def _with_pairs(table: dict[str, Any]) -> dict[str, Any]:
 def _pair(value: list[float] | str) -> tuple[float | None, ...]:
     ends = value.split(":") if isinstance(value, str) else value
     return tuple((int(end) if end else None) if isinstance(end, str) else end for end in ends)
-
-
-def _camera(table: dict[str, Any], size: tuple[int, int]) -> Camera:
-    azimuth, elevation = (math.radians(table.get(key, 0.0)) for key in ("azimuth", "elevation"))
-    return Camera.front(size[0] / size[1]).orbit(azimuth, elevation)
 
 
 def _radians(degrees: float | list[float]) -> float | list[float]:
