@@ -231,7 +231,6 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return ChunkedRows(chunks, summary, sizes, order, dtype)
 
     def _order_columns(self, num_columns: int) -> Int[np.ndarray, " d"]:
-        """The columns of X with time last."""
         return order_columns(check_column(self.time_column, num_columns), num_columns)
 
     def _run(self, data: Rows | ChunkedRows) -> tuple[Run, Model]:
@@ -400,9 +399,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             params, sums = update_online(params, sums, new, model, jnp.asarray(fraction, scaled.dtype))
         status = EMStatus.NOT_CONVERGED if np.isfinite(value) else EMStatus.NOT_FINITE
         if status == EMStatus.NOT_FINITE:
-            raise invalid(
-                "X", expected="a batch near the components", got="densities that underflow", cure="Shuffle the data."
-            )
+            expected, got = "a batch near the components", "densities that underflow"
+            raise invalid("X", expected=expected, got=got, cure="Shuffle the data.")
         history = [*self._history, value]
         self._set_fitted(Run(params, value - self._scaling.log_volume, history, batches, status, 0), model)
         self._online, self._history = (sums, seen + total, batches, model), history
