@@ -22,11 +22,11 @@ from foldgauss.estimator.chunks import Chunks, is_chunked, open_chunks, summariz
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import draw_subset, initialize, params_from_gaussians, restrict_covariances
 from foldgauss.estimator.em.loop import EMStatus, Run, broadcast_degrees, run_em, select_best
+from foldgauss.estimator.em.m_step import Model
 from foldgauss.estimator.em.online import FORGETTING, compute_batch_statistics, update_online
 from foldgauss.estimator.em.prune import count_parameters, drop_unused, prune_mixture
 from foldgauss.estimator.em.scaling import Scaling, compute_scaling, to_mixture
 from foldgauss.estimator.em.statistics import Blocks, Points, enable_dtype, make_points
-from foldgauss.estimator.em.updates import Model
 from foldgauss.estimator.parameter_checks import (
     check_array,
     check_column,

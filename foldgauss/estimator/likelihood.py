@@ -22,7 +22,7 @@ from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
-from foldgauss.estimator.time_profile import Profile, Space, maximize
+from foldgauss.estimator.profile_likelihood import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
 __all__ = ["CenterParameters", "DegreeChoice", "Fit", "FitStatus", "Replicates", "bootstrap", "fit", "select_degree"]

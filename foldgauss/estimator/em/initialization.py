@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.components import Parameters
+from foldgauss.estimator.em.m_step import Model, update_components
 from foldgauss.estimator.em.statistics import Points, accumulate, make_points
-from foldgauss.estimator.em.updates import Model, update_components
 
 __all__ = [
     "INITIALIZERS",

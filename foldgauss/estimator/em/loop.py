@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.components import Parameters
+from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
 from foldgauss.estimator.em.statistics import (
     Blocks,
     Points,
@@ -23,7 +24,6 @@ from foldgauss.estimator.em.statistics import (
     step_times,
     sum_over_points,
 )
-from foldgauss.estimator.em.updates import Model, newton_step, profile_log_likelihood, update_components
 
 __all__ = ["EMStatus", "Run", "State", "broadcast_degrees", "log_likelihood", "run_em", "select_best", "step"]
 
