@@ -90,12 +90,14 @@ class Checkpoint:
 
 @dataclasses.dataclass(frozen=True)
 class FitRun:
-    """A finished fit of a job: its frames, its model and the `info` of the last step."""
+    """A finished fit of a job: its frames, its model, the `info` and the state of the last step."""
 
     job: FitJob
     clip: Clip
     model: VideoModel
     info: FitInfo
+    state: FitState
+    checkpoint: Checkpoint
 
     def save(self, scores: Evaluation | None = None) -> None:
         """Write the model, with its mean scores once they are measured."""
@@ -109,9 +111,12 @@ def run_fit(
     observer: OpenObserver,
     *,
     resume: Literal["required", "if possible", "never"] = "if possible",
+    save_last: bool = True,
     on_checkpoint_error: CheckpointError = lambda error, step: None,
 ) -> FitRun:
-    """Fit the frames of a job, from its checkpoint if it resumes; the last state is saved in the checkpoint.
+    """Fit the frames of a job, from its checkpoint if it resumes.
+
+    With `save_last` the last state is saved, too, so that scores can be measured again after an interruption.
 
     With `resume` "never", the first step removes an old checkpoint. The observer is opened once the frames are read.
     Neither the model nor a record is written: see `FitRun.save`.
@@ -127,8 +132,8 @@ def run_fit(
     if resume == "never":
         steps = _replacing(checkpoint, steps)
     with observer(clip, state) as observe:
-        state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
-    return FitRun(job, clip, to_model(state, job.config, clip.size, clip.fps), info)
+        state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds, save_last=save_last)
+    return FitRun(job, clip, to_model(state, job.config, clip.size, clip.fps), info, state, checkpoint)
 
 
 def run_steps(
@@ -136,8 +141,10 @@ def run_steps(
     observe: Observer,
     checkpoint: Checkpoint | None = None,
     seconds: float | None = None,
+    *,
+    save_last: bool = True,
 ) -> tuple[FitState, FitInfo]:
-    """Take all steps of a fit and return the last; every so many `seconds`, and at the end, the state is saved.
+    """Take all steps of a fit and return the last; the state is saved every so many `seconds`, and at the end.
 
     Raises as `run_fit`.
     """
@@ -150,7 +157,7 @@ def run_steps(
                     checkpoint.save(state)
                 raise Stopped(f"stopped after step {info.step}")
             due = time.monotonic() - saved > (CHECKPOINT_SECONDS if seconds is None else seconds)
-            if checkpoint is not None and (due or is_last):
+            if checkpoint is not None and (due or (is_last and save_last)):
                 checkpoint.try_save(state)
                 saved = time.monotonic()
     except FitDiverged as error:

@@ -139,17 +139,20 @@ def fit(
         job,
         observe,
         resume="required" if resume else "never",
+        save_last=False,  # the model is written at once
         on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
     )
     try:
         run.save()  # at once: the evaluation may be interrupted
     except OSError as error:
+        run.checkpoint.try_save(run.state)
         raise _explain_unsaved(error, job.checkpoint) from error
     try:
         if history is not None:
             _save_curves(curves, history)
         scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
     except KeyboardInterrupt:
+        run.checkpoint.try_save(run.state)
         if job.checkpoint.exists():
             text = f"{target} is written, without its scores: add --resume --overwrite to measure them."
             err.print(text, soft_wrap=True)
