@@ -47,7 +47,7 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run("compress", work / "model.safetensors", work / "clip", "--max-loss-db", 0.3, "--passes", 1) == 0
     shown = capsys.readouterr().out
-    assert re.search(r"smaller by a factor of\s*│ \d+\.\d\d", shown)
+    assert re.search(r"compression factor\s*│ \d+\.\d\d", shown)
     about = read_metadata("model.fgz")
     assert about["clip"] == "clip"
     assert about["loss_db"] <= 0.3

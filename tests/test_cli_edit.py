@@ -67,7 +67,7 @@ def test_pictures_of_an_edit(work, tmp_path, capsys):
     for name, size in (("edited.gif", None), ("edited.mp4", "20x32"), ("edited", "20x32")):
         options = [] if size is None else ["--size", size]
         assert run("edit", work / "model.safetensors", work / "baked.toml", "--out", tmp_path / name, *options) == 0
-        assert "7 frames at 25 frames a second" in capsys.readouterr().out
+        assert "7 frames at 25 frames per second" in capsys.readouterr().out
         clip = read_video(tmp_path / name)
         assert (clip.num_frames, clip.size) == (FRAMES, (20, 32) if size else SIZE)
     edited = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()

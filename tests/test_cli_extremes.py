@@ -87,5 +87,5 @@ def test_steps_that_do_not_see_all_frames_are_warned_of(tmp_path, capsys):
     for steps, warned in ((8, True), (9, False)):
         out = tmp_path / f"{steps}.safetensors"
         assert run("fit", clip, "--out", out, "--gaussians", 100, "--steps", steps) == 0
-        assert ("8 steps see 8 of 9 frames" in " ".join(capsys.readouterr().err.split())) == warned
+        assert ("8 steps use 8 of 9 frames" in " ".join(capsys.readouterr().err.split())) == warned
         assert load_video_model(out).num_frames == 9

@@ -130,7 +130,7 @@ def test_edited_models_and_compact_files(work, tmp_path):
         (("--at", ",".join(["1"] * 40)), "--at: expected at most 32"),
         (("--parts", "1"), "--parts: expected a whole number from 2"),
         (("--width", "3"), "--width: expected at least 16"),
-        (("--width", "99999999"), "--width: expected a picture that fits in memory"),
+        (("--width", "99999999"), "--width: expected an image that fits in memory"),
         (("--out", "a.jpg"), "--out: expected a name ending in .png"),
         (("--out", "missing/a.png"), "missing"),
     ],

@@ -233,7 +233,7 @@ def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, c
     given = {"MODEL": here, "clip": work / "clip"}
     assert run(*(given.get(word, word) for word in words)) == 2
     said = told(capsys)
-    assert "MODEL: expected a model of one piece, got one of 3 segments. Take one out: foldgauss segment" in said
+    assert "MODEL: expected a model of one piece, got one of 3 segments. Extract one: foldgauss segment" in said
     assert sorted(tmp_path.iterdir()) == before
 
 

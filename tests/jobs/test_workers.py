@@ -74,7 +74,7 @@ def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_he
     (failed,) = (outcome for outcome in outcomes if outcome.failure is not None)
     assert failed.job.name == "broken.mp4"
     assert "does not open as a video" in failed.failure
-    assert {progress.name for progress in told if progress.share == 1} == {f"clip{k}.mp4" for k in range(3)}
+    assert {progress.name for progress in told if progress.fraction == 1} == {f"clip{k}.mp4" for k in range(3)}
 
 
 @pytest.mark.parametrize(("is_remote", "says"), [(True, "start some"), (False, "if __name__")])
@@ -82,7 +82,7 @@ def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, sa
     class NoCrew:
         client, threads = None, 0
 
-        def mend(self, alive):
+        def restart_missing(self, alive):
             assert alive == 0
 
     monkeypatch.setattr(pool, "NO_WORKERS_SECONDS", -1.0)
@@ -90,7 +90,7 @@ def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, sa
     crew = NoCrew()
     crew.is_remote = is_remote
     with pytest.raises(SchedulerLost, match=says):
-        pool._PoolRun(crew, [], ignored, lambda: False)._fill()
+        pool._PoolRun(crew, [], ignored, lambda: False)._submit_waiting()
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):

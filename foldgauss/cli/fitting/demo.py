@@ -28,7 +28,7 @@ from foldgauss.video.fitting.state import to_model
 
 SIZE, FRAMES = (160, 320), (0, 24)
 RECORD = "metrics.json"
-FILES = {"model.safetensors", "reconstruction.mp4", "make_comparison_sheet.png", RECORD}
+FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", RECORD}
 CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
 
 
@@ -58,11 +58,11 @@ def demo(
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
     sheet = make_comparison_sheet([clip.frames[k] for k in shown], [images[k] for k in shown], captions)
-    write_image(out_dir / "make_comparison_sheet.png", sheet)
+    write_image(out_dir / "comparison.png", sheet)
     write_json(out_dir / RECORD, figures | frames)
     print_figures("Demo", figures)
     for name, what in (
-        ("make_comparison_sheet.png", "original, reconstruction and error side by side"),
+        ("comparison.png", "original, reconstruction and error side by side"),
         ("reconstruction.mp4", "the rendered model, for any browser (VP9)"),
         ("model.safetensors", "the model: try `foldgauss render` with --upsample 4"),
         (RECORD, "the figures above, and those of each frame"),
