@@ -22,9 +22,9 @@ from benchmarks import _bending, _common
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.initialization import params_from_gaussians
 from foldgauss.estimator.em.loop import State, _step_restarts, broadcast_degrees
+from foldgauss.estimator.em.m_step import Model
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.em.statistics import make_points
-from foldgauss.estimator.em.updates import Model
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
 DIM = 3

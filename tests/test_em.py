@@ -9,10 +9,10 @@ import pytest
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components
 from foldgauss.estimator.em.loop import EMStatus, broadcast_degrees, run_em, select_best
+from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
 from foldgauss.estimator.em.online import change_reference
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.em.statistics import Times, accumulate, make_points, step_times
-from foldgauss.estimator.em.updates import Model, newton_step, profile_log_likelihood, update_components
 
 K, N, DEGREE = 3, 200, 2
 NO_SCALING = Scaling(np.zeros(3), np.ones(3))

@@ -118,7 +118,7 @@ def _estimator(names, folder):
 def _extending(names, folder):
     assert np.isfinite(names["jump"].log_prob(names["x"])).all()
     assert names["wide"] > 2 * names["narrow"]
-    np.testing.assert_allclose(names["mine"], names["judge"], atol=1e-5)
+    np.testing.assert_allclose(names["mine"], names["expected"], atol=1e-5)
     before = names["model"].render(0.8)
     for video in ("swirled", "later"):
         assert np.abs(names[video].render(0.8) - before).max() > 0.02
@@ -181,7 +181,7 @@ def _rendering(names, folder):
     np.testing.assert_allclose(names["same"], image, atol=0.02)
     np.testing.assert_allclose(names["mirrored"], names["same"][:, ::-1], atol=1e-3)
     np.testing.assert_allclose(names["trace"].image, np.moveaxis(image, -1, 0), atol=1e-6)
-    np.testing.assert_allclose(1 - names["trace"].transmittance, names["light_taken"], atol=1e-6)
+    np.testing.assert_allclose(1 - names["trace"].transmittance, names["alpha"], atol=1e-6)
     assert np.mean((names["better"] - target) ** 2) < 0.5 * np.mean((image - target) ** 2)
     for other in ("added", "sharp", "soft", "aside", "from_above"):
         assert np.isfinite(names[other]).all()

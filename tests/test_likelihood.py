@@ -11,7 +11,7 @@ from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.estimator.likelihood import FitStatus, _student_quantile, bootstrap, fit, select_degree
-from foldgauss.estimator.time_profile import Ascent, Profile, _step
+from foldgauss.estimator.profile_likelihood import Ascent, Profile, _step
 from foldgauss.fold import PolynomialFold
 
 BEND = [[0.8, -0.5], [0.6, 0.9]]  # odd and even powers, so that each sign mistake shows

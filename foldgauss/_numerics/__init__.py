@@ -1,1 +1,6 @@
-"""Model-independent numerics: batch shapes, triangular factors, safe gradients, regression, SIMD types."""
+"""Numerics that are independent of any model.
+
+`batch` aligns, broadcasts and checks modules with batch dimensions; `factor` and `triangular` compute Cholesky factors
+and triangular solves; `regression.weighted_regression` fits polynomials; `safe_grad.evaluate_with_safe_grad` gives
+finite derivatives of log-densities; `pointwise` calls functions elementwise; `simd` has vectors for Numba kernels.
+"""

@@ -37,7 +37,7 @@ def hermite(v: Float[Array, "*batch"], degree: int) -> Float[Array, "*batch k"]:
 
 
 def hermite_columns(v: Float[Array, "*batch"], degree: int) -> list[Float[Array, "*batch"]]:
-    """The columns of `hermite`, not yet side by side."""
+    """The columns of `hermite` as a list."""
     columns = [jnp.ones_like(v), v][: degree + 1]
     for k in range(1, degree):
         columns.append((v * columns[k] - math.sqrt(k) * columns[k - 1]) / math.sqrt(k + 1))
@@ -62,9 +62,8 @@ def weighted_regression(
 ) -> Regression:
     """argmin over polynomials g of `sum_i w_i |y_i - g(v_i)|^2 / a_i`, the same for every Sigma.
 
-    Every space coordinate has the same design and the same weights: so least squares per coordinate *is*
-    the generalised least squares with a full Sigma (Zellner's theorem). `degree` gives the shapes, `used` <= degree
-    the polynomial: one compiled program then serves all degrees.
+    With the same design and weights in every coordinate, least squares per coordinate equals generalized least squares
+    with a full Sigma (Zellner's theorem). `degree` fixes the shapes, `used` <= degree is the polynomial's degree.
     """
     active = jnp.arange(degree + 1, dtype=used.dtype) <= used
     design = jnp.where(active[None], hermite(v, degree), 0)
@@ -72,9 +71,11 @@ def weighted_regression(
     log_unit = jnp.max(jnp.where(present, -0.5 * log_a, -jnp.inf))
     row = jnp.where(present, jnp.sqrt(weights) * jnp.exp(-0.5 * log_a - log_unit), 0)[:, None]
     q, r = jnp.linalg.qr(row * design)
-    r = jnp.where(active[None] & active[:, None], r, jnp.eye(degree + 1, dtype=r.dtype))  # columns left out: inert
+    r = jnp.where(
+        active[None] & active[:, None], r, jnp.eye(degree + 1, dtype=r.dtype)
+    )  # unused columns have no effect
     diagonal = jnp.abs(jnp.diagonal(r))
-    length = jnp.sqrt((r * r).sum(0))  # of the columns: what a diagonal entry must not vanish against
+    length = jnp.sqrt((r * r).sum(0))  # of the columns, to which diagonal entries are compared
     rank_deficient = (diagonal <= 8 * degree * jnp.finfo(v.dtype).eps * length).any() | (length == 0).any()
     safe = jnp.where(rank_deficient, jnp.eye(degree + 1, dtype=r.dtype), r)
     projected = jnp.where(active[:, None], jnp.matmul(q.T, row * y), 0)

@@ -1,11 +1,8 @@
-"""Vectors of 16 float32 for Numba kernels, spelled out instead of left to the loop vectoriser.
+"""Explicit vectors of 16 float32 for Numba kernels, independent of LLVM's loop vectorizer.
 
-A value of type `VECTOR` is one LLVM vector: one AVX-512 register, or two or four narrower ones where a machine has no
-wider. What a kernel keeps in local variables then stays in registers over any loops, and how many channels or
-sums there are does not decide whether LLVM finds a vector loop. Arithmetic between vectors is `+`, `-`, `*`, `/`;
-comparisons give a `MASK` of 16 bits. Numba's own fast-math flags hold here too.
-
-Kernels that use these are kept on disk under their own file's date: after a change here, remove the kept code.
+A value of type `VECTOR` is one LLVM vector: one AVX-512 register, or two or four narrower ones. Local variables of a
+kernel then stay in registers over any loops. Arithmetic is `+`, `-`, `*`, `/`; comparisons give a `MASK` of 16 bits.
+Numba's fast-math flags apply. Kernels are cached by their own file's date: after a change here, remove the cache.
 """
 
 import math
@@ -235,7 +232,7 @@ _f = nb.float32
 def exp2(x):
     """2^x within 2e-7: a polynomial of the part in [-0.5, 0.5], the whole part into the exponent.
 
-    For x in [-126, 127]; anything else gives numbers without meaning, for the caller to drop.
+    For x in [-126, 127]; other results are meaningless.
     """
     whole, part = split_exponent(x)
     y = broadcast(_f(1.3264727e-3))
@@ -253,7 +250,7 @@ def exp(x):
     y, most = x * broadcast(_f(math.log2(math.e))), broadcast(_f(126.0))
     y = select(y < most, y, most)
     y = select(y > broadcast(_f(-126.0)), y, broadcast(_f(-126.0)))
-    return select(x >= x, exp2(y), x)  # NaN stays what it is
+    return select(x >= x, exp2(y), x)  # NaN propagates
 
 
 @inline

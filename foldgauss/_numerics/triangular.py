@@ -1,4 +1,4 @@
-"""Triangular algebra for many systems: small vectors as lists of columns, so that XLA makes one loop of it."""
+"""Triangular algebra for many systems: small vectors as lists of columns, which XLA fuses to one loop."""
 
 import jax.numpy as jnp
 from jax import lax
@@ -6,9 +6,8 @@ from jaxtyping import Array, Float
 
 Vector = Float[Array, "*#batch dim"]
 Matrix = Float[Array, "*#batch dim dim"]
-#: A small vector is one array (*batch, 1) per coordinate: stacking them is a pass over memory of its own, across which
-#: no loop is fused (a million log-densities on stacked vectors: 24 ms instead of 1 ms). A large one is one array
-#: (*batch, dim): there the coordinates written out would take minutes to compile.
+#: A small vector is one array (*batch, 1) per coordinate, since XLA does not fuse loops across stacking them. A large
+#: one is one array (*batch, dim), since separate coordinates would take minutes to compile.
 Columns = list[Array]
 
 #: Up to this size triangular systems are written out: XLA's CPU solver is called once per matrix and is 10x slower.
@@ -52,8 +51,8 @@ def solve_upper(tril: Matrix, b: Columns) -> Columns:
 def solve_upper_matrix(upper: Float[Array, "dim dim"], b: Float[Array, "dim columns"]) -> Float[Array, "dim columns"]:
     """R^-1 B for one upper triangle; many by `jax.vmap`.
 
-    Written out not only for speed: jaxlib 0.10's solver for batches waits, on a worker of XLA's pool, for other workers
-    of that pool, so two independent solves of batches can wait for each other for ever on two cores.
+    Unrolled not only for speed: jaxlib 0.10's solver for batches waits, on a worker of XLA's pool, for other workers
+    of that pool, so that two independent solves can deadlock on two cores.
     """
     if upper.shape[-1] > UNROLLED_SIZE:
         return lax.linalg.triangular_solve(upper, b, left_side=True, lower=False)

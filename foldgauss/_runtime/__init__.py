@@ -1,1 +1,6 @@
-"""Independent helpers: argument checks, settings, threads, Numba kernels, signals and file locks."""
+"""Processes, threads and argument checks, independent of any model.
+
+`checks.invalid` builds the errors of the whole package; `threads.run_tasks` runs work on the thread pool;
+`kernels.kernel` compiles Numba kernels; `interrupts`, `file_lock` and `machine` handle signals, locks and the
+description of the machine; `settings` documents and validates the fields of configurations.
+"""

@@ -38,7 +38,7 @@ def is_within(value: object, bounds: str) -> bool:
 def _is_finite(value: Real) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # an integer beyond the floats
+    except OverflowError:  # an integer larger than any float
         return False
 
 
@@ -61,7 +61,7 @@ def check_signature(parameter: str, function: Callable, *arguments: str) -> None
 
 
 def warn_if_degrees(parameter: str, *angles: float, stacklevel: int = 3) -> None:
-    """Warn of angles that are hardly radians: whole or half numbers beyond a turn."""
+    """Warn if an angle is probably in degrees: a multiple of 0.5 larger than one turn."""
     for angle in angles:
         if abs(angle) > 2 * math.pi and float(2 * angle).is_integer():
             text = f"{parameter}: expected radians, got {angle:g}, {abs(angle) / (2 * math.pi):.1f} turns."

@@ -21,7 +21,7 @@ def hold_lock(file: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:
-        raise LockHeld(f"{file} is held by another") from error
+        raise LockHeld(f"{file} is held elsewhere") from error
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Ctrl-C while modules are imported, and SIGTERM while a command runs."""
+"""Signal handling: Ctrl-C while modules are imported, and SIGTERM while a command runs."""
 
 import signal
 import threading
@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-#: Seconds within which another SIGTERM is the same one: `timeout` sends it to a process, and then to its group.
-SAME = 5.0
+#: Seconds within which a second SIGTERM counts as the first: `timeout` signals the process, then its process group.
+REPEAT_SECONDS = 5.0
 #: Exit status of a process that SIGTERM ended, as shells report it.
 TERMINATED = 128 + signal.SIGTERM
 
@@ -17,7 +17,7 @@ class SigtermReceived(KeyboardInterrupt):
     """SIGTERM, raised so that the same cleanup runs as after Ctrl-C."""
 
 
-class _Answer:
+class _SigtermHandler:
     """The first SIGTERM raises `SigtermReceived`; a later one ends the process at once."""
 
     def __init__(self) -> None:
@@ -28,14 +28,14 @@ class _Answer:
         if self.first is None:
             self.first = now
             raise SigtermReceived("ended by SIGTERM")
-        if now - self.first > SAME:
+        if now - self.first > REPEAT_SECONDS:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
 
 
 @contextmanager
 def raise_on_sigterm() -> Iterator[None]:
-    """Within, SIGTERM raises `SigtermReceived`, unless it has a handler; the process then exits with 143.
+    """Inside the block SIGTERM raises `SigtermReceived`, unless it has a handler; the process then exits with 143.
 
     The default handler would leave unfinished files behind.
     """
@@ -43,19 +43,19 @@ def raise_on_sigterm() -> Iterator[None]:
     if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
-    answer = _Answer()
-    signal.signal(signal.SIGTERM, answer)
+    handler = _SigtermHandler()
+    signal.signal(signal.SIGTERM, handler)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        if answer.first is not None:  # whatever became of the exception
+        if handler.first is not None:  # whatever became of the exception
             raise SystemExit(TERMINATED)
 
 
 @contextmanager
 def use_default_signals() -> Iterator[None]:
-    """Within, Ctrl-C and SIGTERM end the process by the system's default, unless they have other handlers.
+    """Inside the block Ctrl-C and SIGTERM end the process by default, unless they have other handlers.
 
     For imports: native libraries may crash at a KeyboardInterrupt or swallow it, and no file is open yet.
     """
@@ -66,7 +66,7 @@ def use_default_signals() -> Iterator[None]:
     ours = {
         number: handler
         for number, handler in handlers.items()
-        if handler is signal.default_int_handler or isinstance(handler, _Answer)
+        if handler is signal.default_int_handler or isinstance(handler, _SigtermHandler)
     }
     for number in ours:
         signal.signal(number, signal.SIG_DFL)

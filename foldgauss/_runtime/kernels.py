@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numba as nb
 from numba.core.caching import FunctionCache
 
-# Not "fast": NaN and infinity keep their meaning; sums may be reordered, which vector sums need.
+# Not "fast": NaN and infinity keep their meaning; sums may be reordered, which vectorized sums need.
 _OPTIONS = {"error_model": "numpy", "fastmath": {"nsz", "contract", "reassoc", "arcp"}}
 
 #: For small functions used inside kernels.
@@ -19,12 +19,12 @@ def kernel(function: Callable) -> Callable:
     Numba checks only the function's own file for changes: a constant from another module must be passed as an argument.
     Where the cache cannot be written, every process compiles again.
     """
-    return _compiled(function, _OPTIONS)
+    return _compile(function, _OPTIONS)
 
 
 def exact_kernel(function: Callable) -> Callable:
-    """As `kernel`, but every operation is rounded as IEEE 754 says, in the order written: the same bits everywhere."""
-    return _compiled(function, {"error_model": "numpy"})
+    """As `kernel`, but operations follow IEEE 754 in the order written: the same bits on every machine."""
+    return _compile(function, {"error_model": "numpy"})
 
 
 class _TolerantCache(FunctionCache):
@@ -35,7 +35,7 @@ class _TolerantCache(FunctionCache):
             super().save_overload(*compiled)
 
 
-def _compiled(function: Callable, options: dict) -> Callable:
+def _compile(function: Callable, options: dict) -> Callable:
     dispatcher = nb.njit(nogil=True, **options)(function)
     with contextlib.suppress(RuntimeError):  # no place for the cache: a read-only installation without a home directory
         dispatcher._cache = _TolerantCache(function)

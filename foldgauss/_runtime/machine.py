@@ -11,7 +11,7 @@ _PACKAGES = ("jax", "jaxlib", "numba", "numpy", "optax")
 
 
 def describe_machine() -> dict[str, object]:
-    """Facts a timing depends on; no names of hosts or users. `load_average`: processes that ran in the last minute."""
+    """Properties that timings depend on, without host or user names; `load_average` is that of the last minute."""
     return {
         "cpu": cpu_model(),
         "cores": available_cores(),

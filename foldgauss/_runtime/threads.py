@@ -1,4 +1,4 @@
-"""One pool of worker threads for the serial `nogil` kernels.
+"""The pool of worker threads that runs serial `nogil` kernels.
 
 Numba's own threading aborts after `fork` (OpenMP) and fails from two Python threads at once (workqueue).
 A pool that runs serial kernels over ranges of work has neither problem, and since the ranges do not depend on the
@@ -17,7 +17,7 @@ from foldgauss._runtime.checks import invalid
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _num_threads: int | None = None
-_forked = False  # from a process in which JAX had started
+_forked = False  # whether this process was forked after JAX had started
 
 
 def available_cores() -> int:
@@ -116,7 +116,7 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
     guard = threading.Lock()
     errors: list[BaseException] = []
     futures: list[Future] = []
-    in_work: list[None] = []  # one for each item
+    in_work: list[None] = []  # one entry for each item in progress
 
     def drain() -> None:
         while True:

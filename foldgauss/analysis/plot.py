@@ -1,4 +1,4 @@
-"""Pictures of a Folded-Gaussian, of a fit's history and of speed against accuracy; matplotlib is imported for one."""
+"""Figures of a Folded-Gaussian, of a fit's history and of speed against accuracy; matplotlib is imported on use."""
 
 import itertools
 from collections.abc import Sequence
@@ -37,9 +37,8 @@ def plot_density(
 ) -> "Axes":
     """The density of a Folded-Gaussian of d = 2, with conditional distributions s | t in red: the paper's figure.
 
-    Time runs to the right, space upwards; contour lines hold 30, 60 and 90% of the probability shown. A red bell
-    stands on each chosen time: `N(s | t)` drawn sideways, all to the same height (a narrow one would be tall), its
-    foot at that time, a dot at its center `loc + f(time_loc - t)`.
+    Contour lines enclose 30, 60 and 90% of the probability shown. The red curve at each of `slices` is `N(s | t)`,
+    rotated and scaled to the same height, with a dot at its center `loc + f(time_loc - t)`.
 
     **Shapes:** `dist` has `event_shape == (2,)` and no batch; `slices` is their number, or the times themselves.
 
@@ -64,7 +63,7 @@ def plot_density(
 
 
 class _Step(Protocol):
-    """What is drawn of a step of a fit: `foldgauss.video.FitInfo`, or anything with these."""
+    """The attributes of a step that are plotted: `foldgauss.video.FitInfo` has them."""
 
     step: int
     seconds: float
@@ -75,9 +74,8 @@ class _Step(Protocol):
 def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> np.ndarray:
     """The course of a fit: PSNR above, loss below, against seconds on the left and steps on the right.
 
-    A step's loss is that of its few frames: it is drawn faint, with its running median over 2% of the history. It
-    changes its meaning where the fit turns to larger frames (by default at 20% and 60% of the plan) and to the squared
-    error (at 70%): jumps there are no accident.
+    A step's loss is that of its few frames: it is plotted faintly, with its running median over 2% of the history. It
+    jumps where the fit changes to larger frames (by default at 20% and 60%) and to the squared error (at 70%).
 
     **Shapes:** `history` has at least one step; `axes`, given or made, are (2, 2).
 
@@ -97,8 +95,8 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
         upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
         lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3, label="each step")
         lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6, label="running median")
-        lower.set(xlabel=name, yscale="log" if (loss > 0).any() else "linear")  # a black clip's is 0 from the start
-        lower.set_xlim(left=0)  # the start takes its seconds too
+        lower.set(xlabel=name, yscale="log" if (loss > 0).any() else "linear")  # 0 throughout for a black clip
+        lower.set_xlim(left=0)  # initialization takes time too
         for ax in (upper, lower):
             ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("PSNR (dB)")
@@ -108,7 +106,7 @@ def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> 
 
 
 class Panel(NamedTuple):
-    """One thing that quality costs: its label, of each point how much, indices of the front and of its knee."""
+    """One kind of cost: its label, the cost of each point, indices of the Pareto front and of its knee."""
 
     label: str
     cost: Sequence[float]
@@ -122,9 +120,10 @@ def plot_tradeoff(
     names: Sequence[tuple[str, str]],
     axes: "np.ndarray | None" = None,
 ) -> np.ndarray:
-    """Quality against what it costs, a panel for each cost: a color for each axis, the front drawn, its knee ringed.
+    """Quality against cost, a panel for each kind of cost, with the Pareto front as a line and a ring at its knee.
 
-    Points of a front are named where there is room for it, the knee always. A point of the axis "base" is a star.
+    Each axis has a color; points of the axis "base" are stars. Points of a front are labeled where there is room, the
+    knee always.
 
     **Shapes:** `quality` and every cost have one number per point, `names` its axis and value; `axes`, given or made,
     are (len(panels),).
@@ -161,14 +160,14 @@ def plot_tradeoff(
     axes[0].set_ylabel("PSNR (dB)")
     figure = axes[0].figure
     figure.legend(loc="outside lower center", ncols=min(len(groups), 6), frameon=False)
-    figure.draw_without_rendering()  # from here on places are known in pixels
+    figure.draw_without_rendering()  # from here on positions are known in pixels
     for panel, ax in zip(panels, axes, strict=True):
         _name_points(ax, panel, quality, [f"{axis} {value}".rstrip() for axis, value in names])
     return axes
 
 
 def _few_ticks(ax, cost: np.ndarray) -> None:
-    """Numbers as one writes them; a span of less than a power of ten would show one alone."""
+    """Plain tick labels; also at 2 and 5 times powers of ten if the range is less than 100."""
     from matplotlib.ticker import FuncFormatter, LogLocator
 
     subs = (1, 2, 5) if cost.max() < 100 * cost.min() else (1,)
@@ -184,7 +183,7 @@ def _short(number: float) -> str:
 
 
 def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) -> None:
-    """Names beside points of the front, none over another name or a point; the knee's first, and in any case."""
+    """Label points of the front without overlaps; the knee first, and always."""
     from matplotlib.text import Text
     from matplotlib.transforms import Bbox
 
@@ -205,19 +204,19 @@ def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) ->
             offset = (distance + 5 * is_knee) * np.array([x, y]) / np.hypot(x, y)
             place = float(panel.cost[k]), float(quality[k])
             note = ax.annotate(text, place, offset, textcoords="offset points", in_layout=False, zorder=5, **how)
-            note.get_window_extent()  # puts the text in its place; the note's extent holds its line, too
+            note.get_window_extent()  # places the text; the note's own extent includes its line
             box = Text.get_window_extent(note)
             if ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max) and not box.count_overlaps(taken):
                 taken.append(box)
                 break
             note.remove()
         else:
-            if is_knee:  # over something else, but named
+            if is_knee:  # overlapping, but labeled
                 ax.annotate(text, place, (0, 14), textcoords="offset points", in_layout=False, ha="center", **font)
 
 
 def _running_median(values: np.ndarray) -> np.ndarray:
-    """Of each value and those around it, 2% of them all; fewer at the ends."""
+    """The median of a window of 2% of the values around each; shorter at the ends."""
     reach = max(len(values) // 100, 1)
     padded = np.pad(values, reach, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
@@ -238,7 +237,7 @@ def _draw_density(dist, ax, t_limits, s_limits) -> None:
 
 
 def _mass_levels(density: np.ndarray) -> np.ndarray:
-    """Densities above which the given shares of the probability lie, rising and distinct, as contours need them."""
+    """Densities that enclose the given fractions of the probability, ascending and distinct, as contours need them."""
     ordered = np.sort(density.ravel())[::-1]
     mass = np.cumsum(ordered) / ordered.sum()
     return np.unique(ordered[np.searchsorted(mass, _MASS)])
@@ -256,7 +255,7 @@ def _draw_slices(dist, ax, times, s_limits, width: float) -> None:
 
 
 def _bell_width(times, t_limits) -> float:
-    """Bells must not reach the next time."""
+    """The height of the conditional densities, less than the gap to the next time."""
     gap = np.diff(np.sort(times)).min() if len(times) > 1 else np.inf
     return min(0.75 * gap, 0.16 * (t_limits[1] - t_limits[0]))
 
@@ -268,7 +267,7 @@ def _conditional(dist, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _space_limits(dist, t_limits) -> tuple[float, float]:
-    """Where s is with a probability of about 99%: the curve's far ends carry no mass and need no room."""
+    """The range of s of about 99% of the probability."""
     loc, scale = float(dist.time_loc), float(dist.time_scale)
     t = np.linspace(max(t_limits[0], loc - 2.2 * scale), min(t_limits[1], loc + 2.2 * scale), 101)
     center, spread = _conditional(dist, t)

@@ -22,11 +22,11 @@ from foldgauss.estimator.chunks import Chunks, is_chunked, open_chunks, summariz
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import draw_subset, initialize, params_from_gaussians, restrict_covariances
 from foldgauss.estimator.em.loop import EMStatus, Run, broadcast_degrees, run_em, select_best
+from foldgauss.estimator.em.m_step import Model
 from foldgauss.estimator.em.online import FORGETTING, compute_batch_statistics, update_online
 from foldgauss.estimator.em.prune import count_parameters, drop_unused, prune_mixture
 from foldgauss.estimator.em.scaling import Scaling, compute_scaling, to_mixture
 from foldgauss.estimator.em.statistics import Blocks, Points, enable_dtype, make_points
-from foldgauss.estimator.em.updates import Model
 from foldgauss.estimator.parameter_checks import (
     check_array,
     check_column,
@@ -231,7 +231,6 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         return ChunkedRows(chunks, summary, sizes, order, dtype)
 
     def _order_columns(self, num_columns: int) -> Int[np.ndarray, " d"]:
-        """The columns of X with time last."""
         return order_columns(check_column(self.time_column, num_columns), num_columns)
 
     def _run(self, data: Rows | ChunkedRows) -> tuple[Run, Model]:
@@ -400,9 +399,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             params, sums = update_online(params, sums, new, model, jnp.asarray(fraction, scaled.dtype))
         status = EMStatus.NOT_CONVERGED if np.isfinite(value) else EMStatus.NOT_FINITE
         if status == EMStatus.NOT_FINITE:
-            raise invalid(
-                "X", expected="a batch near the components", got="densities that underflow", cure="Shuffle the data."
-            )
+            expected, got = "a batch near the components", "densities that underflow"
+            raise invalid("X", expected=expected, got=got, cure="Shuffle the data.")
         history = [*self._history, value]
         self._set_fitted(Run(params, value - self._scaling.log_volume, history, batches, status, 0), model)
         self._online, self._history = (sums, seen + total, batches, model), history

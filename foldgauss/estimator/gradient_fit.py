@@ -88,12 +88,11 @@ def fit_gradient(
         raise invalid("batch_size", expected="a whole number >= 1 or None", got=repr(batch_size))
     optimizer = optax.adam(_LEARNING_RATE) if optimizer is None else optimizer
     key = jax.random.key(0) if key is None else key
-    start = jax.tree.map(lambda z: z, mixture)
-    raw = _init_raw(start)
-    state, values, last = optimizer.init(raw), [], start
+    raw = _init_raw(mixture)
+    state, values, last = optimizer.init(raw), [], mixture
     for number in range(steps + 1):  # once more, since a step evaluates the parameters before it
         step_key = jax.random.fold_in(key, number)
-        new, state, value, current, finite = _step(raw, state, start, x, weights, step_key, optimizer, batch_size)
+        new, state, value, current, finite = _step(raw, state, mixture, x, weights, step_key, optimizer, batch_size)
         if not finite:
             return GradientFit(last, np.array(values), EMStatus.NOT_FINITE)
         raw, last = new, current

@@ -22,7 +22,7 @@ from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
-from foldgauss.estimator.time_profile import Profile, Space, maximize
+from foldgauss.estimator.profile_likelihood import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
 __all__ = ["CenterParameters", "DegreeChoice", "Fit", "FitStatus", "Replicates", "bootstrap", "fit", "select_degree"]
@@ -414,9 +414,8 @@ class Replicates(eqx.Module):
 def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, batch_size: int = 25) -> Replicates:
     """Parametric bootstrap: repeatedly sample as many points from the fit and fit them in the same way.
 
-    For estimated time_loc and time_scale, and for loc and f with their uncertainty included. There the Fisher
-    information is of no use: without a floor its expectation is infinite (`E[1/a] = inf`), and with one the rare
-    outermost times dominate it. The bootstrap assumes the model; its percentile intervals have approximate coverage.
+    For estimated time_loc and time_scale, and for loc and f with their uncertainty included (see `Fit` on the Fisher
+    information). The bootstrap assumes the model; its percentile intervals have approximate coverage.
 
     **Shapes:** `num_replicates` fits of `round(sum of weights)` points, `batch_size` of them at a time in memory.
 

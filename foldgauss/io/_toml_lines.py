@@ -1,6 +1,6 @@
-"""Where the keys of a TOML text stand: `tomllib` gives values without their lines.
+"""Line numbers of the keys of a TOML text, which `tomllib` does not report.
 
-The text is one that `tomllib` has read, so nothing is checked here: it is walked through, key by key.
+The text must be one that `tomllib` accepts: it is scanned key by key without checks.
 """
 
 import functools
@@ -10,12 +10,12 @@ from collections.abc import Mapping
 
 Path = tuple[str | int, ...]
 
-#: Blanks and comments, on lines too.
+#: Whitespace and comments, over several lines.
 _GAP = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 _EQUALS = re.compile(r"[ \t]*=[ \t]*")
-#: One part of a key and what stands behind it; a quoted part may hold dots.
+#: One part of a key and the dot after it, if any; a quoted part may contain dots.
 _PART = re.compile(r"""[ \t]*("(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[A-Za-z0-9_-]+)[ \t]*(\.?)""")
-#: A value without parts: a text of one of four kinds, or a bare word.
+#: A value without parts: a string of one of four kinds, or a bare word.
 _PLAIN = re.compile(
     r'"""(?:[^"\\]|\\[\s\S]|"{1,2}(?!"))*+"{3,5}'
     r"|'''(?:[^']|'{1,2}(?!'))*+'{3,5}"
@@ -41,26 +41,26 @@ class _Walk:
         self.text, self.lines = text, {}
         self._at = self._counted = 0
         self._line = 1
-        self._items: dict[Path, int] = {}  # of arrays of tables
+        self._items: dict[Path, int] = {}  # index of the last table of each array of tables
 
     def document(self) -> None:
         table: Path = ()
         while self._skip(_GAP) < len(self.text):
-            if not self._next("["):
+            if not self._accept("["):
                 self._pair(table)
                 continue
-            several = self._next("[")
-            table = self._begun(self._key((), several=several), several)
-            self._next("]")
-            self._next("]")
+            several = self._accept("[")
+            table = self._open_table(self._key((), several=several), several)
+            self._accept("]")
+            self._accept("]")
 
-    def _begun(self, table: Path, several: bool) -> Path:
-        """Note a header; the path of its table."""
+    def _open_table(self, table: Path, several: bool) -> Path:
+        """Record a header; return the path of its table."""
         if several:
             self._items[table] = self._items.get(table, -1) + 1
             table += (self._items[table],)
-        self.lines.pop(table, None)  # one named on the way to another begins here
-        return self._noted(table)
+        self.lines.pop(table, None)  # replaces the line recorded when it was part of another header
+        return self._record(table)
 
     def _pair(self, table: Path) -> None:
         path = self._key(table)
@@ -68,35 +68,35 @@ class _Walk:
         self._value(path)
 
     def _key(self, table: Path, *, several: bool = False) -> Path:
-        """The path of a key with dots in `table`; below an array of tables its last one is meant."""
+        """The path of a key with dots in `table`; an array of tables stands for its last table."""
         while True:
             part = _PART.match(self.text, self._at)
-            self._noted(table := (*self._last(table), _unquoted(part[1])))
+            self._record(table := (*self._last_table(table), _unquote(part[1])))
             self._at = part.end()
             if not part[2]:
-                return table if several else self._last(table)
+                return table if several else self._last_table(table)
 
-    def _last(self, table: Path) -> Path:
+    def _last_table(self, table: Path) -> Path:
         return (*table, self._items[table]) if table in self._items else table
 
     def _value(self, path: Path) -> None:
-        if self._next("["):
+        if self._accept("["):
             self._array(path)
-        elif self._next("{"):
-            while self._skip(_GAP) < len(self.text) and not self._next("}"):
-                if not self._next(","):
+        elif self._accept("{"):
+            while self._skip(_GAP) < len(self.text) and not self._accept("}"):
+                if not self._accept(","):
                     self._pair(path)
         else:
             self._skip(_PLAIN)
 
     def _array(self, path: Path) -> None:
         count = 0
-        while self._skip(_GAP) < len(self.text) and not self._next("]"):
-            if not self._next(","):
-                self._value(self._noted((*path, count)))
+        while self._skip(_GAP) < len(self.text) and not self._accept("]"):
+            if not self._accept(","):
+                self._value(self._record((*path, count)))
                 count += 1
 
-    def _noted(self, path: Path) -> Path:
+    def _record(self, path: Path) -> Path:
         self._line += self.text.count("\n", self._counted, self._at)
         self._counted = self._at
         self.lines.setdefault(path, self._line)
@@ -106,12 +106,12 @@ class _Walk:
         self._at = pattern.match(self.text, self._at).end()
         return self._at
 
-    def _next(self, sign: str) -> bool:
-        """Whether `sign` comes next; it is then passed."""
+    def _accept(self, sign: str) -> bool:
+        """Whether `sign` comes next; if so, move past it."""
         found = self.text.startswith(sign, self._at)
         self._at += found
         return found
 
 
-def _unquoted(part: str) -> str:
+def _unquote(part: str) -> str:
     return tomllib.loads(f"key = {part}")["key"] if part[0] in "\"'" else part

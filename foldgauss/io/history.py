@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Any, Self
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.analysis.plot import plot_history
@@ -47,21 +47,18 @@ class HistoryFile:
                     cure="Give a new name, or the file that the fit wrote before.",
                 )
             with atomic_path(self.path) as temporary:
-                temporary.write_text("".join(_format_line(line) for line in kept))
+                temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
 
     def __call__(self, state: FitState, info: FitInfo) -> None:
         if info.step <= self._last:
             return  # a finished checkpoint reports its last step again
         self._last = info.step
         try:
-            self._file = self._file or self._opened()
-            self._file.write(_format_line(info_line(info)))
+            self._file = self._file or self.path.open("a" if self._append else "w", encoding="utf-8")
+            self._file.write(json.dumps(info_line(info)) + "\n")
             self._file.flush()
         except OSError as error:
             raise output_error(self.path, error) from error
-
-    def _opened(self) -> TextIO:
-        return open(self.path, "a" if self._append else "w", encoding="utf-8")
 
     def __enter__(self) -> Self:
         return self
@@ -79,7 +76,8 @@ def info_line(info: FitInfo) -> dict[str, Any]:
 
 def read_history(path: str | os.PathLike) -> list[FitInfo]:
     """The steps of a history file, which may belong to a running fit. Raises ValueError for another file."""
-    return [FitInfo(*(_value(line, name) for name in FitInfo._fields)) for line in _read_lines(Path(path))]
+    lines = [{name: value for name, value in line.items() if value is not None} for line in _read_lines(Path(path))]
+    return [FitInfo(*(line.get(name, _NULL.get(name)) for name in FitInfo._fields)) for line in lines]
 
 
 def write_curves(path: str | os.PathLike, history: Iterable[FitInfo]) -> Path:
@@ -94,15 +92,6 @@ def _to_json(value: Any) -> Any:
     if not isinstance(value, float):
         return value
     return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
-
-
-def _value(line: dict[str, Any], name: str) -> Any:
-    value = line.get(name)
-    return _NULL.get(name) if value is None else value
-
-
-def _format_line(line: dict[str, Any]) -> str:
-    return json.dumps(line) + "\n"
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:

@@ -67,12 +67,8 @@ class Trace:
 def check_options(options: RenderOptions) -> None:
     """Raise ValueError for options that this engine does not support."""
     if options.tile_size not in (None, TILE):
-        raise invalid(
-            "options.tile_size",
-            expected=f"None or {TILE} for engine 'cpu'",
-            got=options.tile_size,
-            cure="engine='xla' supports other sizes.",
-        )
+        expected, cure = f"None or {TILE} for engine 'cpu'", "engine='xla' supports other sizes."
+        raise invalid("options.tile_size", expected=expected, got=options.tile_size, cure=cure)
 
 
 def forward(
@@ -132,19 +128,16 @@ def _call(task) -> None:
 
 def _check_leaves(mean, factor, opacity, color, background) -> None:
     """Raise unless the shapes match: the kernels check no bounds."""
-    leaves = (mean, factor, opacity, color, background)
+    names, leaves = "mean, factor, opacity, color, background", (mean, factor, opacity, color, background)
     shapes, dtypes = [np.shape(leaf) for leaf in leaves], {getattr(leaf, "dtype", None) for leaf in leaves}
     num, channels = shapes[2][:1], shapes[4][:1]
     expected = [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
     if shapes != expected or channels == (0,) or not (num and channels):
-        raise invalid(
-            "mean, factor, opacity, color, background",
-            expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel",
-            got=", ".join(map(str, shapes)),
-        )
+        wanted = "shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel"
+        raise invalid(names, expected=wanted, got=", ".join(map(str, shapes)))
     if dtypes != {np.dtype(np.float32)}:
         got = ", ".join(sorted(str(dtype) for dtype in dtypes))
-        raise invalid("mean, factor, opacity, color, background", expected="float32 NumPy arrays", got=got)
+        raise invalid(names, expected="float32 NumPy arrays", got=got)
 
 
 class _ForwardPass:
@@ -238,10 +231,7 @@ def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) 
     for trace, grad_image in zip(traces, grad_images, strict=True):
         if grad_image.shape != trace.image.shape:
             raise invalid("grad_image", expected=f"the image's shape {trace.image.shape}", got=grad_image.shape)
-    jobs = [
-        (trace, grad, _empty_slots(trace), _empty_gradients(trace))
-        for trace, grad in zip(traces, grad_images, strict=True)
-    ]
+    jobs = [(trace, grad, *_empty_sums(trace)) for trace, grad in zip(traces, grad_images, strict=True)]
 
     def sum_rows(task) -> None:
         (trace, grad_image, slots, _), part = task
@@ -262,15 +252,11 @@ def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) 
     ]
 
 
-def _empty_slots(trace: Trace) -> np.ndarray:
-    """An array for the gradient sums of every (splat, row)."""
-    return np.empty((len(trace.buckets[1]), kernels.slot_width(len(trace.image))), np.float32)
-
-
-def _empty_gradients(trace: Trace) -> tuple[np.ndarray, ...]:
-    num = len(trace.geometry)
-    shapes = ((num, 2), (num, 2, 2), (num,), (num, len(trace.image)))
-    return tuple(np.empty(shape, np.float32) for shape in shapes)
+def _empty_sums(trace: Trace) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Arrays for the gradient sums of every (splat, row), and for the gradients of the splats."""
+    num, channels = len(trace.geometry), len(trace.image)
+    slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)
+    return slots, tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
 
 def screen_gradient(d_mean: np.ndarray) -> np.ndarray:

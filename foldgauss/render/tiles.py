@@ -75,18 +75,13 @@ def make_plan(leaves, size, compositing, options, *, tile: int, batch_pixels: in
     plan = Plan(size, compositing == "over", options, tile, 1, batch)
     capacity = options.list_capacity
     if capacity is not None and capacity < num_tiles:
-        raise invalid(
-            "options.list_capacity",
-            expected=f"at least the number of tiles, {num_tiles}",
-            got=capacity,
-            cure="None chooses it.",
-        )
+        expected = f"at least the number of tiles, {num_tiles}"
+        raise invalid("options.list_capacity", expected=expected, got=capacity, cure="None chooses it.")
     if capacity is None:
         geometry = jax.lax.stop_gradient(leaves[:3])  # concrete even under an eager `grad`
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in geometry)
         num = len(leaves[2])
-        # A few wide splats need some slots for every tile: fewer would give rounds of little work, more would be sorted
-        # for nothing if splats are small (a million slots double the time of 20k splats on 160x320).
+        # A few wide splats need slots for every tile, but small splats leave most of them empty.
         guess = min(num * num_tiles, max(SLOTS_PER_SPLAT * num, SLOTS_PER_TILE * num_tiles))
         slots = guess if traced else int(_count_slots(plan, *geometry))
         # A power of two, so that a moving scene does not recompile for each frame.

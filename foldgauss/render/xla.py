@@ -45,8 +45,7 @@ from foldgauss.render.tiles import (
     split_tiles,
 )
 
-#: Measured on two AVX-512 cores, 20k splats on 160x320: 8 gives twice the list entries of 16 but half the pairs of
-#: pixel and splat, and is 1.3 times faster forward, 1.8 with the backward pass.
+#: Twice the list entries of 16, but half the pairs of pixel and splat: faster on CPUs.
 TILE_SIZE = 8
 #: Splats of a chunk: those gathered, and in the backward pass stored, at once.
 CHUNK = 16

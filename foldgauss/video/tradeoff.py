@@ -258,9 +258,8 @@ def knee(cost: Sequence[float], quality: Sequence[float]) -> int | None:
 def to_half_precision(model: VideoModel) -> VideoModel:
     """The model with 16-bit parameters, for a file of about half the size.
 
-    Its splats are in stored form (`to_stored`) with NumPy float16 leaves, which `foldgauss.io.save_video_model` writes
-    and its reader converts back to float32. Frame times, the envelope, and leaves with values beyond 65,504 (such as
-    coefficients of Gaussians that live for one frame) stay in float32.
+    Its splats are in stored form (`to_stored`) with NumPy float16 leaves, which the reader of model files converts back
+    to float32. Frame times, the envelope, and leaves with values beyond 65,504 stay in float32.
     """
     splats, short = to_stored(model.splats), {}
     for field in dataclasses.fields(splats):

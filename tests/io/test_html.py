@@ -498,7 +498,7 @@ def test_a_lost_context_comes_back(opened):
     page = opened(soft_model())
     before = page.picture(0.4)
     page.page.evaluate("void (lost = foldgauss.player.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
-    page.page.get_by_text("has let go of this page").wait_for()
+    page.page.get_by_text("graphics context was lost").wait_for()
     page.page.evaluate("lost.restoreContext()")
     page.page.locator("#notice").wait_for(state="hidden")
     np.testing.assert_array_equal(page.picture(), before)
@@ -638,7 +638,7 @@ def test_controls_work_on_the_whole_clip(opened):
     assert f"{2 * NUM} of {5 * NUM} Gaussians" in text("#stats").inner_text()  # two are seen
     keyboard.press("2")
     page.page.locator("#scrub").fill("14.2")
-    page.until("foldgauss.player.originals.pictures.has(14)")
+    page.until("foldgauss.player.originals.images.has(14)")
     page.settle()
     shot = cv2.imdecode(np.frombuffer(page.page.locator("#canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR)
     assert abs(int(shot[shot.shape[0] // 2, shot.shape[1] // 2, 1]) - 12 * 14) <= 4
@@ -794,12 +794,12 @@ def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     (tmp_path / "run.js").write_text(
         """
         import { readFileSync } from "node:fs";
-        import { prepared } from "./gaussians.js";
-        import { Selection, conditioned } from "./selection.js";
+        import { prepare } from "./gaussians.js";
+        import { Selection, condition } from "./selection.js";
         const file = readFileSync("m.fgz");
-        const model = prepared(file.buffer.slice(file.byteOffset, file.byteOffset + file.length), () => {});
+        const model = prepare(file.buffer.slice(file.byteOffset, file.byteOffset + file.length), () => {});
         const alive = Array.from(new Selection(model).alive(0.3));
-        console.log(JSON.stringify(alive.map((i) => conditioned(model, i, 0.3, 0))));
+        console.log(JSON.stringify(alive.map((i) => condition(model, i, 0.3, 0))));
         """
     )
     ran = subprocess.run(["node", "run.js"], cwd=tmp_path, check=True, timeout=60, capture_output=True, text=True)

@@ -24,7 +24,7 @@ def columns():
 @pytest.mark.parametrize(("name", "values"), [pytest.param(*one, id=one[0]) for one in columns()])
 def test_round_trip(name, values):
     values = np.rint(values).astype(np.int32)
-    plain = coder.Column.plain(len(values))
+    plain = coder.Column.without_contexts(len(values))
     for own in (plain, known(values, 0)):
         values = np.where(own.present, values, 0)
         np.testing.assert_array_equal(coder.decode(coder.encode(values, own), own), values)
@@ -45,7 +45,7 @@ def test_close_to_the_entropy(scale):
     values = np.rint(np.random.default_rng(1).laplace(size=20_000) * scale).astype(np.int32)
     counts = np.unique(values, return_counts=True)[1]
     entropy = -(counts * np.log2(counts / len(values))).sum() / 8
-    assert len(coder.encode(values, coder.Column.plain(len(values)))) < 1.02 * entropy + 100
+    assert len(coder.encode(values, coder.Column.without_contexts(len(values)))) < 1.02 * entropy + 100
 
 
 def test_what_is_near_saves_bits():
@@ -53,7 +53,7 @@ def test_what_is_near_saves_bits():
     rng = np.random.default_rng(3)
     scale = 4.0 ** rng.integers(0, 4, 20_000)
     values = np.rint(rng.laplace(size=20_000) * scale).astype(np.int32)
-    plain = coder.Column.plain(len(values))
+    plain = coder.Column.without_contexts(len(values))
     contexts = np.stack([np.log2(scale), 0 * scale], 1).astype(np.uint8)
     told = len(coder.encode(values, dataclasses.replace(plain, contexts=contexts)))
     assert told < 0.92 * len(coder.encode(values, plain))
@@ -68,7 +68,9 @@ def test_the_bytes_are_those_of_the_format():
     values = np.array([0, 1, -1, 5, -300, 70_000, 0, 0, 2**30 - 1], np.int32)
     contexts = np.array([0, 0, 1, 1, 2, 2, 31, 0, 0], np.uint8)
     near = np.array([-1, 0, 1, 2, 3, 4, 5, 6, 7], np.int32)[:, None]
-    column = dataclasses.replace(coder.Column.plain(9), contexts=np.stack([contexts, contexts[::-1]], 1), near=near)
+    column = dataclasses.replace(
+        coder.Column.without_contexts(9), contexts=np.stack([contexts, contexts[::-1]], 1), near=near
+    )
     assert coder.encode(values, column).hex() == EXPECTED
 
 
@@ -81,7 +83,10 @@ def test_any_bytes_decode_or_are_refused():
     for _ in range(200):
         data = rng.integers(0, 256, rng.integers(0, 400), dtype=np.uint8).tobytes()
         try:
-            assert np.abs(coder.decode(data, coder.Column.plain(300)).astype(np.int64)).max() < 2**coder.LARGEST_BITS
+            assert (
+                np.abs(coder.decode(data, coder.Column.without_contexts(300)).astype(np.int64)).max()
+                < 2**coder.LARGEST_BITS
+            )
         except ValueError:
             refused += 1
     assert refused > 20

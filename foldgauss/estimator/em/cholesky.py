@@ -1,7 +1,6 @@
 """Cholesky factors and their inverses for batches of small matrices, by products only.
 
-The factor of a singular matrix is NaN. jaxlib 0.10's own triangular solver for batches may deadlock on two cores (see
-`foldgauss._numerics.triangular`).
+The factor of a singular matrix is NaN. See `foldgauss._numerics.triangular` on jaxlib's own solver for batches.
 """
 
 import jax.numpy as jnp

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.components import Parameters
+from foldgauss.estimator.em.m_step import Model, update_components
 from foldgauss.estimator.em.statistics import Points, accumulate, make_points
-from foldgauss.estimator.em.updates import Model, update_components
 
 __all__ = [
     "INITIALIZERS",
@@ -138,9 +138,9 @@ def _assign_by_plus_plus(y, weights, num, degree, rng):
 def _assign_by_k_means(y, weights, num, degree, rng):
     centers = _draw_plus_plus_centers(y, weights, num, rng)
     for _ in range(_LLOYD_STEPS):
-        shares = _one_hot(_distances(y, centers).argmin(1), num) * weights[:, None]
-        mass = shares.sum(0)
-        moved = shares.T @ y / np.where(mass > 0, mass, 1)[:, None]
+        fractions = _one_hot(_distances(y, centers).argmin(1), num) * weights[:, None]
+        mass = fractions.sum(0)
+        moved = fractions.T @ y / np.where(mass > 0, mass, 1)[:, None]
         moved = np.where((mass > 0)[:, None], moved, centers)
         if np.array_equal(moved, centers):
             break
@@ -149,8 +149,8 @@ def _assign_by_k_means(y, weights, num, degree, rng):
 
 
 def _assign_at_random(y, weights, num, degree, rng):
-    shares = rng.uniform(size=(len(y), num))
-    return shares / shares.sum(1, keepdims=True)
+    fractions = rng.uniform(size=(len(y), num))
+    return fractions / fractions.sum(1, keepdims=True)
 
 
 def _assign_to_random_points(y, weights, num, degree, rng):

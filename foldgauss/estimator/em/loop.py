@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.components import Parameters
+from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
 from foldgauss.estimator.em.statistics import (
     Blocks,
     Points,
@@ -23,7 +24,6 @@ from foldgauss.estimator.em.statistics import (
     step_times,
     sum_over_points,
 )
-from foldgauss.estimator.em.updates import Model, newton_step, profile_log_likelihood, update_components
 
 __all__ = ["EMStatus", "Run", "State", "broadcast_degrees", "log_likelihood", "run_em", "select_best", "step"]
 
@@ -294,13 +294,9 @@ def _jitter(states: State, number: int) -> State:
     **Source:** Rose 1998, Deterministic annealing for clustering, compression, classification, regression.
     """
     params = states.params
-    noise = jnp.asarray(
-        _JITTER * np.random.default_rng(number).normal(size=params.curve[:, :, 0].shape), params.curve.dtype
-    )
-    return State(
-        params._replace(curve=params.curve.at[:, :, 0].add(jnp.einsum("rkab,rkb->rka", params.tril, noise))),
-        states.step_fraction,
-    )
+    noise = _JITTER * np.random.default_rng(number).normal(size=params.curve[:, :, 0].shape)
+    shift = jnp.einsum("rkab,rkb->rka", params.tril, jnp.asarray(noise, params.curve.dtype))
+    return states._replace(params=params._replace(curve=params.curve.at[:, :, 0].add(shift)))
 
 
 def _reset_components(states: State, restart: int, empty: np.ndarray, mass: np.ndarray) -> State:
@@ -319,7 +315,7 @@ def _reset_components(states: State, restart: int, empty: np.ndarray, mass: np.n
         log_weights[restart, [donor, k]] = half
         mass[[donor, k]] = mass[donor] / 2
     params = Parameters(*(jnp.asarray(z) for z in (log_weights, time_loc, time_scale, curve, tril)))
-    return State(params, states.step_fraction)
+    return states._replace(params=params)
 
 
 def broadcast_degrees(degrees, num_components: int) -> Int[Array, " k"]:

@@ -14,8 +14,8 @@ from foldgauss._numerics.regression import hermite_to_powers
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.cholesky import inverse_lower
 from foldgauss.estimator.em.components import Parameters, change_variable, to_powers
+from foldgauss.estimator.em.m_step import Model, update_components
 from foldgauss.estimator.em.statistics import Points, SufficientStatistics, accumulate
-from foldgauss.estimator.em.updates import Model, update_components
 
 __all__ = ["FORGETTING", "change_reference", "compute_batch_statistics", "update_online"]
 

@@ -17,8 +17,8 @@ from foldgauss.envelope import AbstractEnvelope
 from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
 from foldgauss.estimator.em.components import Parameters, evaluate_densities, to_powers
 from foldgauss.estimator.em.loop import log_likelihood, run_em, select_best
+from foldgauss.estimator.em.m_step import Model, residual_scatter
 from foldgauss.estimator.em.statistics import Blocks, Points, SufficientStatistics, accumulate, sum_over_points
-from foldgauss.estimator.em.updates import Model, residual_scatter
 
 __all__ = ["count_parameters", "drop_unused", "prune_mixture"]
 

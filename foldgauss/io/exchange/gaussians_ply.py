@@ -22,20 +22,12 @@ from foldgauss.video.models.splats import SH_C0
 #: Depth between a Gaussian and the one behind it, in model units: some three steps of float32 at the distance of the
 #: front camera (1.4), so that viewers which sort by depth keep the order. 40,000 Gaussians are 0.016 deep.
 DEPTH_STEP = 4e-7
-
-
 #: Axes of a 3DGS file: as trained scenes have them (COLMAP: x right, y down, z away), or y up and z towards the viewer.
 AXES = ("y-down", "y-up")
-
-
 #: Degrees of spherical harmonics that viewers know as a whole, and the number of `f_rest` columns of each.
 _NUM_REST = {0: 0, 1: 9, 2: 24, 3: 45}
-
-
 #: Logits of opacity are held within: sigmoid(17) is the last below 1 in float32.
 _LOGIT_MAX = 17.0
-
-
 _SMALLEST = 1e-20  # of a standard deviation, whose logarithm must be finite
 
 
@@ -48,10 +40,9 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
     **Shapes:** leaves of `Gaussians3D` of the Gaussians alive at t, NumPy. **Units:** model space (see
     `foldgauss.render.camera`); `depth_step` in its units too.
 
-    All Gaussians of a frame lie in one plane and occlude each other in array order. Here each is placed `depth_step`
-    behind the one before, and is larger by as much as it is farther from the front camera, so that this camera sees
-    exactly the image of the model, and programs that sort by depth blend in the model's order. From elsewhere the
-    layers shift against each other by `depth_step` times their number; 0 puts all of them into the plane.
+    Gaussians of a frame occlude each other in array order. Here each is placed `depth_step` behind the one before, and
+    enlarged in proportion to its distance from the front camera, so that this camera sees the image of the model and
+    programs that sort by depth blend in its order. 0 puts all of them into one plane.
 
     **Raises:** ValueError for a step or a time outside [0, 1].
 
@@ -211,7 +202,7 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
     if not is_3dgs(ply):
-        got = "properties " + ", ".join(ply.names("vertex")[:20]) if ply.names("vertex") else "no element 'vertex'"
+        got = ply.describe_vertices()
         cure = "For a video use read_vegas_ply." if is_vegas(ply) else "It may be a mesh or a point cloud."
         expected = "a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3"
         raise format_error(ply.path, expected=expected, got=got, cure=cure)

@@ -73,6 +73,10 @@ class Ply:
         """The properties of an element in their order; none where it is missing."""
         return self.elements[element].dtype.names if element in self.elements else ()
 
+    def describe_vertices(self) -> str:
+        """The properties of the element `vertex`, for an error message."""
+        return "properties " + ", ".join(self.names("vertex")[:20]) if self.names("vertex") else "no element 'vertex'"
+
     def columns(self, element: str, names: Sequence[str]) -> Float[np.ndarray, "rows names"]:
         """The named properties side by side, float64. Raises `FormatError` for one that is missing or not finite."""
         found = self.names(element)

@@ -125,10 +125,9 @@ def write_pseudomesh(
     """Write frames as triangles: frame_0000.obj, frame_0000.ply and so on, and pseudomesh.json; returns the folder.
 
     Face k of an `.obj` is Gaussian k of the frame, front first, with three vertices of its own: m, m + s1 r1 and
-    m + s2 r2, the covariance's axes to one standard deviation. Mesh tools show it upright (x right, y up, z towards the
-    viewer; the frame's centre is the origin, its longer side 1) in the colours of the vertices. The `.ply` beside it is
-    the frame as an ordinary 3DGS file, y down. Edit the vertices, keep their order and number, and `read_pseudomesh`
-    takes the shape from the `.obj`, opacity and colour from the `.ply`.
+    m + s2 r2, the covariance's axes to one standard deviation; x is right, y up, z towards the viewer, the frame's
+    centre the origin and its longer side 1. The `.ply` beside it is the frame as a 3DGS file, y down. After editing,
+    with vertices kept in number and order, `read_pseudomesh` takes the shape from the `.obj`, the rest from the `.ply`.
 
     `times` (default: the model's frame times), in [0, 1]. The folder appears whole or not at all; one that holds files
     is refused unless `overwrite`, and even then if it holds anything else. `on_frame` is called after each frame.
@@ -235,7 +234,7 @@ def _read_notes(folder: Path, num_frames: int) -> dict:
     except FileNotFoundError:
         return defaults
     except (ValueError, RecursionError, OSError) as error:
-        raise format_error(path, expected="JSON", got="text that is none", cure="Remove it, and give size.") from error
+        raise format_error(path, expected="JSON", got="other text", cure="Remove it, and give size.") from error
     if not isinstance(found, dict):
         raise format_error(path, expected="an object", got=type(found).__name__, cure="Remove it, and give size.")
     return defaults | {name: value for name, value in found.items() if name in defaults}

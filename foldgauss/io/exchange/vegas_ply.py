@@ -33,16 +33,10 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: The envelope's power of the published code, which scales standard deviations by exp(-tau^2 / 2).
 VEGAS_POWER = 2.0
-
-
 #: Standard deviations, in its units, above which the published code renders a Gaussian.
 VEGAS_SCALE_CUTOFF = 1e-4
-
-
 #: `scale_1`, across the plane, has no effect on the image; this eps is written.
 _VEGAS_ACROSS = math.log(1e-8)
-
-
 #: Prefix of our metadata in a comment of the header, which other programs skip.
 _NOTE = "foldgauss "
 
@@ -114,11 +108,9 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
 
     $$ \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2)) $$
 
-    Leaves, sigma_t and the power among them, come back here to float32 rounding. The published code renders it with its
-    own constants: a Gaussian up to 3.03 sigma_t' from m_t, where it is a hundredth as wide as at its widest (at p = 1
-    the model itself ends at a tenth); a model that was fitted with another low pass than 0.3 px^2 (the presets' is 0.1)
-    a little softer; and Gaussians whose scale, after the envelope, is below 1e-4 of its units (a fifth of a pixel at
-    1280 wide) not at all.
+    Leaves are read back to float32 rounding. The published code renders with its own constants: a low pass of 0.3 px^2
+    (the presets' is 0.1), Gaussians up to 3.03 sigma_t' from m_t, and none whose scale, after the envelope, is below
+    1e-4 of its units (a fifth of a pixel at 1280 wide).
 
     **Raises:** ValueError for a model that the published code cannot render: an envelope of power 0, a floor,
     compositing "sum", one frame alone; `OutputError` where the path cannot be written.
@@ -170,7 +162,7 @@ def _vegas_unit(size: tuple[int, int]) -> float:
 def _check_is_vegas(ply: Ply) -> None:
     if not is_vegas(ply):
         cure = "For a still scene use read_3dgs_ply." if is_3dgs(ply) else "Check that it is the right file."
-        got = "properties " + ", ".join(ply.names("vertex")[:20]) if ply.names("vertex") else "no element 'vertex'"
+        got = ply.describe_vertices()
         raise format_error(ply.path, expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
     if "time" not in ply.elements:
         cure = "It may be of another version of the published code."

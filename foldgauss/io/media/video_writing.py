@@ -32,15 +32,12 @@ def write_video(
 ) -> Path:
     """Write frames, uint8 RGB of shape (height, width, 3), and return the path. No partial file is left on errors.
 
-    `.mp4` and `.webm` are VP9 (profile 0, 4:2:0), which browsers play: OpenCV's wheel has no H.264 encoder.
-    4:2:0 halves the color resolution. Bunny is reproduced at 35 dB at 160x320, the limit of 4:2:0 there, and
-    at 40 dB at 640x1280 (OpenCV passes no quality setting to the encoder); a folder of images is lossless. An odd
-    height or width, which OpenCV would cut, is padded by repeating its last row or column.
+    `.mp4` and `.webm` are VP9 (profile 0, 4:2:0: half the color resolution), which browsers play: OpenCV's wheel has no
+    H.264 encoder. An odd height or width is padded by repeating its last row or column.
 
-    `.gif` and `.webp` are animations that repeat forever. A GIF has a palette of 256 colors for each frame and
-    durations in hundredths of a second: each frame lasts a whole number of them, one of two lengths where necessary,
-    so that the total duration is kept. Browsers slow down more than 50 frames per second, which is refused. An
-    animated WebP has 4:2:0 at quality 90. Both are held in memory until the last frame.
+    `.gif` and `.webp` are animations that repeat forever, held in memory until the last frame. A GIF has a palette of
+    256 colors for each frame and durations in hundredths of a second, rounded so that the total is kept; more than 50
+    frames per second, which browsers slow down, are refused. An animated WebP has 4:2:0 at quality 90.
 
     A path without extension, or an existing folder, goes to `write_frames`, with `overwrite` and `image_format`; an
     existing *file* is replaced. `fps` is in (0, 1000].
@@ -227,8 +224,8 @@ def _prepare_for_encoder(frame: np.ndarray) -> np.ndarray:
     if image.shape[0] % 2 or image.shape[1] % 2:
         # OpenCV would drop the odd row or column.
         image = cv2.copyMakeBorder(image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE)
-    # FFmpeg's scaler, as OpenCV calls it, rounds both chroma planes down: on Bunny, Chromium shows red and blue 1.3
-    # gray levels too dark. Adding one level to each leaves 0.3, and gains 0.5 dB at 640x1280. cv2.add saturates.
+    # FFmpeg's scaler, as OpenCV calls it, rounds both chroma planes down, which makes red and blue some 1.3 gray levels
+    # too dark: add one level to each. cv2.add saturates.
     return cv2.add(image, (1, 0, 1, 0))
 
 

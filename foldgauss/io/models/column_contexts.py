@@ -21,30 +21,30 @@ from foldgauss.video.compression.quantize import (
     path_span,
 )
 
-#: Gaussians nearby that say what to expect; candidates for them in each square of a grid; what time counts as length.
-NEIGHBOURS, CANDIDATES, TIME = 4, 16, 0.3
-_LEVELS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
+#: Neighbors that predict a value; candidates for them in each grid square; weight of time in their distance.
+NEIGHBORS, CANDIDATES, TIME_WEIGHT = 4, 16, 0.3
+_MAGNITUDE_BOUNDS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
 
 
-class Walk:
-    """The columns of a file, one after another: ask for `column`, then `add` its numbers."""
+class ColumnContexts:
+    """The contexts of a file's columns in turn: `describe_next` gives a column's, then `add` takes its values."""
 
     def __init__(self, rules: dict[str, Rule], info: CompactInfo):
         self._info, self._decoder = info, ColumnDecoder(rules, info)
-        self._numbers: dict[str, np.ndarray] = {}
+        self._values: dict[str, np.ndarray] = {}
         self._in_cell = self._nearest = np.zeros((info.num_gaussians, 0), np.int32)
         self._half = np.ones(info.num_gaussians)
 
-    def column(self, name: str) -> Column:
-        """The one that comes next."""
+    def describe_next(self, name: str) -> Column:
+        """What is known of the next column before its values."""
         decoder = self._decoder
         rows = decoder.rows(name)
         if name == "cell":
-            return Column.plain(rows)
+            return Column.without_contexts(rows)
         halves = decoder.half_exponents(name)
         known = {"origin": decoder.origin(name), "step": compute_steps(halves, name)}
         if name in COLORS and self._info.shared:
-            return dataclasses.replace(Column.plain(rows), near=np.arange(-1, rows - 1)[:, None], **known)
+            return dataclasses.replace(Column.without_contexts(rows), near=np.arange(-1, rows - 1)[:, None], **known)
         power = path_power(name)
         near = self._nearest if power or name in ("angle", "shade", *COLORS) else self._in_cell
         scale = np.ones(rows)
@@ -54,55 +54,55 @@ class Walk:
         return Column(present=decoder.has(name), contexts=contexts, scale=scale, near=near, **known)
 
     def add(self, name: str, numbers: Int32[np.ndarray, " rows"]) -> None:
-        """Its numbers."""
+        """Record the column's values."""
         decoder, info = self._decoder, self._info
-        self._numbers[name] = numbers
+        self._values[name] = numbers
         decoder.add(name, numbers, decoder.half_exponents(name))
         if name == "cell":
-            self._in_cell = latest_in(numbers, 1 << sum(info.cells))
+            self._in_cell = find_latest_in_cell(numbers, 1 << sum(info.cells))
         if name == "y0":
             v = decoder.values
             middle, self._half = path_span(clamp_unit(v["time"]), v["duration"], info.reach)
             bits = max(info.cells[:2]) + 1
-            self._nearest = nearest_of(v["x0"], v["y0"], TIME * middle, bits)
+            self._nearest = find_nearest(v["x0"], v["y0"], TIME_WEIGHT * middle, bits)
 
     def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
-        """The first and the second context of each number."""
-        q, first = self._numbers, (halves >> 1) & 31
+        """The first and the second context of each value."""
+        q, first = self._values, (halves >> 1) & 31
         if name == "class":
             second = 0
         elif name == "without":
             second = q["class"] & 31
         elif power:
             first = first + 32 * (q["degree"] == power)
-            # The other axis's number that comes before, and this one's of the power before.
+            # The preceding value of the other axis, and this axis's of the power below.
             other = f"x{power}" if name[0] == "y" else f"y{power - 1}"
-            high = q["degree"] if name == "x1" else level(q[other])
-            low = q["degree"] if power == 1 else level(q[f"{name[0]}{power - 1}"])
+            high = q["degree"] if name == "x1" else quantize_magnitude(q[other])
+            low = q["degree"] if power == 1 else quantize_magnitude(q[f"{name[0]}{power - 1}"])
             second = 16 * high + low
         elif name == "blue":
-            second = 16 * level(q["luma"])
+            second = 16 * quantize_magnitude(q["luma"])
         elif name == "green":
-            second = 16 * level(q["luma"]) + level(q["blue"])
+            second = 16 * quantize_magnitude(q["luma"]) + quantize_magnitude(q["blue"])
         else:
             second = (q["class"] & 31) + 32 * (q["without"] & 1)
         return np.stack(np.broadcast_arrays(first, second), 1).astype(np.uint8)
 
 
-def level(numbers: Int32[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
-    """The size of numbers: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most."""
-    return np.searchsorted(_LEVELS, np.abs(numbers), side="right")
+def quantize_magnitude(numbers: Int32[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
+    """Classes of magnitude: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most."""
+    return np.searchsorted(_MAGNITUDE_BOUNDS, np.abs(numbers), side="right")
 
 
-def latest_in(cell: Int32[np.ndarray, " num"], num_cells: int) -> Int32[np.ndarray, "num 4"]:
-    """The last Gaussians before each that are in its cell; where there are none, the one before it. -1: no more."""
-    out = np.full((len(cell), NEIGHBOURS), -1, np.int32)
-    _latest(cell, np.full(num_cells, -1, np.int32), np.full(len(cell), -1, np.int32), out)
+def find_latest_in_cell(cell: Int32[np.ndarray, " num"], num_cells: int) -> Int32[np.ndarray, "num 4"]:
+    """The latest Gaussians before each in its cell; without any, the one before it. -1: no further one."""
+    out = np.full((len(cell), NEIGHBORS), -1, np.int32)
+    _find_latest(cell, np.full(num_cells, -1, np.int32), np.full(len(cell), -1, np.int32), out)
     return out
 
 
 @exact_kernel
-def _latest(cell, last, before, out):
+def _find_latest(cell, last, before, out):
     for i in range(len(cell)):
         j, count = last[cell[i]], 0
         before[i] = j
@@ -115,19 +115,19 @@ def _latest(cell, last, before, out):
         last[cell[i]] = i
 
 
-def nearest_of(
+def find_nearest(
     x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], bits: int
 ) -> Int32[np.ndarray, "num 4"]:
-    """The nearest Gaussians before each, among the last ones of its square of a grid and of those around. -1: none."""
+    """The nearest Gaussians before each, among the latest of its grid square and the adjacent ones. -1: none."""
     side = 1 << bits
     at = [np.minimum(np.maximum(np.floor((one + 0.5) * side), 0), side - 1).astype(np.int64) for one in (x, y)]
-    out = np.full((len(x), NEIGHBOURS), -1, np.int32)
-    _nearest(x, y, time, *at, np.full((side, side), -1, np.int32), np.full(len(x), -1, np.int32), CANDIDATES, out)
+    out = np.full((len(x), NEIGHBORS), -1, np.int32)
+    _find_nearest(x, y, time, *at, np.full((side, side), -1, np.int32), np.full(len(x), -1, np.int32), CANDIDATES, out)
     return out
 
 
 @exact_kernel
-def _nearest(x, y, time, column, row, last, before, most, out):
+def _find_nearest(x, y, time, column, row, last, before, most, out):
     best = np.empty(out.shape[1])
     for i in range(len(x)):
         best[:] = np.inf

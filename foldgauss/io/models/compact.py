@@ -17,8 +17,8 @@ import numpy as np
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.models import range_coder
-from foldgauss.io.models.column_contexts import Walk
-from foldgauss.io.models.model_file import ModelFileError, plain, to_json
+from foldgauss.io.models.column_contexts import ColumnContexts
+from foldgauss.io.models.model_file import ModelFileError, model_file_error, to_json, to_json_types
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression.quantize import (
     FEATURES,
@@ -66,23 +66,23 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
 
 def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    info, walk = quantized.info, Walk(quantized.rules, quantized.info)
-    streams, described = [], []
+    info, contexts = quantized.info, ColumnContexts(quantized.rules, quantized.info)
+    streams, descriptions = [], []
     for name in column_names(info.degree, info.shared):
         numbers = quantized.columns[name]
-        column = walk.column(name)
+        column = contexts.describe_next(name)
         streams.append(range_coder.encode(_wrapped_differences(numbers, info) if name == "cell" else numbers, column))
-        walk.add(name, numbers)
+        contexts.add(name, numbers)
         rule = quantized.rules.get(name)
         own = [] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes]
-        described.append([len(streams[-1]), *own])
+        descriptions.append([len(streams[-1]), *own])
     intervals = quantized.intervals
-    streams.append(range_coder.encode(intervals, range_coder.Column.plain(len(intervals))))
+    streams.append(range_coder.encode(intervals, range_coder.Column.without_contexts(len(intervals))))
     header = dataclasses.asdict(info) | {
         "num_frames": len(intervals) + 1,
-        "columns": described,
+        "columns": descriptions,
         "intervals": len(streams[-1]),
-        "metadata": plain(metadata or {}),
+        "metadata": to_json_types(metadata or {}),
     }
     text = to_json("header", header).encode()
     data = b"".join(streams)
@@ -97,7 +97,7 @@ def _wrapped_differences(cells: np.ndarray, info: CompactInfo) -> np.ndarray:
     return np.diff(cells, prepend=0) & ((1 << sum(info.cells)) - 1)
 
 
-def _cells(steps: np.ndarray, info: CompactInfo) -> np.ndarray:
+def _sum_differences(steps: np.ndarray, info: CompactInfo) -> np.ndarray:
     return (np.cumsum(steps, dtype=np.int64) & ((1 << sum(info.cells)) - 1)).astype(np.int32)
 
 
@@ -114,7 +114,7 @@ def is_compact(path: str | os.PathLike) -> bool:
 
 
 def load_compact(path: str | os.PathLike) -> Quantized:
-    """The numbers in a compact file; `foldgauss.video.compression.quantize.dequantize` makes the model of them.
+    """The quantized model in a compact file, for `foldgauss.video.compression.quantize.dequantize`.
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
@@ -123,23 +123,23 @@ def load_compact(path: str | os.PathLike) -> Quantized:
 
 
 def load_compact_model(path: str | os.PathLike) -> VideoModel:
-    """The model in a compact file. Raises as `load_compact`, also where its numbers are beyond float32."""
+    """The model in a compact file. Raises as `load_compact`, also for values beyond float32."""
     path = check_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
-        raise _unreadable(path, "one with numbers beyond float32")
+        raise _unreadable(path, "one with values beyond float32")
     return model
 
 
 def compact_metadata(path: str | os.PathLike) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
     path = check_path(path)
-    return _header(path, path.read_bytes())[0]["metadata"]
+    return _read_header(path, path.read_bytes())[0]["metadata"]
 
 
 def _unpack(path: Path, data: bytes) -> tuple[Quantized, dict]:
-    header, body = _header(path, data)
+    header, body = _read_header(path, data)
     try:
         return _decode(header, body, len(data)), header["metadata"]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
@@ -147,7 +147,7 @@ def _unpack(path: Path, data: bytes) -> tuple[Quantized, dict]:
         raise _unreadable(path, f"one that does not fit together ({type(error).__name__}: {text})") from error
 
 
-def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
+def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
     """The header and the bytes after it, once the checksum is verified."""
     if not data.startswith(MAGIC):
         got = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
@@ -156,21 +156,14 @@ def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
         raise _unreadable(path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
     if version != VERSION:
-        raise ModelFileError(
-            str(
-                invalid(
-                    "path",
-                    expected=f"a compact model of version {VERSION}, which this program reads",
-                    got=f"version {version} in {str(path)!r}",
-                    cure="Compress the model again." if version < VERSION else "Update foldgauss.",
-                )
-            )
-        )
+        expected, got = f"a compact model of version {VERSION}, which this program reads", f"version {version} in"
+        cure = "Compress the model again." if version < VERSION else "Update foldgauss."
+        raise model_file_error("path", expected=expected, got=f"{got} {str(path)!r}", cure=cure)
     body = data[_FIXED:]
     if length > len(body) or zlib.crc32(body) != checksum:
         raise _unreadable(path, "one that is cut off or damaged (its checksum is another)")
     try:
-        header = json.loads(body[:length], parse_constant=_no_number)
+        header = json.loads(body[:length], parse_constant=_reject_constant)
         if not isinstance(header, dict) or not isinstance(header["metadata"], dict):
             raise ValueError("it is not an object")
     except (ValueError, KeyError, RecursionError) as error:
@@ -178,45 +171,47 @@ def _header(path: Path, data: bytes) -> tuple[dict, bytes]:
     return header, body[length:]
 
 
-def _no_number(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
+def _reject_constant(name: str) -> None:
+    raise ValueError(f"{name} is not valid JSON")
 
 
 def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
-    info = _info(header)
+    info = _parse_info(header)
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     names = column_names(info.degree, info.shared)
-    described = header["columns"]
-    _check(isinstance(described, list) and len(described) == len(names), "columns", "others")
-    lengths = [own[0] for own in described] + [header["intervals"]]
+    descriptions = header["columns"]
+    _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
+    lengths = [own[0] for own in descriptions] + [header["intervals"]]
     _check(all(is_integer(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
-    rules = {name: _rule(name, own[1:]) for name, own in zip(names, described, strict=True) if not is_integral(name)}
+    rules = {
+        name: _parse_rule(name, own[1:]) for name, own in zip(names, descriptions, strict=True) if not is_integral(name)
+    }
     _check(
-        all(is_integral(name) == (len(own) == 1) for name, own in zip(names, described, strict=True)),
+        all(is_integral(name) == (len(own) == 1) for name, own in zip(names, descriptions, strict=True)),
         "rule",
         "none",
     )
-    walk, columns, start = Walk(rules, info), {}, 0
+    contexts, columns, start = ColumnContexts(rules, info), {}, 0
     for name, length in zip(names, lengths[:-1], strict=True):
-        numbers = range_coder.decode(body[start : start + length], walk.column(name))
-        columns[name] = _cells(numbers, info) if name == "cell" else numbers
-        _check_numbers(name, columns[name], info)
-        walk.add(name, columns[name])
+        numbers = range_coder.decode(body[start : start + length], contexts.describe_next(name))
+        columns[name] = _sum_differences(numbers, info) if name == "cell" else numbers
+        _check_indices(name, columns[name], info)
+        contexts.add(name, columns[name])
         start += length
-    intervals = range_coder.decode(body[start:], range_coder.Column.plain(num_frames - 1))
+    intervals = range_coder.decode(body[start:], range_coder.Column.without_contexts(num_frames - 1))
     return Quantized(info, rules, columns, intervals)
 
 
-def _check_numbers(name: str, numbers: np.ndarray, info: CompactInfo) -> None:
+def _check_indices(name: str, numbers: np.ndarray, info: CompactInfo) -> None:
     """Check the columns that are used as indices."""
     most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}.get(name)
     if most is not None:
         _check(numbers.min() >= 0 and numbers.max() <= most, name, "numbers out of range")
 
 
-def _info(header: dict) -> CompactInfo:
+def _parse_info(header: dict) -> CompactInfo:
     size, options = header["size"], header["options"]
     _check(
         isinstance(size, list) and len(size) == 2 and all(is_integer(n, 1) and n <= _SIDE for n in size), "size", size
@@ -238,7 +233,7 @@ def _info(header: dict) -> CompactInfo:
     )
 
 
-def _rule(name: str, numbers: list) -> Rule:
+def _parse_rule(name: str, numbers: list) -> Rule:
     known = FEATURES.index(name) if name in FEATURES else len(FEATURES)
     _check(2 <= len(numbers) <= 2 + known and all(is_within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
     return Rule(numbers[0], numbers[1], tuple(numbers[2:]))
@@ -250,7 +245,5 @@ def _check(right: bool, name: str, got: Any) -> None:
 
 
 def _unreadable(path: Path, got: str) -> ModelFileError:
-    error = invalid(
-        "path", expected="a compact model", got=f"{got}: {str(path)!r}", cure="Copy it again, or compress again."
-    )
-    return ModelFileError(str(error))
+    cure = "Copy it again, or compress again."
+    return model_file_error("path", expected="a compact model", got=f"{got}: {str(path)!r}", cure=cure)

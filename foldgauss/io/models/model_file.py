@@ -18,7 +18,7 @@ from foldgauss._runtime.threads import check_not_forked
 from foldgauss.io._atomic import atomic_path
 
 FORMAT = "foldgauss-model"
-VERSION = "1"  # raised when a program of the version before could not read the file
+VERSION = "1"  # increased when older programs cannot read the file
 
 # NumPy's names for the element types of safetensors that a model may hold.
 _DTYPES = {
@@ -31,9 +31,9 @@ _ITEM_BYTES = {
     "F64": 8, "F32": 4, "F16": 2, "BF16": 2, "BOOL": 1,
     "I64": 8, "I32": 4, "I16": 2, "I8": 1, "U64": 8, "U32": 4, "U16": 2, "U8": 1,
 }  # fmt: skip
-_LONGEST_HEADER = 100_000_000  # bytes; the library reads no longer one
+_LONGEST_HEADER = 100_000_000  # bytes; the limit of the safetensors library
 _PREFIX = 8  # bytes: the length of the JSON header, little-endian, opens a safetensors file
-_RESERVED = "__metadata__"  # the one name that safetensors keeps for itself
+_RESERVED = "__metadata__"  # reserved by safetensors
 _MAGIC = {
     b"\x89PNG": "a PNG image",
     b"\xff\xd8\xff": "a JPEG image",
@@ -56,7 +56,7 @@ class _Kind:
     from_stored: Callable[[Any], Any]
 
 
-def _as_it_is(model: Any) -> Any:
+def _identity(model: Any) -> Any:
     return model
 
 
@@ -69,18 +69,17 @@ def register_model(
     *,
     to_header: Callable[[Any], dict],
     from_header: Callable[[dict], Any],
-    to_stored: Callable[[Any], Any] = _as_it_is,
-    from_stored: Callable[[Any], Any] = _as_it_is,
+    to_stored: Callable[[Any], Any] = _identity,
+    from_stored: Callable[[Any], Any] = _identity,
 ) -> None:
     """Register `model_type` for saving and loading under the name `kind`.
 
-    `to_header(model)` gives the static facts as a dict that JSON can hold. `from_header(dict)` gives the
-    skeleton: the same pytree with a `jax.ShapeDtypeStruct` for every array leaf and everything else in
-    place. It must allocate nothing in proportion to numbers in the dict, which is not trusted.
+    `to_header(model)` returns the static fields as a JSON-compatible dict. `from_header(dict)` returns the skeleton:
+    the same pytree with a `jax.ShapeDtypeStruct` for every array leaf. The dict is not trusted, so `from_header` must
+    not allocate memory in proportion to its values.
 
-    Where a model is stored in another form than it has in memory, `to_stored` gives that pytree, which `to_header` and
-    `from_header` are then about, and `from_stored` is its inverse. The latter raises ValueError for leaves that do not
-    fit each other, which have the skeleton's shapes but may hold anything.
+    `to_stored` converts a model to the pytree that is stored and described by the header; `from_stored` is its inverse
+    and raises ValueError for leaves whose values are inconsistent.
 
     Raises `ValueError` if `kind` already names another type.
     """
@@ -96,17 +95,14 @@ def register_model(
 def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = None) -> Path:
     """Write `model` whole or not at all; returns the path. Equal models and metadata give equal bytes.
 
-    Every array leaf that a traversal of the pytree finds is stored, JAX or NumPy, under its path in the tree
-    ("splats.loc"). `metadata` is free provenance for `read_header` (clip, configuration, metrics); its
-    numbers that JSON lacks (NaN, infinities) become null.
-
-    Before anything is written, the header is turned back into a skeleton and compared with the model, so a
-    file that would not load is never made.
+    Every array leaf of the pytree, JAX or NumPy, is stored under its path in the tree ("splats.loc"). `metadata` is
+    any provenance for `read_header` (clip, configuration, metrics); NaN and infinities become null. The header is
+    checked to describe the model before anything is written.
 
     Raises `ModelFileError` for an unregistered type, a leaf that would be lost (a plain number, a PRNG key)
     or a header that does not describe the model; `OutputError` where the path cannot be written.
     """
-    kind = _kind_of(model)
+    kind = _find_kind(model)
     model = kind.to_stored(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
@@ -127,18 +123,18 @@ def write_tensors(
     header: dict,
     metadata: dict,
 ) -> None:
-    """Write a file of ours, whole or not at all: the tensors that `specs` describe, as `read_header` does.
+    """Write a model file, whole or not at all: tensors with `specs` as in `read_header`.
 
-    `tensors(keys)` gives them one by one in that order, little-endian. Raises as `save_model`.
+    `tensors(keys)` yields them in that order, little-endian. Raises as `save_model`.
     """
     about = {
         "format": FORMAT,
         "version": VERSION,
         "kind": kind,
         "header": to_json("header", header),
-        "metadata": to_json("metadata", plain(metadata)),
+        "metadata": to_json("metadata", to_json_types(metadata)),
     }
-    # The library's writer orders its header at random: same model, other bytes.
+    # Not written by the library, whose header has a random order: equal models must give equal bytes.
     order = sorted(specs, key=lambda key: (-_ITEM_BYTES[specs[key]["dtype"]], key))  # so every tensor is aligned
     entries: dict[str, Any] = {_RESERVED: about}
     end = 0
@@ -150,7 +146,7 @@ def write_tensors(
     if len(text) > _LONGEST_HEADER:
         got = f"one of {len(text):,} bytes for {len(specs):,} tensors"
         cure = "Write the clip as several files."
-        raise _error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
+        raise model_file_error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
         for array in tensors(order):
@@ -163,16 +159,18 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         key = jax.tree_util.keystr(keys, simple=True, separator=".")
         if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
-            raise _error(
+            raise model_file_error(
                 key,
                 expected="an array or a static field",
                 got=f"the plain number {leaf!r}",
                 cure="Make it an array, or a static field that the header holds.",
             )
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
-            continue  # a function or a name: it has no bits to store, and the skeleton brings its own
+            continue  # a function or a name, which the skeleton contains
         if key in found or key == _RESERVED:
-            raise _error(key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key.")
+            raise model_file_error(
+                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
+            )
         found[key] = leaf
     return found
 
@@ -180,7 +178,7 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
     if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
-        raise _error(
+        raise model_file_error(
             key,
             expected="a real, integer or boolean array",
             got=f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}",
@@ -192,11 +190,11 @@ def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     return array  # tobytes gives C order whatever the strides
 
 
-def _kind_of(model: Any) -> _Kind:
+def _find_kind(model: Any) -> _Kind:
     for kind in _KINDS.values():
         if type(model) is kind.model_type:
             return kind
-    raise _error(
+    raise model_file_error(
         "model",
         expected="one of the registered types " + (", ".join(sorted(_KINDS)) or "(none yet)"),
         got=type(model).__name__,
@@ -207,11 +205,11 @@ def _kind_of(model: Any) -> _Kind:
 def _check_described(kind: _Kind, model: Any, header: str) -> None:
     """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
     skeleton = kind.from_header(json.loads(header))
-    described = _specs(_array_leaves(skeleton))
-    _check_tensors(described, _widened(_specs(_array_leaves(model)), described), "header")
+    described = _get_specs(_array_leaves(skeleton))
+    _check_tensors(described, _widen_half_precision(_get_specs(_array_leaves(model)), described), "header")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
     if have != want:
-        raise _error(
+        raise model_file_error(
             "header",
             expected=f"every static fact of the model of kind {kind.name!r}",
             got="a skeleton of another structure",
@@ -222,14 +220,14 @@ def _check_described(kind: _Kind, model: Any, header: str) -> None:
 def to_json(parameter: str, value: Any) -> str:
     """JSON, the same for the same value. Raises `ModelFileError` for what it cannot hold."""
     try:
-        return json.dumps(value, allow_nan=False, sort_keys=True, default=_scalar)
+        return json.dumps(value, allow_nan=False, sort_keys=True, default=_encode_scalar)
     except (TypeError, ValueError, RecursionError) as error:
-        raise _error(
+        raise model_file_error(
             parameter, expected="a dict that JSON can hold", got=str(error), cure="Use plain types."
         ) from error
 
 
-def _scalar(value: Any) -> Any:
+def _encode_scalar(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, os.PathLike):
@@ -237,12 +235,12 @@ def _scalar(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__}")
 
 
-def plain(value: Any) -> Any:
+def to_json_types(value: Any) -> Any:
     """Metadata as JSON types: NaN and infinities, such as the PSNR of a perfect frame, become null."""
     if isinstance(value, dict):
-        return {str(key): plain(part) for key, part in value.items()}
+        return {str(key): to_json_types(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
+        return [to_json_types(part) for part in value]
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value
@@ -254,9 +252,9 @@ def plain(value: Any) -> Any:
 def load_model(path: str | os.PathLike) -> Any:
     """Read the model that `save_model` wrote, equal to the bit. Nothing in the file is executed.
 
-    Leaves come as JAX arrays; 64-bit ones stay NumPy arrays unless JAX's x64 mode is on, since JAX would
-    round them; those kept in half precision come in the type that the header describes. No more memory is taken than
-    twice the file's size, plus the skeleton and what `from_stored` adds.
+    Leaves are JAX arrays, except 64-bit ones without JAX's x64 mode, which stay NumPy arrays; those stored in half
+    precision are converted to the header's type. Memory: at most twice the file's size, plus the skeleton and what
+    `from_stored` adds.
 
     Raises `FileNotFoundError` for a missing file, `ModelFileError` for one of another kind or version, a
     damaged one, or one whose tensors differ from what its header describes.
@@ -267,30 +265,30 @@ def load_model(path: str | os.PathLike) -> Any:
 
 
 def load_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict], prefix: str = "") -> Any:
-    """The model of that kind and header whose `tensors` stand in the file under `prefix` and their keys.
+    """The model of that kind and header whose `tensors` are stored under `prefix` and their keys.
 
     Raises `ModelFileError` as `load_model`.
     """
-    kind, skeleton = _described(path, kind_name, header, tensors)
+    kind, skeleton = _match_kind(path, kind_name, header, tensors)
     check_not_forked()
-    filled = _filled(skeleton, path, prefix)
+    filled = _read_leaves(skeleton, path, prefix)
     try:
         return kind.from_stored(filled)
     except ValueError as error:
-        got = f"others in {str(path)!r} ({_line(error)})"
-        raise _error("path", expected="tensors that fit each other", got=got) from error
+        got = f"others in {str(path)!r} ({_one_line(error)})"
+        raise model_file_error("path", expected="tensors that fit each other", got=got) from error
 
 
 def check_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> None:
     """Raise `ModelFileError` unless the header describes these tensors; none of them is read."""
-    _described(path, kind_name, header, tensors)
+    _match_kind(path, kind_name, header, tensors)
 
 
-def _described(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> tuple[_Kind, Any]:
-    """The kind, and the skeleton of a model of it that the header describes and that the tensors fit."""
+def _match_kind(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> tuple[_Kind, Any]:
+    """The kind, and the skeleton made from the header, checked against the tensors."""
     kind = _KINDS.get(kind_name)
     if kind is None:
-        raise _error(
+        raise model_file_error(
             "path",
             expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
             got=f"kind {kind_name!r} in {str(path)!r}",
@@ -299,13 +297,13 @@ def _described(path: Path, kind_name: str, header: dict, tensors: dict[str, dict
     try:
         skeleton = kind.from_header(header)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        raise _error(
+        raise model_file_error(
             "path",
             expected=f"the header of a model of kind {kind.name!r}",
-            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_line(error)})",
+            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_one_line(error)})",
         ) from error
-    described = _specs(_array_leaves(skeleton))
-    _check_tensors(_widened(tensors, described), described, str(path))
+    described = _get_specs(_array_leaves(skeleton))
+    _check_tensors(_widen_half_precision(tensors, described), described, str(path))
     return kind, skeleton
 
 
@@ -327,7 +325,7 @@ def read_header(path: str | os.PathLike) -> dict:
             tensors[key] = {"dtype": part.get_dtype(), "shape": list(part.get_shape())}
     _check_version(path, strings)
     about = {name: strings[name] for name in ("format", "version", "kind")}
-    return about | {name: _from_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
+    return about | {name: _parse_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
 
 
 def _check_container(path: Path) -> None:
@@ -337,27 +335,29 @@ def _check_container(path: Path) -> None:
             f"path: expected a model file, got {str(path)!r}, which is missing. Check the spelling."
         )
     if not path.is_file():
-        raise _unreadable(path, "not a plain file")
+        raise _unreadable_error(path, "not a plain file")
     size = path.stat().st_size
     with open(path, "rb") as file:
         first = file.read(_PREFIX + 1)
     if size == 0:
-        raise _unreadable(path, "an empty file")
+        raise _unreadable_error(path, "an empty file")
     for magic, name in _MAGIC.items():
         if first.startswith(magic):
-            raise _unreadable(path, name)
+            raise _unreadable_error(path, name)
     length = int.from_bytes(first[:_PREFIX], "little")
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
-        raise _unreadable(path, "a file of another kind, or one cut off within its first bytes")
+        raise _unreadable_error(path, "a file of another kind, or one cut off within its first bytes")
     if length > size - _PREFIX:
-        raise _unreadable(path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged")
+        raise _unreadable_error(
+            path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
+        )
 
 
 def _check_version(path: Path, strings: dict[str, str]) -> None:
     if strings.get("format") != FORMAT:
-        raise _unreadable(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
+        raise _unreadable_error(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
     if strings.get("version") != VERSION:
-        raise _error(
+        raise model_file_error(
             "path",
             expected=f"a model file of version {VERSION}, which this program reads",
             got=f"version {strings.get('version')} in {str(path)!r}",
@@ -365,28 +365,28 @@ def _check_version(path: Path, strings: dict[str, str]) -> None:
         )
     for name in ("kind", "header", "metadata"):
         if name not in strings:
-            raise _unreadable(path, f"one without the field {name!r}")
+            raise _unreadable_error(path, f"one without the field {name!r}")
 
 
-def _from_json(path: Path, name: str, strings: dict[str, str]) -> dict:
+def _parse_json(path: Path, name: str, strings: dict[str, str]) -> dict:
     try:
         value = json.loads(strings[name])
     except (ValueError, RecursionError) as error:
-        raise _unreadable(path, f"one whose field {name!r} is not JSON ({_line(error)})") from error
+        raise _unreadable_error(path, f"one whose field {name!r} is not JSON ({_one_line(error)})") from error
     if not isinstance(value, dict):
-        raise _unreadable(path, f"one whose field {name!r} is not a JSON object")
+        raise _unreadable_error(path, f"one whose field {name!r} is not a JSON object")
     return value
 
 
-def _specs(leaves: dict[str, Any]) -> dict[str, dict]:
+def _get_specs(leaves: dict[str, Any]) -> dict[str, dict]:
     return {
         key: {"dtype": _DTYPES.get(leaf.dtype.name, leaf.dtype.name), "shape": list(leaf.shape)}
         for key, leaf in leaves.items()
     }
 
 
-def _widened(kept: dict[str, dict], described: dict[str, dict]) -> dict[str, dict]:
-    """What is read of the tensors kept: those of single precision may be kept in half, with fewer digits."""
+def _widen_half_precision(kept: dict[str, dict], described: dict[str, dict]) -> dict[str, dict]:
+    """The specs of tensors as read: those stored in half precision are widened to single where described so."""
     pairs = {key: (spec, described.get(key, spec)) for key, spec in kept.items()}
     return {
         key: want if (have["dtype"], want["dtype"]) == ("F16", "F32") and have["shape"] == want["shape"] else have
@@ -395,17 +395,17 @@ def _widened(kept: dict[str, dict], described: dict[str, dict]) -> dict[str, dic
 
 
 def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> None:
-    """The tensors that are there against those that the header describes: same keys, shapes and types."""
+    """Raise unless the tensors have the keys, shapes and types that the header describes."""
     for key in sorted(have.keys() | want.keys()):
         if have.get(key) != want.get(key):
-            raise _error(
+            raise model_file_error(
                 f"tensor {key!r} of {where!r}",
                 expected=_spec_text(want.get(key)),
                 got=_spec_text(have.get(key)),
             )
 
 
-def _filled(skeleton: Any, path: Path, prefix: str) -> Any:
+def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
     """The skeleton with each `ShapeDtypeStruct` replaced by its tensor."""
     with open_tensors(path) as file:
 
@@ -414,39 +414,36 @@ def _filled(skeleton: Any, path: Path, prefix: str) -> Any:
                 return leaf
             key = jax.tree_util.keystr(keys, simple=True, separator=".")
             array = file.get_tensor(prefix + key)
-            return _to_leaf(key, array.astype(np.float32) if _is_half(array, leaf) else array)
+            return _to_leaf(key, array.astype(leaf.dtype) if array.dtype == np.float16 else array)
 
         return jax.tree_util.tree_map_with_path(fill, skeleton)
 
 
 @contextmanager
 def open_tensors(path: Path) -> Iterator[Any]:
-    """The file as the library opens it: `get_tensor(key)` reads one. Raises `ModelFileError` for a damaged one."""
+    """Open a safetensors file: `get_tensor(key)` reads one. Raises `ModelFileError` for a damaged file."""
     try:
         with safe_open(path, framework="numpy") as file:
             yield file
     except SafetensorError as error:
-        raise _unreadable(path, f"a damaged or truncated file ({_line(error)})") from error
-
-
-def _is_half(array: np.ndarray, described: jax.ShapeDtypeStruct) -> bool:
-    return array.dtype == np.float16 and described.dtype == np.float32
+        raise _unreadable_error(path, f"a damaged or truncated file ({_one_line(error)})") from error
 
 
 def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
     if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
-        raise _error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
+        raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
         return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
     return np.array(array)
 
 
-def _error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
+def model_file_error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
+    """The error with the text of `invalid`."""
     return ModelFileError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
 
 
-def _unreadable(path: Path, got: str) -> ModelFileError:
-    return _error(
+def _unreadable_error(path: Path, got: str) -> ModelFileError:
+    return model_file_error(
         "path",
         expected=f"a {FORMAT} file",
         got=f"{got}: {str(path)!r}",
@@ -458,5 +455,5 @@ def _spec_text(spec: dict | None) -> str:
     return "no such tensor" if spec is None else f"{spec['dtype']} of shape {spec['shape']}"
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200]

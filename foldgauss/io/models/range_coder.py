@@ -1,10 +1,10 @@
 """An adaptive binary range coder for columns of integers, with the same bits on every platform.
 
-A number becomes a zero flag, a sign and an exponential Golomb code of its magnitude. Flag, sign, exponent and the two
-leading bits below it are coded with adaptive probabilities; further bits are nearly uniform and
-cost one bit each. Three *contexts* of a number, small numbers that both sides know, have a probability each, and
-the three are mixed as logits with weights that learn, too. The third context is what Gaussians nearby lead one to
-expect. All is arithmetic of whole numbers but for that expectation, which is float64 in a stated order.
+An integer becomes a zero flag, a sign and an exponential Golomb code of its magnitude. Flag, sign, exponent and the two
+leading bits below it are coded with adaptive probabilities; further bits are nearly uniform and cost one bit each.
+Each value has three contexts, small integers known to encoder and decoder. Their probabilities are mixed as logits with
+adaptive weights. The third context is a prediction from nearby Gaussians, computed in float64 in a fixed order; all
+else is integer arithmetic.
 
 Source: G. N. N. Martin, "Range encoding" (1979); P. Elias' gamma code (1975), in exponential Golomb form; M. Mahoney,
 "Adaptive weighing of context models for lossless data compression" (2005).
@@ -22,15 +22,15 @@ from foldgauss._runtime.kernels import exact_kernel
 LARGEST_BITS = 30
 #: Probabilities of one context: zero flag, sign, unary exponent, and 1 + 2 for the leading bits of each exponent.
 NODES = 2 + 32 + 3 * 32
-#: Values of a context, and contexts of a number.
+#: Values of a context, and contexts of an integer.
 CONTEXTS, MODELS = 256, 3
-#: Bytes that no number's code exceeds: 2 + 31 + 30 bits of four bytes each.
-ROOM = 256
-#: Number of bits up to which a probability is the fraction of ones so far; later it is an exponential mean.
+#: Bound on the bytes of an integer's code: 2 + 31 + 30 bits of four bytes each.
+MAX_CODE_BYTES = 256
+#: A probability is the fraction of ones in up to this many bits, and then an exponential mean.
 MEMORY = 400
-#: Weights of the mixture, times 65536, at first; and how fast they learn, times 2^18.
+#: Initial weights of the mixture, times 65536, and their learning rate, times 2^18.
 WEIGHT, RATE = 29491, 6
-#: Mixed probabilities, times 65536, stay so far from 0 and 1.
+#: Least distance of mixed probabilities from 0 and 1, times 65536.
 MARGIN = 32
 #: Logits are whole multiples of 1/256 from -8 to 8. Knots of the logistic function every half, and lines between them.
 _KNOTS = [
@@ -41,7 +41,7 @@ _KNOTS = [
 _i = nb.int64
 
 
-def _logistic() -> np.ndarray:
+def _tabulate_logistic() -> np.ndarray:
     """Probability times 65536 of the logit (place - 2048) / 256."""
     place = np.arange(4096)
     k, part = place >> 7, place & 127
@@ -49,7 +49,7 @@ def _logistic() -> np.ndarray:
     return (knots[k] * (128 - part) + knots[k + 1] * part + 64) >> 7
 
 
-LOGISTIC = _logistic()
+LOGISTIC = _tabulate_logistic()
 #: Its inverse, for the upper 12 bits of a probability: the least logit that gives as much.
 LOGIT = np.minimum(np.searchsorted(LOGISTIC, np.arange(4096) * 16 + 8), 4095) - 2048
 
@@ -58,9 +58,9 @@ LOGIT = np.minimum(np.searchsorted(LOGISTIC, np.arange(4096) * 16 + 8), 4095) - 
 class Column:
     """What encoder and decoder know of a column before its values.
 
-    `present`: which rows have a number; the others' is 0. `contexts` below 256. A number q is the value
-    `origin + q step`; that of the rows `near` (-1: none), divided by their own `scale` and multiplied by the row's,
-    leads to expect the row's own. Rows without a number count as `fill`.
+    `present`: which rows have an integer; others are 0. `contexts`: below 256. An integer q encodes the value
+    `origin + q step`. A row's value is predicted by the mean over the rows `near` (-1: none) of value / `scale`, times
+    its own scale. Absent rows count as `fill`.
     """
 
     present: Bool[np.ndarray, " num"]
@@ -72,23 +72,23 @@ class Column:
     fill: float = 0.0
 
     @classmethod
-    def plain(cls, num: int) -> "Column":
+    def without_contexts(cls, num: int) -> "Column":
         """A column without contexts."""
         one, none = np.ones(num), np.zeros((num, 0), np.int32)
         return cls(np.ones(num, bool), np.zeros((num, 2), np.uint8), np.zeros(num), one, one, none)
 
-    def arrays(self) -> tuple:
+    def as_arrays(self) -> tuple:
         floats = (np.ascontiguousarray(one, np.float64) for one in (self.origin, self.step, self.scale))
         near = np.ascontiguousarray(self.near, np.int32)
         return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near, float(self.fill)
 
 
-# ------------------------------------------------------------------------------------------ what both sides do
+# ------------------------------------------------------------------------------------------ adaptive model
 
 
 @exact_kernel
-def _expect(i, near, seen, origin, step, scale):
-    """The context of what rows nearby lead to expect: 0 for nothing, else 16 and the sign times the size."""
+def _predict_context(i, near, seen, origin, step, scale):
+    """The context predicted from nearby rows: 0 without any, else 16 plus the signed class of magnitude."""
     total, count = 0.0, 0
     for k in range(near.shape[1]):
         if near[i, k] >= 0:
@@ -106,7 +106,7 @@ def _expect(i, near, seen, origin, step, scale):
 
 @exact_kernel
 def _mix(node, own, chances, weights, logits, logistic, logit):
-    """The probability of a one at a node, times 65536; `own` are the contexts."""
+    """The probability of a one at a node, times 65536, given the contexts `own`."""
     total = 0
     for m in range(MODELS):
         logits[m] = logit[chances[m, own[m], node, 0] >> 4]
@@ -116,8 +116,8 @@ def _mix(node, own, chances, weights, logits, logistic, logit):
 
 
 @exact_kernel
-def _learn(node, own, chances, weights, logits, p, bit):
-    """A chance is (probability of one times 65536, bits seen + 2)."""
+def _update(node, own, chances, weights, logits, p, bit):
+    """Update weights and `chances`, which are (probability of a one times 65536, bits seen + 2)."""
     error = (65536 if bit else 0) - p
     for m in range(MODELS):
         weights[node, m] += (logits[m] * error * RATE) >> 18
@@ -131,18 +131,18 @@ def _learn(node, own, chances, weights, logits, p, bit):
 
 
 @exact_kernel
-def _middle(low, high, p):
-    """Where the interval is parted: below lie ones, of probability p / 65536."""
+def _split_interval(low, high, p):
+    """The split of the interval: a one, of probability p / 65536, lies below."""
     span = high - low
     return low + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
 
 
-# ------------------------------------------------------------------------------------------ numbers to bytes
+# ------------------------------------------------------------------------------------------ encoder
 
 
 @exact_kernel
-def _put(out, place, interval, p, bit):
-    middle = _middle(interval[0], interval[1], p)
+def _encode_bit(out, place, interval, p, bit):
+    middle = _split_interval(interval[0], interval[1], p)
     if bit:
         interval[1] = middle
     else:
@@ -156,11 +156,11 @@ def _put(out, place, interval, p, bit):
 
 
 @exact_kernel
-def _put_learned(out, place, interval, state, node, bit):
+def _encode_adaptive(out, place, interval, state, node, bit):
     own, chances, weights, logits, logistic, logit = state
     p = _mix(node, own, chances, weights, logits, logistic, logit)
-    place = _put(out, place, interval, p, bit)
-    _learn(node, own, chances, weights, logits, p, bit)
+    place = _encode_bit(out, place, interval, p, bit)
+    _update(node, own, chances, weights, logits, p, bit)
     return place
 
 
@@ -171,41 +171,41 @@ def _encode(values, present, contexts, origin, step, scale, near, fill, state, o
     for k in range(len(values)):
         if not present[k]:
             continue
-        if place + ROOM > len(out):
+        if place + MAX_CODE_BYTES > len(out):
             return 0
         value = _i(values[k])
         own[0], own[1] = contexts[k, 0], contexts[k, 1]
-        own[2] = _expect(k, near, seen, origin, step, scale)
+        own[2] = _predict_context(k, near, seen, origin, step, scale)
         seen[k] = (origin[k] + value * step[k]) / scale[k]
-        place = _put_learned(out, place, interval, state, 0, value == 0)
+        place = _encode_adaptive(out, place, interval, state, 0, value == 0)
         if value == 0:
             continue
-        place = _put_learned(out, place, interval, state, 1, value < 0)
+        place = _encode_adaptive(out, place, interval, state, 1, value < 0)
         magnitude, exponent = abs(value), 0
         while magnitude >> (exponent + 1):
-            place = _put_learned(out, place, interval, state, 2 + exponent, True)
+            place = _encode_adaptive(out, place, interval, state, 2 + exponent, True)
             exponent += 1
-        place = _put_learned(out, place, interval, state, 2 + exponent, False)
+        place = _encode_adaptive(out, place, interval, state, 2 + exponent, False)
         leading = 1
         for b in range(exponent - 1, -1, -1):
             bit = (magnitude >> b) & 1
             if leading < 4:
-                place = _put_learned(out, place, interval, state, 34 + 3 * exponent + leading - 1, bit == 1)
+                place = _encode_adaptive(out, place, interval, state, 34 + 3 * exponent + leading - 1, bit == 1)
                 leading = 2 * leading + bit
             else:
-                place = _put(out, place, interval, 32768, bit == 1)
-    # The shortest run of bytes that points into the interval whatever follows: zeros are read after the end.
+                place = _encode_bit(out, place, interval, 32768, bit == 1)
+    # The shortest bytes that identify the interval: zeros are read after the end.
     out[place] = (interval[0] >> 24) + (1 if interval[0] & 0xFFFFFF else 0)
     return place + 1
 
 
-# ------------------------------------------------------------------------------------------ and back
+# ------------------------------------------------------------------------------------------ decoder
 
 
 @exact_kernel
-def _get(data, reader, p):
+def _decode_bit(data, reader, p):
     """One bit; the reader is (low, high, code, next byte)."""
-    middle = _middle(reader[0], reader[1], p)
+    middle = _split_interval(reader[0], reader[1], p)
     bit = reader[2] <= middle
     if bit:
         reader[1] = middle
@@ -221,17 +221,17 @@ def _get(data, reader, p):
 
 
 @exact_kernel
-def _get_learned(data, reader, state, node):
+def _decode_adaptive(data, reader, state, node):
     own, chances, weights, logits, logistic, logit = state
     p = _mix(node, own, chances, weights, logits, logistic, logit)
-    bit = _get(data, reader, p)
-    _learn(node, own, chances, weights, logits, p, bit)
+    bit = _decode_bit(data, reader, p)
+    _update(node, own, chances, weights, logits, p, bit)
     return bit
 
 
 @exact_kernel
 def _decode(data, present, contexts, origin, step, scale, near, fill, most, state, values):
-    """Whether the data is one that the encoder may have written."""
+    """Decode into `values`; whether the encoder may have written the data."""
     reader, seen, own = np.zeros(4, np.int64), np.full(len(values), fill), state[0]
     reader[1] = 0xFFFFFFFF
     for k in range(4):
@@ -244,46 +244,46 @@ def _decode(data, present, contexts, origin, step, scale, near, fill, most, stat
         if reader[3] > len(data) + 4:
             return False
         own[0], own[1] = contexts[k, 0], contexts[k, 1]
-        own[2] = _expect(k, near, seen, origin, step, scale)
-        if not _get_learned(data, reader, state, 0):
-            negative = _get_learned(data, reader, state, 1)
+        own[2] = _predict_context(k, near, seen, origin, step, scale)
+        if not _decode_adaptive(data, reader, state, 0):
+            negative = _decode_adaptive(data, reader, state, 1)
             exponent = 0
-            while _get_learned(data, reader, state, 2 + exponent):
+            while _decode_adaptive(data, reader, state, 2 + exponent):
                 exponent += 1
                 if exponent >= most:
                     return False
             magnitude, leading = 1, 1
             for _ in range(exponent):
                 if leading < 4:
-                    bit = _get_learned(data, reader, state, 34 + 3 * exponent + leading - 1)
+                    bit = _decode_adaptive(data, reader, state, 34 + 3 * exponent + leading - 1)
                     leading = 2 * leading + bit
                 else:
-                    bit = _get(data, reader, 32768)
+                    bit = _decode_bit(data, reader, 32768)
                 magnitude = 2 * magnitude + bit
             values[k] = -magnitude if negative else magnitude
         seen[k] = (origin[k] + values[k] * step[k]) / scale[k]
-    return reader[3] == len(data) + 3  # the encoder ends with one byte where four are looked at
+    return reader[3] == len(data) + 3  # the encoder ends with one byte, the decoder reads four
 
 
 def encode(values: Int32[np.ndarray, " num"], column: Column) -> bytes:
     """The bytes of a column; magnitudes below 2^30."""
-    room = 4 * len(values) + 2 * ROOM
+    room = 4 * len(values) + 2 * MAX_CODE_BYTES
     while True:
         out = np.empty(room, np.uint8)
-        if length := _encode(values, *column.arrays(), _state(), out):
+        if length := _encode(values, *column.as_arrays(), _initial_state(), out):
             return out[:length].tobytes()
-        room *= 4  # a column that is dearer than the numbers themselves: it jumps about
+        room *= 4  # its code is longer than four bytes per value
 
 
 def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
-    """The column that `encode` had; raises ValueError for bytes that it cannot have written."""
+    """The inverse of `encode`. Raises ValueError for bytes that it cannot have written."""
     values = np.empty(len(column.present), np.int32)
-    if not _decode(np.frombuffer(data, np.uint8), *column.arrays(), LARGEST_BITS, _state(), values):
+    if not _decode(np.frombuffer(data, np.uint8), *column.as_arrays(), LARGEST_BITS, _initial_state(), values):
         raise ValueError("a column of numbers is damaged")
     return values
 
 
-def _state() -> tuple[np.ndarray, ...]:
+def _initial_state() -> tuple[np.ndarray, ...]:
     chances = np.empty((MODELS, CONTEXTS, NODES, 2), np.int64)
     chances[..., 0], chances[..., 1] = 32768, 2
     weights = np.full((NODES, MODELS), WEIGHT, np.int64)

@@ -18,6 +18,7 @@ from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.model_file import (
     ModelFileError,
     check_part,
+    load_model,
     load_part,
     open_tensors,
     read_header,
@@ -63,7 +64,7 @@ def join_segments(
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
         specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
         try:
-            segments.append(_segment(entries[-1], about["tensors"], partial(_load, file)))
+            segments.append(_segment(entries[-1], about["tensors"], partial(load_model, file)))
         except (KeyError, TypeError, ValueError) as error:
             raise _unfit(file, f"one with {error}", "Fit it again.") from error
     SegmentedVideo(segments)  # raises ValueError unless they fit together
@@ -171,11 +172,6 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def _load(path: Path) -> VideoModel | EditedVideo:
-    about = read_header(path)
-    return load_part(path, about["kind"], about["header"], about["tensors"])
-
-
 def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     """The segment that a header describes; its model is loaded on access.
 
@@ -192,7 +188,10 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         models = {f"layers.{number}.model.": layer["model"] for number, layer in enumerate(header["layers"])}
         lead = list(models)[header["timeline"]]
     for prefix, model in models.items():
-        num, num_frames = tensors[f"{prefix}splats.loc"]["shape"][0], _num_frames(tensors, prefix)
+        num, num_frames = (
+            tensors[f"{prefix}splats.loc"]["shape"][0],
+            tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1,
+        )
         if not (is_integer(model["num_gaussians"], 1) and model["num_gaussians"] == num):
             raise ValueError("another number of Gaussians than are stored")
         if not (is_integer(model["num_frames"], 1) and model["num_frames"] == num_frames):
@@ -218,10 +217,6 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         load=load,
         metadata=entry["metadata"],
     )
-
-
-def _num_frames(tensors: dict[str, dict], prefix: str) -> int:
-    return tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
 
 
 def _num_parameters(spec: dict) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._atomic import check_path
-from foldgauss.io.models.model_file import ModelFileError, load_model, read_header, register_model, save_model
+from foldgauss.io.models.model_file import load_model, model_file_error, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
@@ -20,8 +20,8 @@ SELECTION = "selection"
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class _Kept:
-    """The content of the file: the mask, and the digest of its model."""
+class _SelectionRecord:
+    """The content of a selection file."""
 
     mask: np.ndarray
     digest: str = dataclasses.field(metadata={"static": True})
@@ -45,15 +45,14 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
     num = model.splats.num_gaussians
     if selection.num_gaussians != num:
         raise invalid("selection", expected=f"one of the model's {num:,} Gaussians", got=f"{selection.num_gaussians:,}")
-    return save_model(path, _Kept(selection.mask, digest(model)))
+    return save_model(path, _SelectionRecord(selection.mask, compute_digest(model)))
 
 
 def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     """Read a selection of `model`'s Gaussians.
 
-    **Raises:** ValueError where it was made for another model, or for this one before a change: another number or
-    order of Gaussians, or other values; `FileNotFoundError`, and `ModelFileError` for a file of another kind, a
-    damaged or newer one.
+    **Raises:** ValueError for a selection of another model, or of this one before it was changed; `FileNotFoundError`;
+    `ModelFileError` for a file of another kind, a damaged or a newer one.
     """
     check_path(path, "path, model")
     if not isinstance(model, VideoModel):
@@ -62,18 +61,18 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     kind = read_header(path)["kind"]
     if kind != SELECTION:
         cure = "Give the file that save_selection wrote."
-        raise ModelFileError(str(invalid("path", expected="a selection", got=f"{kind!r} in {str(path)!r}", cure=cure)))
-    kept = load_model(path)
+        raise model_file_error("path", expected="a selection", got=f"{kind!r} in {str(path)!r}", cure=cure)
+    record = load_model(path)
     num, cure = model.splats.num_gaussians, "Load it with the model that it was made for, unchanged."
-    if len(kept.mask) != num:
-        got = f"one of {len(kept.mask):,} in {str(path)!r}"
+    if len(record.mask) != num:
+        got = f"one of {len(record.mask):,} in {str(path)!r}"
         raise invalid("path", expected=f"a selection of the model's {num:,} Gaussians", got=got, cure=cure)
-    if kept.digest != digest(model):
+    if record.digest != compute_digest(model):
         raise invalid("path", expected="a selection of this model", got=f"another's in {str(path)!r}", cure=cure)
-    return Selection(np.asarray(kept.mask))
+    return Selection(np.asarray(record.mask))
 
 
-def digest(model: VideoModel) -> str:
+def compute_digest(model: VideoModel) -> str:
     """SHA-256 of the Gaussians: every leaf of the splats, by name, type, shape and value."""
     summed = hashlib.sha256()
     for keys, leaf in jax.tree_util.tree_flatten_with_path(model.splats)[0]:
@@ -83,14 +82,15 @@ def digest(model: VideoModel) -> str:
     return summed.hexdigest()
 
 
-def _describe(kept: _Kept) -> dict:
-    return {"num_gaussians": len(kept.mask), "digest": kept.digest}
-
-
-def _skeleton(header: dict) -> _Kept:
+def _make_skeleton(header: dict) -> _SelectionRecord:
     if not isinstance(header["digest"], str):
-        raise ValueError("the digest is no text")
-    return _Kept(jax.ShapeDtypeStruct((header["num_gaussians"],), np.bool_), header["digest"])
+        raise ValueError("the digest is not a string")
+    return _SelectionRecord(jax.ShapeDtypeStruct((header["num_gaussians"],), np.bool_), header["digest"])
 
 
-register_model(SELECTION, _Kept, to_header=_describe, from_header=_skeleton)
+register_model(
+    SELECTION,
+    _SelectionRecord,
+    to_header=lambda record: {"num_gaussians": len(record.mask), "digest": record.digest},
+    from_header=_make_skeleton,
+)

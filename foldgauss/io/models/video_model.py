@@ -15,7 +15,14 @@ from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_with
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import check_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
-from foldgauss.io.models.model_file import ModelFileError, load_part, read_header, register_model, save_model
+from foldgauss.io.models.model_file import (
+    ModelFileError,
+    load_part,
+    model_file_error,
+    read_header,
+    register_model,
+    save_model,
+)
 from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.editing.chain import Edit
@@ -57,7 +64,7 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
     """Raise ValueError for a name with an extension that is another format's."""
     path = Path(path)
     if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
-        cure = "Pictures: write_video, or foldgauss render; other programs' formats: export."
+        cure = "Images: write_video, or foldgauss render; other programs' formats: export."
         if path.suffix.lower() == COMPACT_SUFFIX:
             cure = "A compact file: foldgauss compress, or foldgauss.video.compress and foldgauss.io.save_compact."
         raise invalid(
@@ -73,7 +80,7 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
 
     Of segments no more than the header is read: see `SegmentedVideo`, which loads them on access.
 
-    Raises `FileNotFoundError`; `ModelFileError` also where the file holds something else of ours.
+    Raises `FileNotFoundError`; `ModelFileError` also for a file of another kind.
     """
     path = check_path(path)
     if is_compact(path):
@@ -85,16 +92,13 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
 
 
 def read_metadata(path: str | os.PathLike) -> dict:
-    """What was noted when a model's file was written, of either kind. Raises as `load_video_model`."""
+    """The metadata of a model file, compact or not. Raises as `load_video_model`."""
     path = check_path(path)
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
 def read_origin(path: str | os.PathLike) -> dict:
-    """`read_metadata`, without those of `fit`'s notes that are of another kind than `fit` writes: none are there.
-
-    Metadata are free and not trusted.
-    """
+    """`read_metadata`, which is not trusted, without those of `fit`'s entries that have another type than it writes."""
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
 
 
@@ -126,20 +130,10 @@ def read_header_of_kind(path: str | os.PathLike, *kinds: str) -> dict:
     """The header of a file of one of these kinds; raises `ModelFileError` for another kind."""
     about = read_header(path)
     if about["kind"] not in kinds:
-        raise ModelFileError(
-            f"path: expected a model of kind {' or '.join(map(repr, kinds))}, got {about['kind']!r} in {str(path)!r}. "
-            "Give the file that `foldgauss fit` wrote to --out."
-        )
+        expected, cure = " or ".join(map(repr, kinds)), "Give the file that `foldgauss fit` wrote to --out."
+        got = f"{about['kind']!r} in {str(path)!r}"
+        raise model_file_error("path", expected=f"a model of kind {expected}", got=got, cure=cure)
     return about
-
-
-def _to_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
-    """The same tree, with the splats of each model in the form that they are stored in."""
-    return _with_splats(video, to_stored)
-
-
-def _from_stored(video: VideoModel | EditedVideo) -> VideoModel | EditedVideo:
-    return _with_splats(video, from_stored)
 
 
 def _with_splats(video: VideoModel | EditedVideo, change: Callable[[Any], Any]) -> VideoModel | EditedVideo:
@@ -213,9 +207,8 @@ def _describe_camera(camera: Camera | Callable | None) -> dict | None:
     if camera is None:
         return None
     if not isinstance(camera, Camera):
-        cure = "Write the pictures, or save with seen_from(None) and set the camera again."
-        error = invalid("camera", expected="a Camera, which can be written down", got="a function", cure=cure)
-        raise ModelFileError(str(error))
+        cure = "Write the images, or save with seen_from(None) and set the camera again."
+        raise model_file_error("camera", expected="a Camera, which can be saved", got="a function", cure=cure)
     return {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
 
 
@@ -240,6 +233,9 @@ def _camera_skeleton(header: dict | None) -> Camera | None:
     return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
 
 
-_FORMS = {"to_stored": _to_stored, "from_stored": _from_stored}
+_FORMS = {
+    "to_stored": partial(_with_splats, change=to_stored),
+    "from_stored": partial(_with_splats, change=from_stored),
+}
 register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
 register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)

@@ -1,5 +1,5 @@
-// Decoder of compact model files (.fgz): see docs/format.md. The same bits as foldgauss.video.compression.quantize.dequantize, whose
-// operations it repeats in their order. Runs in browsers and elsewhere; no dependency.
+// Decoder of compact model files (.fgz), see docs/format.md. It repeats the operations of
+// foldgauss.video.compression.quantize.dequantize in their order, for the same bits. No dependency on a browser.
 
 const FEATURES = ["class", "size", "stretch", "duration", "opacity"];
 const COLORS = ["luma", "blue", "green"];
@@ -17,7 +17,7 @@ const KNOTS = [
   22, 36, 60, 98, 162, 267, 439, 720, 1179, 1921, 3108, 4971, 7812, 11955, 17625, 24743, 32768,
   40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097, 65269, 65374, 65438, 65476, 65500, 65514,
 ];
-// Columns that a bit of `without` says a Gaussian has no number in: the bit, the value instead, what counts as a feature.
+// Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature.
 const ABSENT = { duration: [1, Math.fround(6.931471824645996), 0], time: [1, 0.5, 0], opacity: [2, 8, 4] };
 const LN2 = 0.6931471805599453, SQRT2 = 1.4142135623730951;
 const NEIGHBOURS = 4, CANDIDATES = 16, TIME = 0.3;
@@ -33,15 +33,15 @@ const LOGIT = Int32Array.from({ length: 4096 }, (_, p) => {
 
 const clip = (x, low, high) => Math.min(Math.max(x, low), high);
 
-/** Sizes of numbers: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most. */
-function level(size) {
+/** Class of a magnitude: 0, 1, 2, then 3 to 5, 6 to 11 and so on; 15 at most. */
+function magnitudeClass(size) {
   let found = 0;
   for (let bound = 0.5; found < 15 && size >= bound; ) bound = ++found === 1 ? 1.5 : 2 * bound;
   return found;
 }
 
-/** What is known of a column before its numbers, for one of which nothing is. */
-export function plain(num) {
+/** What is known of a column before its values: here nothing, without contexts. */
+export function emptyColumn(num) {
   return {
     num, has: () => true, contexts: () => [0, 0], origin: () => 0, step: () => 1, scale: () => 1,
     near: new Int32Array(0), width: 0,
@@ -50,22 +50,22 @@ export function plain(num) {
 
 const START = 32768 * 512 + 2;
 
-/** A node's state, p 512 + n, after it has seen a bit. */
+/** A node's state, p 512 + n, after a bit. */
 function after(state, one) {
   const p = state >> 9, n = state & 511;
   const next = one ? p + Math.floor((65536 - p) / n) : p - Math.floor(p / n);
   return next * 512 + (n < MEMORY ? n + 1 : n);
 }
 
-/** A column's numbers, Int32Array, from its bytes and what is known of it. */
+/** A column's integers, Int32Array, from its bytes and what is known of it. */
 export function decodeColumn(data, column) {
   const size = CONTEXTS * NODES;
-  // Of each node in each context: the probability of a one times 512, and how many it has learned from.
+  // Of each node in each context: the probability of a one times 512, plus the number of bits seen.
   const first = new Int32Array(size).fill(START), second = new Int32Array(size).fill(START);
   const third = new Int32Array(size).fill(START);
   const weights = new Float64Array(NODES * MODELS).fill(WEIGHT);
-  let atFirst = 0, atSecond = 0, atThird = 0; // where the contexts of a number begin
-  const range = Uint32Array.of(0, 0xffffffff, 0); // low, high, code; as an array, or each bit would make new numbers
+  let atFirst = 0, atSecond = 0, atThird = 0; // offsets of the contexts of the current value
+  const range = Uint32Array.of(0, 0xffffffff, 0); // low, high, code; typed, since boxed numbers would be allocated for each bit
   let next = 0;
   const byte = () => (next < data.length ? data[next++] : (next++, 0));
   for (let k = 0; k < 4; k++) range[2] = (range[2] << 8) | byte();
@@ -80,7 +80,7 @@ export function decodeColumn(data, column) {
     }
     return one;
   };
-  const learned = (node) => {
+  const adaptiveBit = (node) => {
     const one = atFirst + node, other = atSecond + node, near = atThird + node, weight = MODELS * node;
     const l0 = LOGIT[first[one] >> 13], l1 = LOGIT[second[other] >> 13], l2 = LOGIT[third[near] >> 13];
     const total = Math.floor((l0 * weights[weight] + l1 * weights[weight + 1] + l2 * weights[weight + 2]) / 65536);
@@ -104,21 +104,21 @@ export function decodeColumn(data, column) {
     }
     if (found === 0) return 0;
     const ratio = ((total / found) * column.scale(i) - column.origin(i)) / column.step(i);
-    return ratio >= 0 ? 16 + level(ratio) : 16 - level(Math.abs(ratio));
+    return ratio >= 0 ? 16 + magnitudeClass(ratio) : 16 - magnitudeClass(Math.abs(ratio));
   };
   for (let i = 0; i < column.num; i++) {
     if (!column.has(i)) continue;
     const [one, other] = column.contexts(i);
     [atFirst, atSecond, atThird] = [one * NODES, other * NODES, expected(i) * NODES];
-    if (!learned(0)) {
-      const negative = learned(1);
+    if (!adaptiveBit(0)) {
+      const negative = adaptiveBit(1);
       let exponent = 0;
-      while (learned(2 + exponent)) if (++exponent >= LARGEST_BITS) throw new Error("a column is damaged");
+      while (adaptiveBit(2 + exponent)) if (++exponent >= LARGEST_BITS) throw new Error("a column is damaged");
       let magnitude = 1, leading = 1;
       for (let b = 0; b < exponent; b++) {
         let one;
         if (leading < 4) {
-          one = learned(34 + 3 * exponent + leading - 1) ? 1 : 0;
+          one = adaptiveBit(34 + 3 * exponent + leading - 1) ? 1 : 0;
           leading = 2 * leading + one;
         } else one = bit(32768) ? 1 : 0;
         magnitude = 2 * magnitude + one;
@@ -162,7 +162,7 @@ function legendre(degree) {
   });
 }
 
-/** Middle and half-width of the span of time over which a path is described. */
+/** Middle and half-width of the span of time that a path describes. */
 function spanOf(time, duration, reach) {
   const halves = clip(Math.floor(2 * (duration * (1 / LN2)) + 0.5), -FARTHEST, FARTHEST);
   const wide = reach * power(halves), first = Math.max(time - wide, 0), last = Math.min(time + wide, 1);
@@ -181,8 +181,8 @@ function along(cell, cells, axis) {
   return index;
 }
 
-/** The last Gaussians before each in its cell, or the one before it: rows of four numbers, -1 for none. */
-function latestIn(cell, numCells) {
+/** The latest Gaussians before each in its cell, else the one before it: rows of four indices, -1 for none. */
+function findLatestInCell(cell, numCells) {
   const last = new Int32Array(numCells).fill(-1), before = new Int32Array(cell.length);
   const out = new Int32Array(NEIGHBOURS * cell.length).fill(-1);
   for (let i = 0; i < cell.length; i++) {
@@ -194,8 +194,8 @@ function latestIn(cell, numCells) {
   return out;
 }
 
-/** The nearest Gaussians before each, among the last ones of its square of a grid and of those around. */
-function nearestOf(x, y, time, bits) {
+/** The nearest Gaussians before each, among the latest of its grid square and the adjacent ones. */
+function findNearest(x, y, time, bits) {
   const side = 2 ** bits, num = x.length, square = (v) => clip(Math.floor((v + 0.5) * side), 0, side - 1);
   const last = new Int32Array(side * side).fill(-1), before = new Int32Array(num);
   const out = new Int32Array(NEIGHBOURS * num).fill(-1), best = new Float64Array(NEIGHBOURS);
@@ -222,14 +222,14 @@ function nearestOf(x, y, time, bits) {
   return out;
 }
 
-/** The columns of a file in their order. */
+/** The names of a file's columns in order. */
 function columnNames(degree, shared) {
   const path = Array.from({ length: 2 * degree + 2 }, (_, k) => "xy"[k % 2] + (k >> 1));
   return [...WHOLE.slice(0, 4), ...FEATURES.slice(1), "time", ...path, "angle", ...(shared ? ["shade"] : []), ...COLORS];
 }
 
-/** Numbers q and values v of all columns. */
-function unrolled(header, streamOf, onColumn) {
+/** The values of all columns. */
+function decodeColumns(header, streamOf, onColumn) {
   const num = header.num_gaussians, { degree, shared, cells } = header, q = {}, v = {}, features = [];
   const [height, width] = header.size, longer = Math.max(height, width);
   const sides = [width / longer, height / longer, 1], middles = [0, 0, 0.5];
@@ -258,19 +258,18 @@ function unrolled(header, streamOf, onColumn) {
       }
     const contexts = (i) => {
       const first = (halves[i] >> 1) & 31, own = name === "class" ? 0 : q.class[i] & 31;
-      if (name === "class") return [first, own];
-      if (name === "without") return [first, own];
+      if (name === "class" || name === "without") return [first, own];
       if (k > 0) {
-        const top = first + (q.degree[i] === k ? 32 : 0), size = (other) => level(Math.abs(q[other][i]));
+        const top = first + (q.degree[i] === k ? 32 : 0), size = (other) => magnitudeClass(Math.abs(q[other][i]));
         const low = k > 1 ? size(name[0] + (k - 1)) : q.degree[i];
         const high = name[0] === "y" ? size("x" + k) : k > 1 ? size("y" + (k - 1)) : q.degree[i];
         return [top, 16 * high + low];
       }
-      if (name === "blue") return [first, 16 * level(Math.abs(q.luma[i]))];
-      if (name === "green") return [first, 16 * level(Math.abs(q.luma[i])) + level(Math.abs(q.blue[i]))];
+      if (name === "blue") return [first, 16 * magnitudeClass(Math.abs(q.luma[i]))];
+      if (name === "green") return [first, 16 * magnitudeClass(Math.abs(q.luma[i])) + magnitudeClass(Math.abs(q.blue[i]))];
       return [first, own + 32 * (q.without[i] & 1)];
     };
-    let known = { ...plain(rows), origin: (i) => from[i], step: (i) => steps[i] };
+    let known = { ...emptyColumn(rows), origin: (i) => from[i], step: (i) => steps[i] };
     if (common) known = { ...known, near: Int32Array.from({ length: rows }, (_, i) => i - 1), width: 1 };
     else if (name !== "cell") {
       const near = k > 0 || ["angle", "shade", ...COLORS].includes(name) ? nearest : inCell;
@@ -282,7 +281,7 @@ function unrolled(header, streamOf, onColumn) {
     if (name === "cell") {
       let here = 0;
       for (let i = 0; i < num; i++) numbers[i] = here = (here + numbers[i]) & (2 ** (cells[0] + cells[1] + cells[2]) - 1);
-      inCell = latestIn(numbers, 2 ** (cells[0] + cells[1] + cells[2]));
+      inCell = findLatestInCell(numbers, 2 ** (cells[0] + cells[1] + cells[2]));
     }
     q[name] = numbers;
     const value = (v[name] = new Float64Array(rows));
@@ -293,7 +292,7 @@ function unrolled(header, streamOf, onColumn) {
     if (name === "y0") {
       const middle = new Float64Array(num);
       for (let i = 0; i < num; i++) [middle[i], half[i]] = spanOf(inClip(v.time[i]), v.duration[i], header.reach);
-      nearest = nearestOf(v.x0, v.y0, middle.map((own) => TIME * own), Math.max(cells[0], cells[1]) + 1);
+      nearest = findNearest(v.x0, v.y0, middle.map((own) => TIME * own), Math.max(cells[0], cells[1]) + 1);
     }
   });
   if (shared) for (const name of COLORS) v[name] = Float64Array.from(q.shade, (own) => v[name][own]);
@@ -302,7 +301,7 @@ function unrolled(header, streamOf, onColumn) {
 
 /**
  * {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times.
- * `onColumn` is told the share of columns that are done.
+ * `onColumn` is called with the fraction of columns decoded.
  */
 export function decode(buffer, onColumn = () => {}) {
   const bytes = new Uint8Array(buffer), fixed = new DataView(buffer);
@@ -312,8 +311,8 @@ export function decode(buffer, onColumn = () => {}) {
   const header = JSON.parse(new TextDecoder().decode(bytes.subarray(20, start)));
   const num = header.num_gaussians, degree = header.degree;
   const stream = (length) => bytes.subarray(start, (start += length));
-  const v = unrolled(header, stream, onColumn);
-  const intervals = decodeColumn(stream(header.intervals), plain(header.num_frames - 1));
+  const v = decodeColumns(header, stream, onColumn);
+  const intervals = decodeColumn(stream(header.intervals), emptyColumn(header.num_frames - 1));
   const leaves = {
     loc: new Float32Array(2 * num), log_scale: new Float32Array(2 * num), angle_logit: new Float32Array(num),
     time_loc_logit: new Float32Array(num), log_time_scale: new Float32Array(num),

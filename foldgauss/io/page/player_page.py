@@ -24,6 +24,7 @@ from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.video.compression.quantize import (
+    COLORS,
     Quantized,
     Rule,
     column_names,
@@ -45,7 +46,7 @@ LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
 _IMPORT = re.compile(r'^import (?:\{[^}]*\}|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
-#: Binary logarithms of the steps, for pages that quantize a model: to a hundredth of what each number is measured by.
+#: Binary logarithm of equal steps, where steps in proportion are beyond the format.
 _EVEN = -18.0
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
@@ -180,20 +181,16 @@ def quantize_finely(model: VideoModel) -> Quantized:
 
 
 def _fine_rules(degree: int) -> dict[str, Rule]:
-    """Steps in proportion to what a number is measured by: paths by the shorter deviation, times by the longer ones.
+    """Steps in proportion to a scale: paths to the shorter standard deviation, times to sigma_t.
 
     Features are class, size, stretch, duration, opacity, in this order.
     """
-    rules = {name: Rule(0.0, exponent) for name, exponent in _STEPS.items()}
-    rules["duration"] = Rule(0.0, -8.5)
+    rules = {name: Rule(0.0, -8.5) for name in ("size", "stretch", "duration", *COLORS)}
     rules["opacity"] = Rule(0.0, -7.5)
     rules["time"] = Rule(0.5, -9.0, (0.0, 0.0, 0.0, _PER_E))
     rules["angle"] = Rule(0.5, -10.5, (0.0, 0.0, -2 * _PER_E))
     by_width = (0.0, _PER_E, -_PER_E)
     return rules | {f"{axis}{k}": Rule(0.0, -7.5, by_width) for k in range(degree + 1) for axis in "xy"}
-
-
-_STEPS = {"size": -8.5, "stretch": -8.5, "luma": -8.5, "blue": -8.5, "green": -8.5}
 
 
 # -------------------------------------------------------------------------------------------- the original

@@ -5,7 +5,7 @@ the model's time.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,9 +23,6 @@ from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfi
 from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 __all__ = ["plot_correlation", "plot_increments", "plot_pairs", "plot_times", "plot_trace"]
 
 _BLUE, _RED, _GREY, _ORANGE, _GREEN = "#1f4e79", "#d1242f", "#57606a", "#bc4c00", "#1a7f37"
@@ -36,7 +33,7 @@ _COLORS = (_BLUE, _ORANGE, _GREEN, _RED, "#8250df", _GREY)
 
 def plot_times(
     posterior: FrameTimePosterior,
-    axes: "np.ndarray | None" = None,
+    axes: np.ndarray | None = None,
     *,
     fitted: Float[np.ndarray, " num_frames"] | None = None,
     flagged: Sequence[Irregularity] | None = None,
@@ -108,11 +105,11 @@ def plot_times(
 
 def plot_increments(
     posterior: FrameTimePosterior,
-    ax: "Axes | None" = None,
+    ax: Any = None,
     *,
     level: float = 0.9,
     flagged: Sequence[Irregularity] | None = None,
-) -> "Axes":
+) -> Any:
     """Plot each increment in units of the median one, with its central interval; mark duplicated and dropped frames.
 
     Cuts are omitted. Raises as `plot_times` and `increment_intervals` do.
@@ -148,7 +145,7 @@ def plot_increments(
 
 
 def plot_pairs(
-    posterior: FrameTimePosterior, frames: Sequence[int] | None = None, axes: "np.ndarray | None" = None
+    posterior: FrameTimePosterior, frames: Sequence[int] | None = None, axes: np.ndarray | None = None
 ) -> np.ndarray:
     """A corner plot of the joint distribution of a few frames' times, in frames from their means.
 
@@ -205,7 +202,7 @@ def plot_pairs(
 
 
 def plot_trace(
-    posterior: FrameTimePosterior, frames: Sequence[int] | None = None, axes: "np.ndarray | None" = None
+    posterior: FrameTimePosterior, frames: Sequence[int] | None = None, axes: np.ndarray | None = None
 ) -> np.ndarray:
     """Trace plot, one color per ensemble: mean over its walkers (bold lines) and their central 90% (thin lines).
 
@@ -252,7 +249,7 @@ def plot_trace(
     return axes
 
 
-def plot_correlation(profiles: LikelihoodProfiles, ax: "Axes | None" = None) -> "Axes":
+def plot_correlation(profiles: LikelihoodProfiles, ax: Any = None) -> Any:
     """Plot the correlation of residuals by distance; the title states the effective number of independent values.
 
     White noise would fall from 1 to 0 within a pixel. **Units:** pixels.

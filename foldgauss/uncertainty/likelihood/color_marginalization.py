@@ -57,18 +57,13 @@ def marginalize_colors(
     model's own with standard deviation `prior_scale`, in units of the pixels' range; as it tends to 0, so does the
     difference to `base`.
 
-    **Width:** at equal colors the information of a time, g^T C^{-1} g with g = dR/dt, never exceeds that with colors
-    held, g^T g / s^2. The profile may still be narrower than `base` and shifted, since its colors are optimal for the
-    other frames, which those of a fit that is stopped early and clamped are not.
+    **Width:** the information of a time, g^T C^{-1} g with g = dR/dt, never exceeds that with colors held, g^T g / s^2,
+    at equal colors. Here they are optimal for the other frames, so the profile may be shifted and narrower than `base`.
 
     Up to `most_dense` Gaussians the result is exact (Cholesky). Beyond, the quadratic form is solved by conjugate
-    gradients, to about 1e-3 nats, and differences of log det by the trapezoidal rule over traces estimated with
-    `probes` random sign vectors, drawn from `seed` and equal at all times of a frame. 40,000 Gaussians at 160x320, 132
-    frames, one core: 80 s for the equations, then 30 to 55 s per frame. `on_frame` is called with the numbers of frames
-    done and to do.
-
-    Beyond the new nodes the profile continues as `base`, scaled to the same initial slope and never above the value at
-    the junction.
+    gradients, to about 1e-3 nats, and differences of log det are integrated from traces estimated with `probes` random
+    sign vectors of `seed`. `on_frame` is called with the numbers of frames done and to do. Beyond the new nodes the
+    profile continues as `base`, scaled to the same initial slope and never above the value at the junction.
 
     **Shapes and units:** as `ProfileCurves`; nats, the maximum of each new profile is 0.
 

@@ -41,6 +41,7 @@ SLOPE_STEP = 64
 #: A model must explain this fraction of the frames' variance; and a warning is given if its squared error exceeds this
 #: multiple of the mean frame's, as that of a model of another clip of the same scene may.
 EXPLAINED, WORSE_THAN_MEAN = 0.2, 1.5
+_RIGHT_MODEL = "Give the model of this video, at its size and crop."
 #: A warning is given if the first or last frame fits better by PINNED nats at a time AWAY frames from 0 or 1.
 PINNED, AWAY = 10.0, 0.5
 
@@ -269,24 +270,27 @@ def _check_changes(frames: np.ndarray) -> None:
         raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
 
 
+def check_explained(left: float, variance: float) -> None:
+    """Raise ValueError unless the model's squared error `left` is small enough beside the frames' variance."""
+    if left > (1 - EXPLAINED) * variance:
+        got = f"a model that explains {100 * (1 - left / variance) if variance else 0:.0f}% of their variance"
+        expected = f"frames of which the model explains {100 * EXPLAINED:.0f}%"
+        raise invalid("video", expected=expected, got=got, cure=_RIGHT_MODEL)
+
+
 def _check_explained(frames: np.ndarray, builder: ProfileBuilder) -> list[str]:
     """Raises if the model explains too little of the variance over space and time; warns by the variance over time."""
     mean = np.mean(frames, axis=0, dtype=np.float64)
     over_time = sum(float(np.square(frame - mean).sum()) for frame in frames) / 255**2
     over_all = over_time + len(frames) * float(np.square(mean - mean.mean((0, 1))).sum()) / 255**2
     left = sum(float(each.errors.min()) for each in builder.samples)
-    cure = "Give the model of this video, at its size and crop."
-    if left > (1 - EXPLAINED) * over_all:
-        got = f"a model that explains {100 * (1 - left / over_all) if over_all else 0:.0f}% of their variance"
-        raise invalid(
-            "video", expected=f"frames of which the model explains {100 * EXPLAINED:.0f}%", got=got, cure=cure
-        )
+    check_explained(left, over_all)
     if left <= WORSE_THAN_MEAN * over_time:
         return []
     worse = left / over_time if over_time else np.inf
     return [
         f"The model's errors are {worse:.1f} times those of the mean frame: nearly nothing moves in this video, or the"
-        f" model is of another one. {cure}"
+        f" model is of another one. {_RIGHT_MODEL}"
     ]
 
 

@@ -169,10 +169,9 @@ def score_fraction(
     \qquad V_2 = \sum_{p, h} r_p g_p\, r_{p + h} g_{p + h}
     $$
 
-    also summed over channels, with lags h up to twice the `correlated_reach`, tapered from half of that on. V_1 is the
-    variance for noise that is independent of the slope, with the local residual scale s and the correlations rho of
-    `covariance`, preferably the mean of many frames. V_2 uses the residuals themselves, which lie along edges as slopes
-    do, but cancel over few pixels at the best time. A fit that has learned part of the noise reduces both, and the
+    also summed over channels, with lags h up to twice the `correlated_reach`, tapered from half of that on. V_1 is for
+    noise independent of the slope, with the local residual scale s and the correlations rho of `covariance`, preferably
+    the mean of many frames; V_2 uses the residuals. A fit that has learned part of the noise reduces both, and the
     fraction is then too large.
 
     **Source:** the sandwich of Huber 1967; covariances over two dimensions as Conley 1999, with the flat-topped weights

@@ -3,14 +3,11 @@ r"""Uncertainty of frame times by refitting splats and times together.
 The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times: to
 resampled frames (method="pixels"), to all frames but some (method="frames"), or once more (method="order").
 
-What remains conditioned on. Time and folds trade off: with any increasing g, times g(t_k) and splats whose m_t, sigma_t
-and folds follow g show the same frames, as far as folds of the model's degree can represent it. Only $t_0 = 0$ and
-$t_{n-1} = 1$ are fixed by definition; a smooth warp is otherwise limited only by the start and the length of the fit.
-So absolute times spread the more the longer the fit, without bound in principle, and `RefitTimes.local` measures what a
-smooth warp hardly changes, each frame's time relative to its neighbors. Few steps keep times near their start, and they
-spread less than they might. Also given are the number of Gaussians and, with start="model", their order in depth and
-the optimum near the model. From scratch most of the spread is not due to noise but to the order of steps: compare
-"order".
+Times are not identified absolutely: for any increasing g, times g(t_k) and splats whose m_t, sigma_t and folds follow g
+show the same frames. Only $t_0 = 0$ and $t_{n-1} = 1$ are fixed, so absolute times spread the more the longer the fit;
+`RefitTimes.local` measures what a smooth warp hardly changes, each frame's time relative to its neighbors. The number
+of Gaussians is held, too, and with start="model" their depth order. From scratch most of the spread is due to the
+order of steps: compare "order".
 """
 
 import dataclasses
@@ -22,7 +19,7 @@ import scipy.stats
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.uncertainty.likelihood.likelihood_profiles import EXPLAINED
+from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
 from foldgauss.video.fitting.loop import FitState, fit_steps, start_from, to_model
@@ -61,9 +58,8 @@ class RefitTimes:
     **Shapes:** `times`, `unseen` (replicates, num_frames), see `Refit`; `own` (num_frames,). **Units:** times of the
     model, [0, 1].
 
-    A frame's `std` is the standard deviation of its times over the replicates. With frames left out, each frame but the
-    first and the last is unseen in one replicate only, so they share one `std`: the root mean square difference from
-    the model's time. Most of it is the splats' error at times without a frame, which fitted frames do not have.
+    A frame's `std` is the standard deviation of its times over the replicates; with frames left out, all frames share
+    one: the root mean square difference from the model's times, of which most is the splats' error without that frame.
     """
 
     times: Float64[np.ndarray, "replicates num_frames"]
@@ -269,18 +265,11 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
         raise invalid(
             "video", expected="frames without alpha for pixels", got=f"{video.dtype} {video.shape}", cure=cure
         )
-    left = sum(float(np.square(each, dtype=np.float64).sum()) for each in _residuals(residuals))
+    images = residuals.render_at(np.asarray(model.frame_times.times()))
+    left = sum(float(np.square(residuals.residual(k, each), dtype=np.float64).sum()) for k, each in enumerate(images))
     variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in residuals.frames) * math.prod(model.size) / 255**2
-    if left > (1 - EXPLAINED) * variation:
-        got = f"a model that explains {100 * (1 - left / variation) if variation else 0:.0f}% of their variance"
-        expected = f"frames of which the model explains {100 * EXPLAINED:.0f}%"
-        raise invalid("video", expected=expected, got=got, cure="Give the model of this video, at its size and crop.")
+    check_explained(left, variation)
     return residuals
-
-
-def _residuals(residuals: Residuals) -> Iterator[Float32[np.ndarray, "3 height width"]]:
-    for k, image in enumerate(residuals.render_at(np.asarray(residuals.model.frame_times.times()))):
-        yield residuals.residual(k, image)
 
 
 def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None) -> FitConfig:
@@ -302,12 +291,10 @@ def resample_frames(
 ) -> UInt8[np.ndarray, "num_frames height width 3"]:
     """Bootstrap frames: the model's images plus residuals in blocks with random signs.
 
-    Every frame is cut into blocks of `block` pixels by a randomly placed grid, and the residuals of a block, of all
-    channels, are multiplied by 1 or -1. With place="kept" they stay in place, so that large residuals stay at edges.
-    With "moved" they are taken from a random position of the same frame, periodic at its borders, so that their
-    variance is uniform. In both cases the mean is the model's image; the variance is the pixel's squared residual if
-    kept, as `score_fraction` assumes, and the frame's mean squared residual if moved, as `effective_fraction` assumes.
-    Frames are independent. Values are rounded to 8 bits and clipped.
+    A randomly placed grid divides every frame into blocks of `block` pixels, whose residuals are multiplied by 1 or -1.
+    With place="kept" they stay in place, and the variance is the pixel's squared residual, as `score_fraction` assumes.
+    With "moved" they are taken from a random position of the same frame, periodic at its borders, and the variance is
+    uniform, as `effective_fraction` assumes. Values are rounded to 8 bits and clipped.
     """
     frames = np.empty(residuals.frames.shape, np.uint8)
     times = np.asarray(residuals.model.frame_times.times())

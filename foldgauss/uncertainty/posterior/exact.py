@@ -106,8 +106,7 @@ def exact_posterior(curves: ProfileCurves, increments: Increments) -> ExactPoste
     evidence to 1e-2 nats for a hundred frames; for concentrations from 0.2 to 20, and likelihoods from flat to much
     narrower than the distance of frames. Worst for the smallest concentrations, whose densities are infinite beside
     frames with narrow likelihoods.
-    **Cost:** for n frames, O(n) grids at concentration 1, else about n 500^2 powers (150 frames with flat likelihoods:
-    about 1 s, and 6 s).
+    **Cost:** for n frames, O(n) grids at concentration 1, else about n 500^2 powers.
     **Raises:** ValueError if no ordered times have positive likelihood, that is, if the likelihoods of frames exceed
     exp(-740) of their maxima only in the wrong order; NaN in the curves.
     """
@@ -254,7 +253,7 @@ def _density(
     for end, inner, shape in ((0, 1, shapes[0]), (-1, -2, shapes[1])):
         if grid[end] == ends[end] and shape < 2 and shape != 1 and np.isfinite(messages[end]):
             density[end] = density[inner] * (2 / shape - 1)
-    return density / _integral(grid, density)
+    return density / float(np.trapezoid(density, grid))
 
 
 def profile_grid(
@@ -494,10 +493,6 @@ def _cells(above, chance, grid, logs, masses, means, variances, power, alpha, no
             if summed > chance[i]:
                 found[i] = j
                 break
-
-
-def _integral(grid: np.ndarray, density: np.ndarray) -> float:
-    return float(np.trapezoid(density, grid))
 
 
 def _moment(grid: np.ndarray, density: np.ndarray, center: float, power: int) -> float:

@@ -118,9 +118,7 @@ class Increments:
         times = np.broadcast_to(self.held, (*coordinates.shape[:-1], self.num_frames)).copy()
         for part, first, last in self._slices():
             fractions = np.exp(_log_fractions(coordinates[..., part]))
-            start, end = self.held[first - 1], self.held[last + 1]
-            found = start + (end - start) * np.cumsum(fractions, axis=-1)[..., :-1]
-            times[..., first : last + 1] = np.minimum(found, end)  # rounding may exceed it
+            times[..., first : last + 1] = self._place(fractions, first, last)
         return times
 
     def coordinates(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch num_free"]:
@@ -167,10 +165,14 @@ class Increments:
         times = np.broadcast_to(self.held, (num, self.num_frames)).copy()
         for first, last in self.runs:
             fractions = rng.dirichlet(np.full(last - first + 2, self.concentration), num)
-            start, end = self.held[first - 1], self.held[last + 1]
-            found = start + (end - start) * np.cumsum(fractions, axis=1)[:, :-1]
-            times[:, first : last + 1] = np.minimum(found, end)
+            times[:, first : last + 1] = self._place(fractions, first, last)
         return times
+
+    def _place(self, fractions: np.ndarray, first: int, last: int) -> np.ndarray:
+        """The times of a run whose increments are these fractions of it."""
+        start, end = self.held[first - 1], self.held[last + 1]
+        found = start + (end - start) * np.cumsum(fractions, axis=-1)[..., :-1]
+        return np.minimum(found, end)  # rounding may exceed it
 
     def _checked(self, coordinates) -> np.ndarray:
         coordinates = np.asarray(coordinates, np.float64)

@@ -81,9 +81,8 @@ def frame_time_posterior(
     `progress`: whether to show a bar, or a function of (what, done, total). `backend`: an HDF5 file to which the draws
     are written; called again with the same arguments, sampling resumes and gives the same bits.
 
-    **Memory:** 16 bytes per kept time, half of which stay allocated: ensembles x (steps / thin_by) x walkers x frames.
-    2,000 frames, 4 x 32 walkers and 1,000 kept steps take 4 GB, of which 2 GB stay. A larger `thin_by` takes less; with
-    a `backend` the first half is on disk except for one ensemble at a time.
+    **Memory:** 16 bytes per kept time (ensembles x (steps / thin_by) x walkers x frames), of which half stay allocated;
+    with a `backend` the first half is on disk except for one ensemble at a time.
 
     Raises ValueError before any image is rendered for fewer walkers than twice the frames that move at once, settings
     out of range or in conflict with each other, and a backend that cannot be written; later for a backend of another
@@ -109,7 +108,9 @@ def frame_time_posterior(
                 profiles = likelihood_profiles(model, video, noise=noise, on_render=_labeled(show, "images"))
             profiles = condition_on_level(level, model, video, profiles, frames, _labeled(show, "frames"))
             log_prob = frame_time_log_prob(model, frames=frames, concentration=concentration, profiles=profiles)
-        return _Run(log_prob, settings).sample_until_converged(int(steps) // int(thin_by), show, profiles)
+        run = _Run(log_prob, settings)
+        with contextlib.nullcontext() if run.file is None else contextlib.closing(run.file):
+            return run.sample_until_converged(int(steps) // int(thin_by), show, profiles)
 
 
 def _check_arguments(
@@ -177,13 +178,6 @@ class _Run:
         return sampler
 
     def sample_until_converged(self, most: int, show, profiles: LikelihoodProfiles | None) -> FrameTimePosterior:
-        try:
-            return self._sample_until_converged(most, show, profiles)
-        finally:
-            if self.file is not None:
-                self.file.close()
-
-    def _sample_until_converged(self, most: int, show, profiles: LikelihoodProfiles | None) -> FrameTimePosterior:
         done = min(sampler.iteration for sampler in self.samplers)
         goal = min(CHECK_EVERY, most)
         while True:

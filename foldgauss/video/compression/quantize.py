@@ -414,8 +414,7 @@ def _make_info(model: VideoModel) -> CompactInfo:
     if model.num_gaussians < 1:
         raise invalid("model", expected="at least one Gaussian", got="none")
     # A Gaussian's area is about exp(-power tau^2 / 2), of deviation 1 / sqrt(power); a uniform weight of the same
-    # deviation reaches sqrt(3) times as far. Twice that needed the fewest bits (Bunny, 160x320: 1.0 times 527 kB,
-    # 1.6 516, 2.0 509, 2.4 510): small Gaussians may still be visible.
+    # deviation reaches sqrt(3) times as far. Twice that takes the fewest bits, as measured.
     power = float(power[0])
     reach = min(TAU_MAX, math.sqrt(12 / max(power, 0.1)))
     return CompactInfo(

@@ -107,13 +107,10 @@ def compress(
 ) -> Compressed:
     """Quantize `model` as coarsely as `max_loss_db` allows, in dB of the mean PSNR of all frames.
 
-    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that.
-
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
-
-    Gaussians are reordered where that is hardly visible. Parameters that they do not have (`FoldedSplats.degrees`,
-    `static`, `opaque`) stay absent, and shared colours stay shared.
+    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
+    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for `passes` passes once
     Gaussians have been dropped, paths and colours for half as many once geometry is rounded, colours for a quarter once

@@ -29,10 +29,8 @@ SSIM_WINDOW, SSIM_REACH = 11, 5
 def ssim(target: np.ndarray, image: np.ndarray) -> float:
     """Mean SSIM of two uint8 images (height, width, 3), with the weights of Wang et al. 2004.
 
-    1 is equal. Example: `ssim(clip.frames[0], next(model.frames()))`. Raises ValueError where sizes differ.
-
-    The mean is over the pixels whose window of 11 px lies inside the image. A side shorter than that is padded by
-    mirroring the image.
+    1 is equal. The mean is over pixels whose window of 11 px lies inside the image; shorter sides are mirrored. Raises
+    ValueError where sizes differ. Example: `ssim(clip.frames[0], next(model.frames()))`.
     """
     short = [(SSIM_REACH, SSIM_REACH) if length < SSIM_WINDOW else (0, 0) for length in target.shape[:2]]
     pair = (np.pad(one, [*short, (0, 0)], mode="symmetric") for one in (target, image))
@@ -74,9 +72,8 @@ def evaluate(
     """Compare `model` at its frame times with `frames`, uint8 (num_frames, *model.size, 3), or with alpha (..., 4).
 
     Both are composited over `background`: errors in alpha do not show over black, but over white. Images are rounded to
-    8 bits first. `on_frame` is called with each image. `model` is any video, also one in segments. Frames are read one
-    by one, in order: `frames` may be anything with `shape`, `dtype`, `ndim` and `[k]`, as `foldgauss.io.LazyFrames` of
-    a clip larger than memory. Raises ValueError if the number or size of the frames differs from the model's.
+    8 bits first. `on_frame` is called with each image. `model` is any video; `frames` may also be read lazily, such as
+    `foldgauss.io.LazyFrames`. Raises ValueError if the number or size of the frames differs from the model's.
 
     Example: `evaluate(model, clip.frames).mean_psnr`.
     """

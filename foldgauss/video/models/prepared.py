@@ -45,7 +45,9 @@ class PreparedModel:
         height, width = model.size
         self.rows = pack(model.splats)
         _check_finite(self.rows)
-        self.spec = _make_spec(model.splats, tuple(size), height / width if aspect is None else aspect)
+        power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
+        aspect = height / width if aspect is None else aspect
+        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), aspect=aspect)
         self.window = np.empty((len(self.rows), 2), np.float32)
         update_windows(self.rows, np.arange(len(self.rows)), self.window)
         apply_scale_cutoff(self.rows, self.window, self.spec, model.scale_cutoff)
@@ -73,11 +75,6 @@ def _check_finite(rows: np.ndarray) -> None:
             "The fit diverged, or the model was edited: fit again.",
         )
         raise invalid("model", expected="finite numbers", got=got, cure=cure)
-
-
-def _make_spec(splats: FoldedSplats, size: tuple[int, int], aspect: float) -> ConditioningSpec:
-    power, floor = (_common_value(splats.envelope, name) for name in ("power", "floor"))
-    return ConditioningSpec(splats.degree, power, floor, size, aspect=aspect)
 
 
 def _common_value(envelope: TimeLikelihood, name: str) -> float:

@@ -261,11 +261,11 @@ def by_mask(
 
     - `mask`: bool (height, width) for `frame`, or for each of `frames`; (num_frames, height, width), one for each of
       `frames` (default: all); or {frame: mask}. Any size of the model's aspect; values in [0, 1] are fractions.
-    - `follow`: Gaussians that the masked frames hardly show (not alive yet, or occluded) are decided where they are
-      visible: frame by frame outwards from the masked ones, within the shot, they join the decided ones around them
-      with similar motion and colour. False: only Gaussians visible in the masked frames are selected.
-    - Gaussians visible in no frame, as they are occluded or live between two frames, are decided by their position at
-      their own m_t in the nearest frame: by its mask, or with `follow` by the decided ones around.
+    - `follow`: Gaussians that the masked frames hardly show are labeled where they are visible, frame by frame outwards
+      within the shot, as their neighbours of similar motion and colour. False: only Gaussians visible in the masked
+      frames are selected.
+    - Gaussians visible in no frame are labeled by their position at their own m_t in the nearest frame: by its mask, or
+      with `follow` by their labeled neighbours.
 
     One mask selects a whole object; a few masks are better, and one for each frame is best.
 
@@ -370,9 +370,8 @@ def by_click(
     """The object at a click: grown from the greatest contributor at the pixel (x, y) of `frame`, along its motion.
 
     A Gaussian is included if it *looks* like the pixel, to within `tolerance`, and is linked to it by a chain of such
-    neighbours, which touch and move alike in most of the frames in which they touch. The set extends through time up to
-    the cuts of the shot, and ends where the colour or the motion changes; a static background of one colour has neither
-    boundary, so intersect with a box. Gaussians visible in none of the frames examined (at most 48) are left out.
+    neighbours, which touch and move alike in most of the frames in which they touch, up to the cuts of the shot. A
+    static background of one colour has no boundary: intersect with a box. At most 48 frames are examined.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 

@@ -1,8 +1,8 @@
-// Buttons, keys, pointers, and what they tell of the player.
+// Buttons, keys and pointers, and the texts and controls that show the state of the player.
 import { element } from "./elements.js";
 import { SPEEDS } from "./player.js";
 
-const CLICK = 5; // CSS pixels: what moves less is a click
+const CLICK = 5; // CSS pixels: a pointer that moves less is a click
 const CAPTIONS = { model: "Model", original: "Original", difference: "Difference × 4" };
 
 /** Seconds as minutes, seconds and hundredths. */
@@ -23,11 +23,11 @@ function fill(slider, value) {
   slider.style.setProperty("--done", `${(100 * (slider.value - slider.min)) / (slider.max - slider.min || 1)}%`);
 }
 
-function remembered(name) {
+function recall(name) {
   try {
     return localStorage.getItem(name);
   } catch {
-    return null; // in frames that may keep nothing
+    return null; // storage is not allowed in some frames
   }
 }
 
@@ -35,7 +35,7 @@ function remember(name, value) {
   try {
     localStorage.setItem(name, value);
   } catch {
-    // likewise
+    // storage is not allowed in some frames
   }
 }
 
@@ -75,9 +75,9 @@ export class Controls {
     element("modes").hidden = !this.player.hasOriginal;
   }
 
-  // --------------------------------------------------------------------------------------------- what is told
+  // --------------------------------------------------------------------------------------------------- display
 
-  /** Bring all that is told up to date. */
+  /** Update all texts and controls. */
   update() {
     const { player } = this, { timeline, position, playing, edit, selection } = player, { last, fps } = timeline;
     put("now", clock(position / fps));
@@ -92,9 +92,9 @@ export class Controls {
     element("speed").value = String(player.speed);
     const number = (value) => value.toLocaleString("en");
     const rate = playing && player.rate > 2 ? ` · ${player.rate} fps` : "";
-    if (!playing || this.toldAt !== Math.floor(performance.now() / 250))
+    if (!playing || this.shownAt !== Math.floor(performance.now() / 250))
       put("stats", `${number(player.alive)} of ${number(player.segments.total)} Gaussians${rate}`);
-    this.toldAt = Math.floor(performance.now() / 250);
+    this.shownAt = Math.floor(performance.now() / 250);
     put("zoom", player.view.isReset ? "" : `${player.view.zoom.toFixed(1)}×`);
     element("stage").classList.toggle("zoomed", !player.view.isReset);
     element("stage").classList.toggle("brushing", player.brushing);
@@ -108,7 +108,7 @@ export class Controls {
   updatePanel(edit, count, number) {
     element("panel").hidden = !this.player.brushing;
     const { segments, lead } = this.player, { length } = segments.spans;
-    put("picked", count ? `${number(count)} ${length > 1 ? "in this segment" : "picked"}` : "Paint over something");
+    put("picked", count ? `${number(count)} ${length > 1 ? "in this segment" : "selected"}` : "Paint over something");
     if (!this.following) put("follow", `Follow through ${length > 1 ? `segment ${lead.number + 1} of ${length}` : "the clip"}`);
     press("pick", !this.erasing);
     press("erase", this.erasing);
@@ -120,13 +120,13 @@ export class Controls {
     element("offset").disabled ||= edit.copies === 1;
     for (const name of ["scale", "copies", "offset"]) fill(element(name), edit[name]);
     fill(element("radius"), element("radius").value);
-    put("radius-told", `${element("radius").value} px`);
-    put("scale-told", `${edit.scale.toFixed(2)}×`);
-    put("copies-told", String(edit.copies));
-    put("offset-told", edit.offset.toFixed(2));
+    put("radius-value", `${element("radius").value} px`);
+    put("scale-value", `${edit.scale.toFixed(2)}×`);
+    put("copies-value", String(edit.copies));
+    put("offset-value", edit.offset.toFixed(2));
   }
 
-  /** Say so where one waits for a segment. */
+  /** Show a message while a segment is being decoded. */
   updateMissing(missing) {
     if (missing === this.missing) return;
     if (this.missing !== undefined) element("toast").hidden = true;
@@ -135,7 +135,7 @@ export class Controls {
     if (missing !== undefined) this.soon = setTimeout(() => this.toast(`Decoding segment ${missing + 1}`, 60_000), 200);
   }
 
-  /** Captions and the divider, where the pictures are. */
+  /** Place the captions and the divider over the images. */
   updateOverlays() {
     const { player, ratio } = this, panes = player.view.panes(player.numPanes);
     const captions = player.mode === "slider" ? ["original", "model"] : player.mode === "model" ? [] : player.shown;
@@ -173,22 +173,22 @@ export class Controls {
   bindTheme() {
     const wished = matchMedia("(prefers-color-scheme: light)");
     const show = (theme) => (document.documentElement.dataset.theme = theme);
-    show(remembered("foldgauss-theme") ?? (wished.matches ? "light" : "dark"));
-    wished.addEventListener("change", () => remembered("foldgauss-theme") ?? show(wished.matches ? "light" : "dark"));
+    show(recall("foldgauss-theme") ?? (wished.matches ? "light" : "dark"));
+    wished.addEventListener("change", () => recall("foldgauss-theme") ?? show(wished.matches ? "light" : "dark"));
     this.theme = () => {
       show(document.documentElement.dataset.theme === "light" ? "dark" : "light");
       remember("foldgauss-theme", document.documentElement.dataset.theme);
     };
     this.full = () => {
       if (document.fullscreenElement) document.exitFullscreen();
-      else document.documentElement.requestFullscreen?.().catch(() => this.toast("This page may not fill the screen here."));
+      else document.documentElement.requestFullscreen?.().catch(() => this.toast("Full screen is not allowed here."));
     };
     element("full").hidden = !document.fullscreenEnabled;
     this.on("theme", "click", this.theme);
     this.on("full", "click", this.full);
     this.help = () => {
       element("help").showModal();
-      element("help-title").focus(); // not the button: its ring would catch the eye
+      element("help-title").focus(); // not the button, whose focus ring would distract
     };
     this.on("help-open", "click", this.help);
     this.on("help-close", "click", () => element("help").close());
@@ -300,18 +300,18 @@ export class Controls {
     this.following = true;
     player.onChange();
     try {
-      more = await player.follow(async (share) => {
-        put("follow", `Following ${Math.round(100 * share)} %`);
+      more = await player.follow(async (fraction) => {
+        put("follow", `Following ${Math.round(100 * fraction)} %`);
         await new Promise((next) => setTimeout(next));
       });
     } finally {
       this.following = false;
     }
-    this.toast(`${more.toLocaleString("en")} more Gaussians belong to it`);
+    this.toast(`${more.toLocaleString("en")} more Gaussians selected`);
     player.changed();
   }
 
-  /** The numbers of those picked, for Python. */
+  /** Copy the indices of the selected Gaussians, for Python. */
   async copy() {
     const { selection, model, segments, lead } = this.player, which = segments.spans.length > 1 ? { segment: lead.number } : {};
     const text = JSON.stringify({ ...which, num_gaussians: model.num, indices: selection.indices() });
@@ -319,13 +319,13 @@ export class Controls {
       await navigator.clipboard.writeText(text);
       this.toast("Copied. See docs/player.md for how to use it in Python.");
     } catch {
-      this.toast("This browser does not let the page copy here.");
+      this.toast("The browser does not allow copying here.");
     }
   }
 
   // -------------------------------------------------------------------------------------------------- pointers
 
-  /** Where an event is, device pixels of the canvas. */
+  /** Position of an event, in device pixels of the canvas. */
   at(event) {
     const { left, top } = element("stage").getBoundingClientRect();
     return [(event.clientX - left) * this.ratio, (event.clientY - top) * this.ratio];
@@ -377,7 +377,7 @@ export class Controls {
     this.pointers.set(event.pointerId, { x, y });
   }
 
-  /** Two fingers: zoom by how far apart they are, move by their middle. */
+  /** Two fingers: zoom by their distance, move by their midpoint. */
   pinch(id, x, y) {
     const { view } = this.player, moving = this.pointers.get(id);
     const [, still] = [...this.pointers].find(([other]) => other !== id);
@@ -406,7 +406,7 @@ export class Controls {
   }
 
   wheel(event) {
-    if (window !== window.top && !event.ctrlKey && !event.metaKey) return; // in a notebook the wheel is the notebook's
+    if (window !== window.top && !event.ctrlKey && !event.metaKey) return; // in a notebook the wheel scrolls
     event.preventDefault();
     const lines = event.deltaMode === 1 ? 16 : 1, [x, y] = this.at(event);
     this.zoom(Math.exp(-0.0022 * lines * event.deltaY * (event.ctrlKey ? 3 : 1)), x, y);

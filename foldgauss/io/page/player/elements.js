@@ -1,2 +1,2 @@
-// The page's elements by their names.
+// Access to the page's elements by id.
 export const element = (name) => document.getElementById(name);

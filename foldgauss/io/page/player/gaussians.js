@@ -1,19 +1,19 @@
-// The model as the renderer takes it: decoded, its numbers as they act, in texels of four; and who is alive when.
+// A decoded model prepare for rendering: activated parameters in texels of four, and the time windows of Gaussians.
 import { decode } from "./compact.js";
 import { frameTimes } from "./timeline.js";
 
 export const TEXTURE_WIDTH = 2048;
 const SH_C0 = 0.28209479177387814;
-const TAU_MAX = Math.sqrt(-2 * Math.log(0.01)); // beyond, a Gaussian is not drawn
+const TAU_MAX = Math.sqrt(-2 * Math.log(0.01)); // beyond, a Gaussian is not rendered
 
 const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 
 /**
- * From a compact file's bytes to what is drawn. Texels of a Gaussian:
- * 0: place x, y, own time, duration; 1: two deviations, cosine and sine of the first one's angle;
+ * Prepare a compact file's model. Texels of a Gaussian:
+ * 0: m_s, m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle;
  * 2: red, green, blue, opacity; 3 and on: the path's coefficients, two powers each.
  */
-export function prepared(buffer, onProgress) {
+export function prepare(buffer, onProgress) {
   const { header, leaves } = decode(buffer, onProgress);
   const num = header.num_gaussians, degree = header.degree, texels = 3 + Math.ceil(degree / 2), width = 4 * texels;
   const rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
@@ -35,7 +35,7 @@ export function prepared(buffer, onProgress) {
   return { header, num, degree, texels, rows, values, times, windows: windows(header, num, width, values) };
 }
 
-/** From when to when each Gaussian is drawn, pairs: near its own time, and no thinner than the file allows. */
+/** Time windows in which Gaussians are rendered: near m_t, and above the file's scale cutoff. */
 function windows(header, num, width, values) {
   const { power, floor, scale_cutoff: thinnest } = header, spans = new Float32Array(2 * num);
   for (let i = 0; i < num; i++) {

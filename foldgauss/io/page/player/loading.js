@@ -1,7 +1,7 @@
-// Decoding apart from the page, in a worker of its own script; on the page where a browser allows no worker.
-import { prepared } from "./gaussians.js";
+// Decoding in a worker that runs the page's own script, or on the page where no worker is allowed.
+import { prepare } from "./gaussians.js";
 
-/** The bytes of one of the page's data blocks, or null where there is none. */
+/** The bytes of a data block of the page, or null if it is missing. */
 export function blockOf(name) {
   const block = document.getElementById(name);
   return block && bytesOf(block.textContent);
@@ -13,11 +13,11 @@ function bytesOf(text) {
   return bytes;
 }
 
-/** The worker's side: messages with a file's text, answers with the share done, then the model or an error. */
+/** The worker: receives a file's text, answers with the fraction decoded, then with the model or an error. */
 export function serve(scope) {
   scope.onmessage = ({ data }) => {
     try {
-      const model = prepared(bytesOf(data).buffer, (share) => scope.postMessage({ share }));
+      const model = prepare(bytesOf(data).buffer, (fraction) => scope.postMessage({ fraction }));
       scope.postMessage({ model }, [model.values.buffer, model.windows.buffer]);
     } catch (error) {
       scope.postMessage({ error: error.message });
@@ -25,12 +25,12 @@ export function serve(scope) {
   };
 }
 
-/** The segments' spans, of a page that has more models than one. */
+/** The spans of the segments; null for a page with one model. */
 export function spansOfPage() {
   return JSON.parse(document.getElementById("segments")?.textContent ?? "null");
 }
 
-function started() {
+function startWorker() {
   const script = new Blob([document.getElementById("player").textContent], { type: "text/javascript" });
   return new Worker(URL.createObjectURL(script));
 }
@@ -38,42 +38,42 @@ function started() {
 /** Decodes the page's models, one at a time. */
 export class Decoder {
   constructor() {
-    this.blocks = [...document.querySelectorAll('script[id^="model"]')]; // in the clip's order
+    this.blocks = [...document.querySelectorAll('script[id^="model"]')]; // in order of time
   }
 
-  /** Of all models, as they are in the page. */
+  /** Size of all models in the page. */
   get numBytes() {
     return this.blocks.reduce((sum, { textContent }) => sum + (textContent.length * 3) / 4, 0);
   }
 
-  /** A model, decoded; `onShare` is told how far that has come. */
-  decode(number, onShare) {
+  /** Decode a model; `onProgress` is called with the fraction decoded. */
+  decode(number, onProgress) {
     const text = this.blocks[number].textContent;
     return new Promise((resolve, reject) => {
       const here = () => {
         this.stop();
         try {
-          resolve(prepared(bytesOf(text).buffer, onShare));
+          resolve(prepare(bytesOf(text).buffer, onProgress));
         } catch (error) {
           reject(error);
         }
       };
       try {
-        this.worker ??= started();
+        this.worker ??= startWorker();
       } catch {
         setTimeout(here);
         return;
       }
       this.worker.onerror = here;
       this.worker.onmessage = ({ data }) => {
-        if ("share" in data) return onShare(data.share);
+        if ("fraction" in data) return onProgress(data.fraction);
         return data.error ? reject(new Error(data.error)) : resolve(data.model);
       };
       this.worker.postMessage(text);
     });
   }
 
-  /** Leave what is being decoded: its promise is never kept. */
+  /** Stop decoding: the promise is never settled. */
   stop() {
     this.worker?.terminate();
     this.worker = null;

@@ -1,4 +1,4 @@
-// The page's beginning: as a worker, decode; as a page, decode in a worker, then play.
+// Entry point: in a worker, decode; in the page, decode in a worker, then play.
 import { element } from "./elements.js";
 import { Controls } from "./controls.js";
 import { Decoder, serve, spansOfPage } from "./loading.js";
@@ -6,28 +6,28 @@ import { Player } from "./player.js";
 import { Renderer } from "./renderer.js";
 import { Segments } from "./segments.js";
 
-/** Tell people in place of the picture; `share` of 0 to 1 as a bar. */
-function tell(text, share) {
+/** Show a notice in place of the image, with a progress bar for a `fraction` in [0, 1]. */
+function notify(text, fraction) {
   element("notice").hidden = text === "";
   element("notice-text").textContent = text;
-  element("notice-bar").hidden = share === undefined;
-  element("notice-bar").value = share ?? 0;
+  element("notice-bar").hidden = fraction === undefined;
+  element("notice-bar").value = fraction ?? 0;
 }
 
-/** Keep the player up when the graphics card drops its context. */
-function survive(canvas, player) {
+/** Restore the player after the graphics card has lost its context. */
+function restoreOnLoss(canvas, player) {
   canvas.addEventListener("webglcontextlost", (event) => {
     event.preventDefault();
-    tell("The graphics card has let go of this page. It comes back by itself, or when the page is loaded again.");
+    notify("The graphics context was lost. It is restored automatically, or when the page is reloaded.");
   });
   canvas.addEventListener("webglcontextrestored", () => {
     player.renderer.restore();
-    tell("");
+    notify("");
     player.invalidate();
   });
 }
 
-/** What tests and scripts may use; see docs/player.md. */
+/** Interface for tests and scripts; see docs/player.md. */
 function hooks(player) {
   return {
     seek: (time) => player.seek(time),
@@ -44,28 +44,28 @@ function hooks(player) {
   };
 }
 
-let failed = false; // what is told then stays, though a worker may still be decoding
+let failed = false; // the error message stays, though a worker may still be decoding
 
 async function start() {
   const canvas = element("canvas");
-  tell("Decoding", 0);
+  notify("Decoding", 0);
   const decoder = new Decoder();
-  const loading = decoder.decode(0, (share) => failed || tell("Decoding", share));
-  const renderer = new Renderer(canvas); // its programs are compiled meanwhile
+  const loading = decoder.decode(0, (fraction) => failed || notify("Decoding", fraction));
+  const renderer = new Renderer(canvas); // compiles its programs meanwhile
   const segments = new Segments(await loading, spansOfPage(), decoder);
   let controls;
   const player = new Player(canvas, renderer, segments, () => controls?.update());
   controls = new Controls(player);
-  survive(canvas, player);
+  restoreOnLoss(canvas, player);
   segments.onError = (error) => {
     player.pause();
-    tell(error.message);
+    notify(error.message);
   };
-  tell("");
+  notify("");
   player.loadSeconds = performance.now() / 1000;
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches && player.timeline.last > 0) player.play();
   else player.changed();
-  setTimeout(() => !player.playing && player.pause(), 150); // the first picture has the model's own pixels, to be there soon
+  setTimeout(() => !player.playing && player.pause(), 150); // the first image has the model's own size, to appear early
   requestAnimationFrame(() => requestAnimationFrame(() => segments.begin()));
   window.foldgauss.player = player;
   Object.defineProperties(window.foldgauss, Object.getOwnPropertyDescriptors(hooks(player)));
@@ -77,6 +77,6 @@ else {
   window.foldgauss = { ready };
   ready.catch((error) => {
     failed = true;
-    tell(error.message);
+    notify(error.message);
   });
 }

@@ -1,13 +1,13 @@
 #version 300 es
-// A drawn picture's share of a fade: what it adds to the others, colour and light left.
+// The weighted contribution of one rendered image to a fade: colour and transmittance.
 precision highp float;
 
-uniform sampler2D drawn;
+uniform sampler2D rendered;
 uniform float weight;
 
 in vec2 atTarget;
 out vec4 result;
 
 void main() {
-  result = weight * texture(drawn, atTarget);
+  result = weight * texture(rendered, atTarget);
 }

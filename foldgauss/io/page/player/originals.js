@@ -1,40 +1,40 @@
-// The original's frames: pictures in the page's data blocks, decoded when they are wanted.
+// The original's frames, in the page's data blocks, decoded on demand.
 import { blockOf } from "./loading.js";
 
 const KEPT = 24, AHEAD = 4;
 
 export class Originals {
-  /** `onReady` is called when a frame that was missing has come. */
+  /** `onReady` is called when a missing frame has been decoded. */
   constructor(onReady) {
     this.num = document.querySelectorAll('script[id^="frame-"]').length;
-    this.pictures = new Map(); // in the order of their last use
+    this.images = new Map(); // least recently used first
     this.coming = new Set();
     this.onReady = onReady;
   }
 
-  /** Frame k, or while it is decoded the one that was shown last; null at first. */
+  /** Frame k, or the last one shown while it is being decoded; null at first. */
   at(k) {
     for (let next = k; next <= k + AHEAD; next++) this.fetch(next % this.num);
-    const picture = this.pictures.get(k);
-    if (picture) {
-      this.pictures.delete(k);
-      this.pictures.set(k, picture);
-      this.last = picture;
+    const image = this.images.get(k);
+    if (image) {
+      this.images.delete(k);
+      this.images.set(k, image);
+      this.last = image;
     }
-    return picture ?? this.last ?? null;
+    return image ?? this.last ?? null;
   }
 
   async fetch(k) {
-    if (this.pictures.has(k) || this.coming.has(k)) return;
+    if (this.images.has(k) || this.coming.has(k)) return;
     this.coming.add(k);
     const data = new Blob([blockOf(`frame-${k}`)], { type: "image/webp" });
-    const picture = await createImageBitmap(data, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+    const image = await createImageBitmap(data, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
     this.coming.delete(k);
-    this.pictures.set(k, picture);
-    for (const [old, own] of this.pictures) {
-      if (this.pictures.size <= KEPT) break;
+    this.images.set(k, image);
+    for (const [old, own] of this.images) {
+      if (this.images.size <= KEPT) break;
       if (own === this.last) continue;
-      this.pictures.delete(old);
+      this.images.delete(old);
       own.close();
     }
     this.onReady();

@@ -1,4 +1,4 @@
-// The player: what time it is, what is shown of it and how, and when to draw.
+// The player: position in time, display mode and edits, and when to render.
 import { Originals } from "./originals.js";
 import { WHAT } from "./renderer.js";
 import { View, common } from "./view.js";
@@ -6,9 +6,9 @@ import { View, common } from "./view.js";
 export const SPEEDS = [1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2];
 const TINT = [1, 0.58, 0.2];
 const MOST_PIXELS = 6e6;
-const SLOW = 1 / 27, FAST = 1 / 50; // seconds a picture: draw fewer pixels, more pixels
+const SLOW = 1 / 27, FAST = 1 / 50; // seconds per image: render fewer pixels, more pixels
 
-/** What is done to those picked. `front` null: copies come to the front. */
+/** Edits of the selected Gaussians. `front` null: in front if there are copies. */
 const UNCHANGED = { vanish: false, front: null, scale: 1, copies: 1, offset: 0.2 };
 
 export class Player {
@@ -29,12 +29,12 @@ export class Player {
     this.originals = new Originals(() => this.invalidate());
     Object.assign(this, { playing: false, speed: 1, loop: true });
     Object.assign(this, { mode: "model", split: 0.5, background: [0, 0, 0], brushing: false, edit: { ...UNCHANGED } });
-    Object.assign(this, { quality: 0.1, alive: 0, drawn: [], waiting: false, before: 0, pace: 0 });
+    Object.assign(this, { quality: 0.1, alive: 0, renderTimes: [], waiting: false, before: 0, pace: 0 });
   }
 
   // ---------------------------------------------------------------------------------------------- time
 
-  /** Be at a position; what was seen before stays until that is decoded. */
+  /** Set the position; the previous image stays until its segments are decoded. */
   goTo(position) {
     this.position = position;
     this.time = this.timeline.timeAt(position);
@@ -43,19 +43,19 @@ export class Player {
     this.lead = this.seen.reduce((one, other) => (other.weight > one.weight ? other : one));
   }
 
-  /** Go to a position, in frames; between frames is the model's own in-between time. */
+  /** Go to a position in frames; fractions are times between frames. */
   seekPosition(position) {
     this.goTo(Math.min(Math.max(position, 0), this.timeline.last));
     this.changed();
   }
 
-  /** Go to a time of the clip, 0 to 1; fulfilled when what is seen then is decoded. */
+  /** Go to a time of the clip, 0 to 1; fulfilled when its segments are decoded. */
   seek(time) {
     this.seekPosition(this.segments.positionOf(time));
     return this.segments.ready();
   }
 
-  /** Of the segment that is seen most: its model, and what is picked of it. */
+  /** The model of the segment with the largest weight, and its selection. */
   get model() {
     return this.lead.model;
   }
@@ -91,7 +91,7 @@ export class Player {
     const passed = this.before ? Math.min((now - this.before) / 1000, 0.25) : 0, { last } = this.timeline;
     this.before = now;
     this.adapt(passed);
-    if (this.segments.missing !== undefined) return; // it goes on when that is decoded
+    if (this.segments.missing !== undefined) return; // wait until it is decoded
     const next = this.position + passed * this.timeline.fps * this.speed, rest = this.rest ?? 0;
     let to = next;
     this.rest = 0;
@@ -99,12 +99,12 @@ export class Player {
       this.pause();
       return this.seekPosition(last);
     }
-    if (next > last && rest + next - last < 1) [to, this.rest] = [last, rest + next - last]; // the last frame's own time
+    if (next > last && rest + next - last < 1) [to, this.rest] = [last, rest + next - last]; // the last frame is shown for its full duration
     else if (next > last) to = 0;
     this.goTo(to);
   }
 
-  /** Fewer pixels where pictures come slowly, down to the model's own; all of them where there is time, or a pause. */
+  /** Adapt the resolution to the frame rate: down to the model's own size, or up to the screen's. */
   adapt(passed) {
     if (passed <= 0) return;
     this.pace += 0.15 * (passed - this.pace);
@@ -112,14 +112,14 @@ export class Player {
     else if (this.pace < FAST) this.quality = Math.min(1.03 * this.quality, 1);
   }
 
-  // ------------------------------------------------------------------------------------------- drawing
+  // ----------------------------------------------------------------------------------------- rendering
 
   changed() {
     this.onChange();
     this.invalidate();
   }
 
-  /** Draw soon, once; nothing is drawn where nothing has changed. */
+  /** Schedule one rendering. */
   invalidate() {
     if (this.waiting) return;
     this.waiting = true;
@@ -127,8 +127,8 @@ export class Player {
       this.waiting = false;
       if (this.playing) this.advance(now);
       this.draw();
-      if (this.playing && this.segments.next) this.renderer.take(this.segments.next); // before it is to be drawn
-      this.drawn = [...this.drawn.filter((own) => now - own < 1000), now];
+      if (this.playing && this.segments.next) this.renderer.take(this.segments.next); // upload it before it is needed
+      this.renderTimes = [...this.renderTimes.filter((own) => now - own < 1000), now];
       this.onChange();
       if (this.playing) this.invalidate();
     });
@@ -148,7 +148,7 @@ export class Player {
     return this.mode === "side" ? 2 : 1;
   }
 
-  /** What each pane shows. */
+  /** What each pane shows: model, original or both. */
   get shown() {
     return { side: ["original", "model"] }[this.mode] ?? [this.mode];
   }
@@ -157,8 +157,8 @@ export class Player {
     const { renderer, view } = this, [width, height] = view.area;
     if (renderer.gl.isContextLost() || width < 2 || height < 2) return;
     if (this.mode !== "model") {
-      const picture = this.originals.at(Math.min(Math.round(this.position), this.originals.num - 1));
-      if (picture) renderer.setOriginal(picture);
+      const image = this.originals.at(Math.min(Math.round(this.position), this.originals.num - 1));
+      if (image) renderer.setOriginal(image);
     }
     const panes = view.panes(this.numPanes);
     const visible = panes.map((pane) => common(view.frameIn(pane), pane));
@@ -168,16 +168,16 @@ export class Player {
     panes.forEach((pane, k) => this.show(this.shown[k], view.frameIn(pane), visible[k], inTarget));
   }
 
-  /** Draw the visible part of the frame; returns which part of the target that is. */
+  /** Render the visible part of the frame; returns its rectangle in the target. */
   drawModel(frame, visible) {
-    const least = 1 / frame.scale; // the model's own pixels: fewer would be coarser than it is
+    const least = 1 / frame.scale; // the model's own resolution
     const most = Math.sqrt(MOST_PIXELS / Math.max(visible.width * visible.height, 1));
     const k = Math.min(Math.max(this.quality, least), Math.max(most, Math.min(least, 1)));
     const size = [visible.width, visible.height].map((own) => Math.max(Math.ceil(own * k), 1));
     const middle = [frame.x + frame.width / 2 - visible.x, frame.y + frame.height / 2 - visible.y];
     this.drawTo({
       width: size[0], height: size[1], unit: k * Math.max(frame.width, frame.height), origin: middle.map((own) => k * own),
-      // The footprint that the model was fitted with, in its pixels, however large these are here.
+      // The low-pass filter of the fit, in the model's pixels, whatever their size here.
       lowPass: this.model.header.options.low_pass * Math.max(k * frame.scale, 1) ** 2,
     });
     return [0, 0, (visible.width * k) / size[0], (visible.height * k) / size[1]];
@@ -195,7 +195,7 @@ export class Player {
     this.renderer.draw(parts, target);
   }
 
-  /** Put one part on the screen. */
+  /** Show one pane. */
   show(what, frame, visible, inTarget) {
     if (what !== "slider") return this.put(WHAT[what], frame, visible, visible, inTarget);
     const middle = frame.x + this.split * frame.width, far = 1e6;
@@ -207,14 +207,14 @@ export class Player {
   put(what, frame, visible, part, inTarget) {
     const [width, height] = this.view.area;
     if (part.width <= 0 || part.height <= 0) return;
-    const share = (whole) => [
+    const fraction = (whole) => [
       (part.x - whole.x) / whole.width, (part.y - whole.y) / whole.height, part.width / whole.width, part.height / whole.height,
     ];
-    const of = share(visible), target = [of[0] * inTarget[2], of[1] * inTarget[3], of[2] * inTarget[2], of[3] * inTarget[3]];
-    this.renderer.put(what, share({ x: 0, y: 0, width, height }), share(frame), target, this.background);
+    const of = fraction(visible), target = [of[0] * inTarget[2], of[1] * inTarget[3], of[2] * inTarget[2], of[3] * inTarget[3]];
+    this.renderer.put(what, fraction({ x: 0, y: 0, width, height }), fraction(frame), target, this.background);
   }
 
-  /** The picture of this time as the engines of foldgauss draw it, width x height: red, green, blue, 255. */
+  /** The image at this time as the engines of foldgauss render it, width x height: red, green, blue, 255. */
   pixels(width, height) {
     if (this.segments.missing !== undefined) throw new Error("This time is still being decoded: await seek(t) first.");
     const [rows, columns] = this.model.header.size, aspect = rows / columns;
@@ -224,9 +224,9 @@ export class Player {
     return this.renderer.read(this.background);
   }
 
-  /** Pictures drawn in the last second. */
+  /** Images rendered in the last second. */
   get rate() {
-    return this.drawn.length;
+    return this.renderTimes.length;
   }
 
   // ------------------------------------------------------------------------------------------ the brush
@@ -241,10 +241,10 @@ export class Player {
     this.stroke = null;
   }
 
-  /** Pick under the brush: a point of the screen and a radius, device pixels. */
+  /** Select under the brush, at a point of the screen with a radius, in device pixels. */
   paint(x, y, radius, erase) {
-    if (this.segments.missing !== undefined) return; // what is shown is of another time
-    if (this.stroke !== this.selection) { // another segment has come: a stroke of its own
+    if (this.segments.missing !== undefined) return; // the image shown is of another time
+    if (this.stroke !== this.selection) { // a new segment begins a new stroke
       this.endStroke();
       this.beginStroke();
     }
@@ -263,10 +263,10 @@ export class Player {
     this.changed();
   }
 
-  /** Find those picked at all frames of their segment; returns how many more there are. */
-  async follow(onShare) {
+  /** Follow the selection through its segment; returns the number of Gaussians added. */
+  async follow(onProgress) {
     const { selection, time, timeline } = this.lead, before = selection.count;
-    await selection.follow(time, timeline.times, onShare);
+    await selection.follow(time, timeline.times, onProgress);
     return selection.count - before;
   }
 }

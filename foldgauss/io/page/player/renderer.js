@@ -1,4 +1,4 @@
-// WebGL2: the Gaussians of one time into a picture of half floats, and that onto the screen.
+// WebGL2: renders the Gaussians of one time into a half-float texture, and shows it on the screen.
 import { TEXTURE_WIDTH } from "./gaussians.js";
 import splatVertex from "./splat.vert.glsl";
 import splatFragment from "./splat.frag.glsl";
@@ -8,22 +8,22 @@ import mixFragment from "./mix.frag.glsl";
 
 export const WHAT = { model: 0, original: 1, difference: 2 };
 const NO_BOUND = 1e30;
-const ALL_OF_IT = [0, 0, 1, 1], UPRIGHT = [0, 1, 1, -1]; // a target, whose rows go up, filled
-/** Models on the graphics card at once: those of a fade, and the next. */
+const ALL_OF_IT = [0, 0, 1, 1], UPRIGHT = [0, 1, 1, -1]; // a whole target, whose rows go up
+/** Models on the graphics card at once: those of a fade, and the next one. */
 const HELD = 4;
 
-function compiled(gl, kind, source) {
+function compile(gl, kind, source) {
   const shader = gl.createShader(kind);
   gl.shaderSource(shader, source);
   gl.compileShader(shader);
   return shader;
 }
 
-/** A program and the places of its uniforms by name. */
+/** A program and the locations of its uniforms by name. */
 function program(gl, vertex, fragment) {
   const made = gl.createProgram();
-  gl.attachShader(made, compiled(gl, gl.VERTEX_SHADER, vertex));
-  gl.attachShader(made, compiled(gl, gl.FRAGMENT_SHADER, fragment));
+  gl.attachShader(made, compile(gl, gl.VERTEX_SHADER, vertex));
+  gl.attachShader(made, compile(gl, gl.FRAGMENT_SHADER, fragment));
   gl.bindAttribLocation(made, 0, "instance");
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(made));
@@ -43,7 +43,7 @@ function texture(gl, filter) {
   return made;
 }
 
-/** A texture that can be drawn into, of any size asked for. */
+/** A texture to render into, resized on demand. */
 class Target {
   constructor(gl, format) {
     this.gl = gl;
@@ -67,7 +67,7 @@ class Target {
 }
 
 export class Renderer {
-  /** Throws an Error with a text for people where the browser cannot. */
+  /** Throws an Error for display if the browser lacks WebGL 2. */
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This browser has no WebGL 2, or it is switched off.");
@@ -75,16 +75,16 @@ export class Renderer {
     this.restore();
   }
 
-  /** Make all that lives on the graphics card; again after its context was lost. */
+  /** Create all resources on the graphics card, also after its context was lost. */
   restore() {
     const { gl } = this;
     const half = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.splat = program(gl, splatVertex, splatFragment);
     this.show = program(gl, showVertex, showFragment);
     this.blend = program(gl, showVertex, mixFragment);
-    this.drawn = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
+    this.rendered = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
     this.mixed = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
-    this.result = this.drawn; // which of them is shown
+    this.result = this.rendered; // the target that is shown
     this.bytes = new Target(gl, gl.RGBA8);
     this.original = texture(gl, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
@@ -97,17 +97,17 @@ export class Renderer {
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
     gl.disable(gl.DITHER);
-    this.held = new Map(); // models' textures, in the order of their last use
+    this.held = new Map(); // textures by model, least recently used first
   }
 
-  /** Throw an Error with a text for people where a model is too large. */
+  /** Throw an Error for display if a model is too large. */
   check(model) {
     const { gl } = this;
     if (model.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE) && !gl.isContextLost())
-      throw new Error(`This graphics card has no room for ${model.num.toLocaleString("en")} Gaussians.`);
+      throw new Error(`This graphics card cannot hold ${model.num.toLocaleString("en")} Gaussians.`);
   }
 
-  /** A model's Gaussians on the graphics card: the texture of one of the few used last. */
+  /** The texture of a model's Gaussians, uploaded if necessary. */
   take(model) {
     const { gl, held } = this, found = held.get(model);
     held.delete(model);
@@ -123,28 +123,28 @@ export class Renderer {
     return made;
   }
 
-  /** Draw parts, see `drawOne`, each with its `weight`, into one picture: their weighted sum. */
+  /** Render parts, see `drawOne`, and sum them by their `weight`. */
   draw(parts, target) {
     const many = parts.length > 1;
     parts.forEach((part, k) => {
       this.drawOne(part, target);
       if (many) this.mix(part.weight, k === 0);
     });
-    this.result = many ? this.mixed : this.drawn;
+    this.result = many ? this.mixed : this.rendered;
     this.compositing = parts[0].model.header.compositing;
   }
 
-  /** Add what was drawn to the sum. */
+  /** Add the rendered part to the sum. */
   mix(weight, begin) {
-    const { gl, drawn, blend: { made, at } } = this;
-    this.mixed.bind(drawn.width, drawn.height);
+    const { gl, rendered, blend: { made, at } } = this;
+    this.mixed.bind(rendered.width, rendered.height);
     gl.clearColor(0, 0, 0, 0);
     if (begin) gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(made);
     gl.bindVertexArray(null);
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, drawn.texture);
-    gl.uniform1i(at.drawn, 0);
+    gl.bindTexture(gl.TEXTURE_2D, rendered.texture);
+    gl.uniform1i(at.rendered, 0);
     gl.uniform1f(at.weight, weight);
     gl.uniform4fv(at.onScreen, UPRIGHT);
     gl.uniform4fv(at.inTarget, ALL_OF_IT);
@@ -155,15 +155,15 @@ export class Renderer {
   }
 
   /**
-   * Draw a model's Gaussians listed, front to back, at a time into a picture of width x height pixels. The target says
-   * where the model's frame is in it: `unit`, pixels per unit, and `origin`, its centre; `lowPass` in px^2.
+   * Render the listed Gaussians of a model, front to back, at a time, into width x height pixels. Of the target: `unit`,
+   * pixels per unit of model space; `origin`, the frame's centre; `lowPass` in px^2.
    */
   drawOne({ model, instances, time, edit }, { width, height, unit, origin, lowPass }) {
     const { gl, splat: { made, at } } = this, { header } = model, { options } = header;
     const gaussians = this.take(model);
-    this.drawn.bind(width, height);
+    this.rendered.bind(width, height);
     gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(0, 0, 0, 1); // the light that is left, in place of alpha
+    gl.clearColor(0, 0, 0, 1); // alpha holds the transmittance
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (instances.length === 0) return;
     gl.useProgram(made);
@@ -187,28 +187,28 @@ export class Renderer {
     gl.uniform1f(at.support, options.support_radius === null ? NO_BOUND : options.support_radius ** 2);
     gl.uniform2fv(at.pivot, edit.pivot);
     gl.uniform2fv(at.shift, edit.shift);
-    gl.uniform1f(at.pickedScale, edit.scale);
+    gl.uniform1f(at.selectedScale, edit.scale);
     gl.uniform1f(at.highlight, edit.highlight);
     gl.uniform3fv(at.tint, edit.tint);
     gl.enable(gl.BLEND);
-    // Front to back: what comes adds its colour by the light left, and leaves less of it. Sums know no light.
+    // Front to back: colours are weighted by the transmittance, which each Gaussian reduces, except in sums.
     if (header.compositing === "sum") gl.blendFuncSeparate(gl.ONE, gl.ONE, gl.ZERO, gl.ONE);
     else gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, instances.length);
     gl.disable(gl.BLEND);
   }
 
-  /** The original's picture, which later calls of `put` show. */
-  setOriginal(picture) {
+  /** Set the original's frame for later calls of `put`. */
+  setOriginal(image) {
     const { gl } = this;
-    if (picture === this.originalShown) return;
-    this.originalShown = picture;
+    if (image === this.originalShown) return;
+    this.originalShown = image;
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.original);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
   }
 
-  /** Begin a new screen. */
+  /** Clear the screen. */
   clear(width, height) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -217,7 +217,7 @@ export class Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
-  /** Show a part of what was drawn, or of the original. Rectangles are (left, top, width, height), in shares. */
+  /** Show a part of the rendered image or of the original. Rectangles are (left, top, width, height), as fractions. */
   put(what, onScreen, inPicture, inTarget, background, gain = 4) {
     const { gl, show: { made, at } } = this;
     gl.useProgram(made);
@@ -226,7 +226,7 @@ export class Renderer {
     gl.bindTexture(gl.TEXTURE_2D, this.result.texture);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.original);
-    gl.uniform1i(at.drawn, 0);
+    gl.uniform1i(at.rendered, 0);
     gl.uniform1i(at.original, 1);
     gl.uniform1i(at.what, what);
     gl.uniform1f(at.gain, gain);
@@ -237,7 +237,7 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
 
-  /** What was drawn, as bytes: red, green, blue, 255, the top row first. */
+  /** The rendered image as bytes: red, green, blue, 255, the top row first. */
   read(background) {
     const { gl, result: { width, height } } = this, bytes = new Uint8Array(4 * width * height);
     this.bytes.bind(width, height);

@@ -1,12 +1,12 @@
-// Who is alive, who is picked by the brush, and who belongs to them at other times.
+// Gaussians alive at a time, their selection by brush strokes, and its propagation to other times.
 
-const SEEN = 0.01; // opacity times the light that reaches a Gaussian's centre: less is not picked
-const FAR = 3.4; // deviations: beyond, no alpha is above 1 / 255
-const SAME_COLOR = 0.02; // squared distance of colours that counts as a deviation
-const COPIES_FROM = 28, PICKED = 2 ** 31;
+const SEEN = 0.01; // least opacity times transmittance at its centre for a Gaussian to be selected
+const FAR = 3.4; // standard deviations: beyond, no alpha exceeds 1 / 255
+const SAME_COLOR = 0.02; // variance of colour differences
+const COPIES_FROM = 28, SELECTED = 2 ** 31;
 
-/** A Gaussian at a time: centre, variances along its axes with the pixel's footprint added, axes. Model units. */
-export function conditioned(model, i, time, lowPass) {
+/** A Gaussian condition on a time: centre, variances along its axes with the low-pass filter's added, axes. Model units. */
+export function condition(model, i, time, lowPass) {
   const { values, texels, degree, header } = model, at = 4 * texels * i;
   const u = values[at + 2] - time, tau = u / values[at + 3];
   const a = header.floor + (1 - header.floor) * Math.exp(-0.5 * header.power * tau * tau);
@@ -30,8 +30,8 @@ function alphaAt(one, x, y) {
 
 const extent = (one) => FAR * Math.sqrt(Math.max(one.first, one.second));
 
-/** How alike the colours of two Gaussians are, 0 to 1. */
-function likeness(model, i, j) {
+/** Similarity of the colours of two Gaussians, 0 to 1. */
+function colorSimilarity(model, i, j) {
   const { values, texels } = model, at = 4 * texels * i + 8, other = 4 * texels * j + 8;
   let square = 0;
   for (let c = 0; c < 3; c++) square += (values[at + c] - values[other + c]) ** 2;
@@ -41,14 +41,14 @@ function likeness(model, i, j) {
 export class Selection {
   constructor(model) {
     this.model = model;
-    this.picked = new Uint8Array(model.num);
+    this.selected = new Uint8Array(model.num);
     this.count = 0;
-    this.strokes = []; // of each: who changed
+    this.strokes = []; // indices changed by each
     this.room = new Uint32Array(model.num);
     this.lowPass = model.header.options.low_pass / Math.max(...model.header.size) ** 2;
   }
 
-  /** The numbers of those alive at a time, in their order. Valid until the next call. */
+  /** Indices of the Gaussians alive at a time, in order. Valid until the next call. */
   alive(time) {
     const { room, model: { num, windows } } = this, t = Math.fround(time);
     let count = 0;
@@ -56,21 +56,21 @@ export class Selection {
     return room.subarray(0, count);
   }
 
-  /** What is drawn, front to back, and how many Gaussians are alive: picked ones as the edit says. */
+  /** Instances to render, front to back, with the edit applied, and the number of Gaussians alive. */
   instances(time, edit) {
-    const alive = this.alive(time), { picked } = this;
+    const alive = this.alive(time), { selected } = this;
     if (this.count === 0) return { list: alive.slice(), alive: alive.length };
     const list = [];
     const add = (wanted) => {
       for (const i of alive) {
         if (!wanted(i)) continue;
-        if (!picked[i]) list.push(i);
-        else if (!edit.vanish) for (let c = 0; c < edit.copies; c++) list.push(i + c * 2 ** COPIES_FROM + PICKED);
+        if (!selected[i]) list.push(i);
+        else if (!edit.vanish) for (let c = 0; c < edit.copies; c++) list.push(i + c * 2 ** COPIES_FROM + SELECTED);
       }
     };
     if (edit.front) {
-      add((i) => picked[i]);
-      add((i) => !picked[i]);
+      add((i) => selected[i]);
+      add((i) => !selected[i]);
     } else add(() => true);
     return { list: Uint32Array.from(list), alive: alive.length };
   }
@@ -80,58 +80,58 @@ export class Selection {
   }
 
   /**
-   * Pick, or let go, those seen at a time whose centres are within a circle, model units. Where those picked have
-   * vanished, what they hid is seen and can be picked, too.
+   * Select, or erase, the visible Gaussians at a time whose centres are in a circle, model units. Where the selected
+   * ones have vanished, those behind them are visible.
    */
   paint(time, x, y, radius, erase, vanished) {
     const { model, lowPass } = this, near = [];
     for (const i of this.alive(time)) {
-      if (vanished && !erase && this.picked[i]) continue;
-      const one = conditioned(model, i, time, lowPass);
+      if (vanished && !erase && this.selected[i]) continue;
+      const one = condition(model, i, time, lowPass);
       if (Math.hypot(one.x - x, one.y - y) < radius + extent(one)) near.push(one);
     }
     const inside = (one) => Math.hypot(one.x - x, one.y - y) < radius;
     near.forEach((one, place) => {
-      if (inside(one) && (erase || one.opacity * this.light(near, place) >= SEEN)) this.change(one.i, !erase);
+      if (inside(one) && (erase || one.opacity * this.transmittance(near, place) >= SEEN)) this.change(one.i, !erase);
     });
   }
 
-  /** The light that reaches the centre of a Gaussian in a list from front to back. */
-  light(list, place) {
+  /** Transmittance at the centre of a Gaussian in a list from front to back. */
+  transmittance(list, place) {
     const { x, y, opacity } = list[place];
-    let light = 1;
-    if (this.model.header.compositing === "sum") return light;
-    for (let k = 0; k < place && light * opacity >= SEEN; k++) light *= 1 - Math.min(alphaAt(list[k], x, y), 0.99);
-    return light;
+    let transmittance = 1;
+    if (this.model.header.compositing === "sum") return transmittance;
+    for (let k = 0; k < place && transmittance * opacity >= SEEN; k++) transmittance *= 1 - Math.min(alphaAt(list[k], x, y), 0.99);
+    return transmittance;
   }
 
   change(i, to) {
-    if (Boolean(this.picked[i]) === to) return;
-    this.picked[i] = to ? 1 : 0;
+    if (Boolean(this.selected[i]) === to) return;
+    this.selected[i] = to ? 1 : 0;
     this.count += to ? 1 : -1;
     this.strokes.at(-1).push(i);
   }
 
   undo() {
     for (const i of this.strokes.pop() ?? []) {
-      this.picked[i] = 1 - this.picked[i];
-      this.count += this.picked[i] ? 1 : -1;
+      this.selected[i] = 1 - this.selected[i];
+      this.count += this.selected[i] ? 1 : -1;
     }
   }
 
   clear() {
-    this.picked.fill(0);
+    this.selected.fill(0);
     this.count = 0;
     this.strokes = [];
   }
 
-  /** The middle of those picked that are alive, weighted by opacity and area; the frame's where there are none. */
+  /** Centre of the selected Gaussians alive, weighted by opacity and area; without any the frame's. */
   middle(time) {
     let x = 0, y = 0, total = 0;
     if (this.count)
       for (const i of this.alive(time)) {
-        if (!this.picked[i]) continue;
-        const one = conditioned(this.model, i, time, this.lowPass), weight = one.opacity * Math.sqrt(one.first * one.second);
+        if (!this.selected[i]) continue;
+        const one = condition(this.model, i, time, this.lowPass), weight = one.opacity * Math.sqrt(one.first * one.second);
         x += weight * one.x;
         y += weight * one.y;
         total += weight;
@@ -140,38 +140,38 @@ export class Selection {
   }
 
   indices() {
-    return Array.from(this.picked.keys()).filter((i) => this.picked[i]);
+    return Array.from(this.selected.keys()).filter((i) => this.selected[i]);
   }
 
   /**
-   * Pick at all frames who belongs to those picked at one: who comes anew belongs to whom its centre is covered by,
-   * of its colour. `onShare` is told how far that is; awaits it, so that the page goes on.
+   * Propagate the selection at one time to all frames: a new Gaussian takes the label of those of its colour that
+   * cover its centre. Awaits `onProgress(fraction)` now and then, so that the page stays responsive.
    */
-  async follow(time, times, onShare) {
+  async follow(time, times, onProgress) {
     const before = times.filter((t) => t < time).reverse(), after = times.filter((t) => t > time);
-    const known = new Uint8Array(this.model.num); // 1: belongs, 2: does not
-    for (const i of this.alive(time)) known[i] = this.picked[i] ? 1 : 2;
+    const known = new Uint8Array(this.model.num); // 1: selected, 2: not selected
+    for (const i of this.alive(time)) known[i] = this.selected[i] ? 1 : 2;
     let done = 0;
     for (const way of [after, before])
       for (const t of way) {
-        this.follow_to(t, known);
-        if (++done % 4 === 0) await onShare(done / (before.length + after.length));
+        this.labelFrame(t, known);
+        if (++done % 4 === 0) await onProgress(done / (before.length + after.length));
       }
-    this.begin(); // not before: while it waits, strokes may be painted
+    this.begin(); // only now: strokes may be painted while it waits
     for (let i = 0; i < known.length; i++) if (known[i] === 1) this.change(i, true);
     if (this.strokes.at(-1).length === 0) this.strokes.pop();
   }
 
-  /** Tell of everybody alive at a time whether it belongs, by those of whom it is known. */
-  follow_to(time, known) {
-    const all = Array.from(this.alive(time), (i) => conditioned(this.model, i, time, this.lowPass));
-    const told = all.filter((one) => known[one.i]), reach = told.map(extent), found = [];
+  /** Label the unknown Gaussians alive at a time by a vote of the known ones. */
+  labelFrame(time, known) {
+    const all = Array.from(this.alive(time), (i) => condition(this.model, i, time, this.lowPass));
+    const labeled = all.filter((one) => known[one.i]), reach = labeled.map(extent), found = [];
     for (const one of all) {
       if (known[one.i]) continue;
       const votes = [0, 1e-3, 0];
-      told.forEach((other, k) => {
+      labeled.forEach((other, k) => {
         if (Math.abs(other.x - one.x) > reach[k] || Math.abs(other.y - one.y) > reach[k]) return;
-        votes[known[other.i]] += alphaAt(other, one.x, one.y) * likeness(this.model, one.i, other.i);
+        votes[known[other.i]] += alphaAt(other, one.x, one.y) * colorSimilarity(this.model, one.i, other.i);
       });
       found.push([one.i, votes[1] > votes[2] && votes[1] > 0.02 ? 1 : 2]);
     }

@@ -1,8 +1,8 @@
 #version 300 es
-// What is shown: the drawn model over the background, the original, or how far they are apart.
+// The rendered model over the background, the original, or their difference.
 precision highp float;
 
-uniform sampler2D drawn, original;
+uniform sampler2D rendered, original;
 uniform int what; // 0 the model, 1 the original, 2 the difference
 uniform vec3 background;
 uniform float gain;
@@ -11,7 +11,7 @@ in vec2 atPicture, atTarget;
 out vec4 result;
 
 void main() {
-  vec4 model = texture(drawn, atTarget); // colour, and the light that is left
+  vec4 model = texture(rendered, atTarget); // colour and transmittance
   vec3 color = clamp(model.rgb + model.a * background, 0.0, 1.0);
   vec3 other = texture(original, atPicture).rgb;
   if (what == 1) color = other;

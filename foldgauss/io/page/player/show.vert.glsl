@@ -1,5 +1,5 @@
 #version 300 es
-// A rectangle of the screen that shows a part of a picture: (left, top, width, height), shares of each.
+// A rectangle of the screen that shows a part of an image: (left, top, width, height), as fractions of each.
 precision highp float;
 
 uniform vec4 onScreen, inPicture, inTarget;

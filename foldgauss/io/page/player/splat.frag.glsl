@@ -1,5 +1,5 @@
 #version 300 es
-// A pixel of a Gaussian: alpha by the engine's constants, the colour times it.
+// A pixel of a Gaussian: alpha, limited as in the engines, and the colour times alpha.
 precision highp float;
 
 uniform float cutoff, ceiling, support;

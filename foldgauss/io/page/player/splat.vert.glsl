@@ -10,13 +10,13 @@ uniform float time, envelopePower, envelopeFloor;
 uniform float unit; // pixels of the target per unit of model space
 uniform vec2 origin, target; // the frame's centre and the target's size, pixels
 uniform float lowPass, cutoff, support; // px^2; alpha; squared deviations
-uniform vec2 pivot, shift; // of those picked: what they are scaled about, and how far copies are apart, model units
-uniform float pickedScale, highlight;
+uniform vec2 pivot, shift; // of selected Gaussians: centre of scaling, and offset between copies, model units
+uniform float selectedScale, highlight;
 
-in uint instance; // its number; from bit 28 on which copy it is; the highest bit: it is picked
+in uint instance; // index; from bit 28 the number of the copy; highest bit: selected
 
 flat out vec2 centre;
-flat out vec4 axes; // two rows that take an offset in pixels to deviations
+flat out vec4 axes; // rows that map an offset in pixels to standard deviations
 flat out vec4 paint; // colour and opacity
 flat out float tinted;
 
@@ -38,19 +38,19 @@ vec2 path(int index, float u) {
 void main() {
   int index = int(instance & 0x0fffffffu);
   float copy = float((instance >> 28) & 7u);
-  bool picked = (instance >> 31) == 1u;
+  bool selected = (instance >> 31) == 1u;
   vec4 place = texel(index, 0), shape = texel(index, 1);
   paint = texel(index, 2);
-  tinted = picked ? highlight : 0.0;
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: nothing is drawn
+  tinted = selected ? highlight : 0.0;
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: not rendered
   if (!(paint.a >= cutoff)) return;
 
   float u = place.z - time, tau = u / place.w;
   float shrink = sqrt(envelopeFloor + (1.0 - envelopeFloor) * exp(-0.5 * envelopePower * tau * tau));
   vec2 mean = place.xy + path(index, u), deviations = shape.xy * shrink;
-  if (picked) {
-    mean = pivot + (mean - pivot) * pickedScale + copy * shift;
-    deviations *= pickedScale;
+  if (selected) {
+    mean = pivot + (mean - pivot) * selectedScale + copy * shift;
+    deviations *= selectedScale;
   }
   vec2 variances = deviations * deviations * (unit * unit) + lowPass;
   if (!(min(variances.x, variances.y) > 1e-12)) return;
@@ -59,7 +59,7 @@ void main() {
   vec2 first = shape.zw, second = vec2(-shape.w, shape.z), roots = sqrt(variances);
   centre = mean * unit + origin;
   axes = vec4(first / roots.x, second / roots.y);
-  float reach = min(2.0 * log(paint.a / cutoff), support) * 1.001 + 0.001; // a little too far: alpha alone decides
+  float reach = min(2.0 * log(paint.a / cutoff), support) * 1.001 + 0.001; // slightly too far: alpha decides in the fragment shader
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
   vec2 away = corner * sqrt(reach) * roots;
   gl_Position = vec4(2.0 * (centre + away.x * first + away.y * second) / target - 1.0, 0.0, 1.0);

@@ -1,6 +1,6 @@
-// Frame times as they were learned: from where the clip is to the model's time, as foldgauss.video.models.frame_times has it.
+// Learned frame times: from frame positions to the model's time, as in foldgauss.video.models.frame_times.
 
-const CUT_RATIO = 6; // an interval so many times longer than the median one is a cut
+const CUT_RATIO = 6; // an interval longer than the median one by this factor is a cut
 
 /** The times of the frames, 0 to 1, from the logits of their intervals. */
 export function frameTimes(logits) {
@@ -16,7 +16,7 @@ function median(values) {
   return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
 }
 
-/** Times of a clip's positions, which count frames: 2.5 is half way from frame 2 to frame 3. */
+/** Times of a clip's frame positions: 2.5 is half way from frame 2 to frame 3. */
 export class Timeline {
   constructor(times, fps) {
     this.times = times;
@@ -31,12 +31,12 @@ export class Timeline {
     return this.times.length / this.fps;
   }
 
-  /** The model's time of a position; at a cut, where nothing lies between, that of the nearer frame. */
+  /** The model's time of a position; in the gap of a cut that of the nearer frame. */
   timeAt(position) {
     const held = Math.min(Math.max(position, 0), this.last), k = Math.min(Math.floor(held), this.last - 1);
     if (this.last === 0) return this.times[0];
-    const share = this.isCut[k] ? Math.round(held - k) : held - k;
-    return this.times[k] + share * (this.times[k + 1] - this.times[k]);
+    const fraction = this.isCut[k] ? Math.round(held - k) : held - k;
+    return this.times[k] + fraction * (this.times[k + 1] - this.times[k]);
   }
 
   /** The position of a time of the model. */

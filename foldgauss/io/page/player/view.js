@@ -1,4 +1,4 @@
-// Where pictures are on the screen: fitted, zoomed and moved. Device pixels, y down.
+// Layout of the images on the screen, with zoom and pan. Device pixels, y down.
 
 const MOST = 64;
 const GAP = 8;
@@ -19,7 +19,7 @@ export class View {
     return this.zoom === 1;
   }
 
-  /** Parts of the screen, one a picture, side by side or one above the other, whichever shows more. */
+  /** Panes of the screen, side by side or one above the other, whichever shows larger images. */
   panes(number) {
     const [width, height] = this.area;
     if (number === 1) return [{ x: 0, y: 0, width, height }];
@@ -28,12 +28,12 @@ export class View {
     return [{ x: 0, y: 0, ...above }, { x: 0, y: (height + GAP) / 2, ...above }];
   }
 
-  /** Device pixels a pixel of the frame, for all of it to be seen. */
+  /** Device pixels per pixel of the frame that fit the frame into the pane. */
   fit(pane) {
     return Math.max(Math.min(pane.width / this.width, pane.height / this.height), 1e-3);
   }
 
-  /** Where the frame is, part of it maybe outside of the pane. */
+  /** Rectangle of the frame, which may extend beyond the pane. */
   frameIn(pane) {
     const scale = this.fit(pane) * this.zoom, width = scale * this.width, height = scale * this.height;
     const held = (pan, size, room) => Math.min(Math.max(pan, -Math.max(size - room, 0) / 2), Math.max(size - room, 0) / 2);
@@ -42,7 +42,7 @@ export class View {
     return { x, y, width, height, scale, pan };
   }
 
-  /** Zoom by a factor, the point of the frame under (x, y) staying where it is. */
+  /** Zoom by a factor about the point (x, y). */
   zoomAt(factor, x, y, pane) {
     const zoom = Math.min(Math.max(this.zoom * factor, 1), MOST), ratio = zoom / this.zoom;
     const { pan } = this.frameIn(pane), away = [x - pane.x - pane.width / 2, y - pane.y - pane.height / 2];
@@ -56,20 +56,20 @@ export class View {
     this.pan = this.frameIn(pane).pan;
   }
 
-  /** The pane that a point is in: the first where there is none. */
+  /** The pane that contains a point, else the first. */
   paneAt(x, y, number) {
     const panes = this.panes(number);
     return panes.find((own) => x >= own.x && y >= own.y && x < own.x + own.width && y < own.y + own.height) ?? panes[0];
   }
 
-  /** A point of the screen in model units: the frame's centre is the origin, its longer side 1. */
+  /** A point of the screen in model space, and the scale in pixels per unit. */
   toModel(x, y, pane) {
     const frame = this.frameIn(pane), unit = Math.max(frame.width, frame.height);
     return [(x - frame.x - frame.width / 2) / unit, (y - frame.y - frame.height / 2) / unit, unit];
   }
 }
 
-/** What two rectangles have in common. */
+/** Intersection of two rectangles. */
 export function common(one, other) {
   const x = Math.max(one.x, other.x), y = Math.max(one.y, other.y);
   const width = Math.min(one.x + one.width, other.x + other.width) - x;
