@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -16,8 +17,10 @@ from foldgauss import cli
 from foldgauss.cli.app.application import app, load_commands
 from foldgauss.cli.app.examples import EXAMPLES
 from foldgauss.cli.app.registry import COMMANDS
+from foldgauss.cli.fitting import progress
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io import save_video_model, write_video
+from foldgauss.video.fitting.loop import FitInfo
 
 #: Of a terminal; Typer's help and ours go by it.
 WIDTHS = (80, 160)
@@ -219,11 +222,13 @@ def test_no_input_is_overwritten(words, here, capsys):
     assert {path.name: path.read_bytes() for path in here.iterdir()} == before
 
 
-def test_bars_tell_the_time_left():
+def test_bars_show_the_time_left():
+    """Estimated by rich, except for a fit, whose steps differ in cost and which estimates its own."""
     from rich.progress import TimeRemainingColumn
 
     assert any(isinstance(column, TimeRemainingColumn) for column in TIME_LEFT)
     sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.rglob("*.py")}
-    bars = [name for name, text in sources.items() if "BarColumn(" in text]
-    assert bars
-    assert all("TIME_LEFT" in sources[name] or "seconds_left" in sources[name] for name in bars)
+    bars = {name for name, text in sources.items() if "BarColumn(" in text}
+    assert {name for name in bars if "TIME_LEFT" not in sources[name]} == {"progress"}
+    info = FitInfo(3, 0.5, 0.4, 30.0, 40, 40, 5.0, seconds_left=7.0, stopped_by=None)
+    assert progress._FitColumn().render(SimpleNamespace(fields={"info": info})).rstrip().endswith("7 s left")

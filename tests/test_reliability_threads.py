@@ -297,7 +297,7 @@ FORKED = """
     import numpy as np, jax, jax.numpy as jnp
     from concurrent.futures import ProcessPoolExecutor
     import foldgauss as fg
-from foldgauss.estimator import FoldedGaussianMixture, likelihood
+    from foldgauss.estimator import FoldedGaussianMixture, likelihood
     from foldgauss.estimator.gradient_fit import fit_gradient
     from foldgauss.io import load_video_model, save_video_model
     from foldgauss.render import render

@@ -90,14 +90,18 @@ class Checkpoint:
 
 @dataclasses.dataclass(frozen=True)
 class FitRun:
-    """A finished fit of a job: its frames, its model, the `info` and the state of the last step."""
+    """A finished fit of a job: its frames, its model, the last state and the `info` of the last step."""
 
     job: FitJob
     clip: Clip
     model: VideoModel
-    info: FitInfo
     state: FitState
+    info: FitInfo
     checkpoint: Checkpoint
+
+    def save_checkpoint(self) -> None:
+        """Save the last state, so that the fit need not be repeated if its model cannot be written."""
+        self.checkpoint.try_save(self.state)
 
     def save(self, scores: Evaluation | None = None) -> None:
         """Write the model, with its mean scores once they are measured."""
@@ -111,15 +115,12 @@ def run_fit(
     observer: OpenObserver,
     *,
     resume: Literal["required", "if possible", "never"] = "if possible",
-    save_last: bool = True,
     on_checkpoint_error: CheckpointError = lambda error, step: None,
 ) -> FitRun:
     """Fit the frames of a job, from its checkpoint if it resumes.
 
-    With `save_last` the last state is saved, too, so that scores can be measured again after an interruption.
-
     With `resume` "never", the first step removes an old checkpoint. The observer is opened once the frames are read.
-    Neither the model nor a record is written: see `FitRun.save`.
+    Neither the model nor the last state nor a record is written: see `FitRun`.
 
     Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
     cannot be read or fitted, and for a checkpoint that is required.
@@ -132,8 +133,8 @@ def run_fit(
     if resume == "never":
         steps = _replacing(checkpoint, steps)
     with observer(clip, state) as observe:
-        state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds, save_last=save_last)
-    return FitRun(job, clip, to_model(state, job.config, clip.size, clip.fps), info, state, checkpoint)
+        state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
+    return FitRun(job, clip, to_model(state, job.config, clip.size, clip.fps), state, info, checkpoint)
 
 
 def run_steps(
@@ -141,25 +142,21 @@ def run_steps(
     observe: Observer,
     checkpoint: Checkpoint | None = None,
     seconds: float | None = None,
-    *,
-    save_last: bool = True,
 ) -> tuple[FitState, FitInfo]:
-    """Take all steps of a fit and return the last; the state is saved every so many `seconds`, and at the end.
+    """Take all steps of a fit and return the last; the state is saved every so many `seconds`.
 
     Raises as `run_fit`.
     """
     saved = time.monotonic()
     try:
         for state, info in steps:
-            stop, is_last = observe(state, info), info.progress >= 1
-            if stop and not is_last:
-                if checkpoint is not None:
-                    checkpoint.save(state)
-                raise Stopped(f"stopped after step {info.step}")
+            stop = observe(state, info) and info.progress < 1
             due = time.monotonic() - saved > (CHECKPOINT_SECONDS if seconds is None else seconds)
-            if checkpoint is not None and (due or (is_last and save_last)):
+            if checkpoint is not None and (stop or due):
                 checkpoint.try_save(state)
                 saved = time.monotonic()
+            if stop:
+                raise Stopped(f"stopped after step {info.step}")
     except FitDiverged as error:
         if checkpoint is not None and error.state is not None:
             checkpoint.try_save(error.state)
@@ -290,6 +287,7 @@ _WARNINGS = WarningCapture()
 def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     with _WARNINGS.capture() as caught:
         run = run_fit(job, lambda clip, state: nullcontext(_Reporter(job.name, report)))
+    run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
     scores = evaluate(run.model, clip.frames)
     run.save(scores)

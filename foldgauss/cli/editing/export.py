@@ -156,7 +156,7 @@ def import_command(
         refuse_huge(mesh.size)
         with progress_bar("Drawing", mesh.num_frames) as advance:
             write_video(out_path, advance_over(mesh.frames(), advance), mesh.fps, overwrite=overwrite)
-        out.print(f"{out_path}: {mesh.num_frames} frames at {mesh.fps:g} frames a second", soft_wrap=True)
+        out.print(f"{out_path}: {mesh.num_frames} frames at {mesh.fps:g} frames per second", soft_wrap=True)
         return
     if out_path.suffix.lower() != MODEL_SUFFIX:
         raise wrong_use("--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)

@@ -139,20 +139,19 @@ def fit(
         job,
         observe,
         resume="required" if resume else "never",
-        save_last=False,  # the model is written at once
         on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
     )
     try:
         run.save()  # at once: the evaluation may be interrupted
     except OSError as error:
-        run.checkpoint.try_save(run.state)
+        run.save_checkpoint()
         raise _explain_unsaved(error, job.checkpoint) from error
     try:
         if history is not None:
             _save_curves(curves, history)
         scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
     except KeyboardInterrupt:
-        run.checkpoint.try_save(run.state)
+        run.save_checkpoint()
         if job.checkpoint.exists():
             text = f"{target} is written, without its scores: add --resume --overwrite to measure them."
             err.print(text, soft_wrap=True)
@@ -177,7 +176,7 @@ def summarize_fit(info: FitInfo) -> dict[str, float]:
 def stop_on_signals(show: Observer, checkpoint: Path | None = None) -> Iterator[Observer]:
     """An observer that shows each step and stops the fit after one during which SIGINT or SIGTERM arrived.
 
-    A stopped or diverged fit raises `cli.Stopped`, which says how to continue if there is a `checkpoint`.
+    A stopped or diverged fit raises `cli.Stopped`, which says how to continue if the `checkpoint` exists.
     """
     with note_signals() as request:
 
@@ -189,10 +188,11 @@ def stop_on_signals(show: Observer, checkpoint: Path | None = None) -> Iterator[
         try:
             yield observe
         except FitStopped as error:
-            hint = "; nothing was saved" if checkpoint is None else "; add --resume to continue"
+            kept = checkpoint is not None and checkpoint.exists()
+            hint = "; add --resume to continue" if kept else "; nothing was saved"
             raise Stopped(f"{error} by {request.signal}{hint}.") from error
         except FitDiverged as error:
-            if checkpoint is None or error.state is None:
+            if checkpoint is None or not checkpoint.exists():
                 raise Stopped(str(error)) from error
             hint = "--resume continues from its checkpoint, with --on-divergence back-off at lower learning rates."
             raise Stopped(f"{error} {hint}") from error

@@ -39,7 +39,7 @@ DRAW_OPTIONS = {
 COSTS = {
     "time": ("fit time", "time to fit (s)", False),
     "size": ("file size", "file (bytes)", False),
-    "speed": ("playback speed", "played (frames a second)", True),
+    "speed": ("playback speed", "played (frames per second)", True),
 }
 #: Columns of the time to fit, by clock.
 CLOCKS = {"wall": "seconds", "cpu": "cpu_seconds"}
@@ -265,7 +265,7 @@ def _print_rows(rows: list[dict[str, Any]], fronts: dict[str, Any], clock: str) 
 
 def _print_fronts(rows: list[dict[str, Any]], names: list[str], fronts: dict[str, Any]) -> None:
     units = {"seconds": "{:.1f} s", "cpu_seconds": "{:.1f} CPU seconds", "bytes": "{:,} bytes"}
-    units |= {"frames_per_second": "{:.0f} frames a second"}
+    units |= {"frames_per_second": "{:.0f} frames per second"}
     for cost, (what, *_) in COSTS.items():
         bend, column = fronts[cost]["knee"], fronts[cost]["column"]
         if bend is None:
