@@ -118,7 +118,7 @@ def test_remapping_beyond_the_end_is_said(work, tmp_path, capsys):
     assert "warning" not in capsys.readouterr().err
     assert run("render", model, "--out", tmp_path / "beyond", "--remap", "0=0,0.5=2,1=0") == 0
     told = capsys.readouterr().err
-    assert "warning: --remap: the clip ends at second 0.5, 2 was asked for: its last frame is held" in told
+    assert "warning: --remap: expected seconds up to the end of the clip, 0.5, got 2. Its last frame is held" in told
     assert len(told.strip().splitlines()) == 1
     assert read_video(tmp_path / "beyond").num_frames == 13
 
@@ -242,7 +242,7 @@ def broken_inputs(tmp_path, work):
         "times misspelt": (["render", model, "--out", tmp_path / "f", "--times", "0:1"], 2, "--times"),
         "remap misspelt": (["render", model, "--out", tmp_path / "f", "--remap", "0,1"], 2, "--remap"),
         "remap beyond": (["render", model, "--out", tmp_path / "f", "--remap", "0=0,1e15=1"], 2, "--remap"),
-        "speed beyond": (["render", model, "--out", tmp_path / "f", "--speed", "1e-4", "--fps", "900"], 2, "pictures"),
+        "speed beyond": (["render", model, "--out", tmp_path / "f", "--speed", "1e-4", "--fps", "900"], 2, "images"),
         "remap back": (["render", model, "--out", tmp_path / "f", "--remap", "0=0,2=1,1=1"], 2, "--remap"),
         "upsample beyond": (["render", model, "--out", tmp_path / "f", "--upsample", "1000000000"], 2, "100,000"),
         "no such folder for json": (["evaluate", model, clip, "--json", tmp_path / "no" / "f.json"], 1, "folder"),

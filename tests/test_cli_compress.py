@@ -118,9 +118,7 @@ def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):
 def test_without_the_clip(work, tmp_path, capsys):
     assert run("compress", work / "model.safetensors", "--out", tmp_path / "m.fgz", "--passes", 0) == 0
     told = " ".join(capsys.readouterr().err.split())
-    assert (
-        "the loss is estimated, from the model's own pictures and a PSNR of 33.30 dB that is noted in the file" in told
-    )
+    assert "the loss is estimated, from images of the model and a PSNR of 33.30 dB, recorded in the file" in told
     assert load_video_model(tmp_path / "m.fgz").num_frames == FRAMES
 
 

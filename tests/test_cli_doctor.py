@@ -17,12 +17,12 @@ WELL = [Trial("draw", True, 0.1, 2.0, "drawn"), Trial("fit", True, 0.2, 0.1, "40
 @pytest.fixture
 def well(monkeypatch):
     """Trials that went well, in no time."""
-    monkeypatch.setattr(doctor, "trials", lambda: iter(WELL))
+    monkeypatch.setattr(doctor, "run_trials", lambda: iter(WELL))
 
 
 @pytest.fixture(scope="module")
 def tried():
-    return list(diagnosis.trials())
+    return list(diagnosis.run_trials())
 
 
 def test_the_trials_go_well_here(tried):
@@ -45,15 +45,15 @@ def test_a_wrong_picture_is_seen(monkeypatch):
 
         drawn = {}
         monkeypatch.setattr(diagnosis, "render", render)
-        assert diagnosis._tried("reference", lambda: diagnosis._draw("reference", drawn)).ok
-        return diagnosis._tried("xla", lambda: diagnosis._draw("xla", drawn))
+        assert diagnosis._run_trial("reference", lambda: diagnosis._render("reference", drawn)).ok
+        return diagnosis._run_trial("xla", lambda: diagnosis._render("xla", drawn))
 
     def broken(picture):
         raise RuntimeError("no [such] engine")
 
     assert spoiled(lambda picture: picture).ok
     for how, told in (
-        (lambda picture: picture + 0.01, "away from engine reference"),
+        (lambda picture: picture + 0.01, "expected a difference from engine reference of at most 0.005"),
         (lambda picture: 0 * picture, "empty"),
         (lambda picture: picture * np.nan, "not finite"),
         (broken, "RuntimeError: no [such] engine"),
@@ -69,7 +69,7 @@ def test_report(well, capsys):
     told = capsys.readouterr().out
     for text in ("python", "jaxlib", "usable of", "threads", "GPU"):
         assert text in told
-    assert "All is well; the trials took 0.3 s, and 2.1 s more to compile" in told
+    assert "No problems; the trials took 0.3 s, and compilation 2.1 s more" in told
 
 
 def test_json_and_nothing_else(well, capsys):
@@ -104,10 +104,10 @@ def test_missing_extras_are_told_with_their_cure(well, monkeypatch, capsys):
 
 def test_what_is_broken_is_told_and_exits_1(monkeypatch, capsys):
     failed = Trial("fit a clip", False, 0.1, 0.0, "3.0 dB", "Do this.")
-    monkeypatch.setattr(doctor, "trials", lambda: iter([*WELL, failed]))
+    monkeypatch.setattr(doctor, "run_trials", lambda: iter([*WELL, failed]))
     assert run("doctor") == 1
     told = capsys.readouterr().out
-    assert "Not all is well" in told
+    assert "Problems were found" in told
     assert "fit a clip: 3.0 dB. Do this." in told
     assert run("doctor", "--json") == 1
     assert json.loads(capsys.readouterr().out)["problems"] == ["fit a clip: 3.0 dB. Do this."]
@@ -132,7 +132,7 @@ def test_nothing_that_cannot_be_found_out_breaks_it(well, monkeypatch, capsys):
     def unknown():
         raise RuntimeError("nobody knows")
 
-    for name in ("versions", "extras", "machine", "engines"):
+    for name in ("find_versions", "find_extras", "describe_machine", "find_engines"):
         monkeypatch.setattr(diagnosis, name, unknown)
     run("doctor")
     assert capsys.readouterr().out.count("nobody knows") >= 4
@@ -142,7 +142,7 @@ def test_nothing_that_cannot_be_found_out_breaks_it(well, monkeypatch, capsys):
 
 def test_threads_say_why(monkeypatch):
     monkeypatch.delenv("FOLDGAUSS_NUM_THREADS", raising=False)
-    assert "one for each core" in diagnosis.machine()["threads_because"]
+    assert "one for each core" in diagnosis.describe_machine()["threads_because"]
     monkeypatch.setenv("FOLDGAUSS_NUM_THREADS", "3")
-    found = diagnosis.machine()
-    assert (found["threads"], found["threads_because"]) == (3, "FOLDGAUSS_NUM_THREADS says so")
+    found = diagnosis.describe_machine()
+    assert (found["threads"], found["threads_because"]) == (3, "set by FOLDGAUSS_NUM_THREADS")

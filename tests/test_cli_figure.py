@@ -88,7 +88,7 @@ def test_a_cut_is_not_chosen_and_warned_of(tmp_path, capsys):
     assert run("figure", "interpolation", tmp_path / "m.safetensors", "--out", tmp_path / "a.png") == 0
     assert "from frame 4 to 5" in capsys.readouterr().out
     assert run("figure", "interpolation", tmp_path / "m.safetensors", "--at", 5, "--out", tmp_path / "b.png") == 0
-    assert "between frames 5 and 6 is a cut" in capsys.readouterr().err
+    assert "there is a cut between frames 5 and 6" in capsys.readouterr().err
     ((first, second, _, fourth, last),) = tiles(tmp_path / "b.png", 1, 5)
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(fourth, last)

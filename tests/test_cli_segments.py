@@ -119,7 +119,7 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
     assert run("info", here) == 0
     said = told(capsys)
     for text in (
-        "18 of 40x64 (height x width), 25 a second", "3; begin at a cut: 1; fade in: 1", f"{3 * NUM} in all",
+        "18 of 40x64 (height x width), 25 per second", "3; begin at a cut: 1; fade in: 1", f"{3 * NUM} in all",
         "│ 0 │ 0:7 │ │ 40 │", "│ 1 │ 4:13 │ fading in over 3 │ 40 │ 31.50 │", "│ 2 │ 13:18 │ at a cut │ 40 │",
         "frames of the clip │ [2, 20]",
     ):  # fmt: skip
@@ -129,7 +129,7 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
 def test_figures(here, work, tmp_path, capsys):
     assert run("figure", "interpolation", here, "--at", "5,12") == 0
     said = told(capsys)
-    assert "warning: --at: between frames 12 and 13 is a cut" in said
+    assert "warning: --at: there is a cut between frames 12 and 13" in said
     assert "between frames 5" not in said
     assert run("figure", "interpolation", here, "--overwrite") == 0
     assert "from frame 8 to 9" in told(capsys)
@@ -170,7 +170,7 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     told(capsys)
     for words, message in (
         ((here, 3), "NUMBER: expected a whole number from 0 to 2, got 3"),
-        (("long.1.safetensors", 0), "MODEL: expected a model in segments, got one of one piece"),
+        (("long.1.safetensors", 0), "MODEL: expected a model in segments, got one without segments"),
         ((here, 1), "overwrite"),
         ((here, 1, "--out", "one.mp4"), "--out: expected a name for the model"),
         ((here, 0, "--out", here), "--out"),

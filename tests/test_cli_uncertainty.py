@@ -14,7 +14,7 @@ from commands import run
 from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
 
 from foldgauss.cli.measuring import uncertainty as command
-from foldgauss.cli.measuring.profiles_file import keep_evidence
+from foldgauss.cli.measuring.profiles_file import save_profiles
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.uncertainty import likelihood_profiles
 from foldgauss.uncertainty.posterior.draws_file import lock_draws
@@ -47,7 +47,7 @@ def done(work):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Empty files in place of the pictures, which take seconds: `test_everything_is_there` looks at them."""
-    monkeypatch.setattr(command, "_draw", lambda path, *arguments, **options: path.touch())
+    monkeypatch.setattr(command, "_save_plot", lambda path, *arguments, **options: path.touch())
 
 
 def arguments(work, target, *options):
@@ -101,7 +101,7 @@ def test_arviz_reads_the_draws(done):
 def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys, no_pictures):
     before = (done / "chains.h5").read_bytes()
     assert run(*arguments(work, done, *SHORT)) == 0
-    assert "had finished: nothing was drawn anew" in capsys.readouterr().out
+    assert "was complete: nothing was sampled" in capsys.readouterr().out
     assert (done / "chains.h5").read_bytes() == before
     for other in (["--seed", "1"], ["--concentration", "2"], ["--noise", "independent"]):
         table = (done / "frame_times.csv").read_bytes()
@@ -174,7 +174,7 @@ def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no
 
 def test_draws_that_python_is_writing_are_left_alone(work, tmp_path, capsys, monkeypatch):
     """Known before pictures are drawn."""
-    monkeypatch.setattr(command, "_evidence", None)
+    monkeypatch.setattr(command, "_compute_profiles", None)
     for more in ([], ["--overwrite"]):
         with lock_draws(tmp_path / "chains.h5"):
             assert run(*arguments(work, tmp_path, *SHORT, *more)) == 1
@@ -196,7 +196,7 @@ def test_evidence_that_is_none_is_left_alone(work, tmp_path, capsys, monkeypatch
         assert os.listdir(tmp_path) == ["evidence.npz"]
         assert run(*arguments(work, tmp_path, *SHORT, "--overwrite")) == 1
         assert "NoneType" in capsys.readouterr().err
-    keep_evidence(mine, "another's", likelihood_profiles(model_of_12(), read_video(work / "clip").frames))
+    save_profiles(mine, "another's", likelihood_profiles(model_of_12(), read_video(work / "clip").frames))
     assert run(*arguments(work, tmp_path, *SHORT)) == 1
     assert "NoneType" in capsys.readouterr().err
 

@@ -55,7 +55,7 @@ def test_view_serves_a_page_and_opens_it(served, work):
     assert 'id="frame-0"' not in page
     (url,) = opened
     assert url in told.out
-    assert told.out.rstrip().endswith("Ended.")
+    assert told.out.rstrip().endswith("Stopped.")
     code, servers, _, opened = served(work / "model.safetensors", "--no-browser", "--original", work / "clip")
     assert (code, opened) == (0, [])
     assert f'id="frame-{NUM_FRAMES - 1}"' in servers[0][1]
@@ -92,7 +92,7 @@ def test_a_port_that_is_taken_is_told(served, work):
         port = other.server_address[1]
         code, servers, told, _ = served(work / "model.safetensors", "--port", port, "--no-browser")
     assert (code, servers) == (2, [])
-    assert "--port: expected a port that is free" in told.err
+    assert "--port: expected a free port" in told.err
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
@@ -105,7 +105,7 @@ def test_a_signal_ends_it_well(work, number, code):
         time.sleep(0.3)
         process.send_signal(number)
         last, told = process.communicate(timeout=60)
-    assert (process.returncode, last, told) == (code, "Ended.\n", "")
+    assert (process.returncode, last, told) == (code, "Stopped.\n", "")
 
 
 def test_export_writes_the_page(work, tmp_path, capsys):

@@ -131,11 +131,11 @@ def test_each_variant_changes_one_setting_and_has_a_command():
     made, left = plan_points(BASE, tuple(AXES), 132, (320, 640))
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
-    words = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
-    lines = [words.of(point, 132, (320, 640)) for point in made]
+    commands = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
+    lines = [commands.format_point(point, 132, (320, 640)) for point in made]
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
-        changed = kept.settings_of(point, BASE)
+        changed = kept.changed_settings(point, BASE)
         allowed = {"base": (0,), "batch": (2,), "schedule": (1, 2)}.get(point.axis, (1,))
         assert len(changed) in allowed
         assert "my clip.mp4" in shlex.split(line)
@@ -327,7 +327,7 @@ def test_killed_run_resumes(clip, tmp_path, capsys, monkeypatch):
     fitted.clear()
     assert run(*arguments) == 0  # nothing is left to do
     assert fitted == []
-    assert "The points on the fronts" in capsys.readouterr().out
+    assert "Commands of the points on the Pareto fronts:" in capsys.readouterr().out
     assert record_of(target)["points"] == after
 
 
@@ -397,14 +397,14 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
     [
         (1e-3, LEAST_STEPS, "warning: --minutes: 0.001 are too few for 5 points"),
         (1.0, 1000, "about 1.0 minutes"),
-        (60.0, 3000, "note: 3,000 steps are a whole fit"),
+        (60.0, 3000, "note: 3,000 steps are the default for this clip"),
     ],
 )
 def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
     """At a pace with which all fits take a minute if the base has 1,000 steps."""
     work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
-    pace = Throughput(start=0.0, step=60 / command.SLOWER / (work * 1000.001), evaluation=0.0)
-    monkeypatch.setattr(command._Run, "_pace", lambda self, config: pace)
+    pace = Throughput(start=0.0, step=60 / command.MARGIN / (work * 1000.001), evaluation=0.0)
+    monkeypatch.setattr(command._Run, "_measure_throughput", lambda self, config: pace)
     monkeypatch.setattr(command._Run, "measure", lambda self, made, base: (_ for _ in ()).throw(KeyboardInterrupt))
     arguments = ["--axes", "time,compositing", "--minutes", minutes]
     assert run("tradeoff", clip, "--out", tmp_path / "r", *arguments) == 1
@@ -501,7 +501,7 @@ def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_pat
     (tmp_path / name).write_text("mine")
     assert run("tradeoff", clip, "--out", tmp_path, *QUICK) == 2
     told = " ".join(capsys.readouterr().err.split())
-    assert f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start anew" in told
+    assert f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start over" in told
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
     assert run("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite") == 1
     assert "NoneType" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The command `foldgauss`: arguments, progress display, printing and exit codes; the layers below do the work.
+"""The command `foldgauss`: arguments, progress display, printing and exit codes. The other packages do the work.
 
 `app` is the application: its registry of commands, help and error handling. `shared` has what commands share, and
 `fitting`, `viewing`, `editing` and `measuring` the commands. `main` is the entry point.

@@ -214,10 +214,25 @@ def plan_long_fit(
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
-    configs = _divide_size(config, spans)
-    begin = 0 if frames is None else frames[0] or 0
+    jobs = _make_jobs(
+        clip, folder, config, index, spans, size, checkpoint_seconds, 0 if frames is None else frames[0] or 0
+    )
+    return LongFit(target, folder, index, tuple(spans), jobs, metadata)
+
+
+def _make_jobs(
+    clip: Path,
+    folder: Path,
+    config: FitConfig,
+    index: FrameIndex,
+    spans: Sequence[tuple[int, int]],
+    size: tuple[int, int] | None,
+    checkpoint_seconds: float | None,
+    begin: int,
+) -> tuple[FitJob, ...]:
+    """A job for each segment of the clip, whose first frame has the number `begin`."""
     jobs = []
-    for number, (span, own) in enumerate(zip(spans, configs, strict=True)):
+    for number, (span, own) in enumerate(zip(spans, _divide_size(config, spans), strict=True)):
         low, high = index.span(*span)  # as `read_video` counts, where damaged frames are missing
         job = FitJob(
             name=f"segment {number}",
@@ -233,7 +248,7 @@ def plan_long_fit(
             metadata={"clip": clip.name, "frames": [begin + low, begin + high]},
         )
         jobs.append(job)
-    return LongFit(target, folder, index, tuple(spans), tuple(jobs), metadata)
+    return tuple(jobs)
 
 
 def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]]) -> list[FitConfig]:

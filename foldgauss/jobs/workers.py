@@ -227,7 +227,7 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
 
 
 def _connect(distributed: Any, address: str) -> "Client":
-    if not _ADDRESS.fullmatch(address):  # dask would try for long, and leave half a client
+    if not _ADDRESS.fullmatch(address):  # dask would retry for long, and leave a client behind
         expected, cure = "an address as tcp://host:8786", "`dask scheduler` prints it when it starts."
         raise invalid("scheduler", expected=expected, got=repr(address), cure=cure)
     try:

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli.measuring.profiles_file import keep_evidence, kept_evidence
+from foldgauss.cli.measuring.profiles_file import load_profiles, save_profiles
 from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.media import format_detection
 from foldgauss.io.media.format_detection import _ASF_AUDIO, _CLUSTER, _MATROSKA_AUDIO
@@ -441,11 +441,11 @@ def _evidence() -> bytes:
     profiles = LikelihoodProfiles(
         curves, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
     )
-    return written(lambda path: keep_evidence(path, "key", profiles), ".npz")
+    return written(lambda path: save_profiles(path, "key", profiles), ".npz")
 
 
 def _read_evidence(path: Path) -> None:
-    profiles = kept_evidence(path, "key", 3)
+    profiles = load_profiles(path, "key", 3)
     if profiles is None:
         raise ValueError("expected evidence, got none")  # what the command does then: it draws the pictures
     assert profiles.curves(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
@@ -457,7 +457,7 @@ EVIDENCE = Target(
     lambda: [_evidence()],
     _read_evidence,
     (ValueError,),
-    {"foldgauss.cli.measuring.profiles_file": ("keep_evidence", "is_evidence")},
+    {"foldgauss.cli.measuring.profiles_file": ("save_profiles", "is_profiles_file")},
     lambda data: 4,
     lambda size: 2 * CONSTANT + 64 * size,
     (zip_resealed,),

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 import foldgauss
-from foldgauss.cli.measuring.profiles_file import kept_evidence
+from foldgauss.cli.measuring.profiles_file import load_profiles
 from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
 from foldgauss.io.media.format_detection import read_shown_seconds
@@ -399,11 +399,11 @@ def _evidence_with(**changed) -> bytes:
 def test_evidence_that_does_not_fit_is_drawn_anew(changed, tmp_path):
     path = tmp_path / "e.npz"
     path.write_bytes(media._evidence())
-    assert kept_evidence(path, "key", 3).num_rendered == 12
-    assert kept_evidence(path, "other", 3) is None
-    assert kept_evidence(path, "key", 4) is None
+    assert load_profiles(path, "key", 3).num_rendered == 12
+    assert load_profiles(path, "other", 3) is None
+    assert load_profiles(path, "key", 4) is None
     path.write_bytes(_evidence_with(**changed))
-    assert kept_evidence(path, "key", 3) is None
+    assert load_profiles(path, "key", 3) is None
 
 
 @pytest.mark.parametrize("side", [2**13, 2**15])  # beyond our limit, and beyond Pillow's

@@ -17,7 +17,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "fit": Command("fitting.fit", "Fit a model to a clip; the first of its budgets ends the fit."),
         "fit-many": Command("fitting.fit_many", "Fit a model to each clip of a folder, and list those that fail."),
-        "view": Command("viewing.view", "Play a model in the browser; Ctrl-C ends it."),
+        "view": Command("viewing.view", "Play a model in the browser, until Ctrl-C."),
         "render": Command("viewing.render", "Render a model as a video, also between its frames."),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),
         "info": Command("viewing.info", "Show what a model file contains."),
@@ -27,10 +27,10 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "segment": Command("editing.edit", "Extract one segment of a model in segments as a model of its own."),
         "edit": Command("editing.edit", "Edit objects or single frames of a model by a script."),
-        "compress": Command("editing.compress", "Write a model as a compact file: a fraction of its size."),
+        "compress": Command("editing.compress", "Write a model as a compact file, a fraction of its size."),
         "tradeoff": Command("measuring.tradeoff", "Measure what speed and size cost, one setting at a time."),
         "export": Command("editing.export", "Write a model for other programs, or as a web page."),
-        "import": Command("editing.export", "Read a model of another program: see docs/formats.md."),
+        "import": Command("editing.export", "Read a model of another program, see docs/formats.md."),
         "doctor": Command("measuring.doctor", "Check the installation: versions, devices, and a small fit."),
         "demo": Command("fitting.demo", "Fit 24 frames of the clip Bunny and show the results."),
     }

@@ -1,4 +1,4 @@
-"""The command that makes a model's file small: `compress`."""
+"""The command `compress`."""
 
 import math
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from foldgauss._runtime.checks import is_within
-from foldgauss.cli.app.application import WrongUse, app, err, wrong_use
+from foldgauss.cli.app.application import WrongUse, app, err, warn, wrong_use
 from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
@@ -33,8 +33,8 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.tradeoff import to_half_precision
 
 Score = Callable[[VideoModel], Evaluation]
-#: dB by which a compact file may be better than its model without a word.
-NEARER = 0.5
+#: A compact file that is better than its model by more dB than this causes a warning.
+MAX_GAIN_DB = 0.5
 
 
 @app.command(name="compress")
@@ -43,16 +43,16 @@ def compress_command(
     video: Annotated[
         Path | None,
         typer.Argument(
-            help="The clip it was fitted to: for a smaller file, and a loss that is measured.",
+            help="The clip it was fitted to, for a smaller file and a measured loss.",
             autocompletion=complete_clips,
         ),
     ] = None,
-    max_loss_db: Annotated[float, typer.Option(help="How much of the mean PSNR it may cost, in dB.")] = 0.2,
+    max_loss_db: Annotated[float, typer.Option(help="Largest loss of mean PSNR, in dB.")] = 0.2,
     out_path: Annotated[
         Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
     ] = None,
     passes: Annotated[
-        int, typer.Option(help="Passes over VIDEO that make up for what rounding costs; 0: only round.", min=0)
+        int, typer.Option(help="Passes over VIDEO that reduce the loss by rounding; 0: only round.", min=0)
     ] = 8,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
@@ -63,10 +63,10 @@ def compress_command(
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model as a compact file: a fraction of its size.
+    """Write a model as a compact file, a fraction of its size.
 
-    It is rendered, evaluated, edited and exported as any other. Its pictures differ a little: by --max-loss-db at most.
-    See docs/format.md.
+    It can be rendered, evaluated, edited and exported like any model. It loses at most --max-loss-db of PSNR. See
+    docs/format.md.
     """
     suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
     target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
@@ -88,13 +88,13 @@ def compress_command(
         raise wrong_use("MODEL", expected="a plain model", got="one with edits", cure=cure)
     clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
     if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
-        cure = "Give that clip, or none: numbers are then rounded only."
-        got = f"{str(video)!r}, which it does not show"
+        cure = "Give that clip, or none: parameters are then only rounded."
+        got = f"{str(video)!r}, another clip"
         raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
     if float16:
-        figures = _only_rounded(target, model, about, clip)
+        figures = _write_float16(target, model, about, clip)
     else:
-        figures = _compressed(target, model, about, clip, max_loss_db, passes)
+        figures = _write_compressed(target, model, about, clip, max_loss_db, passes)
     before, after = model_path.stat().st_size, target.stat().st_size
     figures |= {
         "bytes_before": before,
@@ -106,14 +106,14 @@ def compress_command(
 
 
 def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
-    """Write a compact file with what is known of where it comes from, `about`; `known`: whether its PSNR is."""
+    """Write a compact file with the metadata `about`, and its PSNR if that is `known`."""
     about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
     save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
 
 
-def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
-    """Write a model with 16-bit numbers, and the scores, if asked for, of what its reader will get."""
+def save_float16(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
+    """Write a model with 16-bit parameters and, if `score` is given, the scores of the rounded model."""
     about = {name: value for name, value in about.items() if not name.startswith("mean_")}
     small = to_half_precision(model)
     save_video_model(target, small, metadata=about)
@@ -124,42 +124,41 @@ def save_halved(target: Path, model: VideoModel, about: dict[str, Any], score: S
     return scores
 
 
-def _only_rounded(target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None) -> dict[str, Any]:
+def _write_float16(target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None) -> dict[str, Any]:
     def score(model: VideoModel) -> Evaluation:
         return evaluate_with_progress(model, clip.frames)
 
     before = None if clip is None else score(model)
-    scores = save_halved(target, model, about, None if clip is None else score)
+    scores = save_float16(target, model, about, None if clip is None else score)
     lost = {} if scores is None else {"loss_db": before.mean_psnr - scores.mean_psnr}
     return lost | {"num_gaussians": model.num_gaussians}
 
 
-def _compressed(
+def _write_compressed(
     target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None, max_loss_db: float, passes: int
 ) -> dict[str, Any]:
-    told = about.get("mean_psnr")
+    known_psnr = about.get("mean_psnr")
     columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
     with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
-        task = bar.add_task("Compressing", total=None)  # how often it must try nobody knows
+        task = bar.add_task("Compressing", total=None)  # the number of trials is unknown
 
         def show(what: str, loss: float) -> None:
             text = f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost")
             bar.update(task, description=text)
 
         given = None if clip is None else clip.frames
-        made = compress(model, given, max_loss_db=max_loss_db, psnr=told, passes=passes, on_step=show)
-    if passes and made.loss_db < -NEARER:
-        err.print(
-            f"warning: the compact file is {-made.loss_db:.1f} dB nearer to the clip than the model was. Its fit had "
-            "not come to its end; or it was edited, and fitting anew has taken that back. --passes 0 only rounds.",
-            soft_wrap=True,
+        made = compress(model, given, max_loss_db=max_loss_db, psnr=known_psnr, passes=passes, on_step=show)
+    if passes and made.loss_db < -MAX_GAIN_DB:
+        warn(
+            f"the compact file is {-made.loss_db:.1f} dB nearer to the clip than the model. Either its fit had not "
+            "converged, or it was edited, and the passes have undone the edits. --passes 0 only rounds."
         )
-    save_compressed(target, made, about, known=clip is not None or told is not None)
+    save_compressed(target, made, about, known=clip is not None or known_psnr is not None)
     if clip is None:
-        source = "that is noted in the file" if told is not None else "that is assumed"
+        source = "recorded in the file" if known_psnr is not None else "assumed"
         err.print(
-            f"note: without the clip the loss is estimated, from the model's own pictures and a PSNR of "
-            f"{made.psnr:.2f} dB {source}. Give VIDEO for a smaller file, and a loss that is measured.",
+            f"note: without the clip the loss is estimated, from images of the model and a PSNR of "
+            f"{made.psnr:.2f} dB, {source}. Give VIDEO for a smaller file and a measured loss.",
             soft_wrap=True,
         )
     return {"loss_db": made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}

@@ -32,7 +32,7 @@ def edit_command(
         Path,
         typer.Argument(
             metavar="SCRIPT.toml",
-            help="What to select, and what to do with it.",
+            help="The selections and their edits.",
             autocompletion=complete_files(".toml"),
         ),
     ],
@@ -40,7 +40,7 @@ def edit_command(
         Path | None,
         typer.Option(
             "--out",
-            help=f"FILE{MODEL_SUFFIX}: the edited model; a video or a folder: its pictures "
+            help=f"FILE{MODEL_SUFFIX}: the edited model; a video or a folder: its images "
             f"[default: MODEL.SCRIPT{MODEL_SUFFIX} in this folder].",
         ),
     ] = None,
@@ -49,31 +49,31 @@ def edit_command(
 ) -> None:
     """Edit objects or single frames of a model by a script.
 
-    Scripts: docs/editing.md. An edited model is rendered, evaluated and edited again like any other.
+    Scripts: docs/editing.md. An edited model can be rendered, evaluated and edited like any model.
     """
     if out_path is None:
         out_path = name_after(model_path, f".{script_path.stem}{MODEL_SUFFIX}")
     refuse_input(out_path, "model", model_path)
     script = read_edit_script(script_path)
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
-    picture_size = parse_size(size)
-    if as_model and picture_size is not None:
+    image_size = parse_size(size)
+    if as_model and image_size is not None:
         raise wrong_use("--size", expected="a video or a folder as --out", got=out_path)
     if not as_model:
         check_image_path(out_path, others=MODEL_SUFFIX)
-        refuse_huge(picture_size)
+        refuse_huge(image_size)
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
     model = load_video_model(model_path)
     if not as_model:
-        refuse_huge(picture_size or model.size)
+        refuse_huge(image_size or model.size)
     edited = script.apply(model)
     if as_model:
         about = read_origin(model_path)
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
-            edited = _without_scores(model, edited)
+            edited = _drop_scores(model, edited)
         save_video_model(out_path, edited, metadata=about)
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
         if isinstance(edited, SegmentedVideo):
@@ -81,12 +81,12 @@ def edit_command(
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     render_to_file(
-        edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=picture_size, overwrite=overwrite
+        edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=image_size, overwrite=overwrite
     )
 
 
-def _without_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
-    """The edited video; what was noted of its segments' quality is of them unedited."""
+def _drop_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
+    """Remove the recorded scores of edited segments, which were measured before the edit."""
     before = set(map(id, model.segments))
     segments = []
     for segment in edited.segments:
@@ -100,7 +100,7 @@ def _without_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedV
 @app.command(name="segment")
 def segment_command(
     model_path: ModelFile,
-    number: Annotated[int, typer.Argument(metavar="NUMBER", help="Which, from 0; see foldgauss info.")],
+    number: Annotated[int, typer.Argument(metavar="NUMBER", help="Number of the segment, from 0; see foldgauss info.")],
     out_path: Annotated[
         Path | None,
         typer.Option("--out", help=f"FILE{MODEL_SUFFIX} [default: MODEL.NUMBER{MODEL_SUFFIX} in this folder]."),
@@ -109,7 +109,7 @@ def segment_command(
 ) -> None:
     """Extract one segment of a model in segments as a model of its own.
 
-    It is compressed, edited, viewed as any other; its frames are those of its span, told by foldgauss info.
+    It can be compressed, edited and viewed like any model. Its frames are those of its span, see foldgauss info.
     """
     if out_path is None:
         out_path = name_after(model_path, f".{number}{MODEL_SUFFIX}")
@@ -122,7 +122,7 @@ def segment_command(
     check_writable(out_path)
     video, about = load_video_model(model_path), read_origin(model_path)
     if not isinstance(video, SegmentedVideo):
-        raise wrong_use("MODEL", expected="a model in segments", got="one of one piece")
+        raise wrong_use("MODEL", expected="a model in segments", got="one without segments")
     if not 0 <= number < len(video.segments):
         expected = f"a whole number from 0 to {len(video.segments) - 1}"
         raise wrong_use("NUMBER", expected=expected, got=number)
@@ -131,5 +131,5 @@ def segment_command(
     whole = {"clip": about["clip"]} if "clip" in about else {}
     known = whole | {"frames": [begins + segment.first, begins + segment.stop]} | dict(segment.metadata)
     save_video_model(out_path, segment.model, metadata=known)
-    told = f"segment {number}, frames {segment.first:,}:{segment.stop:,}, {segment.num_gaussians:,} Gaussians"
-    out.print(f"{out_path}: {told}", soft_wrap=True)
+    text = f"segment {number}, frames {segment.first:,}:{segment.stop:,}, {segment.num_gaussians:,} Gaussians"
+    out.print(f"{out_path}: {text}", soft_wrap=True)

@@ -32,7 +32,7 @@ from foldgauss.io.models.video_model import (
 from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, write_html
 from foldgauss.video.editing.edited_video import EditedVideo
 
-_CALLED = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles", "html": "player"}
+_NAMES = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles", "html": "player"}
 
 
 @app.command(name="export")
@@ -50,14 +50,14 @@ def export_command(
         Path | None,
         typer.Option(
             "--out",
-            help="FILE.ply for ply, and for ply3dgs of one time; FILE.html for html; else a folder, also for ply of a "
-            "model in segments [default: by the model's name].",
+            help="FILE.ply for ply, and for ply3dgs of one time; FILE.html for html; otherwise a folder, also for ply "
+            "of a model in segments [default: by the model's name].",
         ),
     ] = None,
     times: Annotated[
         str | None,
         typer.Option(
-            metavar="T,T,..|A:B:N", help="These times, in [0, 1]; or N from A to B [default: those of the frames]."
+            metavar="T,T,..|A:B:N", help="Times in [0, 1]; or N times from A to B [default: those of the frames]."
         ),
     ] = None,
     original: Original = None,
@@ -66,7 +66,7 @@ def export_command(
 ) -> None:
     """Write a model for other programs, or as a web page.
 
-    See docs/formats.md; of the page, which plays the model, docs/player.md.
+    See docs/formats.md, and docs/player.md for the page, which plays the model.
     """
     if file_format not in FORMATS:
         raise wrong_use("--format", expected="one of " + ", ".join(FORMATS), got=file_format)
@@ -100,21 +100,21 @@ def export_command(
     if file_format == "html":
         check_writable(out_path)
         frames = None if original is None else read_fitted_clip(model, model_path, original, None)
-        with err.status("Making the page"):
+        with err.status("Writing the page"):
             write_html(out_path, model_path, original=frames, quality=original_quality)
         size = out_path.stat().st_size / 1e6
         out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     if file_format == "ply" and isinstance(model, EditedVideo):
-        cure = "Frames of it go out as ply3dgs or obj."
+        cure = "Its frames can be exported as ply3dgs or obj."
         raise wrong_use("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)
     num_frames = model.num_frames if chosen is None else len(chosen)
     with progress_bar("Writing", num_frames, shown=file_format != "ply") as advance:
         path = export(model, file_format, out_path, times=chosen, overwrite=overwrite, on_frame=advance)
     frames = f"{num_frames:,} frame{'' if num_frames == 1 else 's'}"
-    most = "" if file_format == "ply" else "up to "  # of frames, those alive
-    told = f"{_CALLED[file_format]} ({file_format}), {frames}, {most}{model.num_gaussians:,} Gaussians"
-    out.print(f"{path}: {told}{' each' if most and num_frames > 1 else ''}", soft_wrap=True)
+    most = "" if file_format == "ply" else "up to "  # a frame has only its live Gaussians
+    text = f"{_NAMES[file_format]} ({file_format}), {frames}, {most}{model.num_gaussians:,} Gaussians"
+    out.print(f"{path}: {text}{' each' if most and num_frames > 1 else ''}", soft_wrap=True)
 
 
 @app.command(name="import")
@@ -136,14 +136,14 @@ def import_command(
         ),
     ] = None,
     size: Size = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second [default: as noted in the file, or 25].")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second [default: as in the file, or 25].")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Read a model of another program: see docs/formats.md.
+    """Read a model of another program, see docs/formats.md.
 
-    Frames edited as triangles have no fold any more: they become pictures.
+    Triangles cannot be converted back into Gaussians: they are rendered as images.
     """
-    picture_size = parse_size(size)
+    image_size = parse_size(size)
     if out_path is None:
         out_path = name_after(source, VIDEO_SUFFIXES[0] if source.is_dir() else MODEL_SUFFIX)
     if source.is_dir():
@@ -151,10 +151,10 @@ def import_command(
         if not out_path.is_dir():
             refuse_existing(out_path, overwrite)
             check_writable(out_path)
-        refuse_huge(picture_size)
-        mesh = read_pseudomesh(source, size=picture_size, fps=fps)
+        refuse_huge(image_size)
+        mesh = read_pseudomesh(source, size=image_size, fps=fps)
         refuse_huge(mesh.size)
-        with progress_bar("Drawing", mesh.num_frames) as advance:
+        with progress_bar("Rendering", mesh.num_frames) as advance:
             write_video(out_path, advance_over(mesh.frames(), advance), mesh.fps, overwrite=overwrite)
         out.print(f"{out_path}: {mesh.num_frames} frames at {mesh.fps:g} frames per second", soft_wrap=True)
         return
@@ -162,6 +162,6 @@ def import_command(
         raise wrong_use("--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)
     refuse_existing(out_path, overwrite)
     check_writable(out_path)
-    model = import_model(source, size=picture_size, fps=fps)
+    model = import_model(source, size=image_size, fps=fps)
     save_video_model(out_path, model, metadata={"clip": source.name})
     out.print(f"{out_path}: {model.num_frames} frames, {model.num_gaussians:,} Gaussians", soft_wrap=True)

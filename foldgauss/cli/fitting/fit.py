@@ -116,11 +116,7 @@ def fit(
         fit_in_segments(job, display, options, segment_seconds=segment_seconds, resume=resume, overwrite=overwrite)
         return
     curves = _check_records(target, video, history, preview, overwrite or resume)
-    if job.checkpoint.exists() and not (resume or overwrite):
-        cure = "Continue it with --resume, or start over with --overwrite."
-        raise WrongUse(f"--out: a stopped fit has a checkpoint, {job.checkpoint}. {cure}")
-    if resume and not job.checkpoint.exists():
-        raise WrongUse(f"--resume: expected a stopped fit in {job.checkpoint}, got none. Start it without --resume.")
+    _check_checkpoint(job.checkpoint, resume, overwrite)
 
     @contextmanager
     def observe(clip: Clip, state: FitState | None) -> Iterator[Observer]:
@@ -141,24 +137,14 @@ def fit(
         resume="required" if resume else "never",
         on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
     )
-    try:
-        run.save()  # at once: the evaluation may be interrupted
-    except OSError as error:
-        run.save_checkpoint()
-        raise _explain_unsaved(error, job.checkpoint) from error
-    try:
+    _save_model(run)
+    with _keep_state_on_interrupt(run):
         if history is not None:
             _save_curves(curves, history)
         scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
-    except KeyboardInterrupt:
-        run.save_checkpoint()
-        if job.checkpoint.exists():
-            text = f"{target} is written, without its scores: add --resume --overwrite to measure them."
-            err.print(text, soft_wrap=True)
-        raise
     try:
         run.save(scores)
-    except OSError as error:  # the model is there from the first time
+    except OSError as error:
         warn(f"{target} is written, but its scores could not be added: {error}")
     job.checkpoint.unlink(missing_ok=True)
     for text in missed_psnr(config, scores.mean_psnr, run.info):
@@ -220,11 +206,39 @@ def _check_records(target: Path, video: Path, history: Path | None, preview: Pat
     return curves
 
 
-def _explain_unsaved(error: OSError, checkpoint: Path) -> OutputError:
-    """The error of a model that cannot be written, with how to continue."""
-    if not checkpoint.exists():
-        return OutputError(f"{error} There was no room for a checkpoint either: the fit is lost.")
-    return OutputError(f"{error} The fit is kept in {checkpoint}: --resume continues it, and writes the model.")
+def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
+    """Refuse a checkpoint that would be lost, and --resume without one."""
+    if checkpoint.exists() and not (resume or overwrite):
+        cure = "Continue it with --resume, or start over with --overwrite."
+        raise WrongUse(f"--out: a stopped fit has a checkpoint, {checkpoint}. {cure}")
+    if resume and not checkpoint.exists():
+        raise WrongUse(f"--resume: expected a stopped fit in {checkpoint}, got none. Start it without --resume.")
+
+
+def _save_model(run: FitRun) -> None:
+    """Write the model before its evaluation, which may be interrupted; if that fails, the state is saved instead."""
+    try:
+        run.save()
+    except OSError as error:
+        run.save_checkpoint()
+        checkpoint = run.job.checkpoint
+        text = "There was no room for a checkpoint either: the fit is lost."
+        if checkpoint.exists():
+            text = f"The fit is kept in {checkpoint}: --resume continues it, and writes the model."
+        raise OutputError(f"{error} {text}") from error
+
+
+@contextmanager
+def _keep_state_on_interrupt(run: FitRun) -> Iterator[None]:
+    """If the evaluation is interrupted, save the state, from which it can be repeated."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        run.save_checkpoint()
+        if run.job.checkpoint.exists():
+            text = f"{run.job.target} is written, without its scores: add --resume --overwrite to measure them."
+            err.print(text, soft_wrap=True)
+        raise
 
 
 def _save_curves(path: Path, history: Path) -> None:

@@ -24,14 +24,14 @@ from foldgauss.video.fitting.loop import fit
 from foldgauss.video.models.metrics import psnr
 
 NAME = "foldgauss"
-#: Scene and image size of the trials, largest difference between engines, and the fit.
-NUM_SPLATS, SIZE, ALIKE = 60, (48, 64), 5e-3
+#: Scene and image size of the trials, largest difference between engines, the fit and its lowest PSNR in dB.
+NUM_SPLATS, SIZE, MAX_DIFFERENCE = 60, (48, 64), 5e-3
 TINY = FitConfig(num_gaussians=150, degree=2, steps=40)
-LEAST_PSNR = 20.0
+MIN_PSNR = 20.0
 
 
 class Trial(NamedTuple):
-    """What was tried, whether it went well, and how long it took; `first_seconds` more went into compilation."""
+    """The result of a trial, as text in `told`, and its duration; compilation took `first_seconds` more."""
 
     name: str
     ok: bool
@@ -41,18 +41,13 @@ class Trial(NamedTuple):
     cure: str = ""
 
 
-def facts() -> dict[str, Any]:
-    """What is installed and what this machine has. Never raises: what cannot be found out is told so."""
-    asked = {
-        "versions": versions,
-        "extras": extras,
-        "machine": machine,
-        "engines": engines,
-    }
-    return {name: _told(find) for name, find in asked.items()}
+def collect_facts() -> dict[str, Any]:
+    """The installed versions, the machine and the engines. An error is reported under "unknown"."""
+    parts = {"versions": find_versions, "extras": find_extras, "machine": describe_machine, "engines": find_engines}
+    return {name: _find_or_explain(find) for name, find in parts.items()}
 
 
-def _told(find: Callable[[], Any]) -> Any:
+def _find_or_explain(find: Callable[[], Any]) -> Any:
     try:
         return find()
     except Exception as error:
@@ -64,32 +59,32 @@ def _short(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-def version_of(distribution: str) -> str | None:
+def find_version(distribution: str) -> str | None:
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
         return None
 
 
-def versions() -> dict[str, str | None]:
-    """Python's, this package's, and those of all that it cannot do without; None: missing."""
+def find_versions() -> dict[str, str | None]:
+    """Versions of Python, of this package and of its dependencies; None: missing."""
     needed = {name for name, extra in _requirements() if extra is None} | {"jaxlib"}
     return {"python": platform.python_version(), NAME: __version__} | {
-        name: version_of(name) for name in sorted(needed)
+        name: find_version(name) for name in sorted(needed)
     }
 
 
-def extras() -> dict[str, dict[str, str | None]]:
-    """Of each extra that users want, its packages."""
+def find_extras() -> dict[str, dict[str, str | None]]:
+    """The packages of each optional extra with their versions; None: missing."""
     found: dict[str, dict[str, str | None]] = {}
     for name, extra in _requirements():
         if extra in ("samples", "plot", "uncertainty", "numpyro", "sklearn"):
-            found.setdefault(extra, {})[name] = version_of(name)
+            found.setdefault(extra, {})[name] = find_version(name)
     return found
 
 
 def _requirements() -> Iterator[tuple[str, str | None]]:
-    """Distributions that this package asks for, each with the extra that asks, or None."""
+    """Distributions that this package depends on, each with the extra that requires it, or None."""
     for line in importlib.metadata.requires(NAME) or ():
         name = re.match(r"[\w.-]+", line)[0]
         extra = re.search(r"extra == ['\"](\w+)['\"]", line)
@@ -97,7 +92,7 @@ def _requirements() -> Iterator[tuple[str, str | None]]:
             yield name, extra and extra[1]
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     total, free = _memory()
     return {
         "system": platform.platform(),
@@ -115,14 +110,14 @@ def machine() -> dict[str, Any]:
 
 def _why_threads() -> str:
     if threads._num_threads is not None:
-        return "set_num_threads said so"
+        return "set by set_num_threads"
     if os.environ.get("FOLDGAUSS_NUM_THREADS") is not None:
-        return "FOLDGAUSS_NUM_THREADS says so"
-    return "one for each core that this process may use; FOLDGAUSS_NUM_THREADS changes it"
+        return "set by FOLDGAUSS_NUM_THREADS"
+    return "one for each core that this process may use; see FOLDGAUSS_NUM_THREADS"
 
 
 def _memory() -> tuple[float | None, float | None]:
-    """GiB of memory, and of it what is free now, where the system tells."""
+    """Total and free memory in GiB; None if the system does not report it."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         sizes = {line.partition(":")[0]: int(line.split()[1]) / 2**20 for line in lines}
@@ -136,15 +131,15 @@ def _memory() -> tuple[float | None, float | None]:
 
 
 def _instructions() -> str:
-    """The widest that kernels are compiled for, by LLVM's names."""
+    """The vector instructions that kernels are compiled for, by the names of LLVM."""
     from llvmlite import binding
 
     features = binding.get_host_cpu_features()
     known = ("avx512f", "avx2", "fma", "avx", "sse4.2", "sve", "neon")
-    return " ".join(name for name in known if features.get(name)) or "none that is told"
+    return " ".join(name for name in known if features.get(name)) or "unknown"
 
 
-def engines() -> dict[str, Any]:
+def find_engines() -> dict[str, Any]:
     devices = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
     backend = jax.default_backend()
     return {
@@ -156,7 +151,7 @@ def engines() -> dict[str, Any]:
 
 
 def moving_blob(num_frames: int = 6) -> np.ndarray:
-    """A bright spot on its way across a picture, uint8 RGB."""
+    """Frames of a bright spot that moves across the image, uint8 RGB."""
     height, width = SIZE
     y, x = np.mgrid[0:height, 0:width]
     t = np.linspace(0.25, 0.75, num_frames)[:, None, None]
@@ -164,15 +159,15 @@ def moving_blob(num_frames: int = 6) -> np.ndarray:
     return np.stack([255 * blob, 90 + 0 * blob, 200 - 150 * blob], -1).astype(np.uint8)
 
 
-def trials() -> Iterator[Trial]:
+def run_trials() -> Iterator[Trial]:
     """Small trials of rendering and fitting. An error makes a trial fail."""
-    drawn: dict[str, np.ndarray] = {}
+    images: dict[str, np.ndarray] = {}
     for engine in ("reference", "xla", "cpu"):
-        yield _tried(f"render an image, engine {engine}", lambda engine=engine: _draw(engine, drawn))
-    yield _tried("fit a clip of 6 frames", _fit)
+        yield _run_trial(f"render an image, engine {engine}", lambda engine=engine: _render(engine, images))
+    yield _run_trial("fit a clip of 6 frames", _fit)
 
 
-def _tried(name: str, attempt: Callable[[], str]) -> Trial:
+def _run_trial(name: str, attempt: Callable[[], str]) -> Trial:
     """Run twice: the first run compiles."""
     begun = time.perf_counter()
     try:
@@ -187,7 +182,9 @@ def _tried(name: str, attempt: Callable[[], str]) -> Trial:
         return Trial(name, False, round(time.perf_counter() - begun, 3), 0.0, _short(error), _REINSTALL)
 
 
-_REINSTALL = "Reinstall: pip install --force-reinstall foldgauss. If that is no cure, report it with `doctor --json`."
+_REINSTALL = (
+    "Reinstall: pip install --force-reinstall foldgauss. If that does not help, report it with `doctor --json`."
+)
 
 
 class _Failed(Exception):
@@ -204,22 +201,25 @@ def _scene() -> Splats2D:
     return Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
 
 
-def _draw(engine: str, drawn: dict[str, np.ndarray]) -> str:
-    drawn[engine] = picture = np.asarray(render(_scene(), SIZE, engine=engine))
-    if not np.isfinite(picture).all() or picture.max() < 0.1:
-        raise _Failed("the image is empty, or not finite", _REINSTALL)
-    if engine == "reference" or "reference" not in drawn:
+def _render(engine: str, images: dict[str, np.ndarray]) -> str:
+    images[engine] = image = np.asarray(render(_scene(), SIZE, engine=engine))
+    if not np.isfinite(image).all() or image.max() < 0.1:
+        raise _Failed("the image is empty or not finite", _REINSTALL)
+    if engine == "reference" or "reference" not in images:
         return "rendered"
-    apart = float(np.abs(picture - drawn["reference"]).max())
-    if apart > ALIKE:
-        raise _Failed(f"{apart:.2g} away from engine reference, at most {ALIKE:g} was expected", _REINSTALL)
-    return f"as engine reference, to {apart:.1g}"
+    difference = float(np.abs(image - images["reference"]).max())
+    if difference > MAX_DIFFERENCE:
+        raise _Failed(
+            f"expected a difference from engine reference of at most {MAX_DIFFERENCE:g}, got {difference:.2g}",
+            _REINSTALL,
+        )
+    return f"as engine reference, to {difference:.1g}"
 
 
 def _fit() -> str:
     frames = moving_blob()
     model = fit(frames, TINY).model
     got = float(np.mean([psnr(*pair) for pair in zip(frames, model.frames(), strict=True)]))
-    if got < LEAST_PSNR:
-        raise _Failed(f"{got:.1f} dB, at least {LEAST_PSNR:g} were expected", _REINSTALL)
+    if got < MIN_PSNR:
+        raise _Failed(f"expected at least {MIN_PSNR:g} dB, got {got:.1f}", _REINSTALL)
     return f"{TINY.steps} steps, {got:.1f} dB"

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from foldgauss.cli.app.application import app, err, out
-from foldgauss.cli.measuring.diagnosis import NAME, Trial, facts, trials
+from foldgauss.cli.measuring.diagnosis import NAME, Trial, collect_facts, run_trials
 
 GREEN, RED, YELLOW = "green", "red", "yellow"
 _FOR = {
@@ -29,21 +29,21 @@ def doctor(
     It takes some seconds, more if kernels are compiled for the first time. The exit code is 0 if there are no problems;
     otherwise 1, and each problem is printed with its remedy.
     """
-    found = facts()
+    found = collect_facts()
     if not as_json:
         _print_facts(found)
         out.print("\nTrials", style="bold")
     done = []
-    with err.status("Trying", spinner="dots") as status:
-        for trial in trials():
+    with err.status("Running trials", spinner="dots") as status:
+        for trial in run_trials():
             done.append(trial)
             if not as_json:
                 _print_trial(trial)
-            status.update(f"Trying: {len(done)} done")
+            status.update(f"Running trials: {len(done)} done")
     problems = _problems(found, done)
     if as_json:
-        told = {"well": not problems, "problems": problems, **found, "trials": [one._asdict() for one in done]}
-        print(json.dumps(told, indent=2))
+        text = {"well": not problems, "problems": problems, **found, "trials": [one._asdict() for one in done]}
+        print(json.dumps(text, indent=2))
     else:
         _print_end(done, problems)
     if problems:
@@ -51,7 +51,7 @@ def doctor(
 
 
 def _problems(found: dict[str, Any], done: list[Trial]) -> list[str]:
-    """Problems of this installation, with remedies. A missing extra is none."""
+    """Problems of this installation, with remedies. A missing extra is not a problem."""
     problems = [f"{one.name}: {one.told}. {one.cure}" for one in done if not one.ok]
     missing = [name for name, version in found["versions"].items() if version is None]
     if missing:
@@ -71,8 +71,8 @@ def _print_facts(found: dict[str, Any]) -> None:
         table.add_column(no_wrap=True, width=2)
         table.add_column(no_wrap=True)
         table.add_column(overflow="fold")
-        for color, name, told in rows:
-            table.add_row(_mark(color), name, told)
+        for color, name, text in rows:
+            table.add_row(_mark(color), name, text)
         out.print(table)
 
 
@@ -84,9 +84,9 @@ def _mark(color: str) -> Text:
 
 
 def _version_rows(found: dict[str, str | None]) -> list[Row]:
-    if "unknown" in found:  # as where the sources run uninstalled
+    if "unknown" in found:  # as for sources that are not installed
         return [(YELLOW, "versions", str(found["unknown"]))]
-    return [(GREEN if told else RED, name, told or "missing") for name, told in found.items()]
+    return [(GREEN if text else RED, name, text or "missing") for name, text in found.items()]
 
 
 def _extra_rows(found: dict[str, Any]) -> list[Row]:
@@ -97,8 +97,8 @@ def _extra_rows(found: dict[str, Any]) -> list[Row]:
         there = ", ".join(f"{one} {version}" for one, version in packages.items() if version)
         missing = [one for one, version in packages.items() if version is None]
         cure = f"no {', '.join(missing)}: pip install '{NAME}[{name}]'" if missing else ""
-        told = "; ".join(text for text in (there, cure) if text)
-        rows.append((YELLOW if missing else GREEN, name, f"{_FOR.get(name, '')}: {told}".removeprefix(": ")))
+        text = "; ".join(part for part in (there, cure) if part)
+        rows.append((YELLOW if missing else GREEN, name, f"{_FOR.get(name, '')}: {text}".removeprefix(": ")))
     return rows
 
 
@@ -106,7 +106,7 @@ def _machine_rows(found: dict[str, Any]) -> list[Row]:
     if "unknown" in found:
         return [(RED, "machine", found["unknown"])]
     free = "" if found["memory_free_gib"] is None else f", {found['memory_free_gib']:g} free"
-    clip = f"clips of up to {found['largest_clip_gib']:g} GiB are read"
+    clip = f"clips of up to {found['largest_clip_gib']:g} GiB fit"
     return [
         (GREEN, "system", found["system"]),
         (GREEN, "processor", f"{found['processor']} ({found['instructions']})"),
@@ -123,7 +123,7 @@ def _engine_rows(found: dict[str, Any]) -> list[Row]:
     accelerator = (
         f"JAX sees {seen}: engine xla renders there, and fits run there"
         if found["gpu"]
-        else f"none that JAX sees ({seen})"
+        else f"not visible to JAX ({seen})"
     )
     return [
         (GREEN, "engines", f"{', '.join(found['engines'])}; auto is {found['auto']}"),
@@ -142,10 +142,10 @@ def _print_trial(trial: Trial) -> None:
 
 def _print_end(done: list[Trial], problems: list[str]) -> None:
     seconds, first = (sum(times) for times in zip(*((one.seconds, one.first_seconds) for one in done), strict=True))
-    told = f"the trials took {seconds:.1f} s, and {first:.1f} s more to compile what is new"
+    text = f"the trials took {seconds:.1f} s, and compilation {first:.1f} s more"
     if not problems:
-        out.print(f"\nAll is well; {told}.", style=GREEN, soft_wrap=True)
+        out.print(f"\nNo problems; {text}.", style=GREEN, soft_wrap=True)
         return
-    out.print(f"\nNot all is well; {told}.", style=RED, soft_wrap=True)
+    out.print(f"\nProblems were found; {text}.", style=RED, soft_wrap=True)
     for problem in problems:
         out.print(f"  {problem}", soft_wrap=True)

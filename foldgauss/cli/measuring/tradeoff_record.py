@@ -1,4 +1,4 @@
-"""What `tradeoff` keeps and tells: its record, the commands that reproduce points, its tables."""
+"""Results of `tradeoff`: its record, the commands that reproduce points, and its tables."""
 
 import csv
 import dataclasses
@@ -30,16 +30,16 @@ RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "bas
 FILES = {RECORD, ROWS, PLOT, BASE}
 #: Options of `fit` by field of `FitConfig`, and of `fit` and `evaluate` by constant of `RenderOptions`.
 FIT_OPTIONS = {field.name: setting_of(field).option for field in CONFIG_FIELDS.values()}
-#: Those without a number: it is there, or it is not.
+#: Options without a value.
 FLAGS = {"economy": "--economy"}
-DRAW_OPTIONS = {
+RENDER_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("alpha_cutoff", "support_radius", "transmittance_stop")
 }
-#: Panels of the plot: what costs, its label, and whether more of it is better.
+#: Panels of the plot: the cost, its label, and whether more is better.
 COSTS = {
     "time": ("fit time", "time to fit (s)", False),
     "size": ("file size", "file (bytes)", False),
-    "speed": ("playback speed", "played (frames per second)", True),
+    "speed": ("playback speed", "frames per second", True),
 }
 #: Columns of the time to fit, by clock.
 CLOCKS = {"wall": "seconds", "cpu": "cpu_seconds"}
@@ -51,14 +51,14 @@ COLUMNS = (
 
 @dataclasses.dataclass
 class Record:
-    """What is known so far, in `path`: the settings, the plan and a row for each point, kept as it is done.
+    """The results so far, in `path`: the settings, the plan and a row for each measured point.
 
-    Raises WrongUse where results of other settings are kept, or something else is.
+    Raises WrongUse if `path` has results of other settings or is not a record.
     """
 
     path: Path
     settings: dict[str, Any]
-    anew: bool = False
+    restart: bool = False
     plan: dict[str, Any] = dataclasses.field(default_factory=dict)
     rows: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     fronts: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -66,7 +66,7 @@ class Record:
     machine: dict[str, Any] = dataclasses.field(default_factory=describe_machine)
 
     def __post_init__(self) -> None:
-        if not self.path.exists() or self.anew:
+        if not self.path.exists() or self.restart:
             return
         kept = self._read()
         before = kept["settings"]
@@ -75,7 +75,7 @@ class Record:
             raise WrongUse(
                 f"--out: {self.path} holds results of other settings: "
                 + ", ".join(f"{name} was {before.get(name)!r}, is {self.settings[name]!r}" for name in changed)
-                + ". Choose another folder, or start anew with --overwrite."
+                + ". Choose another folder, or start over with --overwrite."
             )
         self.plan, self.machine = kept["plan"], kept["machine"]
         self.rows = {f"{row['axis']} {row['value']}".rstrip(): row for row in kept["points"]}
@@ -91,17 +91,17 @@ class Record:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise WrongUse(
                 f"--out: expected results of `foldgauss tradeoff` in {self.path}, got something else ({error}). "
-                "Choose another folder, or start anew with --overwrite."
+                "Choose another folder, or start over with --overwrite."
             ) from error
         return kept
 
-    def keep(self) -> None:
+    def save(self) -> None:
         kept = {"settings": self.settings, "machine": self.machine, "plan": self.plan}
         kept |= {"left_out": self.left_out, "fronts": self.fronts}
         write_json(self.path, kept | {"points": list(self.rows.values())})
 
 
-#: What rows hold by column: in words, and how it is told.
+#: The type of each column, and a function that checks it.
 _TEXT = "a text", lambda value: isinstance(value, str)
 _NUMBER = "a number", lambda value: is_within(value, "(-inf, inf)")
 _SECONDS = "a number >= 0", lambda value: is_within(value, "[0, inf)")
@@ -123,7 +123,7 @@ _CELLS: dict[str, tuple[str, Callable[[object], bool]]] = {
 
 
 def _check_row(number: int, row: object) -> None:
-    """Raise ValueError, by the names of row and column, for what was edited into something else."""
+    """Raise ValueError, with the names of row and column, for an invalid value."""
     if not isinstance(row, dict):
         raise ValueError(f"row {number}: {short_repr(row)}")
     named = isinstance(row.get("axis"), str) and isinstance(row.get("value"), str)
@@ -136,7 +136,7 @@ def _check_row(number: int, row: object) -> None:
 
 
 def _check_rest(kept: dict[str, Any]) -> None:
-    """Likewise for what else of it is used: the steps of the base, the seconds of its motion, the cores."""
+    """Check the other values that are used: the steps of the base, the seconds of its motion, the cores."""
     plan, motion = kept["plan"], kept["plan"].get("motion", {"wall": 0.0, "cpu": 0.0})
     if plan and not is_integer(plan.get("steps"), 1):
         raise ValueError(f"plan: 'steps' should be a whole number >= 1, not {short_repr(plan.get('steps'))}")
@@ -149,18 +149,18 @@ def _check_rest(kept: dict[str, Any]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Commands:
-    """The command lines that reproduce points, run from the folder that this one is run from."""
+    """The command lines that reproduce points, to be run from the current folder."""
 
     video: Path
     size: str | None
     frames: str | None
     folder: Path
 
-    def of(self, point: Point, num_frames: int, size: tuple[int, int]) -> str:
-        """`point` as commands: its fit; or what is done to the base's model, which is kept."""
+    def format_point(self, point: Point, num_frames: int, size: tuple[int, int]) -> str:
+        """The command that fits the model of `point`, or converts or evaluates that of the base."""
         name, base = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_"), self.folder / BASE
         if point.played is not None:
-            constants = _changed(point.played, point.config.options, DRAW_OPTIONS)
+            constants = _changed(point.played, point.config.options, RENDER_OPTIONS)
             return shlex.join(["foldgauss", "evaluate", str(base), str(self.video), *constants])
         if point.stored != FLOAT32:
             how = ["--float16"] if point.stored == FLOAT16 else ["--passes", str(PASSES[point.stored])]
@@ -173,7 +173,7 @@ class Commands:
         words += [] if self.frames is None else ["--frames", self.frames]
         default = FitConfig(num_gaussians=default_num_gaussians(num_frames, *size))
         words += _changed(point.config, default, FIT_OPTIONS)
-        words += _changed(point.config.options, default.options, DRAW_OPTIONS)
+        words += _changed(point.config.options, default.options, RENDER_OPTIONS)
         return shlex.join(["foldgauss", *words])
 
 
@@ -185,8 +185,8 @@ def _changed(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions, 
     return list(itertools.chain.from_iterable(words))
 
 
-def settings_of(point: Point, base: FitConfig) -> dict[str, Any]:
-    """Every setting that differs from the base's."""
+def changed_settings(point: Point, base: FitConfig) -> dict[str, Any]:
+    """Every setting that differs from the base."""
     changed = {
         field.name: "on" if field.name in FLAGS else getattr(point.config, field.name)
         for field in dataclasses.fields(base)
@@ -202,8 +202,8 @@ def settings_of(point: Point, base: FitConfig) -> dict[str, Any]:
     return changed | ({} if point.stored == FLOAT32 else {"stored": point.stored})
 
 
-def report(record: Record, made: list[Point], left: list[Skipped], clock: str) -> None:
-    """The fronts and their knees, into the files beside the record and onto the screen."""
+def report(record: Record, made: list[Point], skipped: list[Skipped], clock: str) -> None:
+    """Write and print the Pareto fronts and their knees."""
     rows, folder = [record.rows[point.name] for point in made], record.path.parent
     names = [point.name for point in made]
     panels, columns = [], {"time": CLOCKS[clock], "size": "bytes", "speed": "frames_per_second"}
@@ -214,16 +214,16 @@ def report(record: Record, made: list[Point], left: list[Skipped], clock: str) -
         chosen = pareto_front(costs, quality)
         bend = knee([costs[k] for k in chosen], [quality[k] for k in chosen])
         at = None if bend is None else chosen[bend]
-        told = label.replace("(s)", "(CPU seconds)") if columns[cost] == "cpu_seconds" else label
-        panels.append(Panel(told, amounts, chosen, at))
+        text = label.replace("(s)", "(CPU seconds)") if columns[cost] == "cpu_seconds" else label
+        panels.append(Panel(text, amounts, chosen, at))
         record.fronts[cost] = {
             "what": what,
             "column": columns[cost],
             "front": [names[k] for k in chosen],
             "knee": None if at is None else names[at],
         }
-    record.left_out = {one.name: one.why for one in left}
-    record.keep()
+    record.left_out = {one.name: one.why for one in skipped}
+    record.save()
     _write_csv(folder / ROWS, rows, record.fronts)
     try:
         write_tradeoff(
@@ -269,13 +269,15 @@ def _print_fronts(rows: list[dict[str, Any]], names: list[str], fronts: dict[str
     for cost, (what, *_) in COSTS.items():
         bend, column = fronts[cost]["knee"], fronts[cost]["column"]
         if bend is None:
-            out.print(f"PSNR against {what}: no knee; the front is {'; '.join(fronts[cost]['front'])}", soft_wrap=True)
+            out.print(
+                f"PSNR against {what}: no knee; the Pareto front is {'; '.join(fronts[cost]['front'])}", soft_wrap=True
+            )
             continue
         row = rows[names.index(bend)]
         figure = units[column].format(row[column])
         out.print(f"PSNR against {what}: the knee is {bend}, {row['psnr']:.2f} dB with {figure}", soft_wrap=True)
     on = {name for cost in COSTS for name in fronts[cost]["front"]}
-    out.print("The points on the fronts, by command:")
+    out.print("Commands of the points on the Pareto fronts:")
     for name, row in zip(names, rows, strict=True):
         if name in on:
             out.print(f"  {name}: {row['command']}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The command that says how sure the learned frame times are: `uncertainty`."""
+"""The command `uncertainty`."""
 
 import csv
 import dataclasses
@@ -17,7 +17,7 @@ from foldgauss import __version__
 from foldgauss._runtime.checks import invalid
 from foldgauss.cli.app.application import Stopped, WrongUse, app, err, out, warn, wrong_use
 from foldgauss.cli.app.completion import complete_choice
-from foldgauss.cli.measuring.profiles_file import is_evidence, keep_evidence, kept_evidence
+from foldgauss.cli.measuring.profiles_file import is_profiles_file, load_profiles, save_profiles
 from foldgauss.cli.shared.arguments import FittedClip, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import name_after
@@ -40,12 +40,12 @@ from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.uncertainty.posterior.settings import check_settings
 from foldgauss.video.models.video_model import VideoModel
 
-CHAINS, EVIDENCE = "chains.h5", "evidence.npz"
-PICTURES = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
+CHAINS, PROFILES = "chains.h5", "evidence.npz"
+PLOTS = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PICTURES)
-#: Draws of each ensemble that posterior.nc holds, evenly spaced: of all there would be gigabytes.
-MOST_DRAWS = 4000
+FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PLOTS)
+#: Largest number of draws of each ensemble in posterior.nc, evenly spaced; all of them may take gigabytes.
+MAX_DRAWS = 4000
 
 
 @app.command(name="uncertainty")
@@ -58,7 +58,7 @@ def uncertainty_command(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Folder for tables, pictures and draws [default: MODEL-uncertainty in this folder].",
+            help="Folder for tables, plots and draws [default: MODEL-uncertainty in this folder].",
         ),
     ] = None,
     frames: Annotated[
@@ -71,36 +71,43 @@ def uncertainty_command(
         str | None,
         typer.Option(
             metavar="K,A:B,..",
-            help="Draw the times of these frames, the others held [default: of all between the ends].",
+            help="Sample the times of these frames, with the others fixed [default: all but the first and last].",
         ),
     ] = None,
     noise: Annotated[
         str,
         typer.Option(
-            help=f"What of the residuals counts: {', '.join(NOISES)}; see docs/uncertainty.md.",
+            help=f"Noise model of the residuals: {', '.join(NOISES)}; see docs/uncertainty.md.",
             autocompletion=complete_choice(NOISES),
         ),
     ] = "score",
     level: Annotated[
         str,
         typer.Option(
-            help="What is given: splats, all of them; colors: all but their colours, which takes longer.",
+            help="Known parameters: splats, all of them; colors, all but the colors, which takes longer.",
             autocompletion=complete_choice(LEVELS),
         ),
     ] = "splats",
     concentration: Annotated[
-        float, typer.Option(help="Of the Dirichlet prior on increments: 1 is uniform, more is towards an even pace.")
+        float,
+        typer.Option(
+            help="Concentration of the Dirichlet prior on increments: 1 is uniform, more favors equal increments."
+        ),
     ] = 1.0,
-    walkers: Annotated[int | None, typer.Option(help="Walkers of each ensemble [default: as many as suffice].")] = None,
-    ensembles: Annotated[int, typer.Option(help="Independent ensembles, which R-hat compares.")] = 4,
-    steps: Annotated[int, typer.Option(help="Most steps; fewer once it has converged.")] = 20_000,
+    walkers: Annotated[
+        int | None, typer.Option(help="Walkers of each ensemble [default: chosen by the number of frames].")
+    ] = None,
+    ensembles: Annotated[int, typer.Option(help="Independent ensembles, compared by R-hat.")] = 4,
+    steps: Annotated[
+        int, typer.Option(help="Largest number of steps; sampling ends earlier once it has converged.")
+    ] = 20_000,
     seed: Annotated[int, typer.Option(help="Seed of all draws.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Estimate the uncertainty of the frame times, given the splats.
 
-    Tells error bars of every frame, duplicated and dropped frames, and whether sampling has converged. A run that was
-    stopped goes on when called again with the same arguments; more --steps go on from fewer.
+    Writes error bars of every frame, duplicated and dropped frames, and convergence diagnostics. The same command
+    continues a stopped run, or with more --steps a finished one.
     """
     for name in ("matplotlib", "emcee", "h5py", "h5netcdf", "arviz"):
         import_optional(name)
@@ -114,37 +121,37 @@ def uncertainty_command(
     refuse_segments(model_path)
     model = load_video_model(model_path)
     if not isinstance(model, VideoModel):
-        cure = "Take the model that was edited, and the clip that it was fitted to."
+        cure = "Give the model before the edit, and the clip that it was fitted to."
         raise wrong_use("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)
     clip = read_fitted_clip(model, model_path, video, frames, same_number=False)
     if clip.num_frames != model.num_frames and read_origin(model_path).get("clip") == Path(clip.source).name:
         expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
-        cure = "To draw the times of some of them: --only A:B."
+        cure = "To sample the times of some of them: --only A:B."
         raise wrong_use("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)
     _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
-    key = _key(model_path, clip, noise, level, wanted if level == "colors" else None)
-    context.with_resource(_made_folder(out_dir))
-    own = tuple(out_dir / name for name in (*FILES, EVIDENCE))
+    key = _digest_inputs(model_path, clip, noise, level, wanted if level == "colors" else None)
+    context.with_resource(_create_folder(out_dir))
+    own = tuple(out_dir / name for name in (*FILES, PROFILES))
     context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
-    with _no_other_run(), lock_draws(out_dir / CHAINS):
-        pass  # known now, not when pictures are drawn
-    profiles = kept_evidence(out_dir / EVIDENCE, key, clip.num_frames)
+    with _explain_other_run(), lock_draws(out_dir / CHAINS):
+        pass  # fails now rather than after rendering
+    profiles = load_profiles(out_dir / PROFILES, key, clip.num_frames)
     if profiles is None and (out_dir / CHAINS).exists() and not overwrite:
         kept = out_dir / CHAINS
-        raise _of_another(kept) if is_sealed(kept) else _damaged(kept)
+        raise _other_draws(kept) if is_sealed(kept) else _damaged_draws(kept)
     with _bars() as bars:
         if profiles is not None:
             for note in profiles.notes:
-                warn(f"{note}")
+                warn(note)
         else:
-            profiles = _evidence(model, clip, noise, level, wanted, bars)
-            keep_evidence(out_dir / EVIDENCE, key, profiles)
+            profiles = _compute_profiles(model, clip, noise, level, wanted, bars)
+            save_profiles(out_dir / PROFILES, key, profiles)
         log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, profiles=profiles)
         settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
-        posterior = _drawn(out_dir / CHAINS, overwrite, bars, profiles=profiles, log_prob=log_prob, **settings)
+        posterior = _sample(out_dir / CHAINS, overwrite, bars, profiles=profiles, log_prob=log_prob, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     _write(out_dir, posterior, fitted, f"{model_path.name}, by {Path(clip.source).name}", level)
-    _tell(out_dir, posterior)
+    _print_summary(out_dir, posterior)
 
 
 def _parse_only(text: str | None) -> list[int] | None:
@@ -164,20 +171,22 @@ def _parse_only(text: str | None) -> list[int] | None:
 
 
 def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
-    """Refuse a folder that cannot be right, before any work; it is made when there is something to put into it."""
+    """Refuse a folder that cannot be used, before any work; it is created later."""
     if folder.exists() and not folder.is_dir():
         raise wrong_use("--out", expected="a folder", got=f"the file {folder}")
     if video.is_dir() and folder.resolve() == video.resolve():
-        cure = "Pictures would be frames there."
+        cure = "Plots would be frames there."
         raise wrong_use("--out", expected="a folder other than the clip's", got=folder, cure=cure)
-    shown = [path for path in folder.glob("*") if not path.name.startswith(".")]  # not what a kill left of a picture
-    images = [path for path in shown if path.suffix.lower() in IMAGES and path.name not in PICTURES]
+    shown = [
+        path for path in folder.glob("*") if not path.name.startswith(".")
+    ]  # without temporary files of a killed run
+    images = [path for path in shown if path.suffix.lower() in IMAGES and path.name not in PLOTS]
     if images:
-        cure = "Pictures would be frames there."
+        cure = "Plots would be frames there."
         raise wrong_use("--out", expected="a folder without other images", got=folder, cure=cure)
     there = [name for name in FILES if (folder / name).exists()]
-    if (folder / EVIDENCE).exists() and not is_evidence(folder / EVIDENCE):  # a run that was killed may leave its own
-        there.append(EVIDENCE)
+    if (folder / PROFILES).exists() and not is_profiles_file(folder / PROFILES):  # a killed run may have left its own
+        there.append(PROFILES)
     if there and not (folder / CHAINS).exists() and not overwrite:
         raise WrongUse(f"--out: {folder / there[0]} exists. Choose another folder, or add --overwrite.")
     if folder.is_dir():
@@ -185,24 +194,24 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _made_folder(path: Path) -> Iterator[None]:
-    """Within, the folder is there; one that was not, and into which nothing came, is gone afterwards."""
+def _create_folder(path: Path) -> Iterator[None]:
+    """Create the folder; one that was new and is still empty is removed at the end."""
     existed = path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"--out: cannot make the folder {path} ({error.strerror}). Choose another.") from error
+        raise OutputError(f"--out: cannot create the folder {path} ({error.strerror}). Choose another.") from error
     try:
         check_writable(path / FILES[0])
         yield
     finally:
         if not existed:
-            with suppress(OSError):  # there is something in it
+            with suppress(OSError):  # it is not empty
                 path.rmdir()
 
 
 def _check_settings(num_frames: int, only, concentration: float, walkers, ensembles: int, steps: int) -> None:
-    """All that can be known to be wrong before pictures are drawn."""
+    """Refuse invalid settings before anything is rendered."""
     try:
         found = Increments.with_free(np.linspace(0.0, 1.0, num_frames), only, concentration)
     except ValueError as error:
@@ -216,15 +225,15 @@ def _check_settings(num_frames: int, only, concentration: float, walkers, ensemb
     check_settings(found.num_free, walkers=walkers, ensembles=ensembles, steps=steps)
 
 
-def _key(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] | None) -> str:
-    """Of all that the evidence depends on."""
+def _digest_inputs(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] | None) -> str:
+    """A digest of everything that the profiles depend on."""
     about = fingerprint(clip) | {"noise": noise, "level": level, "only": only, "version": __version__}
     digest = hashlib.blake2b(model_path.read_bytes(), digest_size=16)
     digest.update(json.dumps(about, sort_keys=True).encode())
     return digest.hexdigest()
 
 
-def _evidence(
+def _compute_profiles(
     model: VideoModel, clip: Clip, noise: str, level: str, only: list[int] | None, bars
 ) -> LikelihoodProfiles:
     profiles = likelihood_profiles(
@@ -236,42 +245,42 @@ def _evidence(
 
 
 @contextmanager
-def _no_other_run() -> Iterator[None]:
-    """Draws may be written from Python, too, which knows of no option."""
+def _explain_other_run() -> Iterator[None]:
+    """Convert the error about another run that samples to the same file."""
     try:
         yield
     except BlockingIOError as error:
         raise OutputError(str(error).replace("backend:", "--out:", 1)) from error
 
 
-def _of_another(path: Path) -> WrongUse:
-    cure = "Choose another folder, or add --overwrite to give them up."
+def _other_draws(path: Path) -> WrongUse:
+    cure = "Choose another folder, or add --overwrite to replace them."
     expected = "the draws of this model, clip and settings"
     return wrong_use("--out", expected=expected, got=f"others in {path}", cure=cure)
 
 
-def _damaged(path: Path) -> WrongUse:
+def _damaged_draws(path: Path) -> WrongUse:
     return WrongUse(f"--out: {path} is damaged. Remove it, or add --overwrite.")
 
 
 @contextmanager
 def _bars() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar for the pictures and one for the steps, where somebody looks."""
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[told]}")
+    """Progress bars of rendering and sampling, on a terminal."""
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[text]}")
     with Progress(*columns, TimeElapsedColumn(), *TIME_LEFT, console=err, disable=not err.is_terminal) as progress:
         tasks: dict[str, Any] = {}
-        titles = {"pictures": "Drawing pictures", "frames": "Without colours", "steps": "Sampling"}
+        titles = {"pictures": "Rendering", "frames": "Integrating colors", "steps": "Sampling"}
 
         def show(what: str, done: int, total: int) -> None:
             if what not in tasks:
-                tasks[what] = progress.add_task(titles.get(what, what.capitalize()), total=total, told="")
-            progress.update(tasks[what], completed=done, total=total, told=f"{done:,}/{total:,}")
+                tasks[what] = progress.add_task(titles.get(what, what.capitalize()), total=total, text="")
+            progress.update(tasks[what], completed=done, total=total, text=f"{done:,}/{total:,}")
 
         yield show
 
 
-def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePosterior:
-    """Sample, from where a stopped run is kept; with `overwrite`, instead of another run."""
+def _sample(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePosterior:
+    """Sample, from the draws of a stopped run if there are any; with `overwrite`, draws of another run are replaced."""
     existed, course = path.exists(), []
 
     def show(what: str, done: int, total: int) -> None:
@@ -281,7 +290,7 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
         bars(what, done, total)
 
     def sample() -> FrameTimePosterior:
-        with _no_other_run():
+        with _explain_other_run():
             return frame_time_posterior(progress=show, backend=path, **arguments)
 
     try:
@@ -292,43 +301,43 @@ def _drawn(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePost
                 raise
             if not overwrite:
                 if "damaged" in str(error):
-                    raise _damaged(path) from error
-                raise _of_another(path) from error
+                    raise _damaged_draws(path) from error
+                raise _other_draws(path) from error
             path.unlink()
             existed, posterior = False, sample()
     except KeyboardInterrupt as error:
-        raise Stopped(f"stopped; what {path} holds goes on when called again.") from error
+        raise Stopped(f"stopped; the same command continues from {path}.") from error
     except OSError as error:
         if error.filename is None or Path(error.filename) != path:
             raise
-        again = f" What {path} holds goes on when called again." if path.exists() else ""
+        again = f" The same command continues from {path}." if path.exists() else ""
         raise OutputError(f"{output_error(path, error)}{again}") from error
     if existed:
-        text = "had finished: nothing was drawn anew" if not course else "went on from where it was stopped"
+        text = "was complete: nothing was sampled" if not course else "was continued"
         out.print(f"{path}: {text}", soft_wrap=True)
     return posterior
 
 
 def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> None:
-    """Every file whole, and the one that counts most first."""
+    """Write all files, each atomically, the most important ones first."""
     flagged = irregularities(posterior)
     _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
     with atomic_path(folder / "summary.md") as temporary:
         text = summary(posterior, fitted, flagged=flagged, level=level)
         temporary.write_text(f"# Frame times of {title}\n\n{text}")
     _write_netcdf(folder / "posterior.nc", posterior)
-    _draw(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
-    _draw(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
-    _draw(folder / "corner.png", plots.plot_pairs, posterior)
-    _draw(folder / "trace.png", plots.plot_trace, posterior)
+    _save_plot(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
+    _save_plot(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
+    _save_plot(folder / "corner.png", plots.plot_pairs, posterior)
+    _save_plot(folder / "trace.png", plots.plot_trace, posterior)
     if posterior.profiles is not None:
-        _draw(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
+        _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
 
 
-def _draw(path: Path, plot: Callable, *arguments: Any, **options: Any) -> None:
+def _save_plot(path: Path, plot: Callable, *arguments: Any, **options: Any) -> None:
     from matplotlib import pyplot
 
-    pyplot.switch_backend("Agg")  # which wants no screen
+    pyplot.switch_backend("Agg")  # needs no display
     figure = np.ravel(plot(*arguments, **options))[0].figure
     try:
         with atomic_path(path) as temporary:
@@ -355,17 +364,17 @@ def _cell(value: Any) -> str:
 
 def _write_netcdf(path: Path, posterior: FrameTimePosterior) -> None:
     steps, walkers = posterior.times.shape[1:3]
-    stride = -(-steps * walkers // MOST_DRAWS)
+    stride = -(-steps * walkers // MAX_DRAWS)
     thinned = dataclasses.replace(posterior, times=posterior.times[:, ::stride])
     data = thinned.to_arviz()
     data.attrs["kept_one_step_in"] = stride
     with atomic_path(path) as temporary:
-        # As much as it will be, and more: HDF5 may crash on a disk that is full, Python says so.
+        # Reserve the space first: HDF5 may crash on a full disk, where Python raises an error.
         temporary.write_bytes(bytes(2 * thinned.times.nbytes + (1 << 20)))
         data.to_netcdf(str(temporary), engine="h5netcdf")
 
 
-def _tell(folder: Path, posterior: FrameTimePosterior) -> None:
+def _print_summary(folder: Path, posterior: FrameTimePosterior) -> None:
     out.print((folder / "summary.md").read_text(), soft_wrap=True)
     if not posterior.converged:
         warn(f"{posterior.message} The draws so far are in {folder}.")

@@ -33,7 +33,7 @@ def evaluate_command(
     model_path: ModelFile,
     video: FittedClip,
     json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the figures here, too.")
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Also write the figures here.")
     ] = None,
     frames: Annotated[
         str | None,
@@ -50,9 +50,8 @@ def evaluate_command(
 ) -> None:
     """Compare a model with its clip: PSNR and SSIM of every frame.
 
-    Of a model in segments those of each segment are shown; --json has the frames'.
-
-    Tells the size of the file, its bits per pixel and how fast it is drawn, too.
+    Also shows the size of the file, its bits per pixel and the rendering speed. The table of a model in
+    segments has a row for each segment; --json has every frame.
     """
     if json_path is not None:
         for what, source in (("model", model_path), ("clip", video)):
@@ -78,7 +77,7 @@ def evaluate_command(
 
 
 def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:
-    """A row for each segment, by the frames that it begins: those of a clip of hours are too many for a screen."""
+    """Print a row for each segment: the frames of a long clip are too many for a table."""
     table = Table("segment", "frames", "PSNR (dB)", "lowest", "SSIM")
     stops = [segment.first for segment in model.segments[1:]] + [model.num_frames]
     for number, (segment, stop) in enumerate(zip(model.segments, stops, strict=True)):

@@ -18,7 +18,7 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: Number of segments that are listed.
-MOST_SEGMENTS = 100
+MAX_SEGMENTS = 100
 
 
 @app.command()
@@ -27,18 +27,18 @@ def info(model_path: ModelFile) -> None:
     model = load_video_model(model_path)
     about = read_metadata(model_path)
     if isinstance(model, SegmentedVideo):
-        _tell_of_segments(model_path, model, about)
+        _print_segments(model_path, model, about)
         return
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
     figures = {
-        "frames": _frames_told(model),
+        "frames": _describe_frames(model),
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
-        **_economies(model),
+        **_describe_savings(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
-        "frame times": _about_times(np.asarray(model.frame_times.times())),
+        "frame times": _describe_times(np.asarray(model.frame_times.times())),
         "parameters stored": f"{model.num_parameters:,}",
-        "file": _size_of(model_path, model),
+        "file": _describe_size(model_path, model),
     }
     if isinstance(model, EditedVideo):
         figures["edits"] = ", ".join(
@@ -49,29 +49,29 @@ def info(model_path: ModelFile) -> None:
 
 def _print_facts(model_path: Path, figures: dict[str, str], about: dict) -> None:
     table = Table(title=str(model_path), show_header=False)
-    # What was noted of the frames fitted to stands beside what the model's own frames are.
-    noted = {f"{k} of the clip" if k in figures else k: _shorten(v) for k, v in about.items() if v is not None}
-    for name, value in (figures | noted).items():
+    # Metadata of the fitted clip may have the name of a figure of the model.
+    metadata = {f"{k} of the clip" if k in figures else k: _shorten(v) for k, v in about.items() if v is not None}
+    for name, value in (figures | metadata).items():
         table.add_row(name, value)
     out.print(table)
 
 
-def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> None:
-    """What the header says: no model is loaded."""
+def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> None:
+    """Print what the header contains; the models are not loaded."""
     cuts, fades = len(model.cuts), len(model.segments) - 1 - len(model.cuts)
     joints = f"; begin at a cut: {cuts:,}; fade in: {fades:,}" if len(model.segments) > 1 else ""
     figures = {
-        "frames": _frames_told(model),
+        "frames": _describe_frames(model),
         "segments": f"{len(model.segments):,}{joints}",
         "Gaussians": f"{model.num_gaussians:,} in all",
         "fold": f"polynomial of degree {model.degree}",
         "parameters stored": f"{model.num_parameters:,}",
-        "file": _size_of(model_path, model),
+        "file": _describe_size(model_path, model),
     }
     _print_facts(model_path, figures, about)
     table = Table("segment", "frames", "begins", "Gaussians", "PSNR (dB)")
     before = None
-    for number, segment in enumerate(model.segments[:MOST_SEGMENTS]):
+    for number, segment in enumerate(model.segments[:MAX_SEGMENTS]):
         shared = 0 if before is None else before.stop - segment.first
         begins = "" if before is None else f"fading in over {shared:,}" if shared else "at a cut"
         quality = segment.metadata.get("mean_psnr")
@@ -79,43 +79,43 @@ def _tell_of_segments(model_path: Path, model: SegmentedVideo, about: dict) -> N
         table.add_row(str(number), *row, f"{quality:.2f}" if is_within(quality, "(0, 100]") else "")
         before = segment
     out.print(table)
-    if len(model.segments) > MOST_SEGMENTS:
-        out.print(f"and {len(model.segments) - MOST_SEGMENTS:,} more segments")
+    if len(model.segments) > MAX_SEGMENTS:
+        out.print(f"and {len(model.segments) - MAX_SEGMENTS:,} more segments")
 
 
-def _frames_told(model: Video) -> str:
-    return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} a second"
+def _describe_frames(model: Video) -> str:
+    return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} per second"
 
 
-def _economies(model: VideoModel | EditedVideo) -> dict[str, str]:
-    """What Gaussians do without, where some do."""
+def _describe_savings(model: VideoModel | EditedVideo) -> dict[str, str]:
+    """Parameters that some Gaussians do not have or share, by name."""
     parts = [layer.model.splats for layer in as_edited(model).layers]
     degrees = np.concatenate([splats.degrees for splats in parts])
-    told = {}
+    found = {}
     if any((splats.degrees < splats.degree).any() for splats in parts):
         counts = zip(*np.unique(degrees, return_counts=True), strict=True)
-        told["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
+        found["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
     if static := sum(int(splats.static.sum()) for splats in parts):
-        told["static"] = f"{static:,} of {len(degrees):,} Gaussians, throughout the clip"
+        found["static"] = f"{static:,} of {len(degrees):,} Gaussians, throughout the clip"
     if opaque := sum(int(splats.opaque.sum()) for splats in parts):
-        told["opaque"] = f"{opaque:,} of {len(degrees):,} Gaussians, without transmittance"
-    advance_over = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
-    for what, name in (("colors", "colours"), ("shapes", "shapes")):
-        # Where most have their own, what is alike is so by chance, as of rounded numbers.
-        few = [(num, counts[what]) for num, counts in advance_over if 2 * counts.get(what, num) <= num]
+        found["opaque"] = f"{opaque:,} of {len(degrees):,} Gaussians, without transmittance"
+    counted = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
+    for what, name in (("colors", "colors"), ("shapes", "shapes")):
+        # If most Gaussians have their own values, equal ones are a coincidence, as of rounded values.
+        few = [(num, counts[what]) for num, counts in counted if 2 * counts.get(what, num) <= num]
         shared = [f"{count:,}, shared by {num:,} Gaussians" for num, count in few]
         if shared:
-            told[name] = ", ".join(shared)
-    return told
+            found[name] = ", ".join(shared)
+    return found
 
 
-def _about_times(times: np.ndarray) -> str:
+def _describe_times(times: np.ndarray) -> str:
     if len(times) == 1:
-        return "one frame alone, shown at all times"
+        return "a single frame, shown at all times"
     return f"learned, steps {np.diff(times).min():.2e} to {np.diff(times).max():.2e}"
 
 
-def _size_of(path: Path, model: Video) -> str:
+def _describe_size(path: Path, model: Video) -> str:
     num_bytes, num_pixels = path.stat().st_size, model.num_frames * model.size[0] * model.size[1]
     kind = "compact, " if is_compact(path) else ""
     return f"{kind}{num_bytes:,} bytes, {8 * num_bytes / num_pixels:.3f} bits per pixel of the frames"

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import app, err, wrong_use
+from foldgauss.cli.app.application import app, warn, wrong_use
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.arguments import (
     MAX_TIMES,
@@ -37,7 +37,7 @@ from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 
-MAX_UPSAMPLE, MAX_PICTURES = MAX_TIMES, 10 * MAX_TIMES
+MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
 
 
@@ -55,11 +55,9 @@ def render(
     size: Size = None,
     upsample: Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")] = None,
     fps: Annotated[
-        float | None, typer.Option(help="Frames a second [default: the clip's; with --upsample K, K times that].")
+        float | None, typer.Option(help="Frames per second [default: as the clip; with --upsample K, K times as many].")
     ] = None,
-    speed: Annotated[
-        float | None, typer.Option(help="How fast time goes by: 0.25 is slow motion, -1 backwards.")
-    ] = None,
+    speed: Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow motion, -1 backwards.")] = None,
     remap: Annotated[
         str | None,
         typer.Option(metavar="S=C,S=C,..", help="Second C of the clip at second S: 0=0,1=1,3=1,4=2 holds second 1."),
@@ -68,13 +66,13 @@ def render(
         str | None, typer.Option(metavar="T,T,..|A:B:N", help="These times of the model, in [0, 1]; or N from A to B.")
     ] = None,
     background: Annotated[
-        str, typer.Option(metavar="RRGGBB", help="Colour behind a model of a clip with alpha, as ffffff.")
+        str, typer.Option(metavar="RRGGBB", help="Background color of a model of a clip with alpha, as ffffff.")
     ] = "000000",
     image_format: Annotated[
         str | None,
         typer.Option(
             "--format",
-            help="Of the images in a folder: png or webp, both exact [default: png].",
+            help="Format of the images in a folder: png or webp, both lossless [default: png].",
             autocompletion=complete_choice(IMAGE_FORMATS),
         ),
     ] = None,
@@ -84,10 +82,10 @@ def render(
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a video, also between its frames."""
-    course = _Course(upsample, fps, speed, _parse_remap(remap), parse_times(times))
-    picture_size, behind = parse_size(size), parse_color(background)
+    timeline = _Timeline(upsample, fps, speed, _parse_remap(remap), parse_times(times))
+    image_size, background_color = parse_size(size), parse_color(background)
     if out_path is None:
-        out_path = _named_after_model(model_path, course, image_format)
+        out_path = _name_output(model_path, timeline, image_format)
     check_image_path(out_path, single=True)
     if image_format is not None and (out_path.suffix and not out_path.is_dir()):
         raise wrong_use("--format", expected="a folder as --out", got=out_path)
@@ -100,34 +98,34 @@ def render(
     model = load_video_model(model_path)
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)
-    refuse_huge(picture_size or model.size)
-    shown, rate = course.times(np.asarray(model.frame_times.times()), model.fps), course.rate(model.fps)
-    course.warn_of_end(model.num_frames, model.fps)
+    refuse_huge(image_size or model.size)
+    shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
+    timeline.warn_of_end(model.num_frames, model.fps)
     render_to_file(
         model,
         out_path,
         shown,
         rate,
-        size=picture_size,
-        background=behind,
+        size=image_size,
+        background=background_color,
         image_format=image_format or "png",
         overwrite=overwrite,
     )
 
 
-def _named_after_model(model_path: Path, course: "_Course", image_format: str | None) -> Path:
-    """A video, a picture or a folder by the model's name: never that of the clip, which may well lie here."""
+def _name_output(model_path: Path, timeline: "_Timeline", image_format: str | None) -> Path:
+    """The default name of the video, image or folder; never that of the clip, which may be in this folder."""
     if image_format is not None:
         return name_after(model_path, "-frames")
-    suffix = IMAGE_SUFFIX if course.chosen is not None and len(course.chosen) == 1 else VIDEO_SUFFIXES[0]
+    suffix = IMAGE_SUFFIX if timeline.chosen is not None and len(timeline.chosen) == 1 else VIDEO_SUFFIXES[0]
     path = name_after(model_path, suffix)
-    clip = read_origin(model_path).get("clip", path.name)  # where it is not known, it may be of that name
+    clip = read_origin(model_path).get("clip", path.name)  # if unknown, it may have that name
     return name_after(model_path, f".rendered{suffix}") if path.name == clip else path
 
 
 @dataclasses.dataclass(frozen=True)
-class _Course:
-    """Which times are shown, and how fast: the options of `render`, at most one of the last four but `fps`."""
+class _Timeline:
+    """Chooses the rendered times and the frame rate; `upsample`, `speed`, `remap` and `chosen` exclude each other."""
 
     upsample: int | None
     fps: float | None
@@ -150,11 +148,11 @@ class _Course:
             raise wrong_use("--speed", expected=expected, got=self.speed)
 
     def rate(self, fps: float) -> float:
-        """Frames a second of what is shown, given the clip's."""
+        """Frames per second of the output, given those of the clip."""
         return fps * (self.upsample or 1) if self.fps is None else self.fps
 
     def times(self, frame_times: np.ndarray, fps: float) -> np.ndarray:
-        """The model times that are shown, in their order."""
+        """The model times to render, in order."""
         if self.chosen is not None:
             return self.chosen
         if self.upsample is not None:
@@ -165,24 +163,23 @@ class _Course:
             self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
             return times_at(frame_times, remapped_positions(self.remap, fps, rate))
         speed = self.speed or 1.0
-        if self.speed is not None or self.fps is not None:  # a clip's own frames are as many as there are
+        if self.speed is not None or self.fps is not None:  # otherwise it has as many frames as the clip
             self._refuse_long("--speed", (len(frame_times) - 1) * rate / abs(speed))
         return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
 
     def warn_of_end(self, num_frames: int, fps: float) -> None:
-        """Say so where more of the clip is asked for than there is: its last frame lasts until num_frames / fps."""
-        asked = 0.0 if self.remap is None else max(of_clip for _, of_clip in self.remap)
-        if asked > num_frames / fps * (1 + 1e-6):
-            err.print(
-                f"warning: --remap: the clip ends at second {num_frames / fps:.4g}, {asked:.4g} was asked for: "
-                "its last frame is held from there on.",
-                soft_wrap=True,
+        """Warn if `remap` exceeds the clip, whose last frame ends at num_frames / fps."""
+        last = 0.0 if self.remap is None else max(of_clip for _, of_clip in self.remap)
+        if last > num_frames / fps * (1 + 1e-6):
+            warn(
+                f"--remap: expected seconds up to the end of the clip, {num_frames / fps:.4g}, got {last:.4g}. "
+                "Its last frame is held from there on."
             )
 
-    def _refuse_long(self, option: str, num_pictures: float) -> None:
-        if num_pictures > MAX_PICTURES:
-            expected = f"at most {MAX_PICTURES:,} pictures"
-            raise wrong_use(option, expected=expected, got=f"{num_pictures:,.0f} of them")
+    def _refuse_long(self, option: str, num_images: float) -> None:
+        if num_images > MAX_IMAGES:
+            expected = f"at most {MAX_IMAGES:,} images"
+            raise wrong_use(option, expected=expected, got=f"{num_images:,.0f}")
 
 
 def _parse_remap(text: str | None) -> list[tuple[float, float]] | None:

@@ -1,4 +1,4 @@
-"""The command that shows a model in the browser: `view`."""
+"""The command `view`."""
 
 import webbrowser
 from contextlib import suppress
@@ -24,23 +24,21 @@ def view_command(
     port: Annotated[int, typer.Option(help="Serve at this port.", min=0, max=65535, show_default="a free one")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
 ) -> None:
-    """Play a model in the browser; Ctrl-C ends it.
+    """Play a model in the browser, until Ctrl-C.
 
-    The page is served to this machine alone. To keep it: foldgauss export MODEL --format html.
+    The page is served to this machine only. To save it: foldgauss export MODEL --format html.
     """
     frames = None
     if original is not None:
         frames = read_fitted_clip(load_video_model(model_path), model_path, original, None)
-    with err.status("Making the page"):
+    with err.status("Writing the page"):
         page = html_page(model_path, original=frames, quality=original_quality)
     warn_of_size(page, original is not None)
     try:
         server = _Server(page.encode(), port)
     except OSError as error:
-        expected, got = "a port that is free", f"{port} ({error.strerror})"
-        raise wrong_use(
-            "--port", expected=expected, got=got, cure="Take another, or leave the option out for a free one."
-        ) from error
+        cure = "Choose another, or omit the option for a free one."
+        raise wrong_use("--port", expected="a free port", got=f"{port} ({error.strerror})", cure=cure) from error
     with server:
         out.print(f"{model_path.name}, {len(page) / 1e6:.1f} MB, until Ctrl-C at {server.url}", soft_wrap=True)
         if browser:
@@ -48,11 +46,11 @@ def view_command(
         try:
             server.serve_forever()
         except KeyboardInterrupt:
-            out.print("Ended.")
+            out.print("Stopped.")
 
 
 class _Server(ThreadingHTTPServer):
-    """One page, for browsers of this machine alone."""
+    """Serves one page to browsers of this machine."""
 
     daemon_threads = True
 
@@ -65,7 +63,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """The page at /, nothing else; and not to whom a foreign name has brought here."""
+    """Answers requests for / only, and refuses foreign host names (DNS rebinding)."""
 
     server: _Server
 
@@ -88,8 +86,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("X-Content-Type-Options", "nosniff")
             self.end_headers()
             if send:
-                with suppress(ConnectionError):  # a tab that was closed meanwhile
+                with suppress(ConnectionError):  # the tab was closed
                     self.wfile.write(self.server.page)
 
     def log_message(self, *message: object) -> None:
-        """Nothing: the console is the user's."""
+        """Do not log to the console."""
