@@ -135,7 +135,7 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no
     assert len(draws_of(target)[0]) < 70
     assert not (target / "frame_times.csv").exists()
     assert run(*words) == 0
-    assert "went on from where it was stopped" in capsys.readouterr().out
+    assert "was continued" in capsys.readouterr().out
     for one, other in zip(draws_of(target), draws_of(done), strict=True):
         np.testing.assert_array_equal(one, other)
     assert table_of(target) == table_of(done)
