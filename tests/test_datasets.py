@@ -88,7 +88,7 @@ def test_davis_reads_labels_beside_their_frames(root):
     assert (found.clip.frames.shape, found.clip.fps) == ((4, HEIGHT, WIDTH, 3), 24.0)
     np.testing.assert_array_equal(found.masks, [labels(k) for k in range(4)])
     assert found.masks.dtype == np.uint8
-    assert found.unmasked is None
+    assert (found.num_objects, found.unmasked) == (2, None)
 
 
 def test_davis_range_and_window_keep_frames_and_masks_together(root):
@@ -101,6 +101,7 @@ def test_davis_range_and_window_keep_frames_and_masks_together(root):
 def test_davis_without_masks_says_why(root):
     found = datasets.davis(root, "dog-agility")
     assert found.masks is None
+    assert found.num_objects == 0
     assert found.unmasked.startswith("1 of 3 frames have a mask")
 
 
@@ -118,6 +119,7 @@ def test_a_palette_with_void_alone_has_no_object(root):
         write_mask(root / "Annotations" / "480p" / "bear" / f"{k:05d}.png", labels(k) // 255 * 255)
     found = datasets.davis(root, "bear")
     assert set(np.unique(found.masks)) == {0, 255}
+    assert found.num_objects == 0
 
 
 def _fails(error, match, *arguments, **options):

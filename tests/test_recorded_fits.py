@@ -1,5 +1,6 @@
 """Fits keep their bits, and model files of earlier versions keep loading."""
 
+import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 import recorded_fits
 
 from foldgauss.io import load_selection, load_video_model, read_vegas_ply
+from foldgauss.video import Economy, FitConfig
+from foldgauss.video.fitting.config import rename_options, rename_settings
 
 DATA = Path(__file__).parent / "data" / "v0.1"
 RECORDED = json.loads((DATA / "fits.json").read_text())
@@ -48,3 +51,13 @@ def test_selection_and_ply_of_an_earlier_version_load():
     selection = load_selection(DATA / "selection.safetensors", model)
     assert 0 < np.count_nonzero(selection.mask) < model.num_gaussians
     assert read_vegas_ply(DATA / "vegas.ply").num_gaussians == model.num_gaussians
+
+
+def test_settings_in_records_of_an_earlier_version_are_read():
+    """So that finished jobs are not done again, and unfinished ones resume."""
+    recorded = json.loads((DATA / "settings.json").read_text())
+    economical = FitConfig(economy=Economy(), scale_rates_by_duration=False, interpolation_fraction=0.25)
+    for name, config in {"default": FitConfig(), "economy": economical}.items():
+        assert rename_settings(recorded[name]) == json.loads(json.dumps(dataclasses.asdict(config)))
+    assert rename_settings(["own_time"]) == ["own_time"]
+    assert rename_options("fit a.mp4 --ssim-share 0.1 --steps 5") == "fit a.mp4 --ssim-fraction 0.1 --steps 5"

@@ -23,7 +23,7 @@ from foldgauss.cli.shared.tables import write_json
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.render import RenderOptions
-from foldgauss.video.fitting.config import FitConfig, default_num_gaussians
+from foldgauss.video.fitting.config import FitConfig, default_num_gaussians, rename_options, rename_settings
 from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
@@ -87,6 +87,8 @@ class Record:
                 raise ValueError("parts are missing")
             for number, row in enumerate(kept["points"], 1):
                 _check_row(number, row)
+                row["value"] = row["value"].replace("compact, mended", "compact, finetuned")  # as it was called before
+                row |= {"settings": rename_settings(row["settings"]), "command": rename_options(row["command"])}
             _check_rest(kept)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise WrongUse(

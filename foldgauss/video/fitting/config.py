@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import field
+from types import MappingProxyType
 from typing import Any
 
 from foldgauss._runtime.checks import check_one_of, invalid
@@ -400,3 +402,34 @@ def planned_steps(config: FitConfig, num_frames: int) -> int | None:
 def _is_smallest(config: FitConfig) -> bool:
     """Whether the smallest model at a PSNR is asked for."""
     return config.economy is not None and config.economy.psnr is not None
+
+
+#: Names that settings had before they were renamed, in records that earlier versions wrote.
+_EARLIER_NAMES: Mapping[str, str] = MappingProxyType(
+    {
+        "own_time": "scale_rates_by_duration",
+        "only_alive": "sparse_updates",
+        "falling": "decayed",
+        "square_share": "l2_fraction",
+        "between_share": "interpolation_fraction",
+        "ssim_share": "ssim_fraction",
+        "quarter_share": "quarter_fraction",
+        "half_share": "half_fraction",
+        "first_share": "first_fraction",
+        "last_share": "last_fraction",
+    }
+)
+
+
+def rename_settings(settings: Any) -> Any:
+    """Settings of a record, as of `dataclasses.asdict(config)`, by their present names; no dict: as it is."""
+    if not isinstance(settings, dict):
+        return settings
+    return {_EARLIER_NAMES.get(name, name): rename_settings(value) for name, value in settings.items()}
+
+
+def rename_options(command: str) -> str:
+    """A command of a record, with the present names of its options."""
+    for earlier, name in _EARLIER_NAMES.items():
+        command = command.replace(f"--{earlier.replace('_', '-')} ", f"--{name.replace('_', '-')} ")
+    return command
