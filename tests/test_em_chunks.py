@@ -230,7 +230,7 @@ def test_pruning_statistics_of_blocks_equal_those_of_points():
     with statistics.enable_dtype(np.float64):
         points = statistics.make_points(fitted._scaling.apply(x[there]), weights[there], 3)
         blocks = statistics.Blocks(chunks, prepare, np.dtype(np.float64), 3, [there.sum()])
-        for function in (prune._log_likelihoods_without, prune._accumulate):
+        for function in (prune._log_likelihoods_without, statistics.accumulate):
             pairs = [
                 statistics.sum_over_points(function, z, fitted._params, fitted._envelope) for z in (points, blocks)
             ]
