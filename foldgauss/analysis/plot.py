@@ -122,7 +122,7 @@ def plot_tradeoff(
 ) -> np.ndarray:
     """Quality against cost, a panel for each kind of cost, with the Pareto front as a line and a ring at its knee.
 
-    Each axis has a color; points of the axis "base" are stars. Points of a front are labeled where there is room, the
+    Each axis has a color; points of the axis "base" are stars. Points of a Pareto front are labeled where they fit, the
     knee always.
 
     **Shapes:** `quality` and every cost have one number per point, `names` its axis and value; `axes`, given or made,

@@ -222,7 +222,7 @@ def _save_model(run: FitRun) -> None:
     except OSError as error:
         run.save_checkpoint()
         checkpoint = run.job.checkpoint
-        text = "There was no room for a checkpoint either: the fit is lost."
+        text = "The checkpoint could not be written either: the fit is lost."
         if checkpoint.exists():
             text = f"The fit is kept in {checkpoint}: --resume continues it, and writes the model."
         raise OutputError(f"{error} {text}") from error
