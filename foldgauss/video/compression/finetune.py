@@ -8,7 +8,7 @@ from jaxtyping import Float32, Int32
 
 from foldgauss.render import cpu
 from foldgauss.video.fitting.codebook import Codebook
-from foldgauss.video.fitting.config import UNIT_TIME, LearningRates
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, update_rows
 from foldgauss.video.models.conditioning import apply_scale_cutoff, backpropagate, condition, update_windows
 from foldgauss.video.models.prepared import PreparedModel
@@ -41,9 +41,9 @@ def finetune_model(
     """
     prepared = PreparedModel(model, model.size)
     rows, window, spec = prepared.rows, prepared.window, prepared.spec
-    rates, own = np.zeros(rows.shape[1], np.float32), LearningRates()
+    rates, config = np.zeros(rows.shape[1], np.float32), FitConfig()
     for name, place in columns(model.degree).items():
-        rates[place] = getattr(own, name) if free is None or name in free else 0.0
+        rates[place] = getattr(config.rates, name) if free is None or name in free else 0.0
     kinds, codebook = find_kinds(rows, model.degree), Codebook.create(shared, 3)
     state = FitState.create(rows, kinds, model.frame_times.logits, colors=codebook)
     grad, times = np.zeros_like(rows), np.asarray(model.frame_times.times())
@@ -62,7 +62,7 @@ def finetune_model(
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
         backpropagate(rows, done, cpu.backward(trace, by_image)[:4], spec, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
-        update_rows(state, grad, done.alive, rates * rate, degree=model.degree, unit_time=UNIT_TIME)
+        update_rows(state, grad, done.alive, rates * rate, degree=model.degree, units=config.rate_units)
         if free is None:
             update_windows(rows, done.alive, window)
             if model.scale_cutoff > 0:

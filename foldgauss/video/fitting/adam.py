@@ -11,6 +11,7 @@ correction is right however seldom the Gaussian is alive.
 """
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,19 @@ _CHUNK = 2048  # rows per task
 _f, _u = nb.float32, nb.uint64
 
 
+class RateUnits(NamedTuple):
+    """The sigma_t and the size at which the learning rates of positions, folds and m_t are stated; 0: they are absolute.
+
+    A Gaussian's size is the geometric mean of its two standard deviations. See `config.LearningRates`.
+    """
+
+    time: float = 0.0
+    size: float = 0.0
+
+
+ABSOLUTE = RateUnits()
+
+
 def adam_step(
     grad: Float[np.ndarray, "num width"],
     first: Float[np.ndarray, "num width"],
@@ -57,10 +71,10 @@ def adam_step(
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, unit, at, corrections):
+def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, units, at, corrections):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     width, own = _u(rows.shape[1]), rates.copy()
-    spread, time, opacity, fold = at
+    loc, scale, spread, time, opacity, fold = at
     static_bit, opaque_bit, degrees = bits
     for k in range(start, stop):
         i = touched[k]
@@ -75,13 +89,18 @@ def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits
             g[opacity] = _f(0.0)
         for c in range(fold + 2 * powers, width):
             g[c] = _f(0.0)
-        if unit > _f(0.0):
-            wide = (_f(STATIC_TIME_SCALE) if static else math.exp(row[spread])) / unit
+        size, short = _f(1.0), _f(1.0)
+        if units.size > _f(0.0):
+            size = math.exp(_f(0.5) * (row[scale] + row[scale + 1])) / units.size
+            own[loc], own[loc + 1] = rates[loc] * size, rates[loc + 1] * size
+        if units.time > _f(0.0):
+            wide = (_f(STATIC_TIME_SCALE) if static else math.exp(row[spread])) / units.time
             own[time] = rates[time] * wide
-            short, power = _f(1.0) / wide, _f(1.0)
-            for c in range(fold, width, 2):
-                power *= short
-                own[c], own[c + 1] = rates[c] * power, rates[c + 1] * power
+            short = _f(1.0) / wide
+        power = size
+        for c in range(fold, width, 2):
+            power *= short
+            own[c], own[c + 1] = rates[c] * power, rates[c + 1] * power
         for c in range(width):
             gradient = g[c]
             g[c] = _f(0.0)
@@ -100,25 +119,26 @@ def sparse_adam(
     rates: np.ndarray,
     *,
     kinds: np.ndarray | None = None,
-    unit_time: float = 0.0,
+    units: RateUnits = ABSOLUTE,
 ) -> None:
     """One step on the rows `touched`, in place; their gradients are set to zero.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
     row; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which parameters each Gaussian has
-    (default: all); the others stay. With `unit_time` > 0 the rates of m_t and of the fold are those at sigma_t =
-    `unit_time`, and scaled for other sigma_t as `config.LearningRates` documents.
+    (default: all); the others stay. `units`: how rates are scaled by each Gaussian's duration and size.
     """
     place = columns(0)  # the fold comes last, so its degree does not shift these
-    at = tuple(place[name].start for name in ("log_time_scale", "time_loc_logit", "opacity_logit", "coefficients"))
+    names = ("loc", "log_scale", "log_time_scale", "time_loc_logit", "opacity_logit", "coefficients")
+    at = tuple(place[name].start for name in names)
     num = len(touched)
     if kinds is None:
         kinds = np.full(len(rows), (rows.shape[1] - at[-1]) // 2, np.uint8)
-    moments, bits, unit = (first, second, counts), (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK), np.float32(unit_time)
+    moments, bits = (first, second, counts), (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK)
+    units = RateUnits(*np.float32(units))
 
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
-        _update(start, stop, touched, rows, grad, *moments, kinds, bits, rates, unit, at, BIAS_CORRECTIONS)
+        _update(start, stop, touched, rows, grad, *moments, kinds, bits, rates, units, at, BIAS_CORRECTIONS)
 
     run_tasks(work, range(0, num, _CHUNK))
 
@@ -126,7 +146,7 @@ def sparse_adam(
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX
 
 
-def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, unit_time: float):
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, units: RateUnits):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
     degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
     grad = jnp.where(_has_parameter(kinds, degree), grad, jnp.zeros_like(grad))
@@ -135,7 +155,7 @@ def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, uni
     beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
     mean = beta1 * first + (one - beta1) * grad
     square = beta2 * second + (one - beta2) * grad * grad
-    own = rates[None, :] * _rate_factors(rows, kinds, degree, unit_time)
+    own = rates[None, :] * _rate_factors(rows, kinds, degree, units)
     moved = rows - own * mean * corrections[:, :1] / (jnp.sqrt(square * corrections[:, 1:]) + np.float32(EPSILON))
     chosen = touched[:, None]
     return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts
@@ -152,18 +172,21 @@ def _has_parameter(kinds: UInt8[Array, " num"], degree: int) -> Bool[Array, "num
     return ~(absent | (column >= place["coefficients"].start + 2 * (kinds & DEGREE_MASK)))
 
 
-def _rate_factors(rows, kinds, degree: int, unit_time: float) -> Float[Array, "num width"]:
-    """The factors by which each Gaussian's duration scales its learning rates, see `config.LearningRates`."""
+def _rate_factors(rows, kinds, degree: int, units: RateUnits) -> Float[Array, "num width"]:
+    """The factors by which each Gaussian's size and duration scale its learning rates, see `config.LearningRates`."""
     factors, place = jnp.ones_like(rows), columns(degree)
-    if unit_time == 0:
-        return factors
-    static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
-    spread = jnp.exp(rows[:, place["log_time_scale"].start])
-    wide = jnp.where(static, np.float32(STATIC_TIME_SCALE), spread) / np.float32(unit_time)
-    factors, power = factors.at[:, place["time_loc_logit"].start].set(wide), jnp.ones_like(wide)
+    size = short = jnp.ones_like(rows[:, 0])
+    if units.size > 0:
+        size = jnp.exp(np.float32(0.5) * rows[:, place["log_scale"]].sum(axis=1)) / np.float32(units.size)
+        factors = factors.at[:, place["loc"]].set(size[:, None])
+    if units.time > 0:
+        static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
+        spread = jnp.exp(rows[:, place["log_time_scale"].start])
+        wide = jnp.where(static, np.float32(STATIC_TIME_SCALE), spread) / np.float32(units.time)
+        factors, short = factors.at[:, place["time_loc_logit"].start].set(wide), 1 / wide
     for column in range(place["coefficients"].start, place["coefficients"].stop, 2):
-        power = power * (1 / wide)
-        factors = factors.at[:, column : column + 2].set(power[:, None])
+        size = size * short
+        factors = factors.at[:, column : column + 2].set(size[:, None])
     return factors
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.economy import MIN_PASSES_PER_ROUND
-from foldgauss.video.fitting.schedule import Level, find_level, steps_per_pass, work_fraction
+from foldgauss.video.fitting.schedule import Level, find_level, relative_area, steps_per_pass, work_after
 from foldgauss.video.fitting.state import FitState, mean_psnr
 
 #: A fit to a target PSNR evaluates all frames once in so many passes, which takes a tenth of its time.
@@ -17,46 +17,62 @@ OVERTIME = 1.5
 BIRTH_SLOWDOWN = 1.15
 #: A round of pruning costs as much for each frame as so many steps with it: a forward pass and four backward.
 STEPS_PER_ROUND = 2.0
-#: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many and this
-#: fraction of the time.
-WARM_UP, MIN_STEPS, MEASURED_FRACTION = 5, 10, 0.05
+#: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many.
+WARM_UP, MIN_STEPS = 5, 10
+#: The fractions of the time at which the number of steps is planned, by the speed since the one before.
+PLANNED_AT = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97)
 #: Steps of the whole fit are slower than the first ones by this: Gaussians grow longer in time.
 SLOWDOWN = 1.05
 
 
 class StepPlanner:
-    """Turns minutes into a number of steps, once: everything else in a fit is a function of steps, so that a resumed
-    fit continues as if it had not been interrupted."""
+    """Turns minutes into a number of steps, by the measured speed, and corrects it at stated times (`PLANNED_AT`).
 
-    def __init__(self, config: FitConfig, fractions: list[float], num_frames: int):
-        """`fractions` of the plan by level."""
-        self.config, self.fractions, self.count = config, fractions, 0
+    The plan is a part of the state: everything else in a fit is a function of steps and of the plan, so that a resumed
+    fit continues as if it had not been interrupted. Densification and pruning follow a schedule of the whole plan: with
+    them it is made once.
+    """
+
+    def __init__(self, config: FitConfig, levels: list[Level], num_frames: int):
+        self.config, self.levels, self.count, self.work, self.seconds = config, levels, 0, 0.0, 0.0
         rounds = 0 if config.economy is None else config.economy.rounds
         self.for_pruning = STEPS_PER_ROUND * rounds * num_frames / config.batch_size  # steps' worth of time, at most
-        self.seconds = [[] for _ in fractions]  # of steps, by level
+        self.once = config.economy is not None or config.growth is not None
 
-    def plan(self, state: FitState, level: int, seconds: float) -> int:
-        """Steps of the whole fit, or 0 while the speed is not known yet; the last step took `seconds`, at `level`."""
-        if state.step == self.config.steps:
-            return state.step
-        budget = 60 * self.config.minutes
-        if state.seconds >= budget:
-            return state.step
+    def update(self, state: FitState, level: int, seconds: float) -> None:
+        """Plan the steps of the whole fit, if it is time; the last step took `seconds`, at `level`."""
+        config = self.config
+        if config.minutes is None or (state.plan and self.once):
+            return
+        budget = 60 * config.minutes
+        if not state.plan and (state.step == config.steps or state.seconds >= budget):
+            state.plan = state.step
+            return
         self.count += 1
-        if self.count > WARM_UP * len(self.fractions):
-            self.seconds[level].append(seconds)
-        enough = sum(map(sum, self.seconds)) >= budget * MEASURED_FRACTION
-        enough |= self.config.steps is not None and state.step >= self.config.steps * MEASURED_FRACTION
-        if min(map(len, self.seconds)) < MIN_STEPS or not enough:
-            return 0
-        seconds = [np.mean(own) for own in self.seconds]
-        # The steps so far count as steps of the first level, of which so many fewer are left.
-        left = (budget - state.seconds) / SLOWDOWN + state.step * seconds[0]
-        if self.for_pruning:
+        if self.count > WARM_UP * len(self.levels):
+            self.work += relative_area(self.levels, self.levels[level])
+            self.seconds += seconds
+        if not self._is_due(state, budget):
+            return
+        progress = measure_progress(state, config) if state.plan else 0.0
+        work_of_step = work_after(self.levels, progress) / (1 - progress)  # the mean of the steps that are left
+        left = (budget - state.seconds) * self.work / self.seconds / SLOWDOWN / work_of_step
+        if not state.plan and self.for_pruning:
             most = left * STEPS_PER_ROUND / (STEPS_PER_ROUND + MIN_PASSES_PER_ROUND)
-            left = left / BIRTH_SLOWDOWN - min(self.for_pruning * seconds[-1], most)
-        planned = max(int(left / np.dot(self.fractions, seconds)), state.step)
-        return min(planned, self.config.steps or planned)
+            left = left / BIRTH_SLOWDOWN - min(self.for_pruning, most)
+        if state.plan:
+            state.planned_step, state.planned_progress = state.step, progress
+        state.plan = min(state.step + max(int(left), 0), config.steps or math.inf)
+        self.count, self.work, self.seconds = WARM_UP * len(self.levels), 0.0, 0.0
+
+    def _is_due(self, state: FitState, budget: float) -> bool:
+        measured = self.count - WARM_UP * len(self.levels)
+        if measured < MIN_STEPS * (1 if state.plan else len(self.levels)):
+            return False
+        if not state.plan:
+            enough = self.seconds >= PLANNED_AT[0] * budget
+            return enough or (self.config.steps is not None and state.step >= self.config.steps * PLANNED_AT[0])
+        return any(state.seconds - self.seconds < part * budget <= state.seconds for part in PLANNED_AT)
 
 
 class TimeLeft:
@@ -69,27 +85,33 @@ class TimeLeft:
     def estimate(self, state: FitState, progress: float) -> float:
         """Seconds; at most what is left of the minutes, where they are limited."""
         most = math.inf if self.config.minutes is None else max(60 * self.config.minutes - state.seconds, 0.0)
-        work = work_fraction(self.levels, progress)
+        work = 1 - work_after(self.levels, progress) / work_after(self.levels, 0.0)
         if state.step <= self.first or not state.plan:
             self.seconds, self.work = state.seconds, work
         known = work > self.work
         return min((state.seconds - self.seconds) * (1 - work) / (work - self.work), most) if known else most
 
 
-def measure_progress(state: FitState, config: FitConfig) -> float:
-    """The fraction of the plan that is done, above 1 in overtime; without a plan, of the steps asked for, or 0."""
-    plan = state.plan or config.steps
-    return state.step / plan if plan else 0.0
+def measure_progress(state: FitState, config: FitConfig, step: int | None = None) -> float:
+    """The fraction of the plan that is done, above 1 in overtime; without a plan, of the steps asked for, or 0.
+
+    `step`: after so many steps instead of those taken, by the present plan.
+    """
+    step = state.step if step is None else step
+    plan, start, done = state.plan or config.steps, state.planned_step, state.planned_progress
+    if not plan:
+        return 0.0
+    return done + (1 - done) * (step - start) / max(plan - start, 1)
 
 
-def next_level(state: FitState, levels: list[Level]) -> int:
+def next_level(state: FitState, config: FitConfig, levels: list[Level]) -> int:
     """The level of the next step; while the speed is measured, all in turn."""
-    return find_level(levels, state.step / state.plan) if state.plan else state.step % len(levels)
+    return find_level(levels, measure_progress(state, config)) if state.plan else state.step % len(levels)
 
 
-def starts_level(state: FitState, levels: list[Level], level: int) -> bool:
+def starts_level(state: FitState, config: FitConfig, levels: list[Level], level: int) -> bool:
     """Whether the next step is the first one of a `level` of the plan."""
-    return state.plan > 0 and level != find_level(levels, (state.step - 1) / state.plan)
+    return state.plan > 0 and level != find_level(levels, measure_progress(state, config, state.step - 1))
 
 
 def find_limit(state: FitState, config: FitConfig, frames: np.ndarray) -> str | None:

@@ -10,6 +10,7 @@ from typing import Any
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.settings import check_settings, setting
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.fitting.adam import RateUnits
 from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 
@@ -18,9 +19,11 @@ from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UN
 class LearningRates:
     """Learning rates of Adam at the first step, by leaf, in model space (the frame's longer side is 1).
 
-    With `FitConfig.scale_rates_by_duration` the unit of time is each Gaussian's own duration: the learning rate of c_k
-    is `coefficients` (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME. A step then moves
-    short and long Gaussians equally far in space, and in time by the same fraction of their durations.
+    With `FitConfig.scale_rates_by_size` the unit of length is each Gaussian's own size s, the geometric mean of its
+    standard deviations: the learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
+    With `FitConfig.scale_rates_by_duration` the unit of time is its own duration: the learning rate of c_k is
+    `coefficients` times (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME.
+    A step then moves small and large, short and long Gaussians by the same fraction of their sizes and durations.
     """
 
     loc: float = 6.9e-4
@@ -39,8 +42,9 @@ class LearningRates:
                 raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
 
 
-#: The sigma_t at which the learning rates of folds and m_t are stated.
-UNIT_TIME = 0.06
+#: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and m_t
+#: are stated.
+UNIT_TIME, UNIT_SIZE = 0.06, 0.005
 #: Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
 MAX_GAUSSIANS = 10_000_000
 #: Beyond this degree, float32 cannot tell the powers of u and their gradients apart.
@@ -79,6 +83,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "initialization": "uniform",
         "follow_motion": False,
         "scale_rates_by_duration": False,
+        "scale_rates_by_size": False,
         "quarter_fraction": 0.0,
         "half_fraction": 0.0,
         "sparse_updates": False,
@@ -218,6 +223,10 @@ class FitConfig:
         default=True,
         metadata=setting("Learning rates are in units of each Gaussian's duration", "See `LearningRates`."),
     )
+    scale_rates_by_size: bool = field(
+        default=True,
+        metadata=setting("Learning rates are in units of each Gaussian's size", "See `LearningRates`."),
+    )
     quarter_fraction: float = field(
         default=0.2,
         metadata=setting(
@@ -324,6 +333,12 @@ class FitConfig:
             raise invalid("target_psnr", expected="None with an economy", got=self.target_psnr, cure=cure)
         if self.initialization == "uniform" and self.follow_motion:
             raise invalid("follow_motion", expected="False with initialization 'uniform'", got=True)
+
+    @property
+    def rate_units(self) -> RateUnits:
+        """The units in which `rates` are stated."""
+        by_time, by_size = self.scale_rates_by_duration, self.scale_rates_by_size
+        return RateUnits(UNIT_TIME if by_time else 0.0, UNIT_SIZE if by_size else 0.0)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "FitConfig":

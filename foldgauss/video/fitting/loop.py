@@ -103,12 +103,18 @@ def fit(
 
 
 def fit_steps(
-    frames: np.ndarray, config: FitConfig, state: FitState | None = None, *, motion: Motion | None = None
+    frames: np.ndarray,
+    config: FitConfig,
+    state: FitState | None = None,
+    *,
+    motion: Motion | None = None,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[tuple[FitState, FitInfo]]:
     """The steps of a fit, from the start or resumed from `state`: yields (state, info) after each one.
 
     `motion`: the optical flow of the frames, where it is already known; computing it takes some hundredths of a second
-    per frame.
+    per frame. `clock` gives seconds, of which `FitConfig.minutes` is a budget: with `time.process_time` and one thread,
+    fits beside other work are comparable.
     """
     check_not_forked()
     check_frames(frames)
@@ -116,22 +122,24 @@ def fit_steps(
     engine = choose_engine(frames, config, state)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = _start(frames, config, None, find_motion) if state is None else state
+    state = _start(frames, config, None, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
     levels = stepper.levels
-    planner = StepPlanner(config, [level.fraction for level in levels], len(frames))
+    planner = StepPlanner(config, levels, len(frames))
     time_left = TimeLeft(state, config, levels)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
     if state.step == 0 and guard.comparable and config.initialization == "clip":
+        begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
+        state.seconds += clock() - begun
     stopped_by = find_limit(state, config, frames)
     if stopped_by:  # a resumed state that needs no more steps
         yield state, _make_info(state, config, time_left, StepResult(math.nan, math.nan, 0), stopped_by)
     while not stopped_by:
-        begun = time.perf_counter()
-        level = next_level(state, levels)
+        begun = clock()
+        level = next_level(state, config, levels)
         result = stepper.step(state, measure_progress(state, config), level)
-        new_level, error_before = starts_level(state, levels, level), state.error
+        new_level, error_before = starts_level(state, config, levels, level), state.error
         _update_error(state, result, new_level, batch_fraction=config.batch_size / len(frames))
         state.step += 1
         if new_level or not state.plan:  # without a plan yet, levels take turns
@@ -147,17 +155,16 @@ def fit_steps(
             stepper.grow(state)
         if config.economy is not None and state.plan:
             stepper.prune(state)
-        passed = time.perf_counter() - begun
+        passed = clock() - begun
         state.seconds += passed
-        if not state.plan:
-            state.plan = planner.plan(state, level, passed)
-        begun = time.perf_counter()
+        planner.update(state, level, passed)
+        begun = clock()
         stopped_by = find_limit(state, config, frames)
         if stopped_by == "smallest_at_psnr":
             stepper.trim(state)
         if stopped_by:
             guard.finish(state)
-        state.seconds += time.perf_counter() - begun
+        state.seconds += clock() - begun
         yield state, _make_info(state, config, time_left, result, stopped_by)
 
 
@@ -205,14 +212,18 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
 
 def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
     """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
-    return _start(frames, config, logits, motion_finder(frames))
+    return _start(frames, config, logits, motion_finder(frames), time.perf_counter)
 
 
 def _start(
-    frames: np.ndarray, config: FitConfig, logits: np.ndarray | None, find_motion: Callable[[], Motion]
+    frames: np.ndarray,
+    config: FitConfig,
+    logits: np.ndarray | None,
+    find_motion: Callable[[], Motion],
+    clock: Callable[[], float],
 ) -> FitState:
     frames = np.ascontiguousarray(frames[..., :3])  # with alpha: as seen over black
-    begun, num_frames = time.perf_counter(), len(frames)
+    begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follow_motion else None
     if logits is None:
         logits = make_time_logits(num_frames, motion.find_cuts() if motion is not None else [])
@@ -224,7 +235,7 @@ def _start(
         logits,
         growing=config.growth is not None,
         plan=0 if config.minutes is not None else planned_steps(config, num_frames),
-        seconds=time.perf_counter() - begun,
+        seconds=clock() - begun,
     )
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
+from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 
 #: Tracks have at most so many frames to either side.
@@ -302,14 +303,16 @@ def _gather(stack, index, scaled) -> np.ndarray:
     return above + low * (below - above)
 
 
-#: Ridge on the coefficients, in frames at the edge of the window.
-RIDGE = 0.03
+#: Ridge on the coefficients, in frames at the edge of the window: a weak prior for rest, a stronger one against
+#: curvature. Short tracks show neither.
+RIDGES = np.array([0.03, 0.12, 0.48])
 #: Width of the window in which a fold has to follow its track, in units of sigma_t: where the Gaussian is visible.
 WINDOW = 1.2
 #: A power is used only if the fold without it misses by more than this many pixels, and with it by less than this
 #: fraction of that: beyond its track a cubic leaves the frame. (Bunny, 80x160, 15,000 Gaussians, 2,000 steps: always
 #: cubic 35.6 dB, as needed 35.9; bikes 29.25 and 29.26, always linear 28.8.)
 NEEDED, GAINED = 0.3, 0.8
+CHUNK = 1024  # tracks per task
 
 
 def fit_folds(
@@ -336,22 +339,61 @@ def _fit_powers(
     tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int, used: int
 ) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
     """`fit_folds` with the first `used` powers."""
-    num, steps, _ = tracks.shift.shape
-    longest = steps // 2
-    coefficients = np.zeros((num, degree, 2), np.float32)
-    u = -np.arange(-longest, longest + 1) / longest  # in units of the longest track, so that powers are of one size
-    weight = tracks.known * np.exp(-0.5 * (u * longest / (WINDOW * spread[:, None])) ** 2)
-    left = shift = tracks.shift  # 0 where it is not known
-    if used:
-        powers = u[:, None] ** np.arange(1, used + 1)
-        products = np.einsum("sj,sk->sjk", powers, powers).reshape(steps, -1)
-        normal = (weight @ products).reshape(num, used, used)
-        # A weak prior for rest, a stronger one against curvature, in units of the window: short tracks show neither.
-        window = np.minimum(WINDOW * spread / longest, 1.0)[:, None] ** (2 * np.arange(1, used + 1))
-        normal += (RIDGE * np.array([1.0, 4.0, 16.0])[:used] * window)[:, :, None] * np.eye(used)
-        right = np.einsum("ns,nsc,sj->njc", weight, shift, powers, optimize=True)
-        fitted = np.linalg.solve(normal, right)
-        coefficients[:, :used] = fitted / longest ** np.arange(1, used + 1)[:, None]
-        left = shift - np.einsum("sj,njc->nsc", powers, fitted)
-    miss = np.einsum("ns,nsc->n", weight, left * left) / weight.sum(1)
-    return coefficients, np.sqrt(miss)
+    num = len(spread)
+    coefficients, miss = np.zeros((num, degree, 2), np.float32), np.empty(num, np.float32)
+    arguments = tracks.shift, tracks.known, WINDOW * np.asarray(spread, np.float64), RIDGES, used, coefficients, miss
+    run_tasks(lambda start: _fit(start, min(start + CHUNK, num), *arguments), range(0, num, CHUNK))
+    return coefficients, miss
+
+
+@kernel
+def _fit(start, stop, shift, known, window, ridges, used, coefficients, miss):
+    """Weighted least squares of the tracks start..stop, by Cholesky's factor of the normal equations."""
+    longest = known.shape[1] // 2
+    powers, normal, factor = np.empty(used), np.empty((used, used)), np.empty((used, used))
+    right, fitted = np.empty((used, 2)), np.empty((used, 2))
+    for n in range(start, stop):
+        total, squares = 0.0, 0.0
+        normal[:], right[:] = 0.0, 0.0
+        unit = min(window[n], float(longest))  # of u, so that powers are of one size
+        for step in range(2 * longest + 1):
+            if not known[n, step]:
+                continue
+            u, weight = (longest - step) / unit, math.exp(-0.5 * ((longest - step) / window[n]) ** 2)
+            power = u
+            total += weight
+            for j in range(used):
+                powers[j] = power
+                power *= u
+            for c in range(2):
+                own = shift[n, step, c]
+                squares += weight * own * own
+                for j in range(used):
+                    right[j, c] += weight * own * powers[j]
+            for j in range(used):
+                for k in range(used):
+                    normal[j, k] += weight * powers[j] * powers[k]
+        for j in range(used):
+            for k in range(j + 1):
+                left = normal[j, k] + (ridges[j] if j == k else 0.0)
+                for m in range(k):
+                    left -= factor[j, m] * factor[k, m]
+                factor[j, k] = math.sqrt(left) if j == k else left / factor[k, k]
+        for c in range(2):
+            for j in range(used):
+                left = right[j, c]
+                for m in range(j):
+                    left -= factor[j, m] * fitted[m, c]
+                fitted[j, c] = left / factor[j, j]
+            for j in range(used - 1, -1, -1):
+                left = fitted[j, c]
+                for m in range(j + 1, used):
+                    left -= factor[m, j] * fitted[m, c]
+                fitted[j, c] = left / factor[j, j]
+            # sum w (s - p)^2 = sum w s^2 - 2 sum w s p + sum w p^2
+            for j in range(used):
+                for k in range(used):
+                    squares += fitted[j, c] * normal[j, k] * fitted[k, c]
+                squares -= 2 * fitted[j, c] * right[j, c]
+                coefficients[n, j, c] = fitted[j, c] / unit ** (j + 1)
+        miss[n] = math.sqrt(max(squares, 0.0) / total)

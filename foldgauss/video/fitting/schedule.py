@@ -1,5 +1,6 @@
 """What each step of a fit uses: its views of the clip, the resolution of its frames, and its learning rates."""
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -112,15 +113,21 @@ def find_level(levels: list[Level], progress: float) -> int:
     return len(levels) - 1
 
 
-def work_fraction(levels: list[Level], progress: float) -> float:
-    """The fraction of the fit's time that is over at `progress`, where a step's time is as its frame's area."""
-    end, done, total = 0.0, 0.0, 0.0
-    for level in levels:
-        area = level.size[0] * level.size[1]
-        done += area * min(max(progress - end, 0.0), level.fraction)
-        total += area * level.fraction
-        end += level.fraction
-    return min(done / total, 1.0)
+def work_after(levels: list[Level], progress: float) -> float:
+    """The work of a fit that is left at `progress`; 1 is that of a whole fit at the last level.
+
+    The time of a step is taken to be proportional to its frames' area.
+    """
+    end, left = 1.0, 0.0
+    for level in reversed(levels):
+        left += relative_area(levels, level) * min(max(end - progress, 0.0), level.fraction)
+        end -= level.fraction
+    return left
+
+
+def relative_area(levels: list[Level], level: Level) -> float:
+    """The area of a level's frames, relative to that of the last level."""
+    return math.prod(level.size) / math.prod(levels[-1].size)
 
 
 def shrink_frame(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:

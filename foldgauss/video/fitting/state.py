@@ -18,7 +18,7 @@ import numpy as np
 import optax
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, sparse_adam
+from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
@@ -195,6 +195,8 @@ class FitState:
     statistics: GradientStatistics | None = field(metadata=_stored(OfGrowth()))  # None without densification to come
     step: int = field(default=0, metadata=_COUNT)
     plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
+    planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
+    planned_progress: float = field(default=0.0, metadata=_NUMBER)  # fit that was over there
     seconds: float = field(default=0.0, metadata=_NUMBER)
     error: float = field(default=0.0, metadata=_NUMBER)  # running mean of the squared error
     # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
@@ -327,17 +329,17 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
 
 
 def update_rows(
-    state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, degree: int, unit_time: float
+    state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, degree: int, units: RateUnits
 ) -> None:
     """A step of Adam on the rows `touched` and on the values that they share, in place; `grad` becomes zero there.
 
-    `grad` is float32 (num, width), `rates` and `unit_time` are those of `sparse_adam`.
+    `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
     """
     for name, codebook in (("color_dc", state.colors), ("log_scale", state.shapes)):
         at = columns(degree)[name]
         codebook.step(state.rows[:, at], grad[:, at], touched, rates[at])
     moments = state.first, state.second, state.counts
-    sparse_adam(state.rows, grad, *moments, touched, rates, kinds=state.kinds, unit_time=unit_time)
+    sparse_adam(state.rows, grad, *moments, touched, rates, kinds=state.kinds, units=units)
 
 
 def running_psnr(state: FitState) -> float:

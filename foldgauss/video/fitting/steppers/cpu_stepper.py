@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
 
 from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import update_frame_times
-from foldgauss.video.fitting.config import UNIT_TIME, FitConfig
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.densify import grow
 from foldgauss.video.fitting.optical_flow import Motion, motion_finder
 from foldgauss.video.fitting.pruning.description_length import weigh_frames
@@ -93,8 +92,7 @@ class CpuStepper:
         if not config.sparse_updates:
             touched = np.arange(len(state.rows))
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        unit = UNIT_TIME if config.scale_rates_by_duration else 0.0
-        update_rows(state, self.grad, touched, rates, degree=config.degree, unit_time=unit)
+        update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
         update_windows(state.rows, touched, self.window)
         if config.learn_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
@@ -103,12 +101,11 @@ class CpuStepper:
         return StepResult(float(np.mean(losses)), squared_error, num_alive)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
-        begun, shape, errors = time.perf_counter(), self.shapes[-1], {}
+        shape, errors = self.shapes[-1], {}
         times = np.asarray(frame_times(state.time_logits))
         for k in choose_start_frames(self.num_frames):
             image = self._render(condition(state.rows, self.window, times[k], shape), shape).image
             errors[int(k)] = float(np.mean(np.square(image - to_planes(self.frames[k], self.background))))
-        state.seconds += time.perf_counter() - begun
         return errors
 
     def grow(self, state: FitState) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
-from foldgauss.video.fitting.adam import masked_adam, update_frame_times
+from foldgauss.video.fitting.adam import RateUnits, masked_adam, update_frame_times
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
@@ -68,7 +68,7 @@ class Program:
     ssim_fraction: float
     batch_size: int
     sparse_updates: bool
-    unit_time: float  # of `sparse_adam`
+    rate_units: RateUnits
     learns_times: bool
     grows: bool
     num_devices: int
@@ -136,7 +136,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     touched = seen.alive if program.sparse_updates else used
     moments = arrays.first, arrays.second, arrays.counts
     rows, first, second, counts = masked_adam(
-        arrays.rows, seen.by_rows, *moments, touched, control.rates, kinds=arrays.kinds, unit_time=program.unit_time
+        arrays.rows, seen.by_rows, *moments, touched, control.rates, kinds=arrays.kinds, units=program.rate_units
     )
     logits, time_moments = arrays.time_logits, arrays.time_moments
     if program.learns_times:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from foldgauss.video.fitting.config import UNIT_TIME, FitConfig, chosen_num_gaussians, most_gaussians
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.densify import grow
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
@@ -145,12 +145,9 @@ class JaxStepper:
     def measure_start(self, state: FitState) -> dict[int, float]:
         arrays, num = state.held.arrays, np.int32(state.held.num)
         times = np.asarray(frame_times(state.time_logits))
-        error = compile_error(self.programs[-1])  # before the clock runs
-        begun = time.perf_counter()
+        error = compile_error(self.programs[-1])
         chosen = choose_start_frames(self.num_frames)
-        errors = {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in chosen}
-        state.seconds += time.perf_counter() - begun
-        return errors
+        return {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in chosen}
 
     def _choose_capacity(self, num: int) -> int:
         """Rows of the arrays: a function of the number of Gaussians, so that a resumed fit has the same."""
@@ -182,7 +179,7 @@ class JaxStepper:
             ssim_fraction=config.ssim_fraction,
             batch_size=config.batch_size,
             sparse_updates=config.sparse_updates,
-            unit_time=UNIT_TIME if config.scale_rates_by_duration else 0.0,
+            rate_units=config.rate_units,
             learns_times=config.learn_frame_times and self.num_frames > 2,
             grows=config.growth is not None,
             num_devices=max(divisors),

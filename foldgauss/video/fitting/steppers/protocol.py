@@ -36,4 +36,4 @@ class Stepper(Protocol):
         """Prepare for a state whose arrays were replaced."""
 
     def measure_start(self, state: FitState) -> dict[int, float]:
-        """Mean squared errors of some frames at full size, by frame. The time it takes counts as the fit's."""
+        """Mean squared errors of some frames at full size, by frame."""
