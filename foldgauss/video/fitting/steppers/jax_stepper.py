@@ -4,7 +4,6 @@ After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays 
 state, and for densification, which runs on the host.
 """
 
-import time
 from typing import Any
 
 import jax
@@ -93,6 +92,8 @@ class JaxStepper:
             self.programs = [self._program(level.size) for level in self.levels]
             for program in self.programs:
                 compile_step(program)
+            if state.step == 0 and self.config.initialization == "clip":
+                compile_error(self.programs[-1])
         # Where growth has ended there are statistics nevertheless: without, steps would be compiled anew.
         sizes = Sizes(num, width, self.num_frames, growing=self.config.growth is not None)
 
