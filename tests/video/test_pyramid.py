@@ -11,7 +11,7 @@ from foldgauss.video import Economy, FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting import budget
 from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.loop import start, to_model
-from foldgauss.video.fitting.schedule import find_level, plan_levels, shrink_frame, work_fraction
+from foldgauss.video.fitting.schedule import Level, find_level, plan_levels, shrink_frame, work_after
 from foldgauss.video.fitting.steppers import cpu_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -75,20 +75,57 @@ def test_levels_neither_shift_nor_scale_the_model(small, size):
     assert evaluate(model, shifted).mean_psnr < evaluate(model, frames).mean_psnr - 2
 
 
-def test_minutes_are_planned_by_the_speed_of_all_levels(small, monkeypatch):
-    """Steps of 0.1 s at half and 0.4 s at full size, measured in turn, fill the time together."""
-    pace = budget.StepPlanner(dataclasses.replace(HALF, steps=None, minutes=100 / 60), [0.5, 0.5], num_frames=6)
-    state = start(moving_blobs(), HALF)
+LEVELS = [Level(0.5, (24, 32)), Level(0.5, (48, 64))]
+
+
+def run_by_clock(config, levels, seconds_of, num_frames=6, until=None):
+    """A fit whose steps take `seconds_of(state, level)`: its state, and (step, progress) after every step."""
+    planner, state, course = budget.StepPlanner(config, levels, num_frames), start(moving_blobs(), config), []
     state.plan, state.step, state.seconds = 0, 0, 0.0
-    while not state.plan:
-        level = state.step % 2
-        passed = (0.1, 0.4)[level]
+    while not state.plan or state.step < state.plan:
+        level = budget.next_level(state, config, levels)
+        passed = seconds_of(state, level)
         state.step += 1
         state.seconds += passed
-        state.plan = pace.plan(state, level, passed)
-    m, spent = state.step, state.seconds
-    coarse, fine = state.plan * 0.5 - m, state.plan * 0.5
-    assert spent + (0.1 * coarse + 0.4 * fine) * budget.SLOWDOWN == pytest.approx(100, rel=0.02)
+        planner.update(state, level, passed)
+        course.append((state.step, budget.measure_progress(state, config)))
+        if until is not None and until(state):
+            break
+    return state, course
+
+
+def test_minutes_are_planned_by_the_speed_of_all_levels():
+    """Steps of 0.1 s at half and 0.4 s at full size, measured in turn, fill the time together."""
+    config = dataclasses.replace(HALF, steps=None, minutes=100 / 60)
+    state, _ = run_by_clock(config, LEVELS, lambda state, level: (0.1, 0.4)[level])
+    assert state.seconds == pytest.approx(100, rel=0.01)
+
+
+@pytest.mark.parametrize(("early", "late"), [(3.0, 1.0), (1.0, 3.0)])
+def test_minutes_are_used_up_whatever_the_machine_does(early, late):
+    """The machine is busy at first, or later: the plan is corrected, and progress never falls, jumps or stops short."""
+    config = dataclasses.replace(HALF, steps=None, minutes=100 / 60)
+    pace = lambda state, level: 0.05 * (early if state.seconds < 30 else late)  # noqa: E731
+    state, course = run_by_clock(config, [Level(1.0, (48, 64))], pace)
+    assert state.seconds == pytest.approx(100, rel=0.02)
+    progress = np.array([done for _, done in course])
+    moved = np.diff(progress[progress > 0])
+    assert progress[-1] == 1
+    assert (moved[1:] > 0).all()
+    assert moved.max() < 0.1  # at the first plan, which counts the steps before it; afterwards it is smooth
+
+
+def test_a_resumed_fit_keeps_its_plan():
+    """Stopped between two times of planning and continued by a new planner: as if uninterrupted."""
+    config = dataclasses.replace(HALF, steps=None, minutes=100 / 60)
+    stopped, _ = run_by_clock(config, LEVELS, lambda state, level: 0.2, until=lambda state: state.seconds > 50)
+    plan, course = stopped.plan, (stopped.planned_step, stopped.planned_progress)
+    planner = budget.StepPlanner(config, LEVELS, 6)
+    for _ in range(20):
+        stopped.step += 1
+        stopped.seconds += 0.2
+        planner.update(stopped, 1, 0.2)
+    assert (stopped.plan, stopped.planned_step, stopped.planned_progress) == (plan, *course)
 
 
 def test_minutes_include_rounds_of_pruning():
@@ -96,13 +133,8 @@ def test_minutes_include_rounds_of_pruning():
     plans = []
     for economy in (None, Economy(rounds=2)):
         config = FitConfig(num_gaussians=50, minutes=10 / 60, economy=economy)
-        pace = budget.StepPlanner(config, [1.0], num_frames=6)
-        state = start(moving_blobs(), config)
-        state.plan, state.step, state.seconds = 0, 0, 0.0
-        while not state.plan:
-            state.step += 1
-            state.seconds += 0.01
-            state.plan = pace.plan(state, 0, 0.01)
+        planned = lambda state: state.plan > 0  # noqa: E731
+        state, _ = run_by_clock(config, [Level(1.0, (48, 64))], lambda state, level: 0.01, until=planned)
         plans.append(state.plan)
     plain, economical = plans
     rounds = budget.STEPS_PER_ROUND * 2 * 6
@@ -144,9 +176,11 @@ def test_running_psnr_restarts_at_a_new_level(small, monkeypatch):
 
 def test_work_is_proportional_to_area():
     made = plan_levels(FitConfig(quarter_fraction=0.0, half_fraction=0.5), (640, 1280))
-    assert work_fraction(made, 0.5) == pytest.approx(0.2)
-    assert work_fraction(made, 0.75) == pytest.approx(0.6)
-    assert work_fraction(made, 1.0) == 1
+    whole = work_after(made, 0.0)
+    assert whole == pytest.approx(0.5 * 0.25 + 0.5)
+    assert work_after(made, 0.5) == pytest.approx(0.8 * whole)
+    assert work_after(made, 0.75) == pytest.approx(0.4 * whole)
+    assert work_after(made, 1.0) == 0
 
 
 @pytest.mark.parametrize("steps", [12, 300])

@@ -23,7 +23,7 @@ from foldgauss.cli.shared.tables import write_json
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.render import RenderOptions
-from foldgauss.video.fitting.config import FitConfig, default_num_gaussians, rename_options, rename_settings
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, rename_options, rename_settings
 from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
@@ -173,7 +173,8 @@ class Commands:
         words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
         words += [] if self.size is None else ["--size", self.size]
         words += [] if self.frames is None else ["--frames", self.frames]
-        default = FitConfig(num_gaussians=default_num_gaussians(num_frames, *size))
+        chosen = dataclasses.replace(point.config, num_gaussians=None)
+        default = FitConfig(num_gaussians=chosen_num_gaussians(chosen, num_frames, *size))
         words += _changed(point.config, default, FIT_OPTIONS)
         words += _changed(point.config.options, default.options, RENDER_OPTIONS)
         return shlex.join(["foldgauss", *words])

@@ -40,7 +40,7 @@ _f, _u = nb.float32, nb.uint64
 
 
 class RateUnits(NamedTuple):
-    """The sigma_t and the size at which the learning rates of positions, folds and m_t are stated; 0: they are absolute.
+    """The sigma_t and size at which the learning rates of positions, folds and m_t are stated; 0: they are absolute.
 
     A Gaussian's size is the geometric mean of its two standard deviations. See `config.LearningRates`.
     """
@@ -76,6 +76,7 @@ def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits
     width, own = _u(rows.shape[1]), rates.copy()
     loc, scale, spread, time, opacity, fold = at
     static_bit, opaque_bit, degrees = bits
+    total = 0.0
     for k in range(start, stop):
         i = touched[k]
         counts[i] += 1
@@ -107,6 +108,8 @@ def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits
             m[c] = beta1 * m[c] + (_f(1.0) - beta1) * gradient
             v[c] = beta2 * v[c] + (_f(1.0) - beta2) * gradient * gradient
             row[c] -= own[c] * m[c] * correction1 / (math.sqrt(v[c] * correction2) + _f(EPSILON))
+            total += row[c]
+    return total
 
 
 def sparse_adam(
@@ -120,8 +123,8 @@ def sparse_adam(
     *,
     kinds: np.ndarray | None = None,
     units: RateUnits = ABSOLUTE,
-) -> None:
-    """One step on the rows `touched`, in place; their gradients are set to zero.
+) -> bool:
+    """One step on the rows `touched`, in place; their gradients are set to zero. Returns whether they are finite.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
     row; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which parameters each Gaussian has
@@ -136,11 +139,15 @@ def sparse_adam(
     moments, bits = (first, second, counts), (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK)
     units = RateUnits(*np.float32(units))
 
+    sums = np.zeros(-(-num // _CHUNK))
+
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
-        _update(start, stop, touched, rows, grad, *moments, kinds, bits, rates, units, at, BIAS_CORRECTIONS)
+        arrays = touched, rows, grad, *moments, kinds
+        sums[start // _CHUNK] = _update(start, stop, *arrays, bits, rates, units, at, BIAS_CORRECTIONS)
 
     run_tasks(work, range(0, num, _CHUNK))
+    return math.isfinite(sums.sum())
 
 
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX

@@ -9,6 +9,7 @@ from typing import Any
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.settings import check_settings, setting
+from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.fitting.adam import RateUnits
 from foldgauss.video.fitting.economy import Economy
@@ -42,8 +43,8 @@ class LearningRates:
                 raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
 
 
-#: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and m_t
-#: are stated.
+#: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and
+#: m_t are stated.
 UNIT_TIME, UNIT_SIZE = 0.06, 0.005
 #: Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
 MAX_GAUSSIANS = 10_000_000
@@ -124,7 +125,7 @@ class FitConfig:
             "Number of Gaussians at the start",
             least=1,
             most=MAX_GAUSSIANS,
-            unset="by the clip's size and length",
+            unset="by the clip's size and length and the time to fit",
             option="--gaussians",
             group=MODEL,
         ),
@@ -149,7 +150,7 @@ class FitConfig:
         metadata=setting(
             "Optimizer steps",
             least=1,
-            unset="3000, more for long clips",
+            unset="3000, or 30 for each frame",
             option="--steps",
             group=BUDGET,
         ),
@@ -369,27 +370,46 @@ class FitConfig:
 #: Bytes reserved for the header of a model file.
 HEADER_BYTES = 4096
 #: Steps if neither steps nor minutes are given: this many, and at least so many visits to every frame.
-DEFAULT_STEPS, DEFAULT_VISITS = 3000, 12
-#: Fraction of the default number of Gaussians from which the smallest model at a PSNR starts. (Bunny 80x160 at 33 dB,
-#: which takes 3,100: 31.9 thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
-SMALLEST_FRACTION = 0.7
+DEFAULT_STEPS, DEFAULT_VISITS = 3000, 30
+#: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
+PIXEL_TIME = 0.15
+#: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
+DENSITY, DENSITY_POWER = 0.0025, 0.85
+#: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
+#: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
+#: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
+ECONOMICAL, SMALLEST_FRACTION = 177, 0.7
 #: Factor on the default steps for the smallest model at a PSNR: the fit must make up for what is pruned.
 SMALLEST_TIMES = 2
 
 
-def default_num_gaussians(num_frames: int, height: int, width: int) -> int:
-    """40,000 for 160x320, proportional to the square root of the pixels: larger frames are smoother per pixel.
+def default_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int) -> int:
+    """The number of Gaussians that is best for the budget, see docs/fit.md for the measurements.
 
-    Clips whose default steps exceed `DEFAULT_STEPS` get proportionally more, so that no frame has fewer.
+    It is `DENSITY` x^`DENSITY_POWER` for each pixel of all frames, where a core has x microseconds for each: `minutes`
+    times the number of threads, or the time that `steps` take. The model file is never larger than the frames as bytes.
     """
-    return round(177 * math.sqrt(height * width) * max(1.0, DEFAULT_VISITS * num_frames / DEFAULT_STEPS))
+    pixels = num_frames * height * width
+    if config.economy is not None:
+        fraction = SMALLEST_FRACTION if _is_smallest(config) else 1.0
+        return max(round(fraction * ECONOMICAL * math.sqrt(height * width) * max(1.0, num_frames / 250)), 1)
+    visits = (planned_steps(dataclasses.replace(config, minutes=None), num_frames)) * config.batch_size / num_frames
+    microseconds = PIXEL_TIME * visits
+    if config.minutes is not None:
+        by_clock = 60e6 * config.minutes * num_threads() / pixels
+        microseconds = by_clock if config.steps is None else min(microseconds, by_clock)
+    density = min(DENSITY * microseconds**DENSITY_POWER, 3 / bytes_per_gaussian(config.degree))
+    return max(round(density * pixels), 1)
+
+
+def bytes_per_gaussian(degree: int) -> int:
+    """Of a model file."""
+    return 4 * (11 + 2 * degree)
 
 
 def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int) -> int:
     """Number of Gaussians at the start, at most `most_gaussians`. Raises ValueError as that does."""
-    num = config.num_gaussians or default_num_gaussians(num_frames, height, width)
-    if config.num_gaussians is None and _is_smallest(config):
-        num = max(round(SMALLEST_FRACTION * num), 1)
+    num = config.num_gaussians or default_num_gaussians(config, num_frames, height, width)
     return min(num, most_gaussians(config, num_frames))
 
 
@@ -398,7 +418,7 @@ def most_gaussians(config: FitConfig, num_frames: int) -> int:
     most = config.max_gaussians or MAX_GAUSSIANS
     if config.max_size_mb is None:
         return most
-    each = 4 * (11 + 2 * config.degree)  # bytes
+    each = bytes_per_gaussian(config.degree)
     room = int((1e6 * config.max_size_mb - HEADER_BYTES - 4 * num_frames) // each)
     if room < 1:
         least = (HEADER_BYTES + 4 * num_frames + each) / 1e6

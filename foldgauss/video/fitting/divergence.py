@@ -12,10 +12,14 @@ import numpy as np
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.schedule import BACKOFF_FACTOR
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.row_layout import columns
 
-#: Steps between the states that are kept to return to. (A copy of 40,000 Gaussians takes 4 ms.)
-KEEP_EVERY = 50
+#: Steps between the states that are kept to return to: at least the first, and one for so many Gaussians, so that
+#: copies take a hundredth of the time. (A copy of 40,000 takes 4 ms.)
+KEEP_EVERY, COPIED_PER_STEP = 50, 8000
+#: Steps between tests of all parameters; those of the Gaussians alive are tested after every step.
+TEST_EVERY = 10
 #: A mean squared error of so many times the lowest one known is no chance: 6 dB.
 MUCH_WORSE = 4.0
 #: Above 35 dB a fit has not diverged.
@@ -69,10 +73,11 @@ class Guard:
         state.compare_from = state.step + max(PASSES * self.steps_per_pass, MIN_STEPS)
         state.improve_by = state.step + START_PASSES * self.steps_per_pass
 
-    def find_fault(self, state: FitState, loss: float) -> str:
+    def find_fault(self, state: FitState, result: StepResult) -> str:
         """A description of what is wrong after a step; empty if nothing is."""
-        if not (math.isfinite(loss) and state.is_finite("rows") and state.is_finite("time_logits")):
-            return _find_nonfinite(state, self.config) or f"a loss of {loss}"
+        finite = math.isfinite(result.loss) and result.finite and state.is_finite("time_logits")
+        if not finite or (state.step % TEST_EVERY == 0 and not state.is_finite("rows")):
+            return _find_nonfinite(state, self.config) or f"a loss of {result.loss}"
         if state.backoffs >= MAX_BACKOFFS:
             return ""  # no back-off is left, and a bad fit is better than none
         if _time_move(state) > MAX_TIME_MOVE:
@@ -91,12 +96,12 @@ class Guard:
         return ""
 
     def keep_good(self, state: FitState) -> None:
-        """Keep a copy of the state, every `KEEP_EVERY` steps, unless its moments overflow or its frames look bad."""
-        due = state.step - state.last_finite.step >= KEEP_EVERY
+        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless its moments overflow or its frames look bad."""
+        due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP)
         if state.backoffs and state.step < state.compare_from:
             return  # not all frames have been seen since the back-off
         bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > NOT_BETTER)
-        if due and not bad and state.is_finite("second"):
+        if due and not bad and state.is_finite("rows") and state.is_finite("second"):
             state.last_finite = state.copy()
 
     def finish(self, state: FitState) -> None:

@@ -145,7 +145,7 @@ def fit_steps(
         if new_level or not state.plan:  # without a plan yet, levels take turns
             guard.restart(state)
             state.best_error = 0.0
-        fault = guard.find_fault(state, result.loss)
+        fault = guard.find_fault(state, result)
         if fault:
             guard.back_off(state, fault, error_before)
             stepper.adopt(state)

@@ -330,8 +330,10 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
 
 def update_rows(
     state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, degree: int, units: RateUnits
-) -> None:
+) -> bool:
     """A step of Adam on the rows `touched` and on the values that they share, in place; `grad` becomes zero there.
+
+    Returns whether these rows are finite.
 
     `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
     """
@@ -339,7 +341,7 @@ def update_rows(
         at = columns(degree)[name]
         codebook.step(state.rows[:, at], grad[:, at], touched, rates[at])
     moments = state.first, state.second, state.counts
-    sparse_adam(state.rows, grad, *moments, touched, rates, kinds=state.kinds, units=units)
+    return sparse_adam(state.rows, grad, *moments, touched, rates, kinds=state.kinds, units=units)
 
 
 def running_psnr(state: FitState) -> float:

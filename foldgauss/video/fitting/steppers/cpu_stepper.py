@@ -92,13 +92,13 @@ class CpuStepper:
         if not config.sparse_updates:
             touched = np.arange(len(state.rows))
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
+        finite = update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
         update_windows(state.rows, touched, self.window)
         if config.learn_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated
         squared_error = float(np.mean(errors)) if errors else math.nan
-        return StepResult(float(np.mean(losses)), squared_error, num_alive)
+        return StepResult(float(np.mean(losses)), squared_error, num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
         shape, errors = self.shapes[-1], {}

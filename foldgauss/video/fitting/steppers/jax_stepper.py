@@ -125,7 +125,7 @@ class JaxStepper:
         arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
         report = jax.device_get(report)
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
-        return StepResult(float(report.loss), float(report.error), int(report.num_alive))
+        return StepResult(float(report.loss), float(report.error), int(report.num_alive), state.is_finite("rows"))
 
     def grow(self, state: FitState) -> None:
         """Densification on the host, where any is due."""
