@@ -42,7 +42,7 @@ class StepPlanner:
     def update(self, state: FitState, level: int, seconds: float) -> None:
         """Plan the steps of the whole fit, if it is time; the last step took `seconds`, at `level`."""
         config = self.config
-        if config.minutes is None or (state.plan and self.once):
+        if config.minutes is None or (state.plan and (self.once or state.step >= state.plan)):
             return
         budget = 60 * config.minutes
         if not state.plan and (state.step == config.steps or state.seconds >= budget):
