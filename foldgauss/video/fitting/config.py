@@ -27,15 +27,15 @@ class LearningRates:
     A step then moves small and large, short and long Gaussians by the same fraction of their sizes and durations.
     """
 
-    loc: float = 6.9e-4
-    coefficients: float = 4e-3
-    log_scale: float = 0.06
-    angle_logit: float = 0.06
-    opacity_logit: float = 0.15
-    color_dc: float = 0.06
-    time_loc_logit: float = 0.04
-    log_time_scale: float = 0.1
-    frame_times: float = 3e-3
+    loc: float = 3.5e-4
+    coefficients: float = 2e-3
+    log_scale: float = 0.03
+    angle_logit: float = 0.03
+    opacity_logit: float = 0.075
+    color_dc: float = 0.03
+    time_loc_logit: float = 0.02
+    log_time_scale: float = 0.05
+    frame_times: float = 1.5e-3
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
@@ -229,7 +229,7 @@ class FitConfig:
         metadata=setting("Learning rates are in units of each Gaussian's size", "See `LearningRates`."),
     )
     quarter_fraction: float = field(
-        default=0.2,
+        default=0.0,
         metadata=setting(
             "Fraction of the steps, at the start, with frames at a quarter of their size",
             "Frames that are too small stay at full size.",
@@ -239,7 +239,7 @@ class FitConfig:
         ),
     )
     half_fraction: float = field(
-        default=0.4,
+        default=0.0,
         metadata=setting(
             "Fraction of the steps, after those, with frames at half of their size",
             bounds="[0, 1]",
@@ -269,7 +269,7 @@ class FitConfig:
     )
     rates: LearningRates = field(default=LearningRates(), metadata=setting("Learning rates at the first step"))
     final_rate: float = field(
-        default=0.07,
+        default=0.2,
         metadata=setting("Learning rates decay exponentially to this fraction of themselves", bounds="[0, 1]"),
     )
     decayed: str = field(

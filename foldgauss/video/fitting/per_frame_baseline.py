@@ -19,9 +19,9 @@ from foldgauss.video.models.video_model import VideoModel
 #: Parameters of a Gaussian without time: position 2, scales 2, angle, opacity, color 3.
 PARAMETERS = 9
 #: Factors of the fit's learning rates, which are meant for Gaussians that many frames act on; the second of positions.
-#: (Frames of Bunny 160x320 and bikes 272x640, 560 Gaussians, 200 steps: 26.8 and 35.2 dB with the fit's own rates, 27.4
-#: and 36.3 with these, 27.1 and 36.1 with twice all; 400 steps: 27.7 and 37.1, 27.8 and 37.3, 27.8 and 37.2.)
-RATE_FACTOR, LOC_RATE_FACTOR = 2.0, 4.0
+#: (Frames of Bunny 160x320 and bikes 272x640, 560 Gaussians, 200 steps: 26.8 and 35.2 dB with half of these, 27.4 and
+#: 36.3 with these, 27.1 and 36.1 with twice all; 400 steps: 27.7 and 37.1, 27.8 and 37.3, 27.8 and 37.2.)
+RATE_FACTOR, LOC_RATE_FACTOR = 4.0, 8.0
 #: Steps of each frame where neither steps nor minutes are given, and those by which the speed is measured first.
 DEFAULT_STEPS, PILOT_STEPS = 500, 30
 
@@ -81,8 +81,8 @@ def independent_frames(
 
     `config` is that of each frame's fit: starts, loss, coarse levels, rates (see `RATE_FACTOR`), compositing. Its
     `steps` are of each frame (default `DEFAULT_STEPS`); its `minutes` are for all, divided evenly by measured speed.
-    Settings about time (`degree`, `power`, `floor`, `learn_frame_times`, `follow_motion`, `scale_rates_by_duration`)
-    have no meaning here and are ignored. `on_frame` is called with number and model of each frame that is done.
+    Settings about time (`degree`, `power`, `floor`, `learn_frame_times`, `follow_motion`, `scale_rates_by_duration`,
+    `scale_rates_by_size`) have no meaning here and are ignored. `on_frame` is called with number and model of each frame that is done.
 
     **Raises** ValueError for frames that cannot be fitted, for fewer parameters than a Gaussian in each frame has, and
     for settings that would change the numbers of Gaussians, or that need other frames.
@@ -103,7 +103,8 @@ def independent_frames(
     alone = dataclasses.replace(config, degree=0, power=0.0, floor=0.0, minutes=None, steps=None)
     rates = {name: RATE_FACTOR * rate for name, rate in dataclasses.asdict(config.rates).items()}
     alone = dataclasses.replace(alone, rates=LearningRates(**rates | {"loc": LOC_RATE_FACTOR * config.rates.loc}))
-    alone = dataclasses.replace(alone, learn_frame_times=False, follow_motion=False, scale_rates_by_duration=False)
+    alone = dataclasses.replace(alone, learn_frame_times=False, follow_motion=False)
+    alone = dataclasses.replace(alone, scale_rates_by_duration=False, scale_rates_by_size=False)
     if config.minutes is not None:  # the result is not used, but its seconds count
         budget.record(PILOT_STEPS, _fit_frame(frames[0], each, alone, PILOT_STEPS, 0, fps)[1])
     for k, frame in enumerate(frames):
