@@ -10,6 +10,7 @@ from foldgauss.video.fitting.adam import (
     BETA2,
     EPSILON,
     FRAME_TIME_ADAM,
+    RateUnits,
     adam_step,
     masked_adam,
     sparse_adam,
@@ -62,21 +63,28 @@ def test_zero_gradient_changes_nothing():
     np.testing.assert_array_equal(rows, 1)
 
 
-def test_rates_scale_with_duration():
-    """A first step is the rate itself: c_k moves by (unit / sigma_t)^k of it, m_t by sigma_t / unit, others as ever."""
+@pytest.mark.parametrize("unit_size", [0.0, 0.01])
+def test_rates_scale_with_duration_and_size(unit_size):
+    """A first step is the rate itself: c_k moves by (unit / sigma_t)^k of it, m_t by sigma_t / unit; others as ever.
+
+    m_s and c_k also by the size, the geometric mean of the standard deviations.
+    """
     degree, unit, spread = 3, 0.06, np.array([0.03, 0.06, 0.24], np.float32)
+    scales = np.array([[0.01, 0.01], [0.02, 0.08], [0.001, 0.004]], np.float32)
+    size = np.sqrt(scales.prod(1)) / unit_size if unit_size else np.ones(3)
     place = columns(degree)
     rows = np.zeros((3, place["coefficients"].stop), np.float32)
     rows[:, place["log_time_scale"].start] = np.log(spread)
+    rows[:, place["log_scale"]] = np.log(scales)
     before, grad, moments = rows.copy(), np.ones_like(rows), (np.zeros_like(rows), np.zeros_like(rows))
     rates = np.full(rows.shape[1], 1e-3, np.float32)
-    sparse_adam(rows, grad, *moments, np.zeros(3, np.int32), np.arange(3), rates, unit_time=unit)
+    sparse_adam(rows, grad, *moments, np.zeros(3, np.int32), np.arange(3), rates, units=RateUnits(unit, unit_size))
     factor = (before - rows) / 1e-3
     for k in range(1, degree + 1):
         own = factor[:, place["coefficients"]].reshape(3, degree, 2)[:, k - 1]
-        np.testing.assert_allclose(own, ((unit / spread) ** k)[:, None] * np.ones(2), rtol=1e-4)
+        np.testing.assert_allclose(own, (size * (unit / spread) ** k)[:, None] * np.ones(2), rtol=1e-3)
     np.testing.assert_allclose(factor[:, place["time_loc_logit"].start], spread / unit, rtol=1e-4)
-    np.testing.assert_allclose(factor[:, place["loc"]], 1, rtol=1e-4)
+    np.testing.assert_allclose(factor[:, place["loc"]], size[:, None] * np.ones(2), rtol=1e-3)
     np.testing.assert_allclose(factor[:, place["log_time_scale"]], 1, rtol=1e-3)
 
 
@@ -94,7 +102,7 @@ def test_all_implementations_take_the_same_steps():
         change, *own[1:3] = adam_step(grad, *own[1:], rates)
         own[0] -= change.astype(np.float32)
         sparse_adam(sparse[0], grad.copy(), *sparse[1:], np.arange(num), rates)
-        masked = masked_adam(masked[0], grad, *masked[1:], np.ones(num, bool), rates, kinds=kinds, unit_time=0.0)
+        masked = masked_adam(masked[0], grad, *masked[1:], np.ones(num, bool), rates, kinds=kinds, units=RateUnits())
         with jax.numpy_dtype_promotion("standard"):
             update, moments = FRAME_TIME_ADAM.update(grad, moments)
         by_optax -= rates * np.asarray(update)

@@ -30,7 +30,7 @@ from foldgauss.video import (
     fit,
     fit_steps,
 )
-from foldgauss.video.fitting.adam import masked_adam, sparse_adam
+from foldgauss.video.fitting.adam import RateUnits, masked_adam, sparse_adam
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.fitting.state import FitState
@@ -195,8 +195,8 @@ def test_ssim_matches_the_cpu():
     close(own[..., 0], ssim_map(rendered, target))
 
 
-@pytest.mark.parametrize("unit_time", [0.0, 0.06])
-def test_adam_matches_the_cpu(unit_time):
+@pytest.mark.parametrize("units", [RateUnits(), RateUnits(time=0.06), RateUnits(size=0.01), RateUnits(0.06, 0.01)])
+def test_adam_matches_the_cpu(units):
     """Of rows with any number of steps behind them, of all kinds; those that took no part stay to the bit."""
     rng, num, width = np.random.default_rng(0), 400, 17
     rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
@@ -207,7 +207,7 @@ def test_adam_matches_the_cpu(unit_time):
     kinds |= (OPAQUE_BIT * rng.integers(0, 2, num)).astype(np.uint8)
     touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
     arrays = rows, grad, first, second, counts
-    how = {"kinds": kinds, "unit_time": unit_time}
+    how = {"kinds": kinds, "units": units}
     own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, **how))(*arrays)
     judge = [array.copy() for array in arrays]
     sparse_adam(*judge, np.flatnonzero(touched), rates, **how)

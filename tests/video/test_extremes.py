@@ -240,10 +240,9 @@ def test_five_thousand_frames_and_few_steps():
 
 
 def test_long_clips_get_as_many_gaussians_a_frame_as_shorter_ones():
-    number = {n: chosen_num_gaussians(FitConfig(), n, 160, 320) for n in (1, 132, 250, 500, 5000)}
-    assert number[1] == number[132] == number[250] == round(177 * math.sqrt(160 * 320))
-    assert number[500] == pytest.approx(2 * number[250], abs=2)
-    assert number[5000] == pytest.approx(20 * number[250], abs=20)
+    number = {n: chosen_num_gaussians(FitConfig(), n, 160, 320) for n in (250, 500, 5000)}
+    assert number[500] == pytest.approx(2 * number[250], rel=1e-4)
+    assert number[5000] == pytest.approx(20 * number[250], rel=1e-4)
     assert chosen_num_gaussians(FitConfig(max_gaussians=9000), 5000, 160, 320) == 9000
 
 

@@ -1,6 +1,7 @@
 """The fit on small clips: quality, budgets, reproducible bits, resuming and starts from models."""
 
 import dataclasses
+import itertools
 import time
 
 import jax
@@ -190,8 +191,8 @@ def test_frame_times_are_learned():
 
 def test_planned_steps():
     assert planned_steps(FitConfig(), 24) == 3000
-    assert planned_steps(FitConfig(), 1000) == 12_000
-    assert planned_steps(FitConfig(batch_size=4), 1000) == 3000
+    assert planned_steps(FitConfig(), 1000) == 30_000
+    assert planned_steps(FitConfig(batch_size=4), 1000) == 7500
     assert planned_steps(FitConfig(steps=7), 1000) == 7
     assert planned_steps(FitConfig(minutes=1), 1000) is None
     assert planned_steps(FitConfig(minutes=1, steps=9), 1000) == 9
@@ -250,19 +251,35 @@ def test_target_psnr_is_neither_missed_nor_overshot(clip):
     assert max(looked_at, default=0) < 24
 
 
-def test_minutes_are_planned_once():
+def test_a_fit_by_minutes_resumes_exactly():
     """A fit by minutes that was stopped goes on by the plan that it had: to the same bits as if it had not been."""
-    frames, config = moving_blobs(), dataclasses.replace(CONFIG, steps=None, minutes=0.05)
+    frames, config = moving_blobs(), dataclasses.replace(CONFIG, steps=None, minutes=0.2)
+    tick = lambda: itertools.count(step=1 / 128).__next__  # noqa: E731  every reading of the clock is 1/128 s later
     kept = None
-    for state, info in fit_steps(frames, config):
-        if state.plan and kept is None:
+    for state, info in fit_steps(frames, config, clock=tick()):
+        if state.planned_step and kept is None:
             kept = jax.tree.map(np.array, state)
-    assert kept.plan == state.plan == info.step
+    assert state.seconds == pytest.approx(12, rel=0.02)
+    assert state.plan == info.step
     assert kept.step < state.step
-    for again, _ in fit_steps(frames, config, kept):
+    for again, _ in fit_steps(frames, config, kept, clock=tick()):
         pass
     assert again.step == state.step
     np.testing.assert_array_equal(again.rows, state.rows)
+
+
+def test_more_time_means_more_gaussians():
+    """Up to a model file as large as the frames as bytes; a fraction of the pixels suffices for a fraction of them."""
+    number = [chosen_num_gaussians(FitConfig(minutes=m), 80, 480, 854) for m in (0.1, 1.0, 10.0, 100.0, 1000.0)]
+    assert number[0] < number[1] < number[2] <= number[3] == number[4]
+    assert number[-1] * 4 * (11 + 2 * 3) == pytest.approx(80 * 480 * 854 * 3, rel=1e-4)
+    by_steps = [chosen_num_gaussians(FitConfig(steps=n), 80, 480, 854) for n in (10, 1000, 10_000)]
+    assert by_steps[0] < by_steps[1] < by_steps[2]
+    both = chosen_num_gaussians(FitConfig(minutes=1000.0, steps=1000), 80, 480, 854)
+    assert both == by_steps[1]
+    half = chosen_num_gaussians(FitConfig(minutes=0.25), 80, 240, 427)
+    assert half == pytest.approx(number[1] / 4, rel=0.01)
+    assert chosen_num_gaussians(FitConfig(), 1, 1, 1) == 1
 
 
 def test_file_size_limits_the_number_of_gaussians():

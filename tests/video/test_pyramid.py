@@ -84,10 +84,9 @@ def run_by_clock(config, levels, seconds_of, num_frames=6, until=None):
     state.plan, state.step, state.seconds = 0, 0, 0.0
     while not state.plan or state.step < state.plan:
         level = budget.next_level(state, config, levels)
-        passed = seconds_of(state, level)
         state.step += 1
-        state.seconds += passed
-        planner.update(state, level, passed)
+        state.seconds += seconds_of(state, level)
+        planner.update(state, level)
         course.append((state.step, budget.measure_progress(state, config)))
         if until is not None and until(state):
             break
@@ -121,10 +120,10 @@ def test_a_resumed_fit_keeps_its_plan():
     stopped, _ = run_by_clock(config, LEVELS, lambda state, level: 0.2, until=lambda state: state.seconds > 50)
     plan, course = stopped.plan, (stopped.planned_step, stopped.planned_progress)
     planner = budget.StepPlanner(config, LEVELS, 6)
-    for _ in range(20):
+    for _ in range(20):  # 54 s
         stopped.step += 1
         stopped.seconds += 0.2
-        planner.update(stopped, 1, 0.2)
+        planner.update(stopped, 1)
     assert (stopped.plan, stopped.planned_step, stopped.planned_progress) == (plan, *course)
 
 

@@ -35,13 +35,15 @@ class StepPlanner:
 
     def __init__(self, config: FitConfig, levels: list[Level], num_frames: int):
         self.config, self.levels, self.count, self.work, self.seconds = config, levels, 0, 0.0, 0.0
+        self.before = 0.0  # the state's seconds after the step before
         rounds = 0 if config.economy is None else config.economy.rounds
         self.for_pruning = STEPS_PER_ROUND * rounds * num_frames / config.batch_size  # steps' worth of time, at most
         self.once = config.economy is not None or config.growth is not None
 
-    def update(self, state: FitState, level: int, seconds: float) -> None:
-        """Plan the steps of the whole fit, if it is time; the last step took `seconds`, at `level`."""
-        config = self.config
+    def update(self, state: FitState, level: int) -> None:
+        """Plan the steps of the whole fit, if it is time, after a step at `level`."""
+        config, passed = self.config, state.seconds - self.before
+        self.before = state.seconds
         if config.minutes is None or (state.plan and (self.once or state.step >= state.plan)):
             return
         budget = 60 * config.minutes
@@ -51,7 +53,7 @@ class StepPlanner:
         self.count += 1
         if self.count > WARM_UP * len(self.levels):
             self.work += relative_area(self.levels, self.levels[level])
-            self.seconds += seconds
+            self.seconds += passed
         if not self._is_due(state, budget):
             return
         progress = measure_progress(state, config) if state.plan else 0.0

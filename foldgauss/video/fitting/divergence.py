@@ -96,7 +96,7 @@ class Guard:
         return ""
 
     def keep_good(self, state: FitState) -> None:
-        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless its moments overflow or its frames look bad."""
+        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless moments overflow or frames look bad."""
         due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP)
         if state.backoffs and state.step < state.compare_from:
             return  # not all frames have been seen since the back-off

@@ -155,9 +155,8 @@ def fit_steps(
             stepper.grow(state)
         if config.economy is not None and state.plan:
             stepper.prune(state)
-        passed = clock() - begun
-        state.seconds += passed
-        planner.update(state, level, passed)
+        state.seconds += clock() - begun
+        planner.update(state, level)
         begun = clock()
         stopped_by = find_limit(state, config, frames)
         if stopped_by == "smallest_at_psnr":
