@@ -24,7 +24,7 @@ from foldgauss.video import FitConfig, evaluate, fit
 IDEAS = {
     "starts along the flow, shots apart": {"follow_motion": False},
     "rates in units of own time": {"scale_rates_by_duration": False},
-    "coarse to fine": {"quarter_fraction": 0.0, "half_fraction": 0.0},
+    "rates in units of own size": {"scale_rates_by_size": False},
     "squared error at the end": {"l2_fraction": 0.0},
     "frame times learned": {"learn_frame_times": False},
     "low pass 0.1 px^2 instead of 0.3": {"options": RenderOptions()},

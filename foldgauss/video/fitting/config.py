@@ -374,7 +374,7 @@ DEFAULT_STEPS, DEFAULT_VISITS = 3000, 30
 #: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
 PIXEL_TIME = 0.15
 #: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
-DENSITY, DENSITY_POWER = 0.0025, 0.85
+DENSITY, DENSITY_POWER = 0.0028, 0.85
 #: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
 #: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
