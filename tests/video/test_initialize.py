@@ -1,0 +1,51 @@
+"""The starts of a fit: along edges, in order of time."""
+
+import numpy as np
+import pytest
+from clips import moving_blobs
+
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.fitting.initialize import ELONGATION, initialize, sample_orientations
+
+
+def stripes(angle: float, size: tuple[int, int] = (40, 60)) -> np.ndarray:
+    """Stripes along the direction `angle`, x right and y down, as a clip of one frame."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    wave = 127 + 100 * np.sin(0.8 * (np.cos(angle) * y - np.sin(angle) * x))
+    return np.repeat(wave[None, ..., None], 3, axis=-1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.2, 2.5])
+def test_edges_have_their_direction(angle):
+    position = np.random.default_rng(0).uniform([8, 8], [52, 32], (20, 2))
+    found, straight = sample_orientations(stripes(angle), np.zeros(20, int), position)
+    np.testing.assert_allclose(np.sin(found - angle), 0, atol=0.05)
+    assert (found >= np.pi / 2 - 1e-6).all()  # far from the ends of the sigmoid
+    assert (found <= 3 * np.pi / 2 + 1e-6).all()
+    assert (straight > 0.99).all()
+
+
+def test_flat_frames_have_no_edges():
+    found, straight = sample_orientations(np.full((1, 20, 30, 3), 90, np.uint8), np.zeros(5, int), np.full((5, 2), 10.0))
+    assert (straight == 0).all()
+    assert np.isfinite(found).all()
+
+
+def test_starts_are_elongated_along_edges():
+    """Their covariance has its longer axis along the stripes; their area is that of round ones."""
+    angle = 0.4
+    splats = initialize(stripes(angle), 300, degree=1, envelope=TimeLikelihood(power=np.float32(1)), seed=0)
+    factor = np.asarray(splats.gaussians().scale_tril)
+    covariance = factor @ factor.transpose(0, 2, 1)
+    values, axes = np.linalg.eigh(covariance)
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    along = np.abs(axes[:, :, 1] @ direction)
+    assert np.median(along) > 0.98
+    np.testing.assert_allclose(np.median(np.sqrt(values[:, 1] / values[:, 0])), np.exp(2 * ELONGATION), rtol=0.1)
+
+
+def test_gaussians_are_in_order_of_time():
+    """So that those alive at a time lie side by side in memory."""
+    splats = initialize(moving_blobs(), 500, degree=1, envelope=TimeLikelihood(power=np.float32(1)), seed=0)
+    home = np.round(5 / (1 + np.exp(-splats.time_loc_logit.astype(float))))
+    assert (np.diff(home) >= 0).all()
