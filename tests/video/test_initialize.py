@@ -26,7 +26,9 @@ def test_edges_have_their_direction(angle):
 
 
 def test_flat_frames_have_no_edges():
-    found, straight = sample_orientations(np.full((1, 20, 30, 3), 90, np.uint8), np.zeros(5, int), np.full((5, 2), 10.0))
+    found, straight = sample_orientations(
+        np.full((1, 20, 30, 3), 90, np.uint8), np.zeros(5, int), np.full((5, 2), 10.0)
+    )
     assert (straight == 0).all()
     assert np.isfinite(found).all()
 

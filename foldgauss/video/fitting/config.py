@@ -393,12 +393,12 @@ def default_num_gaussians(config: FitConfig, num_frames: int, height: int, width
     if config.economy is not None:
         fraction = SMALLEST_FRACTION if _is_smallest(config) else 1.0
         return max(round(fraction * ECONOMICAL * math.sqrt(height * width) * max(1.0, num_frames / 250)), 1)
-    visits = (planned_steps(dataclasses.replace(config, minutes=None), num_frames)) * config.batch_size / num_frames
-    microseconds = PIXEL_TIME * visits
+    steps, budgets = planned_steps(config, num_frames), []  # in microseconds for each pixel of all frames
+    if steps is not None:
+        budgets.append(PIXEL_TIME * steps * config.batch_size / num_frames)
     if config.minutes is not None:
-        by_clock = 60e6 * config.minutes * num_threads() / pixels
-        microseconds = by_clock if config.steps is None else min(microseconds, by_clock)
-    density = min(DENSITY * microseconds**DENSITY_POWER, 3 / bytes_per_gaussian(config.degree))
+        budgets.append(60e6 * config.minutes * num_threads() / pixels)
+    density = min(DENSITY * min(budgets) ** DENSITY_POWER, 3 / bytes_per_gaussian(config.degree))
     return max(round(density * pixels), 1)
 
 
