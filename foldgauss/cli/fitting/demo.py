@@ -29,7 +29,7 @@ from foldgauss.video.fitting.state import to_model
 SIZE, FRAMES = (160, 320), (0, 24)
 RECORD = "metrics.json"
 FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", RECORD}
-CONFIG = FitConfig(num_gaussians=20_000, degree=3, steps=1500)
+CONFIG = FitConfig(num_gaussians=40_000, steps=1500)
 
 
 @app.command()

@@ -108,9 +108,9 @@ class FitConfig:
     """The configuration of a fit; `FitConfig.preset` returns named ones.
 
     `steps`, `minutes` and `target_psnr` are budgets: the fit ends at the first that is reached. Minutes are converted
-    into steps once, by the measured time per step; with `growth`, `economy` or a target PSNR the clock ends the fit
-    instead. The target PSNR is checked every four passes over the frames. With neither steps nor minutes, the fit takes
-    `DEFAULT_STEPS`, or more for long clips.
+    into steps by the measured speed, and corrected until the end; with `growth` and `economy` once. With these or a
+    target PSNR the clock ends a fit that is late. The target PSNR is checked every four passes over the frames. With
+    neither steps nor minutes, the fit takes `DEFAULT_STEPS`, or more for long clips.
 
     With `two_cameras`, half of the views of a pass are those of an opposite camera: the mirrored frame, and the splats
     seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so the gradients equal
