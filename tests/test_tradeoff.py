@@ -141,7 +141,7 @@ def test_each_variant_changes_one_setting_and_has_a_command():
         assert "my clip.mp4" in shlex.split(line)
     assert made[0].config == BASE
     shown = dict(zip((point.name for point in made), lines, strict=True))
-    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --quarter-fraction 0.0")
+    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --half-fraction 0.4")
     assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
     assert shown["economy on"].endswith("--steps 1000 --economy")  # a flag
     assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
@@ -271,7 +271,8 @@ def test_everything_is_there(done, clip):
     assert rows["degree 0"]["floats"] == base.num_parameters - 6 * base.num_gaussians
     assert rows["cutoff radius 2, played"]["psnr"] != rows["base"]["psnr"]
     assert rows["cutoff radius 2, played"]["seconds"] == rows["base"]["seconds"]
-    assert rows["precision float16"]["bytes"] < 0.52 * rows["base"]["bytes"]
+    saved = rows["base"]["bytes"] - rows["precision float16"]["bytes"]
+    assert saved == pytest.approx(2 * base.num_parameters, rel=0.02)  # what a file has besides is small
 
 
 def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):

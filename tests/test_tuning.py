@@ -175,7 +175,7 @@ class TestTune:
 
         def fit_candidate(candidate):
             made.append(candidate.config)
-            psnr = 30 - np.log2(candidate.config.rates.loc / 6.9e-4 / 2) ** 2 + candidate.config.degree
+            psnr = 30 - np.log2(candidate.config.rates.loc / FitConfig().rates.loc / 2) ** 2 + candidate.config.degree
             return {"psnr": psnr, "worst_psnr": psnr - 2, "gaussians": 100, "steps": 50, "cpu_seconds": 1.0}
 
         monkeypatch.setattr(tune, "fit_candidate", fit_candidate)

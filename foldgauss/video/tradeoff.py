@@ -96,9 +96,9 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
             Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
         ),
         "schedule": (
-            Variant("full size", fit={"quarter_fraction": 0.0, "half_fraction": 0.0}, work=1.8),
-            Variant("half 0.4", fit={"quarter_fraction": 0.0, "half_fraction": 0.4}, work=1.3),
-            Variant("quarter 0.4, half 0.5", fit={"quarter_fraction": 0.4, "half_fraction": 0.5}, work=0.7),
+            Variant("half 0.4", fit={"half_fraction": 0.4}, work=0.7),
+            Variant("quarter 0.2, half 0.4", fit={"quarter_fraction": 0.2, "half_fraction": 0.4}, work=0.55),
+            Variant("quarter 0.4, half 0.5", fit={"quarter_fraction": 0.4, "half_fraction": 0.5}, work=0.4),
         ),
         "cutoff": _cutoffs(),
         "precision": tuple(Variant(stored, stored=stored) for stored in (FLOAT16, *PASSES)),

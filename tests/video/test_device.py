@@ -54,7 +54,7 @@ GROWTH = Growth(
     big_from=30_000,
     screen_gradient=1e-5,
     time_gradient=1e-5,
-    clone_below=0.25,
+    clone_below=0.35,
     reset_every=14_000,
 )
 GROWING = FitConfig(
@@ -66,6 +66,7 @@ GROWING = FitConfig(
     two_cameras=True,
     sparse_updates=False,
     growth=GROWTH,
+    scale_rates_by_size=False,
     engine="xla",
 )
 

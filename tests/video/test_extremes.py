@@ -147,7 +147,7 @@ def test_presets_at_the_extremes(name, preset):
 @pytest.fixture(scope="module")
 def still():
     frames = moving_blobs(1, *SIZE)
-    return frames, fit(frames, FitConfig(num_gaussians=400, steps=120)).model
+    return frames, fit(frames, FitConfig(num_gaussians=200, steps=120)).model
 
 
 def test_one_frame_has_one_time():

@@ -35,7 +35,7 @@ class LearningRates:
     color_dc: float = 0.03
     time_loc_logit: float = 0.02
     log_time_scale: float = 0.05
-    frame_times: float = 1.5e-3
+    frame_times: float = 3e-3
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
