@@ -29,7 +29,7 @@ from foldgauss.video.models.video_model import VideoModel
 METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
 #: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
-#: Learning rates of refits decay to at most this fraction, so that the spread is that of the estimate, not of its steps.
+#: Learning rates of refits decay to at most this fraction: the spread is that of the estimate, not of its last steps.
 FINAL_RATE = 0.07
 #: Streams of random numbers derived from the seed: one for frames, one for the seeds of fits.
 _FRAMES, _FITS = 0, 1
