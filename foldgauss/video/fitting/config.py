@@ -372,7 +372,7 @@ HEADER_BYTES = 4096
 #: Steps if neither steps nor minutes are given: this many, and at least so many visits to every frame.
 DEFAULT_STEPS, DEFAULT_VISITS = 3000, 30
 #: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
-PIXEL_TIME = 0.15
+PIXEL_TIME = 0.4
 #: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
 DENSITY, DENSITY_POWER = 0.0028, 0.85
 #: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
