@@ -191,8 +191,8 @@ def test_frame_times_are_learned():
 
 def test_planned_steps():
     assert planned_steps(FitConfig(), 24) == 3000
-    assert planned_steps(FitConfig(), 1000) == 30_000
-    assert planned_steps(FitConfig(batch_size=4), 1000) == 7500
+    assert planned_steps(FitConfig(), 1000) == 20_000
+    assert planned_steps(FitConfig(batch_size=4), 1000) == 5000
     assert planned_steps(FitConfig(steps=7), 1000) == 7
     assert planned_steps(FitConfig(minutes=1), 1000) is None
     assert planned_steps(FitConfig(minutes=1, steps=9), 1000) == 9

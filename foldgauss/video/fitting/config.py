@@ -150,7 +150,7 @@ class FitConfig:
         metadata=setting(
             "Optimizer steps",
             least=1,
-            unset="3000, or 30 for each frame",
+            unset="3000, or 20 for each frame",
             option="--steps",
             group=BUDGET,
         ),
@@ -370,7 +370,7 @@ class FitConfig:
 #: Bytes reserved for the header of a model file.
 HEADER_BYTES = 4096
 #: Steps if neither steps nor minutes are given: this many, and at least so many visits to every frame.
-DEFAULT_STEPS, DEFAULT_VISITS = 3000, 30
+DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
 #: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
 PIXEL_TIME = 0.4
 #: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
