@@ -6,7 +6,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.video.fitting import optical_flow as motion
-from foldgauss.video.fitting.optical_flow import LONGEST, Motion, Tracks, fit_folds
+from foldgauss.video.fitting.optical_flow import LONGEST, RIDGES, WINDOW, Motion, Tracks, _fit_powers, fit_folds
 
 
 def panning(num_frames: int, step: tuple[float, float], height: int = 96, width: int = 160, seed: int = 0):
@@ -143,3 +143,31 @@ def test_maps_shrink_to_the_memory_limit(monkeypatch):
     tracks = small.follow(np.full(20, 1), np.full((20, 2), [80.0, 48.0], np.float32))
     assert tracks.known[:, LONGEST + 1].all()
     np.testing.assert_allclose(tracks.shift[:, LONGEST + 1], np.tile([2.0, 0.0], (20, 1)), atol=0.5)
+
+
+@pytest.mark.parametrize("used", [1, 2, 3])
+def test_fitted_powers_are_the_weighted_least_squares(used):
+    """The kernel against NumPy's least squares, with the ridge as further rows; tracks and windows of any length."""
+    rng, num, longest = np.random.default_rng(0), 60, 9
+    u = -np.arange(-longest, longest + 1.0)
+    shift = np.cumsum(rng.normal(size=(num, len(u), 2)), axis=1).astype(np.float32)
+    known = np.zeros((num, len(u)), bool)
+    for row in known:
+        row[longest - rng.integers(longest + 1) : longest + 1 + rng.integers(longest + 1)] = True
+    shift -= shift[:, longest : longest + 1]
+    shift[~known] = 0
+    spread = rng.uniform(0.4, 15.0, num)
+    coefficients, miss = _fit_powers(Tracks(shift, known), spread, 3, used)
+    for n in range(num):
+        window = WINDOW * spread[n]
+        unit, root = min(window, longest), np.sqrt(known[n] * np.exp(-0.5 * (u / window) ** 2))
+        powers = (u / unit)[:, None] ** np.arange(1, used + 1)
+        design = np.concatenate([root[:, None] * powers, np.diag(np.sqrt(RIDGES[:used]))])
+        target = np.concatenate([root[:, None] * shift[n], np.zeros((used, 2))])
+        own = np.linalg.lstsq(design, target, rcond=None)[0]
+        np.testing.assert_allclose(
+            coefficients[n, :used], own / unit ** np.arange(1, used + 1)[:, None], rtol=1e-3, atol=1e-5
+        )
+        left = root[:, None] * (shift[n] - powers @ own)
+        np.testing.assert_allclose(miss[n], np.sqrt((left**2).sum() / (root**2).sum()), rtol=1e-3, atol=1e-4)
+    assert (coefficients[:, used:] == 0).all()

@@ -93,7 +93,7 @@ def initialize(
     alive = count_alive(times[home], spread, times)[home]
     scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     # The order in depth is that of `home`, so that the Gaussians alive at a time lie side by side in memory: steps take
-    # a third less time than in random order, and the quality is the same. Static Gaussians are behind.
+    # a third less time than in random order, for 0.2 dB after as many steps. Static Gaussians are behind.
     order = np.argsort(static, kind="stable")
     angle, coherence = sample_orientations(frames, home, position)
     log_scale = np.log(scale)[:, None] + ELONGATION * coherence[:, None] * [1, -1]
