@@ -211,7 +211,7 @@ def test_spread_with_held_splats_matches_the_profiles(place):
     std = np.concatenate([[0], given, [0]])
     how = {"replicates": 24, "block": 2, "place": place}
     assert 0.8 < refit_frame_times(base, noisy, config, steps=200, **how).ratio_to(std) < 1.2
-    assert refit_frame_times(base, noisy, config, steps=20, **how).ratio_to(std) < 0.6
+    assert refit_frame_times(base, noisy, config, steps=3, **how).ratio_to(std) < 0.6
 
 
 # Statistics of replicates

@@ -60,10 +60,10 @@ def test_stop_raises_with_the_last_finite_state():
     def spoil(state):
         state.rows[:, columns(CONFIG.degree)["log_scale"]] = np.nan
 
-    with pytest.raises(FitDiverged, match=r"no finite log_scale in 200 Gaussians.*of step 100") as error:
-        _fit_with(spoil, config, at=120)
+    with pytest.raises(FitDiverged, match=r"no finite log_scale in 200 Gaussians.*of step 120") as error:
+        _fit_with(spoil, config, at=130)
     state = error.value.state
-    assert state.step == 120  # as was told last: what watched goes on from there
+    assert state.step == 130  # as was told last: what watched goes on from there
     assert running_psnr(state) > 20
     assert np.isfinite(state.rows).all()
     assert evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr > 20
@@ -145,7 +145,7 @@ def test_good_fits_raise_no_warning(name, num):
 def test_guard_changes_no_bit(monkeypatch):
     watched = fit(CLIP, CONFIG).model
     monkeypatch.setattr(Guard, "find_fault", lambda self, state, result: "")
-    monkeypatch.setattr(Guard, "keep_good", lambda self, state: None)
+    monkeypatch.setattr(Guard, "keep_good", lambda self, state, **given: None)
     monkeypatch.setattr(CpuStepper, "measure_start", lambda self, state: {})
     alone = fit(CLIP, CONFIG).model
     for one, other in zip(jax.tree.leaves(watched), jax.tree.leaves(alone), strict=True):

@@ -48,7 +48,7 @@ def fit_in_segments(
     )
     with options.open_pool() as pool:  # first: workers start while the clip is indexed
         fit = _plan_with_progress(plan, display)
-        _print_plan(fit, job.config, display, Path(job.clip), str(options))
+        _print_plan(fit, job.config, display, Path(job.clip), options)
         again = f"Give the same command again{' with --resume added' if restart else ''} to continue."
         outcomes = run_jobs(fit.jobs, "segments", display, pool, cure=again)
     for outcome in outcomes:
@@ -134,7 +134,7 @@ def _plan_with_progress(plan: partial[LongFit], display: Display) -> LongFit:
         raise
 
 
-def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, workers: str) -> None:
+def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, options: WorkerOptions) -> None:
     index = fit.index
     if index.num_declared > index.num_frames:
         warn(f"only {index.num_frames} of {index.num_declared} frames of {video} decode; those are used.")
@@ -143,7 +143,7 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     lengths = [stop - first for first, stop in fit.spans]
     size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
-    num = chosen_num_gaussians(longest, max(lengths), *size)
+    num = chosen_num_gaussians(longest, max(lengths), *size, threads=options.threads)
     if display == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
         emit_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
@@ -160,6 +160,6 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     out.print(
         f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
         f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{num:,} Gaussians of degree {config.degree} and {plan}, by {workers}",
+        f"{num:,} Gaussians of degree {config.degree} and {plan}, by {options}",
         soft_wrap=True,
     )

@@ -29,8 +29,6 @@ from foldgauss.video.models.video_model import VideoModel
 METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
 #: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
-#: Learning rates of refits decay to at most this fraction: the spread is that of the estimate, not of its last steps.
-FINAL_RATE = 0.07
 #: Streams of random numbers derived from the seed: one for frames, one for the seeds of fits.
 _FRAMES, _FITS = 0, 1
 #: Grid search for the time of a left-out frame: points per grid, and number of ever finer grids.
@@ -285,9 +283,7 @@ def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None
         steps = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = steps if start == "scratch" else max(1, round((1 - START_AT) * steps))
     economy = None if start == "model" else config.economy  # the model's Gaussians are kept
-    final_rate = min(config.final_rate, FINAL_RATE)
-    changes = {"minutes": None, "target_psnr": None, "economy": economy, "final_rate": final_rate}
-    return dataclasses.replace(config, steps=steps, **changes)
+    return dataclasses.replace(config, steps=steps, minutes=None, target_psnr=None, economy=economy)
 
 
 def resample_frames(

@@ -91,7 +91,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "l2_fraction": 0.0,
         "rates": PUBLISHED_RATES,
         "final_rate": 0.01,
+        "cooldown_fraction": 0.0,
         "decayed": "loc",
+        "error_fraction": 0.0,
+        "relocated_fraction": 0.0,
         "two_cameras": True,
         "growth": Growth(),
         "options": RenderOptions.standard(),
@@ -263,6 +266,26 @@ class FitConfig:
             group=OPTIMIZATION,
         ),
     )
+    error_fraction: float = field(
+        default=0.3,
+        metadata=setting(
+            "Fraction of the views that are drawn in proportion to the frames' squared errors",
+            "The others visit all frames in turn. Improves the worst frames.",
+            bounds="[0, 1)",
+            option="--error-fraction",
+            group=OPTIMIZATION,
+        ),
+    )
+    relocated_fraction: float = field(
+        default=0.05,
+        metadata=setting(
+            "Fraction of the Gaussians that is moved, three times, from where they matter least to the largest errors",
+            "Without densification and economy, which have births of their own.",
+            bounds="[0, 0.5]",
+            option="--relocated-fraction",
+            group=OPTIMIZATION,
+        ),
+    )
     sparse_updates: bool = field(
         default=True,
         metadata=setting("Adam updates the Gaussians alive in the batch; otherwise all of them, as published"),
@@ -271,6 +294,14 @@ class FitConfig:
     final_rate: float = field(
         default=0.2,
         metadata=setting("Learning rates decay exponentially to this fraction of themselves", bounds="[0, 1]"),
+    )
+    cooldown_fraction: float = field(
+        default=0.2,
+        metadata=setting(
+            "Fraction of the steps, at the end, in which learning rates also fall linearly, to almost 0",
+            "Averages out the noise of single frames in the gradients.",
+            bounds="[0, 1]",
+        ),
     )
     decayed: str = field(
         default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=DECAYED)
@@ -380,14 +411,17 @@ DENSITY, DENSITY_POWER = 0.0028, 0.85
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
 ECONOMICAL, SMALLEST_FRACTION = 177, 0.7
 #: Factor on the default steps for the smallest model at a PSNR: the fit must make up for what is pruned.
-SMALLEST_TIMES = 2
+SMALLEST_TIMES = 4
 
 
-def default_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int) -> int:
+def default_num_gaussians(
+    config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None
+) -> int:
     """The number of Gaussians that is best for the budget, see docs/fit.md for the measurements.
 
     It is `DENSITY` x^`DENSITY_POWER` for each pixel of all frames, where a core has x microseconds for each: `minutes`
-    times the number of threads, or the time that `steps` take. The model file is never larger than the frames as bytes.
+    times the number of `threads` (default: those of this process), or the time that `steps` take. The model file is
+    never larger than the frames as bytes.
     """
     pixels = num_frames * height * width
     if config.economy is not None:
@@ -397,7 +431,7 @@ def default_num_gaussians(config: FitConfig, num_frames: int, height: int, width
     if steps is not None:
         budgets.append(PIXEL_TIME * steps * config.batch_size / num_frames)
     if config.minutes is not None:
-        budgets.append(60e6 * config.minutes * num_threads() / pixels)
+        budgets.append(60e6 * config.minutes * (threads or num_threads()) / pixels)
     density = min(DENSITY * min(budgets) ** DENSITY_POWER, 3 / bytes_per_gaussian(config.degree))
     return max(round(density * pixels), 1)
 
@@ -407,9 +441,11 @@ def bytes_per_gaussian(degree: int) -> int:
     return 4 * (11 + 2 * degree)
 
 
-def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int) -> int:
+def chosen_num_gaussians(
+    config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None
+) -> int:
     """Number of Gaussians at the start, at most `most_gaussians`. Raises ValueError as that does."""
-    num = config.num_gaussians or default_num_gaussians(config, num_frames, height, width)
+    num = config.num_gaussians or default_num_gaussians(config, num_frames, height, width, threads)
     return min(num, most_gaussians(config, num_frames))
 
 

@@ -95,9 +95,12 @@ class Guard:
         state.best_error = min(error, state.best_error or error)
         return ""
 
-    def keep_good(self, state: FitState) -> None:
-        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless moments overflow or frames look bad."""
-        due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP)
+    def keep_good(self, state: FitState, *, now: bool = False) -> None:
+        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless moments overflow or frames look bad.
+
+        `now`: at this step, since Gaussians are not comparable with those of earlier copies.
+        """
+        due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP) or now
         if state.backoffs and state.step < state.compare_from:
             return  # not all frames have been seen since the back-off
         bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > NOT_BETTER)

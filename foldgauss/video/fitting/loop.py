@@ -26,6 +26,7 @@ from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, plan
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.fitting.optical_flow import Motion, motion_finder
+from foldgauss.video.fitting.pruning.relocation import is_relocation_due
 from foldgauss.video.fitting.state import FitState, envelope_of, mean_psnr, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -42,7 +43,7 @@ class FitInfo(NamedTuple):
     step: int  #: steps done
     progress: float  #: fraction of the plan that is done, in [0, 1]
     loss: float  #: of this step's batch
-    psnr: float  #: dB, running mean over about one pass through the frames, at the resolution they are seen at
+    psnr: float  #: dB, of the mean squared error of all frames, each at the step and the resolution it was last seen
     num_gaussians: int
     num_alive: int  #: Gaussians that took part in this step
     seconds: float  #: spent fitting so far
@@ -140,7 +141,7 @@ def fit_steps(
         level = next_level(state, config, levels)
         result = stepper.step(state, measure_progress(state, config), level)
         new_level, error_before = starts_level(state, config, levels, level), state.error
-        _update_error(state, result, new_level, batch_fraction=config.batch_size / len(frames))
+        _update_error(state, result)
         state.step += 1
         if new_level or not state.plan:  # without a plan yet, levels take turns
             guard.restart(state)
@@ -151,6 +152,9 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
+            if is_relocation_due(state, config):
+                stepper.relocate(state)
+                guard.keep_good(state, now=True)
         if state.growing and state.plan:
             stepper.grow(state)
         if config.economy is not None and state.plan:
@@ -167,11 +171,12 @@ def fit_steps(
         yield state, _make_info(state, config, time_left, result, stopped_by)
 
 
-def _update_error(state: FitState, result: StepResult, new_level: bool, batch_fraction: float) -> None:
-    """Add a step to the running mean of the squared error, which forgets all others at a new level."""
-    memory = max(1 - batch_fraction, 0.5) if state.error and not new_level else 0.0
-    if not math.isnan(result.squared_error) or not math.isfinite(result.loss):
-        state.error = memory * state.error + (1 - memory) * result.squared_error
+def _update_error(state: FitState, result: StepResult) -> None:
+    """The mean squared error of all frames, each as it was when last seen."""
+    if math.isnan(result.squared_error) and math.isfinite(result.loss):
+        return  # an interpolated image
+    errors = state.frame_errors
+    state.error = float(errors[errors != 0].mean()) if errors.any() else 0.0
 
 
 def _make_info(

@@ -15,6 +15,8 @@ NUM_START_FRAMES = 16
 MIN_SIDE = 120
 #: Learning rates are divided by this whenever a diverged fit backs off.
 BACKOFF_FACTOR = 4.0
+#: The fraction of the learning rates that is left when they have cooled down.
+COLD = 0.02
 
 
 # ------------------------------------------------------------------------------------------------------ views
@@ -29,14 +31,22 @@ def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     return -(-num_views(config, num_frames) // config.batch_size)
 
 
-def choose_views(config: FitConfig, num_frames: int, step: int) -> np.ndarray:
+def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray | None = None) -> np.ndarray:
     """The views of a step: every pass visits all once, in an order that depends on the seed and the pass only.
 
-    View k is frame k; from the number of frames on, frame k - num_frames, mirrored.
+    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. After the first pass, a fraction
+    `config.error_fraction` of the views is replaced by others, drawn in proportion to the `errors` of the frames,
+    (num_frames,), where these are given.
     """
     first, num = step * config.batch_size, num_views(config, num_frames)
     positions = np.arange(first, first + config.batch_size)
-    return np.array([_shuffle(config, num, p // num)[p % num] for p in positions])
+    views = np.array([_shuffle(config, num, p // num)[p % num] for p in positions])
+    if config.error_fraction == 0 or errors is None or first < num or not 0 < errors.sum() < np.inf:
+        return views
+    rng = np.random.default_rng([config.seed, 7, step])
+    chance = np.tile(errors, num // num_frames).astype(float)
+    by_error = rng.choice(num, len(views), p=chance / chance.sum())
+    return np.where(rng.random(len(views)) < config.error_fraction, by_error, views)
 
 
 def _shuffle(config: FitConfig, num: int, epoch: int) -> np.ndarray:
@@ -66,6 +76,9 @@ class RateSchedule:
         """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
         config = self.config
         decay = config.final_rate**progress if config.final_rate > 0 else max(1 - progress, 0.0)
+        left = max(1 - progress, 0.0)
+        if left < config.cooldown_fraction:
+            decay *= COLD + (1 - COLD) * left / config.cooldown_fraction
         slower = BACKOFF_FACTOR**-backoffs
         rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
         times = config.rates.frame_times * (decay if config.decayed == "all" else 1.0) * slower

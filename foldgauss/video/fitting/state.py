@@ -198,7 +198,7 @@ class FitState:
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
     planned_progress: float = field(default=0.0, metadata=_NUMBER)  # fit that was over there
     seconds: float = field(default=0.0, metadata=_NUMBER)
-    error: float = field(default=0.0, metadata=_NUMBER)  # running mean of the squared error
+    error: float = field(default=0.0, metadata=_NUMBER)  # mean squared error of the frames as last seen
     # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
     best_error: float = field(default=0.0, metadata=_NUMBER)  # the lowest one that others are compared with; 0: none
     backoffs: int = field(default=0, metadata=_COUNT)  # how often the fit returned to `last_finite`, with lower rates
@@ -345,7 +345,7 @@ def update_rows(
 
 
 def running_psnr(state: FitState) -> float:
-    """dB, by the running mean of the squared error; at most 100, as `psnr` has for equal images."""
+    """dB, by the mean squared error of the frames as last seen; at most 100, as `psnr` has for equal images."""
     return -10 * math.log10(max(state.error, 1e-10))
 
 

@@ -8,8 +8,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import cpu
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.initialize import SCALE_FACTOR, draw_positions, find_constant, make_splats, make_static
 from foldgauss.video.fitting.optical_flow import Motion
+from foldgauss.video.fitting.schedule import to_planes
+from foldgauss.video.models.background import random_background
+from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns, pack
 
 #: The size of newborns relative to that of evenly spread Gaussians: errors have finer detail than the present image.
@@ -28,12 +33,13 @@ def make_newborns(
     envelope: TimeLikelihood,
     motion: Motion | None,
     opacity: float,
+    with_static: bool,
     seed: tuple[int, ...],
 ) -> Float32[np.ndarray, "num width"]:
     """Packed rows of `num` Gaussians, at frames and positions drawn by squared error, with the colors of the clip.
 
     `errors` are those of the frames, `measure_squares(k)` gives those of the pixels of frame k; `alive` is the mean
-    number of Gaussians alive in a frame.
+    number of Gaussians alive in a frame. With `with_static`, those whose pixel never changes are static.
     """
     rng = np.random.default_rng(seed)
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
@@ -44,11 +50,35 @@ def make_newborns(
 
     position, _ = draw_positions(home, density_of, rng)
     splats, _ = make_splats(frames, home, position, times, degree, envelope, motion, rng, opacity)
-    rows = pack(make_static(splats, find_constant(frames, home, position)))
+    rows = pack(make_static(splats, find_constant(frames, home, position)) if with_static else splats)
     size = frames.shape[1:3]
     apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
     rows[:, columns(degree)["log_scale"]] = np.log(SMALLER * SCALE_FACTOR * apart)
     return rows
+
+
+def make_target(
+    frames: UInt8[np.ndarray, "num_frames height width channels"], k: int, config: FitConfig
+) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
+    """Frame k and the background: with alpha, a random color that is always the same for the frame."""
+    background = random_background(config.seed, k) if frames.shape[3] == 4 else np.zeros(3, np.float32)
+    return to_planes(frames[k], background), background
+
+
+def measure_squares(
+    rows: Float32[np.ndarray, "num width"],
+    window: Float32[np.ndarray, "num 2"],
+    t: float,
+    target: Float32[np.ndarray, "3 height width"],
+    background: Float[np.ndarray, "3"],
+    spec: ConditioningSpec,
+    config: FitConfig,
+) -> Float32[np.ndarray, "height width"]:
+    """Squared errors of the pixels of the image at time t, summed over the channels."""
+    done = condition(rows, window, t, spec)
+    leaves = done.mean, done.factor, done.opacity, done.color, background
+    image = cpu.forward(*leaves, spec.size, compositing=config.compositing, options=config.options).image
+    return ((image - target) ** 2).sum(0)
 
 
 def shuffle_into(num_old: int, num_new: int, rng: np.random.Generator) -> Int[np.ndarray, "all"]:

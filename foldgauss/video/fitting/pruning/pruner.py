@@ -6,12 +6,12 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32
 
-from foldgauss.render import cpu, pixels_per_unit
+from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.initialize import START_OPACITY
 from foldgauss.video.fitting.optical_flow import Motion
-from foldgauss.video.fitting.pruning.births import make_newborns, shuffle_into
+from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares, shuffle_into
 from foldgauss.video.fitting.pruning.description_length import (
     PrunedRows,
     allowed_error,
@@ -20,10 +20,8 @@ from foldgauss.video.fitting.pruning.description_length import (
     weigh_frames,
 )
 from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
-from foldgauss.video.fitting.schedule import to_planes
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr
-from foldgauss.video.models.background import random_background
-from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
+from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import clear_absent_moments, count_parameters, find_initial_kinds
 
@@ -135,26 +133,18 @@ class Pruner:
             np.ascontiguousarray(self._frames[..., :3]),
             times,
             scores.errors,
-            lambda k: self._measure_squares(state.rows, window, k, times[k]),
+            lambda k: measure_squares(state.rows, window, times[k], *self._target(k), self._spec, self._config),
             float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times])),
             degree=config.degree,
             envelope=envelope_of(config),
             motion=self._find_motion() if config.follow_motion else None,
             opacity=START_OPACITY,
+            with_static=True,
             seed=(config.seed, 3, state.step),
         )
         order = shuffle_into(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
         state.extend(new, find_initial_kinds(new, config.degree), newborn=np.ones(num, bool))
         state.keep(order)
-
-    def _measure_squares(
-        self, rows: np.ndarray, window: np.ndarray, k: int, t: float
-    ) -> Float32[np.ndarray, "height width"]:
-        """Squared errors of the pixels of frame k, summed over the channels."""
-        target, background = self._target(k)
-        done = condition(rows, window, t, self._spec)
-        leaves = done.mean, done.factor, done.opacity, done.color, background
-        return ((cpu.forward(*leaves, self._spec.size, **self._render_options()).image - target) ** 2).sum(0)
 
     # ------------------------------------------------------------------------------------------ sharing
 
@@ -187,10 +177,7 @@ class Pruner:
         return mean_psnr(state, self._config, self._frames) if alpha else scores.psnr
 
     def _target(self, k: int) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
-        """Frame k and the background: with alpha, a random color that is always the same for the frame."""
-        alpha = self._frames.shape[3] == 4
-        background = random_background(self._config.seed, k) if alpha else np.zeros(3, np.float32)
-        return to_planes(self._frames[k], background), background
+        return make_target(self._frames, k, self._config)
 
     def _render_options(self) -> dict:
         return {"compositing": self._config.compositing, "options": self._config.options}

@@ -13,6 +13,7 @@ from foldgauss.video.fitting.densify import grow
 from foldgauss.video.fitting.optical_flow import Motion, motion_finder
 from foldgauss.video.fitting.pruning.description_length import weigh_frames
 from foldgauss.video.fitting.pruning.pruner import Pruner
+from foldgauss.video.fitting.pruning.relocation import relocate
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
     choose_start_frames,
@@ -44,7 +45,7 @@ class CpuStepper:
     ):
         """`find_motion` gives the optical flow of the frames, which is needed by a part of the settings only."""
         self.frames, self.config = frames, config
-        find_motion = motion_finder(frames) if find_motion is None else find_motion
+        self.find_motion = find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
         self.num_frames, height, width, _ = frames.shape
         self.levels, self.rates = plan_levels(config, (height, width)), RateSchedule(config)
@@ -73,7 +74,7 @@ class CpuStepper:
         losses, alive, errors = [], [], []
         squared = progress >= 1 - config.l2_fraction
         seen = None if state.statistics is None else []
-        for view in choose_views(config, num_frames, state.step):
+        for view in choose_views(config, num_frames, state.step, state.frame_errors):
             k, mirrored = int(view) % num_frames, int(view) >= num_frames
             fraction = None if self.interpolation is None else self.interpolation.choose(state.step, k)
             t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
@@ -111,6 +112,11 @@ class CpuStepper:
     def grow(self, state: FitState) -> None:
         if grow(state, self.config, self.shapes[-1].size):
             self.adopt(state)
+
+    def relocate(self, state: FitState) -> None:
+        motion = self.find_motion() if self.config.follow_motion else None
+        relocate(state, self.frames, self.config, self.shapes[-1], motion)
+        self.adopt(state)
 
     def prune(self, state: FitState) -> None:
         if self.pruner.prune(state):

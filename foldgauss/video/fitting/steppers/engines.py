@@ -39,7 +39,7 @@ def make_stepper(
     """The stepper of an engine; it takes over the arrays of `state`."""
     if engine == "cpu":
         return CpuStepper(frames, config, state, find_motion)
-    return JaxStepper(frames, config, state, engine)
+    return JaxStepper(frames, config, state, engine, find_motion)
 
 
 def describe_device() -> str:

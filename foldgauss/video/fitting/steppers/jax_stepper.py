@@ -4,6 +4,7 @@ After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays 
 state, and for densification, which runs on the host.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,6 +12,8 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.densify import grow
+from foldgauss.video.fitting.optical_flow import Motion, motion_finder
+from foldgauss.video.fitting.pruning.relocation import relocate
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
     choose_start_frames,
@@ -29,6 +32,7 @@ from foldgauss.video.fitting.steppers.jax_step import (
     replicated,
 )
 from foldgauss.video.fitting.steppers.protocol import StepResult
+from foldgauss.video.models.conditioning import ConditioningSpec
 
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
 #: that is not enough it doubles, and steps are compiled anew.
@@ -72,8 +76,16 @@ class JaxStepper:
     device at the sizes of all levels, as bytes.
     """
 
-    def __init__(self, frames: np.ndarray, config: FitConfig, state: FitState, engine: str):
+    def __init__(
+        self,
+        frames: np.ndarray,
+        config: FitConfig,
+        state: FitState,
+        engine: str,
+        find_motion: Callable[[], Motion] | None = None,
+    ):
         self.frames, self.config, self.engine = frames, config, engine
+        self.find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
         self.levels, self.rates = plan_levels(config, self.size), RateSchedule(config)
@@ -116,7 +128,7 @@ class JaxStepper:
         held, config = state.held, self.config
         rates, time_rate = self.rates.at(progress, state.backoffs)
         control = Control(
-            views=choose_views(config, self.num_frames, state.step).astype(np.int32),
+            views=choose_views(config, self.num_frames, state.step, state.frame_errors).astype(np.int32),
             num=np.int32(held.num),
             squared=np.bool_(progress >= 1 - config.l2_fraction),
             rates=rates,
@@ -136,6 +148,14 @@ class JaxStepper:
             self.adopt(state)
         elif state.step + 1 >= growth.until_step:
             state.held.growing = False
+
+    def relocate(self, state: FitState) -> None:
+        """On the host."""
+        config, (height, width) = self.config, self.size
+        spec = ConditioningSpec(config.degree, config.power, config.floor, (height, width))
+        state.land()
+        relocate(state, self.frames, config, spec, self.find_motion() if config.follow_motion else None)
+        self.adopt(state)
 
     def prune(self, state: FitState) -> None:
         """Nothing: fits with an economy run on the CPU, see `engines.choose_engine`."""

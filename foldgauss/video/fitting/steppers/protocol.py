@@ -27,6 +27,9 @@ class Stepper(Protocol):
     def grow(self, state: FitState) -> None:
         """Densification, pruning and resets of `Growth` that are due at the state's step."""
 
+    def relocate(self, state: FitState) -> None:
+        """Move the Gaussians that matter least to the largest errors."""
+
     def prune(self, state: FitState) -> None:
         """The round of pruning of `Economy` that is due at the state's step, if any."""
 
