@@ -11,8 +11,8 @@ it. With --jobs the clips of a trial are fitted in J processes; caches and memor
 figures of equal J only.
 
 Searched are factors on each default of `LearningRates` (0.25 to 4, on a logarithmic scale), and `final_rate`,
-`ssim_fraction`, `l2_fraction` and `degree`; `SPACE` has the ranges. `--only` names those that are searched, the others
-keep their defaults.
+`ssim_fraction`, `l2_fraction`, `cooldown_fraction`, `error_fraction`, `relocated_fraction` and `degree`; `SPACE` has
+the ranges. `--only` names those that are searched, the others keep their defaults.
 
 With --study trials are kept in FILE, a SQLite database: the same command continues to --trials in all. A trial that was
 interrupted is marked as failed and repeated. A trial one of whose fits diverges is marked as pruned. Proposals depend
@@ -59,6 +59,9 @@ SPACE: dict[str, BaseDistribution] = {
     "final_rate": FloatDistribution(0.01, 0.5, log=True),
     "ssim_fraction": FloatDistribution(0.0, 0.5),
     "l2_fraction": FloatDistribution(0.0, 0.8),
+    "cooldown_fraction": FloatDistribution(0.0, 0.6),
+    "error_fraction": FloatDistribution(0.0, 0.6),
+    "relocated_fraction": FloatDistribution(0.0, 0.15),
     "degree": IntDistribution(1, 3),
 }
 TRIALS, NAME = 50, "foldgauss"

@@ -145,7 +145,7 @@ def test_good_fits_raise_no_warning(name, num):
 def test_guard_changes_no_bit(monkeypatch):
     watched = fit(CLIP, CONFIG).model
     monkeypatch.setattr(Guard, "find_fault", lambda self, state, result: "")
-    monkeypatch.setattr(Guard, "keep_good", lambda self, state, **given: None)
+    monkeypatch.setattr(Guard, "keep_good", lambda self, state: None)
     monkeypatch.setattr(CpuStepper, "measure_start", lambda self, state: {})
     alone = fit(CLIP, CONFIG).model
     for one, other in zip(jax.tree.leaves(watched), jax.tree.leaves(alone), strict=True):

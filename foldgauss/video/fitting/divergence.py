@@ -95,15 +95,24 @@ class Guard:
         state.best_error = min(error, state.best_error or error)
         return ""
 
-    def keep_good(self, state: FitState, *, now: bool = False) -> None:
-        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless moments overflow or frames look bad.
+    def is_converging(self, state: FitState) -> bool:
+        """Whether the fit has not diverged so far and its frames are better than at the start, as far as is known."""
+        if not self.comparable:
+            return True
+        return state.backoffs == 0 and self._error_ratio(state) <= MUCH_WORSE and self._start_ratio(state) < 1
 
-        `now`: at this step, since Gaussians are not comparable with those of earlier copies.
-        """
-        due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP) or now
+    def replace_good(self, state: FitState) -> None:
+        """Keep a copy of a state whose Gaussians are not comparable with those before, nor its errors."""
+        self.restart(state)
+        state.last_finite = state.copy()
+
+    def keep_good(self, state: FitState) -> None:
+        """Keep a copy of the state, every `KEEP_EVERY` steps or more, unless moments overflow or frames look bad."""
+        due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP)
         if state.backoffs and state.step < state.compare_from:
             return  # not all frames have been seen since the back-off
-        bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > NOT_BETTER)
+        most = 1 if state.backoffs else NOT_BETTER  # what a fit that has diverged returns to is no worse than the start
+        bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > most)
         if due and not bad and state.is_finite("rows") and state.is_finite("second"):
             state.last_finite = state.copy()
 
@@ -112,7 +121,7 @@ class Guard:
         if not self.comparable or state.backoffs < MAX_BACKOFFS:
             return
         worse = self._error_ratio(state)
-        if worse > MUCH_WORSE or self._start_ratio(state) > NOT_BETTER:
+        if worse > MUCH_WORSE or self._start_ratio(state) > 1:
             moved, kept = self._most_moved(state), state.last_finite
             state.restore()
             state.error = kept.error or float(np.mean([error for _, error in state.start_errors] or [0.0]))

@@ -152,9 +152,9 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
-            if is_relocation_due(state, config):
+            if is_relocation_due(state, config) and guard.is_converging(state):
                 stepper.relocate(state)
-                guard.keep_good(state, now=True)
+                guard.replace_good(state)
         if state.growing and state.plan:
             stepper.grow(state)
         if config.economy is not None and state.plan:

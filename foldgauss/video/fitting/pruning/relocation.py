@@ -5,6 +5,7 @@ The number of Gaussians, and so the size of the model, stays the same. Source: r
 """
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Float32
 
 from foldgauss.video.fitting.adam import BETA2
@@ -16,7 +17,7 @@ from foldgauss.video.fitting.pruning.births import make_newborns, make_target, m
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque
+from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque, is_static
 
 #: The fractions of the plan after which Gaussians are relocated.
 RELOCATED_AT = (0.2, 0.35, 0.5)
@@ -37,8 +38,8 @@ def relocate(
 ) -> None:
     """Move the fraction `config.relocated_fraction` of the Gaussians, in place; their moments start at zero.
 
-    Frames and pixels of the new ones are drawn by squared error. In depth they lie among those of their time. `spec` is
-    that of whole frames.
+    Frames and pixels of the new ones are drawn by squared error. In depth they lie among those of their time. Some are
+    static where some Gaussians are already. `spec` is that of whole frames.
     """
     num, times = round(config.relocated_fraction * state.num_gaussians), np.asarray(frame_times(state.time_logits))
     window = np.empty((len(state.rows), 2), np.float32)
@@ -61,7 +62,7 @@ def relocate(
         envelope=envelope_of(config),
         motion=motion,
         opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
-        with_static=False,
+        with_static=bool(is_static(state.kinds).any()),
         seed=(config.seed, 3, state.step),
     )
     stay = np.ones(len(rows), bool)
@@ -84,7 +85,7 @@ def measure_influence(
     `PruningScores.second_order` does, for no work at all.
     """
     at = columns(degree)["opacity_logit"].start
-    opacity = 1 / (1 + np.exp(-state.rows[:, at].astype(float)))
+    opacity = scipy.special.expit(state.rows[:, at].astype(float))
     square = state.second[:, at] / np.maximum(1 - BETA2 ** state.counts.astype(float), np.finfo(float).tiny)
     life = np.searchsorted(times, window[:, 1]) - np.searchsorted(times, window[:, 0])
     influence = life * square / np.maximum(1 - opacity, 1e-6) ** 2  # dL/do = dL/dlogit / (o (1 - o))
