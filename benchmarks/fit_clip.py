@@ -9,7 +9,7 @@ and get `default_num_gaussians` by it; other presets have their own numbers. `--
 `FitConfig`, to switch an idea off: `--set follow_motion=False`. `benchmarks.fit_bunny` and `benchmarks.fit_clips` are
 this with other defaults.
 
-The way there is the running PSNR of the fit itself (about one pass through the frames, before rounding to 8 bits);
+The way there is the running PSNR of the fit itself (of the frames as last seen, before rounding to 8 bits);
 `--plot` draws it. The end is `foldgauss.video.evaluate`: scikit-image's PSNR and SSIM of 8-bit pictures, mean
 over all frames. `minutes` is the wall time of the whole fit, motion, starts and compilation included, reading and
 evaluation not.

@@ -270,7 +270,7 @@ def _checkpoint_seeds() -> list[bytes]:
         state = FitState.create(
             floats(num, width), np.zeros(num, np.uint8), floats(2), counts=counts, first=floats(num, width),
             second=floats(num, width), colors=shared, frame_errors=floats(3), statistics=statistics,
-            step=5, plan=100, seconds=1.5, error=0.01, last_finite=state, start_errors=((0, 0.1),),
+            step=5, plan=100, seconds=1.5, last_finite=state, start_errors=((0, 0.1),),
         )  # fmt: skip
         kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))
     return kept

@@ -410,7 +410,7 @@ STEPS = 3
 def stepped(state: FitState) -> FitState:
     step = JaxStepper(FRAMES, GROWING, state, "xla")
     for _ in range(STEPS):
-        state.error = step.step(state, 0.1).loss
+        state.best_error = step.step(state, 0.1).loss
         state.step += 1
     return state
 
@@ -430,7 +430,7 @@ def test_four_devices_match_one(tmp_path):
     )
     one, four = stepped(state), load_checkpoint(done, config=GROWING, source={})
     assert one.held.arrays.rows.sharding.num_devices == 1
-    assert four.error == pytest.approx(one.error, rel=1e-6)
+    assert four.best_error == pytest.approx(one.best_error, rel=1e-6)
     for name in ("rows", "first", "second", "frame_errors", "time_logits"):
         close(getattr(four, name), getattr(one, name), share=1e-4)
     for own, other in zip(four.statistics, one.statistics, strict=True):

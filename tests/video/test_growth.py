@@ -332,7 +332,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
     state = start(frames, config)
     state.rows[:, PLACE["log_scale"]] = np.log(0.1)
     state.rows[:, PLACE["log_time_scale"]] = 1.0
-    unit, k = 40.0, choose_views(config, len(frames), 0)[0]
+    unit, k = 40.0, choose_views(config, len(frames), 0, np.zeros(len(frames)))[0]
 
     def loss(dx, dy):
         rows = state.rows.copy()

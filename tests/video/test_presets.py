@@ -163,8 +163,9 @@ def test_both_views_give_the_same_gradients():
 
 
 def test_a_pass_sees_every_frame_from_both_sides():
-    config = FitConfig(num_gaussians=20, two_cameras=True, batch_size=2)
-    passes = [np.concatenate([choose_views(config, 4, 4 * k + i) for i in range(4)]) for k in range(2)]
+    config = FitConfig(num_gaussians=20, two_cameras=True, batch_size=2, error_fraction=0)
+    errors = np.ones(4)
+    passes = [np.concatenate([choose_views(config, 4, 4 * k + i, errors) for i in range(4)]) for k in range(2)]
     assert sorted(passes[0]) == sorted(passes[1]) == list(range(8))
     assert passes[0].tolist() != passes[1].tolist()
 
@@ -195,7 +196,7 @@ def test_dense_updates_move_all_gaussians():
 @pytest.mark.parametrize("decayed", ["all", "loc"])
 def test_decayed_selects_the_rates(decayed):
     """Where the last step's rate is 0, only what does not fall still moves."""
-    config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, decayed=decayed)
+    config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, decayed=decayed, error_fraction=0)
     state = start(FRAMES, config)
     stepper, before = CpuStepper(FRAMES, config, state), state.rows.copy()
     times = state.time_logits.copy()

@@ -152,19 +152,21 @@ def test_resuming_at_a_coarse_level_keeps_the_bits(small, tmp_path):
 
 def test_target_psnr_is_evaluated_at_full_size(small):
     frames = moving_blobs()
-    config = dataclasses.replace(HALF, steps=400, target_psnr=5.0)
+    config = dataclasses.replace(HALF, steps=400, target_psnr=5.0, error_fraction=0)
     assert [level.size for level in plan_levels(config, (48, 64))] == [(48, 64)]
     *_, (_, last) = fit_steps(frames, config)
     assert (last.stopped_by, last.step) == ("target_psnr", 4 * len(frames))
 
 
 def test_running_psnr_is_that_of_the_frames_as_last_seen(small):
-    """After a pass at a new level it has forgotten the others."""
-    frames, seen = moving_blobs(), []
-    for state, info in fit_steps(frames, HALF):
-        seen.append(info.psnr)
-        assert info.psnr == pytest.approx(-10 * np.log10(state.frame_errors[state.frame_errors > 0].mean()), abs=1e-4)
-    assert abs(seen[-1] - evaluate(to_model(state, HALF, frames.shape[1:3], 25.0), frames).mean_psnr) < 0.5
+    """After a pass at full size nothing of the errors at half the size is left."""
+    frames, errors = moving_blobs(), {}
+    for state, info in fit_steps(frames, dataclasses.replace(HALF, relocated_fraction=0, error_fraction=0)):
+        errors[info.step] = state.frame_errors.copy()
+        seen = state.frame_errors[state.frame_errors > 0]
+        assert info.psnr == pytest.approx(-10 * np.log10(seen.mean()), rel=1e-6)
+    assert (errors[35] == errors[30]).sum() == 1
+    assert (errors[36] != errors[30]).all()
 
 
 def test_work_is_proportional_to_area():

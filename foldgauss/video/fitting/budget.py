@@ -143,7 +143,7 @@ def find_limit(state: FitState, config: FitConfig, frames: np.ndarray) -> str | 
 def _reaches_target(state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
     """Whether the mean PSNR over all frames is `target_psnr`, evaluated once in `PASSES_PER_EVALUATION` passes.
 
-    The running PSNR does not tell: it lags, averages errors over unlike frames, and with alpha random backgrounds.
+    The running PSNR does not tell: it lags, is that of the mean error, and with alpha over random backgrounds.
     """
     steps = steps_per_pass(config, len(frames))
     due = state.step > 0 and state.step % (PASSES_PER_EVALUATION * steps) == 0

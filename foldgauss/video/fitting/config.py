@@ -270,7 +270,7 @@ class FitConfig:
         default=0.3,
         metadata=setting(
             "Fraction of the views that are drawn in proportion to the frames' squared errors",
-            "The others visit all frames in turn. Improves the worst frames.",
+            "In between, all frames are visited in turn. Improves the worst frames.",
             bounds="[0, 1)",
             option="--error-fraction",
             group=OPTIMIZATION,
@@ -280,7 +280,7 @@ class FitConfig:
         default=0.05,
         metadata=setting(
             "Fraction of the Gaussians that is moved, three times, from where they matter least to the largest errors",
-            "Without densification and economy, which have births of their own.",
+            "Ignored with `growth` or `economy`, which add Gaussians themselves, and without `sparse_updates`.",
             bounds="[0, 0.5]",
             option="--relocated-fraction",
             group=OPTIMIZATION,

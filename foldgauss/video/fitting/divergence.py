@@ -70,6 +70,7 @@ class Guard:
 
     def restart(self, state: FitState) -> None:
         """From this step on, errors are not comparable with those before."""
+        state.best_error = 0.0
         state.compare_from = state.step + max(PASSES * self.steps_per_pass, MIN_STEPS)
         state.improve_by = state.step + START_PASSES * self.steps_per_pass
 
@@ -97,9 +98,9 @@ class Guard:
 
     def is_converging(self, state: FitState) -> bool:
         """Whether the fit has not diverged so far and its frames are better than at the start, as far as is known."""
-        if not self.comparable:
-            return True
-        return state.backoffs == 0 and self._error_ratio(state) <= MUCH_WORSE and self._start_ratio(state) < 1
+        if state.backoffs or not (state.is_finite("rows") and state.is_finite("second")):
+            return False
+        return not self.comparable or (self._error_ratio(state) <= MUCH_WORSE and self._start_ratio(state) < 1)
 
     def replace_good(self, state: FitState) -> None:
         """Keep a copy of a state whose Gaussians are not comparable with those before, nor its errors."""
@@ -111,7 +112,7 @@ class Guard:
         due = state.step - state.last_finite.step >= max(KEEP_EVERY, state.num_gaussians // COPIED_PER_STEP)
         if state.backoffs and state.step < state.compare_from:
             return  # not all frames have been seen since the back-off
-        most = 1 if state.backoffs else NOT_BETTER  # what a fit that has diverged returns to is no worse than the start
+        most = 1 if state.backoffs else NOT_BETTER  # after a back-off, keep only states better than the start
         bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > most)
         if due and not bad and state.is_finite("rows") and state.is_finite("second"):
             state.last_finite = state.copy()
@@ -120,11 +121,10 @@ class Guard:
         """At the end of a fit with no back-off left: if its frames are worse than they were, restore the last state."""
         if not self.comparable or state.backoffs < MAX_BACKOFFS:
             return
-        worse = self._error_ratio(state)
-        if worse > MUCH_WORSE or self._start_ratio(state) > 1:
-            moved, kept = self._most_moved(state), state.last_finite
+        worse, kept = self._error_ratio(state), state.last_finite
+        if worse > MUCH_WORSE or self._start_ratio(state) > max(self._start_ratio(kept), 1):
+            moved = self._most_moved(state)
             state.restore()
-            state.error = kept.error or float(np.mean([error for _, error in state.start_errors] or [0.0]))
             warnings.warn(
                 f"the fit ended at step {state.step} with frames {10 * math.log10(worse):.0f} dB worse than they were; "
                 f"{moved} moved most. The result is that of step {kept.step}: lower these learning rates.",
@@ -132,25 +132,24 @@ class Guard:
                 stacklevel=3,
             )
 
-    def back_off(self, state: FitState, fault: str, error_before: float) -> None:
+    def back_off(self, state: FitState, fault: str) -> None:
         """Restore the arrays of the last finite state and lower the learning rates. The count of steps goes on.
 
         Raises FitDiverged if the fit is to stop, or has backed off `MAX_BACKOFFS` times. Its state is then that before
-        the step, whose running error was `error_before`, but for the arrays.
+        the step, but for the arrays.
         """
         step, kept = state.step, state.last_finite
         state.restore()
         message = f"the fit diverged at step {step}: {fault}."
         exhausted = state.backoffs >= MAX_BACKOFFS
         if self.config.on_divergence == "stop" or exhausted:
-            state.step, state.error = step - 1, error_before
+            state.step = step - 1
             cure = "Lower the learning rates, or give on_divergence='back-off', which finds them."
             if exhausted:
                 lowest = f"{BACKOFF_FACTOR**-MAX_BACKOFFS:.1g} of those given"
                 cure = f"It did so even with learning rates {lowest}: lower these, or check the frames."
             raise FitDiverged(f"{message} The state is that of step {kept.step}. {cure}", state)
         state.backoffs += 1
-        state.error = kept.error
         self.restart(state)
         rates = f"1/{BACKOFF_FACTOR**state.backoffs:.0f} of those given"
         warnings.warn(

@@ -26,7 +26,7 @@ from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, plan
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.fitting.optical_flow import Motion, motion_finder
-from foldgauss.video.fitting.pruning.relocation import is_relocation_due
+from foldgauss.video.fitting.pruning.relocation import is_relocation_due, relocates
 from foldgauss.video.fitting.state import FitState, envelope_of, mean_psnr, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -43,7 +43,7 @@ class FitInfo(NamedTuple):
     step: int  #: steps done
     progress: float  #: fraction of the plan that is done, in [0, 1]
     loss: float  #: of this step's batch
-    psnr: float  #: dB, of the mean squared error of all frames, each at the step and the resolution it was last seen
+    psnr: float  #: dB, of the mean squared error of the frames seen so far, each as it was when last seen
     num_gaussians: int
     num_alive: int  #: Gaussians that took part in this step
     seconds: float  #: spent fitting so far
@@ -135,20 +135,18 @@ def fit_steps(
         state.seconds += clock() - begun
     stopped_by = find_limit(state, config, frames)
     if stopped_by:  # a resumed state that needs no more steps
-        yield state, _make_info(state, config, time_left, StepResult(math.nan, math.nan, 0), stopped_by)
+        yield state, _make_info(state, config, time_left, StepResult(math.nan, 0), stopped_by)
     while not stopped_by:
         begun = clock()
         level = next_level(state, config, levels)
         result = stepper.step(state, measure_progress(state, config), level)
-        new_level, error_before = starts_level(state, config, levels, level), state.error
-        _update_error(state, result)
+        new_level = starts_level(state, config, levels, level)
         state.step += 1
         if new_level or not state.plan:  # without a plan yet, levels take turns
             guard.restart(state)
-            state.best_error = 0.0
         fault = guard.find_fault(state, result)
         if fault:
-            guard.back_off(state, fault, error_before)
+            guard.back_off(state, fault)
             stepper.adopt(state)
         else:
             guard.keep_good(state)
@@ -171,14 +169,6 @@ def fit_steps(
         yield state, _make_info(state, config, time_left, result, stopped_by)
 
 
-def _update_error(state: FitState, result: StepResult) -> None:
-    """The mean squared error of all frames, each as it was when last seen."""
-    if math.isnan(result.squared_error) and math.isfinite(result.loss):
-        return  # an interpolated image
-    errors = state.frame_errors
-    state.error = float(errors[errors != 0].mean()) if errors.any() else 0.0
-
-
 def _make_info(
     state: FitState, config: FitConfig, time_left: TimeLeft, result: StepResult, stopped_by: str | None
 ) -> FitInfo:
@@ -199,7 +189,7 @@ def _make_info(
 def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile or load the kernels, on a corner of the clip, before any clock runs: the first time takes 20 s."""
     evaluates = config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None)
-    if engine != "cpu" and not evaluates:
+    if engine != "cpu" and not evaluates and not relocates(config):
         return
     tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
     tiny = dataclasses.replace(tiny, interpolation_fraction=0.0)

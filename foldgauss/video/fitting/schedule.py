@@ -15,8 +15,8 @@ NUM_START_FRAMES = 16
 MIN_SIDE = 120
 #: Learning rates are divided by this whenever a diverged fit backs off.
 BACKOFF_FACTOR = 4.0
-#: The fraction of the learning rates that is left when they have cooled down.
-COLD = 0.02
+#: The factor on the learning rates when they have cooled down; and in overtime, when a fit must still learn.
+COLD, OVERTIME_FACTOR = 0.02, 0.25
 
 
 # ------------------------------------------------------------------------------------------------------ views
@@ -28,25 +28,33 @@ def num_views(config: FitConfig, num_frames: int) -> int:
 
 
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
-    return -(-num_views(config, num_frames) // config.batch_size)
+    """Steps in which every view is seen at least once."""
+    return math.ceil(num_views(config, num_frames) / (config.batch_size * (1 - config.error_fraction)))
 
 
-def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray | None = None) -> np.ndarray:
-    """The views of a step: every pass visits all once, in an order that depends on the seed and the pass only.
+def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray) -> np.ndarray:
+    """The views of a step: in turn, and in between by the `errors` of the frames, (num_frames,), 0 where unknown.
 
-    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. After the first pass, a fraction
-    `config.error_fraction` of the views is replaced by others, drawn in proportion to the `errors` of the frames,
-    (num_frames,), where these are given.
+    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. A fraction `config.error_fraction`
+    of the views, evenly among the others, is drawn in proportion to the errors; frames without one count as average.
+    The others pass through all views, in an order that depends on the seed and the pass only.
     """
-    first, num = step * config.batch_size, num_views(config, num_frames)
-    positions = np.arange(first, first + config.batch_size)
-    views = np.array([_shuffle(config, num, p // num)[p % num] for p in positions])
-    if config.error_fraction == 0 or errors is None or first < num or not 0 < errors.sum() < np.inf:
-        return views
-    rng = np.random.default_rng([config.seed, 7, step])
-    chance = np.tile(errors, num // num_frames).astype(float)
-    by_error = rng.choice(num, len(views), p=chance / chance.sum())
-    return np.where(rng.random(len(views)) < config.error_fraction, by_error, views)
+    num, in_turn = num_views(config, num_frames), 1 - config.error_fraction
+    positions = np.arange(step * config.batch_size, (step + 1) * config.batch_size)
+    taken = np.floor(positions * in_turn).astype(int)
+    views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
+    drawn = np.floor((positions + 1) * in_turn).astype(int) == taken
+    if drawn.any():
+        rng = np.random.default_rng([config.seed, 7, step])
+        views[drawn] = rng.choice(num, drawn.sum(), p=_chances(errors, num))
+    return views
+
+
+def _chances(errors: np.ndarray, num: int) -> np.ndarray:
+    """Probabilities of the views, (num,), in proportion to the errors of their frames."""
+    known = (errors > 0) & np.isfinite(errors)
+    chances = np.where(known, errors, errors[known].mean() if known.any() else 1.0).astype(float)
+    return np.tile(chances / chances.sum(), num // len(errors)) * len(errors) / num
 
 
 def _shuffle(config: FitConfig, num: int, epoch: int) -> np.ndarray:
@@ -76,9 +84,9 @@ class RateSchedule:
         """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
         config = self.config
         decay = config.final_rate**progress if config.final_rate > 0 else max(1 - progress, 0.0)
-        left = max(1 - progress, 0.0)
-        if left < config.cooldown_fraction:
-            decay *= COLD + (1 - COLD) * left / config.cooldown_fraction
+        if max(1 - progress, 0.0) < config.cooldown_fraction:
+            left = (1 - progress) / config.cooldown_fraction
+            decay *= COLD + (1 - COLD) * left if left >= 0 else OVERTIME_FACTOR
         slower = BACKOFF_FACTOR**-backoffs
         rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
         times = config.rates.frame_times * (decay if config.decayed == "all" else 1.0) * slower

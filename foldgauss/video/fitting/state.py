@@ -198,7 +198,6 @@ class FitState:
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
     planned_progress: float = field(default=0.0, metadata=_NUMBER)  # fit that was over there
     seconds: float = field(default=0.0, metadata=_NUMBER)
-    error: float = field(default=0.0, metadata=_NUMBER)  # mean squared error of the frames as last seen
     # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
     best_error: float = field(default=0.0, metadata=_NUMBER)  # the lowest one that others are compared with; 0: none
     backoffs: int = field(default=0, metadata=_COUNT)  # how often the fit returned to `last_finite`, with lower rates
@@ -346,7 +345,9 @@ def update_rows(
 
 def running_psnr(state: FitState) -> float:
     """dB, by the mean squared error of the frames as last seen; at most 100, as `psnr` has for equal images."""
-    return -10 * math.log10(max(state.error, 1e-10))
+    seen = state.frame_errors[state.frame_errors != 0]
+    errors = seen if len(seen) else [error for _, error in state.start_errors] or [0.0]
+    return -10 * math.log10(max(float(np.mean(errors)), 1e-10))
 
 
 def mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:

@@ -6,7 +6,7 @@ The number of Gaussians, and so the size of the model, stays the same. Source: r
 
 import numpy as np
 import scipy
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
@@ -14,6 +14,7 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY
 from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares
+from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
@@ -25,39 +26,49 @@ RELOCATED_AT = (0.2, 0.35, 0.5)
 _MIN_COUNT = 5
 
 
+def relocates(config: FitConfig) -> bool:
+    """Whether a fit relocates Gaussians: densification and economy add Gaussians themselves.
+
+    Where Adam updates all Gaussians in every step, its moments do not tell which ones matter.
+    """
+    adds = config.growth is not None or config.economy is not None
+    return config.relocated_fraction > 0 and not adds and config.sparse_updates
+
+
 def is_relocation_due(state: FitState, config: FitConfig) -> bool:
-    """Whether Gaussians are to be relocated after the state's step."""
-    if config.relocated_fraction == 0 or config.growth is not None or config.economy is not None or not state.plan:
+    """Whether Gaussians are to be relocated after the state's step: at `RELOCATED_AT`, after a pass at least."""
+    if not relocates(config) or not state.plan:
         return False
+    num_frames = len(state.frame_errors)
     before, after = (measure_progress(state, config, step) for step in (state.step - 1, state.step))
-    return any(before < fraction <= after for fraction in RELOCATED_AT) and bool((state.frame_errors > 0).all())
+    crossed = any(before < fraction <= after for fraction in RELOCATED_AT)
+    return crossed and state.step >= steps_per_pass(config, num_frames) and bool(state.frame_errors.any())
 
 
 def relocate(
     state: FitState, frames: np.ndarray, config: FitConfig, spec: ConditioningSpec, motion: Motion | None
 ) -> None:
-    """Move the fraction `config.relocated_fraction` of the Gaussians, in place; their moments start at zero.
+    """Move the fraction `config.relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
 
-    Frames and pixels of the new ones are drawn by squared error. In depth they lie among those of their time. Some are
-    static where some Gaussians are already. `spec` is that of whole frames.
+    Frames and pixels of the new ones are drawn by squared error, and they have the degree of the fit. If the model has
+    static Gaussians, new ones at constant pixels are static too. `spec` is that of whole frames.
     """
-    num, times = round(config.relocated_fraction * state.num_gaussians), np.asarray(frame_times(state.time_logits))
+    times = np.asarray(frame_times(state.time_logits))
     window = np.empty((len(state.rows), 2), np.float32)
     update_windows(state.rows, np.arange(len(state.rows)), window)
     influence = measure_influence(state, window, times, config.degree)
-    out = np.argsort(influence, kind="stable")[:num]
-    out = out[np.isfinite(influence[out])]
-    if not len(out):
+    num = round(config.relocated_fraction * np.isfinite(influence).sum())
+    if num == 0:
         return
-    rows = state.rows
-    alive = [((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times]
+    rows, stay = state.rows, np.ones(len(state.rows), bool)
+    stay[np.argsort(influence, kind="stable")[:num]] = False
     new = make_newborns(
-        len(out),
+        num,
         np.ascontiguousarray(frames[..., :3]),
         times,
         state.frame_errors.astype(float),
         lambda k: measure_squares(rows, window, times[k], *make_target(frames, k, config), spec, config),
-        float(np.mean(alive)),
+        float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times])),
         degree=config.degree,
         envelope=envelope_of(config),
         motion=motion,
@@ -65,29 +76,40 @@ def relocate(
         with_static=bool(is_static(state.kinds).any()),
         seed=(config.seed, 3, state.step),
     )
-    stay = np.ones(len(rows), bool)
-    stay[out] = False
-    at = columns(config.degree)["time_loc_logit"].start
-    place = np.searchsorted(np.sort(rows[stay, at]), new[:, at])  # Gaussians are in order of time
-    order = np.argsort(np.concatenate([np.arange(stay.sum()) + 0.5, place]), kind="stable")
+    kinds = find_initial_kinds(new, config.degree)
     state.keep(np.flatnonzero(stay))
-    state.extend(new, find_initial_kinds(new, config.degree))
+    place = _find_places(state, new, kinds, config)
+    order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
+    state.extend(new, kinds)
     state.keep(order)
+
+
+def _find_places(state: FitState, new: np.ndarray, kinds: np.ndarray, config: FitConfig) -> Int[np.ndarray, " new"]:
+    """Where new Gaussians lie in depth: among those of their time, which are in its order; static ones among static."""
+    at, num = columns(config.degree)["time_loc_logit"].start, len(state.rows)
+    timed, static = np.flatnonzero(~is_static(state.kinds)), np.flatnonzero(is_static(state.kinds))
+    place = np.append(timed, num)[np.searchsorted(np.sort(state.rows[timed, at]), new[:, at])]
+    if len(static):
+        rng, which = np.random.default_rng([config.seed, 8, state.step]), is_static(kinds)
+        place[which] = rng.choice(static, which.sum())
+    return place
 
 
 def measure_influence(
     state: FitState, window: Float32[np.ndarray, "num 2"], times: Float[np.ndarray, " num_frames"], degree: int
 ) -> Float[np.ndarray, " num"]:
-    """How much the frames depend on each Gaussian, up to a common factor; infinite for those that must stay.
+    """How much the frames depend on each Gaussian, up to a common factor; infinite where that is not known.
 
     Adam's second moment of the opacity is the mean square of dL/do over the frames where the Gaussian is alive. The
     signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, as
-    `PruningScores.second_order` does, for no work at all.
+    `PruningScores.second_order` does, without another pass over the frames. Gaussians with few steps and opaque ones
+    are not judged; those alive in no frame have none.
     """
     at = columns(degree)["opacity_logit"].start
     opacity = scipy.special.expit(state.rows[:, at].astype(float))
     square = state.second[:, at] / np.maximum(1 - BETA2 ** state.counts.astype(float), np.finfo(float).tiny)
     life = np.searchsorted(times, window[:, 1]) - np.searchsorted(times, window[:, 0])
     influence = life * square / np.maximum(1 - opacity, 1e-6) ** 2  # dL/do = dL/dlogit / (o (1 - o))
-    influence[(state.counts < _MIN_COUNT) | is_opaque(state.kinds)] = np.inf
+    influence[(state.counts < _MIN_COUNT) & (life > 0)] = np.inf
+    influence[is_opaque(state.kinds)] = np.inf
     return influence

@@ -1,7 +1,6 @@
 """`CpuStepper`: the steps of a fit by the Numba kernels."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -71,7 +70,7 @@ class CpuStepper:
             self.background = random_background(config.seed, state.step)
         times = np.asarray(frame_times(state.time_logits))
         by_time = np.zeros_like(times)
-        losses, alive, errors = [], [], []
+        losses, alive = [], []
         squared = progress >= 1 - config.l2_fraction
         seen = None if state.statistics is None else []
         for view in choose_views(config, num_frames, state.step, state.frame_errors):
@@ -83,7 +82,6 @@ class CpuStepper:
             )
             if fraction is None:
                 by_time[k] += d_time  # a batch may hold a frame twice
-                errors.append(loss.mean_squared_error)
             losses.append(loss.value)
             alive.append(done.alive)
         if state.statistics is not None:
@@ -98,8 +96,7 @@ class CpuStepper:
         if config.learn_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated
-        squared_error = float(np.mean(errors)) if errors else math.nan
-        return StepResult(float(np.mean(losses)), squared_error, num_alive, finite)
+        return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
         shape, errors = self.shapes[-1], {}

@@ -43,7 +43,6 @@ class Report(NamedTuple):
     """What is fetched after each step."""
 
     loss: Float[Array, ""]
-    error: Float[Array, ""]  # mean squared
     num_alive: Int[Array, ""]
     finite_rows: Bool[Array, ""]
     finite_second: Bool[Array, ""]
@@ -144,7 +143,6 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     report = Report(
         loss=seen.loss,
-        error=seen.error,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
         finite_rows=jnp.all(jnp.isfinite(rows)),
         finite_second=jnp.all(jnp.isfinite(second)),
@@ -158,8 +156,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
 class Gradients(NamedTuple):
     """The loss of a batch, its gradients, and which Gaussians it shows."""
 
-    loss: Float[Array, ""]  # means over the batch
-    error: Float[Array, ""]
+    loss: Float[Array, ""]  # mean over the batch
     by_rows: Float[Array, "capacity width"]
     by_times: Float[Array, " num_frames"]
     errors: Float[Array, " num_frames"]  # -1 of frames that are not in the batch
@@ -179,7 +176,7 @@ def _distribute(program: Program):
         total = functools.partial(jax.lax.psum, axis_name=VIEWS)
         largest = functools.partial(jax.lax.pmax, axis_name=VIEWS)
         return Gradients(
-            *map(total, (own.loss, own.error, own.by_rows, own.by_times)),
+            *map(total, (own.loss, own.by_rows, own.by_times)),
             largest(own.errors),
             largest(own.alive.astype(jnp.int32)) > 0,
             largest(own.screen),
@@ -212,7 +209,6 @@ def _differentiate(program: Program, rows, times, frames, control: Control) -> G
     by_rows, by_t = to_rows(by_splats)
     return Gradients(
         loss,
-        jnp.sum(errors) / program.batch_size,
         by_rows,
         jnp.zeros_like(times).at[k].add(by_t),  # a batch may hold a frame twice
         jnp.full_like(times, -1.0).at[k].set(errors),

@@ -1,7 +1,7 @@
 """`JaxStepper`: the steps of a fit on JAX's default devices, where arrays and frames stay between steps.
 
 After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays are fetched where they are read from the
-state, and for densification, which runs on the host.
+state, and for densification and relocation, which run on the host.
 """
 
 from collections.abc import Callable
@@ -137,7 +137,7 @@ class JaxStepper:
         arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
         report = jax.device_get(report)
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
-        return StepResult(float(report.loss), float(report.error), int(report.num_alive), state.is_finite("rows"))
+        return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
 
     def grow(self, state: FitState) -> None:
         """Densification on the host, where any is due."""

@@ -10,7 +10,6 @@ class StepResult(NamedTuple):
     """What one step reports."""
 
     loss: float  #: mean over the batch
-    squared_error: float  #: mean over the frames of the batch; NaN where it had none
     num_alive: int  #: Gaussians that took part
     finite: bool = True  #: whether the parameters of these are finite after the step
 
