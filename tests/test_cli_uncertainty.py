@@ -90,7 +90,8 @@ def test_arviz_reads_the_draws(done):
 
     data = import_optional("arviz").from_netcdf(str(done / "posterior.nc"))
     t = data.posterior["t"]
-    assert t.sizes["chain"] == 2
+    assert set(t["ensemble"].values) == {0, 1}
+    assert t.sizes["chain"] > 20  # one for each walker
     assert t.sizes["frame"] == NUM_FRAMES
     assert {"w"} < set(data.posterior)
     rows = table_of(done)

@@ -24,6 +24,7 @@ from foldgauss.uncertainty import (
 )
 from foldgauss.uncertainty.posterior.laplace import laplace_approximation
 from foldgauss.uncertainty.posterior.moves import BlockSweep
+from foldgauss.uncertainty.posterior.optional_imports import import_optional
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 
 #: Two of the three are so near that their order constrains them.
@@ -495,12 +496,60 @@ def test_progress_is_reported():
     assert all(0 < done <= total for _, done, total in told)
 
 
-def test_arviz_has_all_draws():
-    found = sampled(toy(*NEAR), steps=100, ensembles=2)
-    data = found.to_arviz()
-    ensembles, steps, walkers, frames = found.times.shape
-    assert data.posterior["t"].shape == (ensembles, steps * walkers, frames)
-    assert data.posterior["w"].shape == (ensembles, steps * walkers, frames - 1)
-    assert data.sample_stats["lp"].shape == (ensembles, steps * walkers)
-    np.testing.assert_array_equal(data.posterior["t"].values[1, :walkers], found.times[1, 0])
-    assert data.attrs["message"] == found.message
+@pytest.fixture(scope="module")
+def small():
+    return sampled(toy(*NEAR), steps=100, ensembles=2)
+
+
+def test_arviz_has_all_draws(small):
+    """A chain per walker, whose draws are the steps; the ensemble of each is a coordinate."""
+    data = small.to_arviz()
+    ensembles, steps, walkers, frames = small.times.shape
+    assert data.posterior["t"].shape == (ensembles * walkers, steps, frames)
+    assert data.posterior["w"].shape == (ensembles * walkers, steps, frames - 1)
+    assert data.sample_stats["lp"].shape == (ensembles * walkers, steps)
+    np.testing.assert_array_equal(data.posterior["t"].values[walkers + 3], small.times[1, :, 3])
+    np.testing.assert_array_equal(data.posterior["ensemble"].values, np.repeat([0, 1], walkers))
+    assert data.attrs["message"] == small.message
+
+
+def test_arviz_before_and_after_1_0_have_the_same_groups(small, monkeypatch):
+    before = small.to_arviz()
+    monkeypatch.delattr(import_optional("arviz"), "InferenceData")
+    after = small.to_arviz()
+    assert type(after).__name__ == "DataTree"
+    assert after.attrs == before.attrs
+    for group in ("posterior", "sample_stats"):
+        assert after[group].to_dataset().identical(before[group])
+
+
+#: Autoregressive walkers: their number and that of their steps, and the correlation of neighboring steps.
+AR_WALKERS, AR_STEPS, AR_CORRELATION = 20, 2000, 0.9
+
+
+def autoregressive(num: int, rng: np.random.Generator) -> np.ndarray:
+    """Stationary AR(1) chains of standard deviation 1: (num, AR_STEPS)."""
+    chains = rng.normal(size=(AR_STEPS, num))
+    for k in range(1, AR_STEPS):
+        chains[k] = AR_CORRELATION * chains[k - 1] + np.sqrt(1 - AR_CORRELATION**2) * chains[k]
+    return chains.T
+
+
+def test_arviz_statistics_of_known_chains(small):
+    """ESS within 10% of that of AR(1) chains, n (1 - r) / (1 + r); R-hat 1, and the standard error of the mean.
+
+    With the walkers of an ensemble within one chain, as they once were, the ESS would be more than five times too high.
+    """
+    arviz, rng = import_optional("arviz"), np.random.default_rng(0)
+    times, spread = np.repeat(np.array([0, 0.3, 0.5, 0.7, 1])[None, None, None], AR_STEPS, 1), 0.01
+    times = np.repeat(np.repeat(times, AR_WALKERS, 2), 2, 0)
+    for frame in (1, 2, 3):
+        chains = autoregressive(2 * AR_WALKERS, rng).reshape(2, AR_WALKERS, AR_STEPS)
+        times[..., frame] += spread * np.moveaxis(chains, 1, 2)
+    drawn = dataclasses.replace(small, times=times).to_arviz().posterior["t"].isel(frame=slice(1, 4))
+    truth = 2 * AR_WALKERS * AR_STEPS * (1 - AR_CORRELATION) / (1 + AR_CORRELATION)
+    np.testing.assert_allclose(arviz.ess(drawn)["t"], truth, rtol=0.1)
+    np.testing.assert_allclose(arviz.rhat(drawn)["t"], 1, atol=0.01)
+    np.testing.assert_allclose(arviz.mcse(drawn)["t"], spread / np.sqrt(truth), rtol=0.1)
+    interleaved = {"t": times.reshape(2, AR_STEPS * AR_WALKERS, 5)[..., 1:4]}
+    assert (arviz.ess(arviz.convert_to_dataset(interleaved))["t"].values > 5 * truth).all()

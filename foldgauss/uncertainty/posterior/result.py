@@ -16,6 +16,7 @@ from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 if TYPE_CHECKING:
     import arviz
+    import xarray
 
 #: Frames whose draws are reduced together: only these are copied, not all draws.
 FRAMES_PER_BATCH = 64
@@ -101,20 +102,31 @@ class FrameTimePosterior:
         found[1:-1] = self.std()[1:-1] < fraction * gap * np.sqrt(0.25 / (2 * alpha + 1))
         return found | ~self.log_prob.increments.free
 
-    def to_arviz(self) -> "arviz.InferenceData":
-        """Draws as ArviZ InferenceData: one chain per ensemble, its walkers consecutive within every step.
+    def to_arviz(self) -> "arviz.InferenceData | xarray.DataTree":
+        """Draws for ArviZ: an InferenceData, from ArviZ 1.0 on a DataTree. Each walker is a chain.
 
-        Posterior: `t` (chain, draw, frame) and `w` (chain, draw, interval), centered. Sample statistics: `lp`.
+        Posterior: `t` (chain, draw, frame) and `w` (chain, draw, interval), centered; sample statistics: `lp`; the
+        coordinate `ensemble` (chain) tells which walkers belong together. Consecutive draws of a chain are consecutive
+        steps, as ArviZ's ESS presupposes. Its R-hat takes walkers as independent, `r_hat` takes ensembles.
         """
-        arviz = import_optional("arviz")
+        arviz, xarray = import_optional("arviz"), import_optional("xarray")
         ensembles, steps, walkers, num_frames = self.times.shape
-        flat = self.times.reshape(ensembles, steps * walkers, num_frames)
-        increments = self.log_prob.increments
-        lp = np.stack([self.log_prob(increments.coordinates(each)) for each in flat])
-        return arviz.from_dict(
-            posterior={"t": flat, "w": increments.logits(flat)},
-            sample_stats={"lp": lp},
-            coords={"frame": np.arange(num_frames), "interval": np.arange(num_frames - 1)},
-            dims={"t": ["frame"], "w": ["interval"]},
-            attrs={"converged": int(self.converged), "message": self.message},
-        )
+        times = np.moveaxis(self.times, 2, 1).reshape(ensembles * walkers, steps, num_frames)
+        increments, attrs = self.log_prob.increments, {"converged": int(self.converged), "message": self.message}
+        lp = np.stack([self.log_prob(increments.coordinates(chain)) for chain in times])
+        coords = {
+            "chain": np.arange(ensembles * walkers),
+            "draw": np.arange(steps),
+            "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
+        }
+        places = {"frame": np.arange(num_frames), "interval": np.arange(num_frames - 1)}
+        arrays = {
+            "t": (("chain", "draw", "frame"), times),
+            "w": (("chain", "draw", "interval"), increments.logits(times)),
+        }
+        posterior = xarray.Dataset(arrays, coords | places)
+        statistics = xarray.Dataset({"lp": (("chain", "draw"), lp)}, coords)
+        if hasattr(arviz, "InferenceData"):
+            return arviz.InferenceData(posterior=posterior, sample_stats=statistics, attrs=attrs)
+        groups = {"/": xarray.Dataset(attrs=attrs), "posterior": posterior, "sample_stats": statistics}
+        return xarray.DataTree.from_dict(groups)
