@@ -312,6 +312,11 @@ class FoldedGaussian(eqx.Module):
         return jnp.diagonal(self.moments()[1], axis1=-2, axis2=-1)
 
     @property
+    def stddev(self) -> Float[Array, "*batch d"]:
+        """Standard deviations of the coordinates, as `moments`."""
+        return jnp.sqrt(self.variance)
+
+    @property
     def covariance_matrix(self) -> Float[Array, "*batch d d"]:
         """Cov x of space and time jointly, as `moments`; for space at one time use `condition_time(t)`."""
         return self.moments()[1]

@@ -73,6 +73,37 @@ class Normal(eqx.Module):
     def batch_shape(self) -> tuple[int, ...]:
         return batch_shape_of(ranked_leaves(self))
 
+    @property
+    def mean(self) -> Float[Array, "*batch"]:
+        """`loc`, broadcast to the batch shape."""
+        return jnp.broadcast_to(self.loc, self.batch_shape)
+
+    @property
+    def stddev(self) -> Float[Array, "*batch"]:
+        """`scale`, broadcast to the batch shape."""
+        return jnp.broadcast_to(self.scale, self.batch_shape)
+
+    @property
+    def variance(self) -> Float[Array, "*batch"]:
+        return self.stddev**2
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        """Differential entropy in nats, log(scale) + (1 + log 2 pi) / 2."""
+        return jnp.log(self.stddev) + 0.5 * (1 + _LOG_2PI)
+
+    def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """P(t <= value)."""
+        value, loc, scale = self._aligned(value)
+        return jax.scipy.special.ndtr((value - loc) / scale)
+
+    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+        """The quantile t with P(t <= quantile) = q; NaN for q outside [0, 1]."""
+        q, loc, scale = self._aligned(q)
+        return loc + scale * jax.scipy.special.ndtri(q)
+
+    def _aligned(self, value: ArrayLike) -> list[Array]:
+        return align([(as_value(value, self.loc.dtype), 0), (self.loc, 0), (self.scale, 0)])
+
     def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log N(loc, scale^2)(value)."""
         return _as_gaussian(self).log_prob(as_value(value, self.loc.dtype)[..., None])
@@ -88,6 +119,11 @@ class Normal(eqx.Module):
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples (*sample_shape, *batch), differentiable in the parameters."""
         return _as_gaussian(self).sample(key, sample_shape)[..., 0]
+
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+        """Random samples and their log-densities, both (*sample_shape, *batch)."""
+        value = self.sample(key, sample_shape)
+        return value, self.log_prob(value)
 
 
 class Gaussian(eqx.Module):
@@ -160,7 +196,19 @@ class Gaussian(eqx.Module):
     @property
     def variance(self) -> Float[Array, "*batch dim"]:
         """The diagonal of `covariance_matrix`."""
-        return jnp.diagonal(self.covariance_matrix, axis1=-2, axis2=-1)
+        return self.stddev**2
+
+    @property
+    def stddev(self) -> Float[Array, "*batch dim"]:
+        """Standard deviations of the coordinates, which do not underflow where `variance` does."""
+        by_row = jnp.exp(self.log_scale)[..., None] * jnp.sqrt((self.base_tril**2).sum(-1))
+        return jnp.broadcast_to(by_row, (*self.batch_shape, *self.event_shape))
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        """Differential entropy in nats, log det(Sigma) / 2 + dim (1 + log 2 pi) / 2."""
+        dim, diagonal = self.loc.shape[-1], jnp.diagonal(self.base_tril, axis1=-2, axis2=-1)
+        entropy = jnp.log(diagonal).sum(-1) + dim * self.log_scale + 0.5 * dim * (1 + _LOG_2PI)
+        return jnp.broadcast_to(entropy, self.batch_shape)
 
     def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
         """log N(loc, Sigma)(value)."""
@@ -184,6 +232,11 @@ class Gaussian(eqx.Module):
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         scale = jnp.exp(log_scale)[..., None]
         return loc + join_columns([scale * y for y in multiply_lower(tril, split_columns(noise))])
+
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+        """Random samples (*sample_shape, *batch, dim) and their log-densities (*sample_shape, *batch)."""
+        value = self.sample(key, sample_shape)
+        return value, self.log_prob(value)
 
     def marginal(self, indices) -> "Gaussian":
         """The marginal distribution of the coordinates `indices`, in this order.

@@ -154,6 +154,11 @@ class AbstractMixture(eqx.Module):
         variance = jnp.diagonal(self.covariance_matrix, axis1=-2, axis2=-1)
         return variance if self.event_shape else variance[..., 0]
 
+    @property
+    def stddev(self) -> Float[Array, "*batch d"]:
+        """Standard deviations of the coordinates."""
+        return jnp.sqrt(self.variance)
+
     def _checked(self, x) -> Array:
         x = as_value(x, self.logits.dtype)
         if self.event_shape:

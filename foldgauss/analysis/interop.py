@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.gaussian import Gaussian, Normal
 
 if TYPE_CHECKING:
     import numpyro
@@ -72,11 +71,11 @@ def _numpyro_class() -> type:
 
         @property
         def mean(self):
-            return _mean(self.base)
+            return self.base.mean
 
         @property
         def variance(self):
-            return _variance(self.base)
+            return self.base.variance
 
     return NumpyroDistribution
 
@@ -147,7 +146,7 @@ class FrozenDistribution:
 
     @property
     def mean(self) -> np.ndarray:
-        return _numpy(_mean(self._base))
+        return _numpy(self._base.mean)
 
     @property
     def cov(self) -> np.ndarray:
@@ -182,30 +181,13 @@ def _key(random_state):
     return jax.random.key(int(np.random.default_rng(random_state).integers(2**31)))
 
 
-def _mean(dist):
-    return dist.loc if isinstance(dist, Normal | Gaussian) else dist.mean
-
-
-def _variance(dist):
-    if isinstance(dist, Normal):
-        return dist.scale**2
-    return jnp.diagonal(dist.covariance_matrix, axis1=-2, axis2=-1) if isinstance(dist, Gaussian) else dist.variance
-
-
 def _covariance(dist):
     """The matrix; for a distribution on the line, as in scipy's `norm`, the variance."""
-    if isinstance(dist, Normal):
-        return dist.scale**2
     return dist.covariance_matrix if dist.event_shape else dist.variance
 
 
 def _entropy(dist):
     """In nats."""
-    if isinstance(dist, Normal):
-        return 0.5 * np.log(2 * np.pi * np.e) + jnp.log(dist.scale)
-    if isinstance(dist, Gaussian):
-        dim, diagonal = dist.loc.shape[-1], jnp.diagonal(dist.base_tril, axis1=-2, axis2=-1)
-        return 0.5 * dim * np.log(2 * np.pi * np.e) + jnp.log(diagonal).sum(-1) + dim * dist.log_scale
     if not hasattr(dist, "entropy"):
         cure = "Average -logpdf over rvs."
         raise invalid("entropy", expected="a distribution with an entropy", got=type(dist).__name__, cure=cure)

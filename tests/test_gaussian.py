@@ -1,0 +1,83 @@
+"""Moments, entropy and distribution functions of `Normal` and `Gaussian`, against scipy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from foldgauss import FoldedGaussian
+from foldgauss.gaussian import Gaussian, Normal
+from foldgauss.mixture import FoldedMixture
+
+LOC, SCALE = np.array([-1.0, 0.0, 3.0]), np.array([[0.01], [2.0]])
+VALUES = np.array([-1.02, 0.5, 9.0])
+
+
+@pytest.fixture(autouse=True)
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+def test_normal_is_scipys():
+    ours, scipys = Normal(LOC, SCALE), stats.norm(LOC, SCALE)
+    for name in ("mean", "std", "var", "entropy"):
+        own = getattr(ours, {"std": "stddev", "var": "variance"}.get(name, name))
+        own = own() if callable(own) else own
+        assert own.shape == ours.batch_shape == (2, 3)
+        np.testing.assert_allclose(own, getattr(scipys, name)(), rtol=1e-12)
+    np.testing.assert_allclose(ours.cdf(VALUES), scipys.cdf(VALUES), rtol=1e-10)
+    q = np.array([1e-12, 0.3, 1 - 1e-9])
+    np.testing.assert_allclose(ours.icdf(q), scipys.ppf(q), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(ours.cdf(ours.icdf(q)), np.broadcast_to(q, (2, 3)), rtol=1e-8)
+
+
+def test_normal_at_the_ends():
+    normal = Normal(0.5, 2.0)
+    np.testing.assert_array_equal(normal.cdf(jnp.array([-jnp.inf, jnp.inf])), [0, 1])
+    np.testing.assert_array_equal(normal.icdf(jnp.array([0.0, 1.0])), [-np.inf, np.inf])
+    assert np.isnan(normal.icdf(jnp.array([-0.1, 1.1]))).all()
+    density = jax.vmap(jax.grad(normal.cdf))(jnp.array([-3.0, 0.5]))
+    np.testing.assert_allclose(density, normal.pdf(jnp.array([-3.0, 0.5])), rtol=1e-12)
+
+
+@pytest.mark.parametrize("log_scale", [0.0, -1.5])
+def test_gaussian_is_scipys(log_scale):
+    rng = np.random.default_rng(0)
+    tril = np.tril(rng.normal(size=(4, 3, 3))) + 2 * np.eye(3)
+    ours = Gaussian(rng.normal(size=3), tril, log_scale=log_scale)
+    assert ours.stddev.shape == ours.mean.shape == (4, 3)
+    assert ours.entropy().shape == (4,)
+    for k in range(4):
+        scipys = stats.multivariate_normal(ours.mean[k], np.exp(2 * log_scale) * tril[k] @ tril[k].T)
+        np.testing.assert_allclose(ours.entropy()[k], scipys.entropy(), rtol=1e-12)
+        np.testing.assert_allclose(ours.stddev[k], np.sqrt(np.diag(scipys.cov)), rtol=1e-12)
+        np.testing.assert_allclose(ours.variance[k], np.diag(scipys.cov), rtol=1e-12)
+
+
+def test_standard_deviations_do_not_underflow():
+    narrow = Gaussian(jnp.zeros(2), jnp.eye(2), log_scale=-400.0)
+    assert (narrow.variance == 0).all()
+    np.testing.assert_allclose(jnp.log(narrow.stddev), -400)
+
+
+@pytest.mark.parametrize(
+    "dist",
+    [Normal(LOC, SCALE), Gaussian(np.zeros((5, 2)), np.eye(2))],
+    ids=["normal", "gaussian"],
+)
+def test_samples_come_with_their_log_density(dist):
+    key = jax.random.key(1)
+    value, log_prob = dist.sample_and_log_prob(key, (7,))
+    np.testing.assert_array_equal(value, dist.sample(key, (7,)))
+    np.testing.assert_array_equal(log_prob, dist.log_prob(value))
+    assert value.shape == (7, *dist.batch_shape, *dist.event_shape)
+
+
+def test_standard_deviations_of_the_others():
+    folded = FoldedGaussian([0.1], [[0.3]], time_loc=0.4, time_scale=0.2)
+    components = FoldedGaussian(jnp.zeros((2, 1)), [[0.3]], time_loc=[0.3, 0.7], time_scale=[0.2, 0.1])
+    mixture = FoldedMixture(components, weights=[0.4, 0.6])
+    for dist in (folded, mixture):
+        np.testing.assert_allclose(dist.stddev, np.sqrt(np.diag(dist.covariance_matrix)), rtol=1e-12)
