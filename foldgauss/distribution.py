@@ -121,6 +121,8 @@ class FoldedGaussian(eqx.Module):
     def event_shape(self) -> tuple[int, ...]:
         return (self.loc.shape[-1] + 1,)
 
+    has_rsample = True  #: draws are differentiable in the parameters
+
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return (1, 2, 0, 0, *self.fold.leaf_ranks, *self.envelope.leaf_ranks)

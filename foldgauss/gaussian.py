@@ -62,6 +62,7 @@ class Normal(eqx.Module):
 
     event_shape = ()
     leaf_ranks = (0, 0)
+    has_rsample = True  #: draws are differentiable in the parameters
 
     def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
         dtype = common_dtype(loc, scale)
@@ -147,6 +148,7 @@ class Gaussian(eqx.Module):
     log_scale: Float[Array, "*#batch"]
 
     leaf_ranks = (1, 2, 0)
+    has_rsample = True  #: draws are differentiable in the parameters
 
     def __init__(
         self,

@@ -61,6 +61,8 @@ class AbstractMixture(eqx.Module):
     components: eqx.AbstractVar[eqx.Module]
     logits: eqx.AbstractVar[Float[Array, "*batch k"]]
 
+    has_rsample = False  #: draws jump from component to component
+
     @property
     def event_shape(self) -> tuple[int, ...]:
         return self.components.event_shape

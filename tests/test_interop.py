@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant
 from foldgauss.fold import PolynomialFold
 from foldgauss.gaussian import Gaussian, Normal
+from foldgauss.mixture import FoldedMixture
 
 COVARIANCE = np.array([[0.5, 0.2], [0.2, 0.4]])
 
@@ -120,6 +122,152 @@ def test_numpyro_distribution_is_the_same_distribution(numpyro):
     again = jax.tree.unflatten(treedef, flat)
     np.testing.assert_array_equal(jax.jit(lambda d, x: d.log_prob(x))(again, x).shape, (5, 2))
     assert again.support(x).all()
+
+
+def _mixture(**changes):
+    components = FoldedGaussian(jnp.zeros((2, 1)), [[0.3]], time_loc=[0.3, 0.7], time_scale=[0.2, 0.1], **changes)
+    return FoldedMixture(components, weights=[0.4, 0.6])
+
+
+EVERY = {
+    "folded": (_dist, True),
+    "batched": (lambda: _dist(time_loc=jnp.array([0.2, 0.4])), True),
+    "constant envelope": (lambda: _dist(envelope=Constant()), True),
+    "space at a time": (lambda: _dist().condition_time(0.3), True),
+    "space": (lambda: _dist().marginal((0, 1)), False),
+    "time": (lambda: _dist().marginal((2,)), None),
+    "normal": (lambda: Normal(0.5, jnp.array([0.1, 2.0])), True),
+    "gaussian": (lambda: Gaussian(jnp.zeros((4, 2)), jnp.eye(2)), True),
+    "mixture": (_mixture, False),
+    "mixture at a time": (lambda: _mixture().condition_time(0.3), False),
+}
+
+
+#: Those tested in the quick suite; compiling takes the time.
+QUICK = {"folded", "batched", "normal", "mixture"}
+
+
+@pytest.fixture(params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY])
+def each(request, numpyro):
+    """A distribution as numpyro's, and itself."""
+    dist = EVERY[request.param][0]()
+    return to_numpyro(dist), dist
+
+
+def test_numpyro_parameters_have_constraints(each):
+    """Every array has one, which it satisfies; where it does not, `validate_args` says so."""
+    from numpyro.distributions import constraints
+
+    bridge, dist = each
+    assert len(bridge.arg_constraints) == len(jax.tree.leaves(dist))
+    assert list(bridge.get_args()) == list(bridge.arg_constraints)
+    for name, constraint in bridge.arg_constraints.items():
+        value = getattr(bridge, name)
+        if not constraints.is_dependent(constraint):
+            held = constraint(value)
+            assert held.all()
+            assert held.shape == value.shape[: value.ndim - constraint.event_dim]
+    bridge.validate_args()
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = bridge.nothing
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "value"),
+    [
+        ("time_scale", lambda dist: dist.time_scale, -1.0),
+        ("scale_tril", lambda dist: dist.scale_tril, jnp.ones((2, 2))),
+        ("envelope.floor", lambda dist: dist.envelope.floor, 1.5),
+    ],
+)
+def test_numpyro_validates_arguments(numpyro, name, part, value):
+    spoiled = eqx.tree_at(part, _dist(), jnp.asarray(value))
+    with pytest.raises(ValueError, match=f"invalid {name} parameter"):
+        type(to_numpyro(_dist()))(spoiled, validate_args=True)
+    type(to_numpyro(_dist()))(spoiled, validate_args=False)
+
+
+def test_numpyro_draws_of_mixtures_are_not_reparametrized(each, request):
+    """has_rsample is true where a gradient through a draw is that of its mean, and only there."""
+    bridge, dist = each
+    expected = EVERY[request.node.callspec.params["each"]][1]
+    assert bridge.has_rsample == (dist.has_rsample if expected is None else expected)
+    assert not bridge.has_enumerate_support
+    if not bridge.has_rsample:
+        with pytest.raises(NotImplementedError):
+            bridge.rsample(jax.random.key(0))
+        return
+    np.testing.assert_array_equal(bridge.rsample(jax.random.key(0), (3,)), bridge.sample(jax.random.key(0), (3,)))
+    by_leaves = jax.grad(lambda dist: to_numpyro(dist).rsample(jax.random.key(0), (100,)).mean())(dist)
+    total = sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(by_leaves))
+    assert 0 < total < np.inf
+
+
+def test_numpyro_shapes(each):
+    """expand, to_event, mask, and draws and densities of any sample shape."""
+    bridge, dist = each
+    key, batch, event = jax.random.key(0), dist.batch_shape, dist.event_shape
+    assert (bridge.batch_shape, bridge.event_shape, bridge.event_dim) == (batch, event, len(event))
+    for shape in ((), (5,), (2, 3)):
+        x = bridge.sample(key, shape)
+        assert x.shape == bridge.shape(shape) == (*shape, *batch, *event)
+        assert bridge.log_prob(x).shape == (*shape, *batch)
+        assert bridge.support(x).all()
+    expanded = bridge.expand((3, *batch))
+    assert expanded.has_rsample == bridge.has_rsample
+    x = expanded.sample(key, (2,))
+    assert x.shape == (2, 3, *batch, *event)
+    np.testing.assert_allclose(expanded.log_prob(x), dist.log_prob(x), rtol=1e-6)
+    joint = bridge.to_event(len(batch))
+    assert (joint.batch_shape, joint.event_shape) == ((), (*batch, *event))
+    x = joint.sample(key)
+    np.testing.assert_allclose(joint.log_prob(x), dist.log_prob(x).sum(), rtol=1e-5)
+    hidden = bridge.mask(False)
+    np.testing.assert_array_equal(hidden.log_prob(bridge.sample(key)), jnp.zeros(batch))
+    value, intermediates = bridge.sample_with_intermediates(key)
+    assert value.shape == (*batch, *event)
+    assert intermediates == []
+
+
+def test_numpyro_distributions_are_pytrees(each):
+    """flatten, jit, vmap; a distribution built inside vmap has its new dimension."""
+    from numpyro.distributions.batch_util import promote_batch_shape
+
+    bridge, dist = each
+    again = jax.tree.unflatten(jax.tree.structure(bridge), jax.tree.leaves(bridge))
+    x = bridge.sample(jax.random.key(0), (4,))
+    log_prob = dist.log_prob(x)
+    np.testing.assert_allclose(jax.jit(lambda d, x: d.log_prob(x))(again, x), log_prob, rtol=2e-5, atol=1e-5)
+    np.testing.assert_allclose(jax.vmap(bridge.log_prob)(x), log_prob, rtol=2e-5, atol=1e-5)
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), dist)
+    made = promote_batch_shape(jax.vmap(to_numpyro)(many))
+    if hasattr(dist, "leaf_ranks"):
+        assert made.batch_shape == (2, *dist.batch_shape)
+    both = jax.vmap(lambda d: d.log_prob(x))(made)
+    np.testing.assert_allclose(both, jnp.stack([log_prob, log_prob]), rtol=2e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_numpyro_svi_finds_a_latent_folded_gaussian(numpyro):
+    """The ELBO of a guide of the right family rises to the evidence, 0 here; with reparametrized gradients."""
+    from numpyro import distributions
+    from numpyro.infer import SVI, Trace_ELBO
+
+    target = _dist(envelope=Constant())
+
+    def guide():
+        loc = numpyro.param("loc", jnp.zeros(2))
+        time_loc = numpyro.param("time_loc", 0.0)
+        time_scale = numpyro.param("time_scale", 1.0, constraint=distributions.constraints.positive)
+        fold = PolynomialFold(numpyro.param("fold", jnp.zeros((2, 2))))
+        parts = {"time_loc": time_loc, "time_scale": time_scale, "fold": fold, "envelope": Constant()}
+        numpyro.sample("x", to_numpyro(FoldedGaussian(loc, target.scale_tril, validate_args=False, **parts)))
+
+    svi = SVI(lambda: numpyro.sample("x", target.to_numpyro()), guide, numpyro.optim.Adam(0.02), Trace_ELBO(20))
+    found = svi.run(jax.random.key(0), 1500, progress_bar=False)
+    assert float(found.losses[-100:].mean()) < 0.02
+    np.testing.assert_allclose(found.params["fold"], target.fold.coefficients, atol=0.1)
+    np.testing.assert_allclose(found.params["loc"], target.loc, atol=0.05)
 
 
 @pytest.mark.slow

@@ -22,12 +22,13 @@ __all__ = ["FrozenDistribution", "to_numpyro", "to_scipy"]
 def to_numpyro(dist: Any) -> "numpyro.distributions.Distribution":
     """`dist` as a numpyro distribution, differentiable in its parameters: for models, NUTS and SVI.
 
-    For anything here with `log_prob`, `sample`, `batch_shape` and `event_shape`. Parameters may be traced, so it
-    can be built inside a model out of other sample sites; pass `validate_args=False` to the distribution there if
-    its factor is assembled from them. As a *latent* site a time likelihood makes a funnel (space narrows as time
-    moves away), which is hard for NUTS: sample a normal z there and use `dist.normal_to_fold(z)`.
+    For anything here with `log_prob`, `sample`, `batch_shape`, `event_shape` and `has_rsample`. Parameters may be
+    traced, so it can be built inside a model out of other sample sites; pass `validate_args=False` to the distribution
+    there if its factor is assembled from them. As a *latent* site a time likelihood makes a funnel (space narrows as
+    time moves away), which is hard for NUTS: sample a normal z there and use `dist.normal_to_fold(z)`.
 
-    **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d.
+    **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d. `arg_constraints` names
+    every array of `dist`. Draws of mixtures are not reparametrized (`has_rsample` is False).
 
     **Example:**
 
@@ -50,18 +51,59 @@ def _numpyro_class() -> type:
     except ImportError as error:
         raise ImportError("to_numpyro needs numpyro: pip install 'foldgauss[numpyro]'.") from error
 
+    constraints = distributions.constraints
+    by_name = {
+        "scale": constraints.positive,
+        "time_scale": constraints.positive,
+        "scale_tril": constraints.lower_cholesky,
+        "base_tril": constraints.lower_cholesky,
+        "power": constraints.nonnegative,
+        "floor": constraints.unit_interval,
+        "logits": constraints.dependent(is_discrete=False, event_dim=1),  # -inf is a weight of 0
+    }
+
+    class Constraints(dict):
+        """Empty for numpyro, which lists those of classes; those of its arrays for a distribution."""
+
+        def __get__(self, bridge, owner=None):
+            if bridge is None:
+                return self
+            found = {}
+            for name, (_, rank) in _named_leaves(bridge.base).items():
+                each = by_name.get(name.rpartition(".")[2], constraints.real)
+                if rank is None:
+                    each = constraints.dependent
+                elif rank > each.event_dim:
+                    each = constraints.independent(each, rank - each.event_dim)
+                found[name] = each
+            return found
+
     class NumpyroDistribution(distributions.Distribution):
-        """A foldgauss distribution with numpyro's interface."""
+        """A foldgauss distribution with numpyro's interface; parameters are its leaves: "loc", "fold.coefficients"."""
 
         pytree_data_fields = ("base",)
+        arg_constraints = Constraints()
 
         def __init__(self, base, *, validate_args=None):
             self.base = base
             super().__init__(base.batch_shape, base.event_shape, validate_args=validate_args)
 
+        def __getattr__(self, name):
+            if name != "base" and name in (leaves := _named_leaves(self.base)):
+                return leaves[name][0]
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+        @property
+        def reparametrized_params(self):
+            """All parameters; none of a mixture, whose draws jump from component to component."""
+            return list(_named_leaves(self.base)) if getattr(self.base, "has_rsample", False) else []
+
+        def get_args(self):
+            return {name: leaf for name, (leaf, _) in _named_leaves(self.base).items()}
+
         @property
         def support(self):
-            return distributions.constraints.real_vector if self.event_shape else distributions.constraints.real
+            return constraints.real_vector if self.event_shape else constraints.real
 
         def sample(self, key, sample_shape=()):
             return self.base.sample(key, sample_shape)
@@ -78,6 +120,17 @@ def _numpyro_class() -> type:
             return self.base.variance
 
     return NumpyroDistribution
+
+
+def _named_leaves(dist: Any) -> dict[str, tuple[Any, int | None]]:
+    """The arrays of a distribution by their path, and the rank of each without batch dimensions; None: not known.
+
+    It is not known for distributions that are integrals over time.
+    """
+    paths, _ = jax.tree_util.tree_flatten_with_path(dist)
+    ranks = getattr(dist, "leaf_ranks", (None,) * len(paths))
+    named = zip(paths, ranks, strict=True)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): (leaf, rank) for (path, leaf), rank in named}
 
 
 def to_scipy(dist: Any) -> "FrozenDistribution":
