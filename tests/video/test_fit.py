@@ -16,6 +16,7 @@ from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fi
 from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.config import chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
+from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.steppers import cpu_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 
@@ -245,7 +246,7 @@ def test_target_psnr_is_neither_missed_nor_overshot(clip):
         before[info.step] = evaluate(to_model(state, config, frames.shape[1:3], 25.0), frames).mean_psnr
     assert info.stopped_by == "target_psnr"
     assert before[info.step] >= 24
-    look = 4 * len(frames)
+    look = 4 * steps_per_pass(config, len(frames))
     assert info.step % look == 0
     looked_at = [value for step, value in before.items() if step % look == 0 and step < info.step]
     assert max(looked_at, default=0) < 24

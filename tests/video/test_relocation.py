@@ -268,3 +268,11 @@ def test_the_published_recipe_has_none_of_it():
     config = FitConfig.preset("paper")
     assert (config.cooldown_fraction, config.error_fraction, config.relocated_fraction) == (0, 0, 0)
     assert start(FRAMES, dataclasses.replace(config, num_gaussians=50)).num_gaussians == 50
+
+
+def test_a_mean_psnr_takes_all_views_in_turn():
+    """Its weights of the frames presuppose that each is seen as often."""
+    config, errors = FitConfig(num_gaussians=20, economy=Economy(psnr=30)), np.array([1.0, 2.0, 90.0])
+    assert steps_per_pass(config, 3) == 3
+    assert np.bincount(all_views(config, errors, 30)).tolist() == [10, 10, 10]
+    assert np.bincount(all_views(dataclasses.replace(config, economy=Economy()), errors, 30))[2] > 12

@@ -270,7 +270,7 @@ class FitConfig:
         default=0.3,
         metadata=setting(
             "Fraction of the views that are drawn in proportion to the frames' squared errors",
-            "In between, all frames are visited in turn. Improves the worst frames.",
+            "In between, all frames are visited in turn. Improves the worst frames. Ignored with `economy.psnr`.",
             bounds="[0, 1)",
             option="--error-fraction",
             group=OPTIMIZATION,

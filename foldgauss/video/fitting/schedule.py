@@ -27,19 +27,27 @@ def num_views(config: FitConfig, num_frames: int) -> int:
     return 2 * num_frames if config.two_cameras else num_frames
 
 
+def fraction_in_turn(config: FitConfig) -> float:
+    """The fraction of the views that visit all frames in turn; the others are drawn by error.
+
+    With a mean PSNR to reach all of them do: the frames' losses have weights for it (`weigh_frames`).
+    """
+    return 1.0 if config.economy is not None and config.economy.psnr is not None else 1 - config.error_fraction
+
+
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     """Steps in which every view is seen at least once."""
-    return math.ceil(num_views(config, num_frames) / (config.batch_size * (1 - config.error_fraction)))
+    return math.ceil(num_views(config, num_frames) / (config.batch_size * fraction_in_turn(config)))
 
 
 def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray) -> np.ndarray:
     """The views of a step: in turn, and in between by the `errors` of the frames, (num_frames,), 0 where unknown.
 
-    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. A fraction `config.error_fraction`
-    of the views, evenly among the others, is drawn in proportion to the errors; frames without one count as average.
-    The others pass through all views, in an order that depends on the seed and the pass only.
+    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. All but `fraction_in_turn` of the
+    views, evenly among the others, are drawn in proportion to the errors; frames without one count as average. The
+    others pass through all views, in an order that depends on the seed and the pass only.
     """
-    num, in_turn = num_views(config, num_frames), 1 - config.error_fraction
+    num, in_turn = num_views(config, num_frames), fraction_in_turn(config)
     positions = np.arange(step * config.batch_size, (step + 1) * config.batch_size)
     taken = np.floor(positions * in_turn).astype(int)
     views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
