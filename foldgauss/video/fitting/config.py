@@ -411,7 +411,7 @@ DENSITY, DENSITY_POWER = 0.0028, 0.85
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
 ECONOMICAL, SMALLEST_FRACTION = 177, 0.7
 #: Factor on the default steps for the smallest model at a PSNR: the fit must make up for what is pruned.
-SMALLEST_TIMES = 4
+SMALLEST_TIMES = 5
 
 
 def default_num_gaussians(
