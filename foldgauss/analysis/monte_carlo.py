@@ -53,7 +53,7 @@ def entropy_bounds(mixture) -> tuple[Float[Array, "*batch"], Float[Array, "*batc
 
     Equal to the lower bound where all components are the same, to the upper one where they do not overlap.
 
-    **Shapes:** a mixture with batch (*batch,) -> (*batch,) each. **Source:** Huber et al. 2008, eq. (8) and section IV.
+    **Shapes:** a mixture with batch (*batch,) -> (*batch,) each. **Source:** the entropy is concave; Huber et al. 2008.
     """
     weights, components = mixture.weights, mixture.components
     lower = (weights * components.entropy()).sum(-1)

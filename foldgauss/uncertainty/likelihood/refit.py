@@ -29,6 +29,7 @@ from foldgauss.video.models.video_model import VideoModel
 METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
 #: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
+#: The least `FitConfig.cooldown_fraction` of refits: the spread is that of the estimate, not of its last steps.
 COOLDOWN_FRACTION = 0.2
 #: Streams of random numbers derived from the seed: one for frames, one for the seeds of fits.
 _FRAMES, _FITS = 0, 1
@@ -285,10 +286,8 @@ def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None
         steps = steps if start == "scratch" else max(1, round((1 - START_AT) * steps))
     economy = None if start == "model" else config.economy  # the model's Gaussians are kept
     changes = {"minutes": None, "target_psnr": None, "economy": economy}
-    # The spread is that of the estimate, not of the last steps: learning rates cool down in any case.
-    return dataclasses.replace(
-        config, steps=steps, cooldown_fraction=max(config.cooldown_fraction, COOLDOWN_FRACTION), **changes
-    )
+    changes["cooldown_fraction"] = max(config.cooldown_fraction, COOLDOWN_FRACTION)
+    return dataclasses.replace(config, steps=steps, **changes)
 
 
 def resample_frames(

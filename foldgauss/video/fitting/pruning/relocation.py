@@ -1,6 +1,6 @@
 """Relocation: the Gaussians that matter least to the frames move to where the errors are largest.
 
-The number of Gaussians, and so the size of the model, stays the same. Source: relocation of dead Gaussians in 3DGS-MCMC
+The number of Gaussians stays the same. Source: relocation of dead Gaussians in 3DGS-MCMC
 (Kheradmand et al. 2024); the choice of Gaussians and their new parameters are ours.
 """
 
