@@ -90,10 +90,10 @@ def warp(u: np.ndarray) -> np.ndarray:
     return u + 0.5 * np.sin(2 * np.pi * u) / (2 * np.pi)
 
 
-def inside(interval: np.ndarray, truth: np.ndarray) -> float:
+def inside(interval: tuple[np.ndarray, ...], truth: np.ndarray) -> float:
     """Share of the frames, but for the first and the last, whose true time is in the interval."""
-    low, high = interval[:, 1:-1]
-    return float(((truth[1:-1] >= low) & (truth[1:-1] <= high)).mean())
+    low, high = interval
+    return float(((truth >= low) & (truth <= high))[1:-1].mean())
 
 
 def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: dict[str, float]):
@@ -114,7 +114,7 @@ def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: di
     exact, free, frame = found.exact, found.free, 1 / (len(frames) - 1)
     std = exact.std()[free]
     error = std / np.sqrt(found.ess)
-    ends = np.abs(found.interval(0.9) - exact.interval(0.9))[:, free] / std
+    ends = np.abs(np.subtract(found.interval(0.9), exact.interval(0.9)))[:, free] / std
     figures |= {
         "clip.seconds": pictures + sampling,
         "clip.seconds.pictures": pictures,

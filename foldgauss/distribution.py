@@ -3,13 +3,13 @@
 It is not the |X| "folded normal" of scipy and numpyro: here the *center* of a Gaussian moves along a curve in time.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from foldgauss._numerics.batch import (
+    BatchModule,
     align,
     as_value,
     batch_shape_of,
@@ -38,7 +38,7 @@ from foldgauss.gaussian import Gaussian, Normal
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
 
 
-class FoldedGaussian(eqx.Module):
+class FoldedGaussian(BatchModule):
     """The Folded-Gaussian distribution of x = (s, t), space s in R^(d-1) and time t **last**.
 
         t     ~ N(time_loc, time_scale^2)
@@ -124,10 +124,6 @@ class FoldedGaussian(eqx.Module):
     has_rsample = True  #: draws are differentiable in the parameters
 
     @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (1, 2, 0, 0, *self.fold.leaf_ranks, *self.envelope.leaf_ranks)
-
-    @property
     def batch_shape(self) -> tuple[int, ...]:
         """Broadcast leading dimensions of all leaves, including those of the fold and the envelope."""
         return batch_shape_of(ranked_leaves(self))
@@ -160,25 +156,29 @@ class FoldedGaussian(eqx.Module):
         log_a = jnp.clip(log_a, -largest, largest)
         return Gaussian(dist.loc + shift, dist.scale_tril, log_scale=0.5 * log_a, validate_args=False)
 
-    def log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
+    def log_prob(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """log FN(x) = log N(s | t) + log N(t), by the chain rule.
 
-        **Shapes:** x (*sample, *batch, d), time last -> (*sample, *batch). **Units:** log of 1 / (space^(d-1)
+        **Shapes:** value (*sample, *batch, d), time last -> (*sample, *batch). **Units:** log of 1 / (space^(d-1)
         time).
 
         **Example:** `dist.log_prob(jnp.array([0.1, -0.2, 0.5]))`
 
-        **Source:** eq:foldgauss. **Raises:** ValueError if the last dimension of x is not d.
+        **Source:** eq:foldgauss. **Raises:** ValueError if the last dimension of value is not d.
         """
-        x = as_value(x, self.loc.dtype)
-        check_event("x", x, self.event_shape)
+        value = as_value(value, self.loc.dtype)
+        check_event("value", value, self.event_shape)
         leaves, structure = jax.tree.flatten(self)
 
         def scaled_log_prob(root, s, t, *leaves):
             return jax.tree.unflatten(structure, leaves)._scaled_log_prob(root, s, t)
 
         return evaluate_with_safe_grad(
-            scaled_log_prob, x[..., :-1], x[..., -1], *leaves, closed=self.fold.is_closed and self.envelope.is_closed
+            scaled_log_prob,
+            value[..., :-1],
+            value[..., -1],
+            *leaves,
+            closed=self.fold.is_closed and self.envelope.is_closed,
         )
 
     def _scaled_log_prob(self, root: Array | None, s: Array, t: Array) -> Float[Array, "*#batch"]:
@@ -195,9 +195,9 @@ class FoldedGaussian(eqx.Module):
         """`log_prob` under scipy's name."""
         return self.log_prob(x)
 
-    def pdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
+    def pdf(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """FN(x), shapes as in `log_prob`. **Source:** eq:foldgauss."""
-        return jnp.exp(self.log_prob(x))
+        return jnp.exp(self.log_prob(value))
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples x = (s, t): first t, then s given t; differentiable in all parameters.

@@ -1,6 +1,12 @@
 """The envelope a(t), by which the space covariance of a Folded-Gaussian shrinks away from `time_loc` (eq:cond_dens).
 
 Envelopes are computed in log space: far from `time_loc` `a` underflows, `log a` does not.
+
+**Defaults.** What is constructed or fitted to images (`FoldedGaussian`, `FitConfig`) has the paper's envelope,
+`TimeLikelihood()`. What is estimated from points by maximum likelihood (`foldgauss.estimator`) has `Constant()`: with a
+time likelihood the points of outlying times have weights 1/a without bound, so a few of them decide the fit, and the
+likelihood itself is unbounded where power (d-1) > 2. There `envelope="time_likelihood"` is the paper's with a floor of
+1e-3, which bounds both.
 """
 
 from abc import abstractmethod
@@ -13,25 +19,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from foldgauss._numerics.batch import BatchModule
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._runtime.checks import invalid
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
 
 
-class AbstractEnvelope(eqx.Module):
+class AbstractEnvelope(BatchModule):
     """An envelope with batch dimensions, given by its logarithm.
 
     **Shapes:** t, time_loc, time_scale (*batch,) -> (*batch,). **Units:** the three share theirs; a has none.
 
-    To extend: return `log a <= 0`, let leading dimensions of the leaves broadcast against those of `t`, and
-    return the ranks of the leaves without them in `leaf_ranks`.
+    To extend: return `log a <= 0`, annotate arrays with their shapes (`Float[Array, "*batch"]`), from which it is known
+    what is batch, and let batch dimensions broadcast against those of `t`.
     """
-
-    @property
-    @abstractmethod
-    def leaf_ranks(self) -> tuple[int, ...]:
-        """Rank of each leaf (in the order of `jax.tree.leaves`) for one envelope; the rest is batch."""
 
     #: Whether it depends on its leaves only; a user's function may also close over tracers.
     is_closed: ClassVar[bool] = False
@@ -57,7 +59,6 @@ class Constant(AbstractEnvelope):
     **Source:** eq:cond_dens with a = 1.
     """
 
-    leaf_ranks = ()
     is_closed = True
 
     def log_a(self, t, *, time_loc, time_scale):
@@ -86,7 +87,6 @@ class TimeLikelihood(AbstractEnvelope):
     power: Float[Array, "*#batch"]
     floor: Float[Array, "*#batch"]
 
-    leaf_ranks = (0, 0)
     is_closed = True
 
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):

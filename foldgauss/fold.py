@@ -17,6 +17,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from foldgauss._numerics.batch import BatchModule
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._numerics.triangular import join_columns, split_columns
 from foldgauss._runtime.checks import invalid
@@ -33,19 +34,15 @@ __all__ = [
 ]
 
 
-class AbstractFold(eqx.Module):
+class AbstractFold(BatchModule):
     """A fold with batch dimensions: `fold(u)` maps u of shape (*batch,) to shifts (*batch, d-1).
 
     **Units:** u is time, f(u) is space.
 
-    To extend: let leading dimensions of the leaves broadcast against those of `u`, and return the ranks of the leaves
-    without them in `leaf_ranks`. A function of one scalar needs no class: `as_fold` wraps it.
+    To extend: annotate arrays with their shapes (`Float[Array, "*batch degree d-1"]`), from which it is known what is
+    batch, and let batch dimensions broadcast against those of `u`. A function of one scalar needs no class: `as_fold`
+    wraps it.
     """
-
-    @property
-    @abstractmethod
-    def leaf_ranks(self) -> tuple[int, ...]:
-        """Rank of each leaf (in the order of `jax.tree.leaves`) for one fold; the rest is batch."""
 
     #: Whether it depends on its leaves only; a user's function may also close over tracers.
     is_closed: ClassVar[bool] = False
@@ -67,7 +64,6 @@ class ZeroFold(AbstractFold):
 
     dim: int = eqx.field(static=True)
 
-    leaf_ranks = ()
     is_closed = True
 
     def __init__(self, dim: int):
@@ -98,7 +94,6 @@ class PolynomialFold(AbstractFold):
 
     coefficients: Float[Array, "*batch degree d-1"]
 
-    leaf_ranks = (2,)
     is_closed = True
 
     def __init__(self, coefficients: ArrayLike):
@@ -146,7 +141,6 @@ class SplineFold(AbstractFold):
     knots: tuple[float, ...] = eqx.field(static=True)  # static: not trained
     degree: int = eqx.field(static=True)
 
-    leaf_ranks = (2,)
     is_closed = True
 
     def __init__(self, knots: ArrayLike, coefficients: ArrayLike, *, degree: int = 3):
@@ -191,7 +185,6 @@ class FourierFold(AbstractFold):
     cosine: Float[Array, "*batch order d-1"]
     period: Float[Array, "*batch"]
 
-    leaf_ranks = (2, 2, 0)
     is_closed = True
 
     def __init__(self, sine: ArrayLike, cosine: ArrayLike, *, period: ArrayLike):
@@ -356,10 +349,6 @@ class RestrictedFold(AbstractFold):
 
     fold: AbstractFold
     indices: tuple[int, ...] = eqx.field(static=True)
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return self.fold.leaf_ranks
 
     @property
     def is_closed(self) -> bool:

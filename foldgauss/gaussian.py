@@ -8,7 +8,6 @@ where the log-density is -inf, and otherwise accurate, saturating at the largest
 import functools
 import operator
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from foldgauss._numerics.batch import (
+    BatchModule,
     align,
     as_value,
     batch_shape_of,
@@ -44,7 +44,7 @@ __all__ = ["Gaussian", "Normal"]
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
-class Normal(eqx.Module):
+class Normal(BatchModule):
     """A normal distribution on the real line: the time marginal of a Folded-Gaussian.
 
         N(loc, scale^2)(t) = exp(-((t - loc) / scale)^2 / 2) / (sqrt(2 pi) scale)
@@ -61,7 +61,6 @@ class Normal(eqx.Module):
     scale: Float[Array, "*#batch"]
 
     event_shape = ()
-    leaf_ranks = (0, 0)
     has_rsample = True  #: draws are differentiable in the parameters
 
     def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
@@ -127,7 +126,7 @@ class Normal(eqx.Module):
         return value, self.log_prob(value)
 
 
-class Gaussian(eqx.Module):
+class Gaussian(BatchModule):
     """A Gaussian in any dimension, given by a triangular factor and a scale in log space.
 
         N(loc, exp(2 log_scale) L L^T),   L = base_tril
@@ -147,7 +146,6 @@ class Gaussian(eqx.Module):
     base_tril: Float[Array, "*#batch dim dim"]
     log_scale: Float[Array, "*#batch"]
 
-    leaf_ranks = (1, 2, 0)
     has_rsample = True  #: draws are differentiable in the parameters
 
     def __init__(

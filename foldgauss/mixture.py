@@ -89,40 +89,40 @@ class AbstractMixture(eqx.Module):
 
     # --- densities ------------------------------------------------------------------------------------------
 
-    def log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
+    def log_prob(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """log p(x) = log sum_k w_k p_k(x), finite or -inf. Many points are evaluated in chunks.
 
-        **Shapes:** x (*sample, *batch, d), time (if any) last -> (*sample, *batch).
+        **Shapes:** value (*sample, *batch, d), time (if any) last -> (*sample, *batch).
 
         **Example:** `mixture.log_prob(jnp.array([0.1, -0.2, 0.5]))`
 
-        **Raises:** ValueError if the last dimension of x is not d.
+        **Raises:** ValueError if the last dimension of value is not d.
         """
-        return _log_prob(self, self._checked(x))
+        return _log_prob(self, self._checked(value))
 
-    def pdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
+    def pdf(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """p(x), shapes as in `log_prob`."""
-        return jnp.exp(self.log_prob(x))
+        return jnp.exp(self.log_prob(value))
 
-    def component_log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
+    def component_log_prob(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
         """log p_k(x) of each component, without its weight.
 
-        **Shapes:** x (*sample, *batch, d) -> (*sample, *batch, k).
+        **Shapes:** value (*sample, *batch, d) -> (*sample, *batch, k).
         """
-        return _component_log_prob(self, self._checked(x))
+        return _component_log_prob(self, self._checked(value))
 
-    def responsibilities(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
+    def responsibilities(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
         """P(component k | x) = w_k p_k(x) / p(x): they sum to 1.
 
         Where every component's density underflows, they equal the weights.
 
-        **Shapes:** x (*sample, *batch, d) -> (*sample, *batch, k).
+        **Shapes:** value (*sample, *batch, d) -> (*sample, *batch, k).
 
         **Example:** `mixture.responsibilities(x).argmax(-1)  # the likeliest component of each point`
 
         **Source:** Bayes' rule. **Raises:** as `log_prob`.
         """
-        return _responsibilities(self, self._checked(x))
+        return _responsibilities(self, self._checked(value))
 
     def sample(
         self, key: Key[Array, ""], sample_shape: tuple[int, ...] = (), return_component: bool = False
@@ -164,7 +164,7 @@ class AbstractMixture(eqx.Module):
     def _checked(self, x) -> Array:
         x = as_value(x, self.logits.dtype)
         if self.event_shape:
-            check_event("x", x, self.event_shape)
+            check_event("value", x, self.event_shape)
         return x
 
     # --- interoperability -------------------------------------------------------------------------------------
@@ -346,9 +346,9 @@ class IntegratedMixture(AbstractMixture):
     components: TimeMixture
     logits: Float[Array, "*batch k"]
 
-    def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
+    def cdf(self, value: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x | given), for a single coordinate."""
-        return weighted_sum(self.weights, self.components.cdf(_add_component_axis(self, self._checked(x))))
+        return weighted_sum(self.weights, self.components.cdf(_add_component_axis(self, self._checked(value))))
 
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """Estimated relative error of `pdf(x)`: those of the components, weighted by responsibility."""
@@ -386,9 +386,9 @@ class TimePosterior(AbstractMixture):
         """Estimated relative error of p(s), and hence of every density and probability."""
         return weighted_sum(self.weights, self.components.error_estimate)
 
-    def cdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+    def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(time <= t | s)."""
-        return _cdf(self, self._checked(t))
+        return _cdf(self, self._checked(value))
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """The quantile, the inverse of `cdf`, by bisection; -inf at 0 and +inf at 1. It has no gradient."""

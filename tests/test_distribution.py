@@ -337,10 +337,6 @@ def test_nan_in_nan_out():
 
 def test_an_envelope_of_minus_infinity_is_no_nan():
     class Nothing(AbstractEnvelope):
-        @property
-        def leaf_ranks(self):
-            return ()
-
         def log_a(self, t, *, time_loc, time_scale):
             return jnp.full(jnp.broadcast_shapes(t.shape, time_loc.shape), -jnp.inf, t.dtype)
 
@@ -528,7 +524,7 @@ def test_bad_input_names_the_parameter(changes, name):
 
 
 def test_bad_values_name_the_parameter():
-    with pytest.raises(ValueError, match=r"^x: expected shape \(\*batch, 3\), got "):
+    with pytest.raises(ValueError, match=r"^value: expected shape \(\*batch, 3\), got "):
         _dist().log_prob(jnp.zeros(2))
     with pytest.raises(ValueError, match=r"^scale_tril: expected a positive diagonal"):
         Gaussian(jnp.zeros(2), jnp.zeros((2, 2)))

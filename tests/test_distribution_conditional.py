@@ -592,5 +592,5 @@ def test_bad_requests_are_refused():
         dist.time_given_space([0.0])
     with pytest.raises(ValueError, match=r"^cdf: expected one coordinate, got 2"):
         dist.marginal([0, 1]).cdf(jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"^x: expected shape "):
+    with pytest.raises(ValueError, match=r"^value: expected shape "):
         dist.marginal([0, 1]).log_prob(jnp.zeros(3))

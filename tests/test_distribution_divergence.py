@@ -20,10 +20,6 @@ KL = eqx.filter_jit(kl_divergence)
 class OwnLikelihood(AbstractEnvelope):
     """The time likelihood with power 1 as an envelope of unknown form: only quadrature can know it."""
 
-    @property
-    def leaf_ranks(self):
-        return ()
-
     def log_a(self, t, *, time_loc, time_scale):
         return -0.5 * ((t - time_loc) / time_scale) ** 2
 

@@ -26,10 +26,6 @@ SAMPLE = eqx.filter_jit(FoldedGaussian.sample)
 class Slope(AbstractEnvelope):
     """An envelope of one's own, log a = -|tau|^3 / 4, known by nothing but its values."""
 
-    @property
-    def leaf_ranks(self):
-        return ()
-
     def log_a(self, t, *, time_loc, time_scale):
         return -(jnp.abs((t - time_loc) / time_scale) ** 3) / 4
 

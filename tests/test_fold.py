@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import Array, Float
 from scipy.interpolate import BSpline
 
+from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import AbstractFold, CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold, as_fold
 
 
@@ -195,3 +197,33 @@ def test_bad_input_names_the_parameter(make, name):
 
 def test_integers_become_floats():
     assert PolynomialFold([[1], [2]]).coefficients.dtype == jnp.float32
+
+
+def test_ranks_of_leaves_follow_from_annotations():
+    class Own(AbstractFold):
+        way: Float[Array, "*batch d-1"]
+        width: Float[Array, "*#batch"] | None
+        label: str = eqx.field(static=True)
+        inner: AbstractFold
+
+        def __call__(self, u):
+            return u[..., None] * self.way + self.inner(u)
+
+    inner = FourierFold(jnp.ones((3, 2)), jnp.ones((3, 2)), period=1.0)
+    own = Own(jnp.ones(2), None, "name", inner)
+    assert own.leaf_ranks == (1, 2, 2, 0)
+    assert Own(jnp.ones(2), jnp.ones(()), "name", inner).leaf_ranks == (1, 0, 2, 2, 0)
+    dist = FoldedGaussian(jnp.zeros((4, 2)), jnp.eye(2), time_loc=jnp.zeros((5, 1)), time_scale=1.0, fold=own)
+    assert dist.batch_shape == (5, 4)
+    assert dist.log_prob(jnp.zeros(3)).shape == (5, 4)
+
+
+def test_a_field_without_its_shape_is_an_error():
+    class Own(AbstractFold):
+        way: jax.Array
+
+        def __call__(self, u):
+            return u[..., None] * self.way
+
+    with pytest.raises(ValueError, match=r"Own: expected annotated as Float.*field way without its shape"):
+        FoldedGaussian(jnp.zeros(2), jnp.eye(2), time_loc=0.0, time_scale=1.0, fold=Own(jnp.ones(2)))

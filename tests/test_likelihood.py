@@ -1,5 +1,7 @@
 """Maximum likelihood: against NumPy's least squares, known truths, exact coverage, and data that determine nothing."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,14 +11,18 @@ from scipy import stats
 
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import TimeLikelihood
-from foldgauss.estimator.likelihood import FitStatus, _student_quantile, bootstrap, fit, select_degree
+from foldgauss.envelope import Constant, TimeLikelihood
+from foldgauss.estimator import likelihood
+from foldgauss.estimator.likelihood import FitStatus, _student_quantile, bootstrap
 from foldgauss.estimator.profile_likelihood import Ascent, Profile, _step
 from foldgauss.fold import PolynomialFold
 
 BEND = [[0.8, -0.5], [0.6, 0.9]]  # odd and even powers, so that each sign mistake shows
 TRIL = [[0.3, 0.0], [0.1, 0.2]]
 LOC, TIME_LOC, TIME_SCALE = [0.1, -0.4], 0.4, 0.3
+#: The points' own envelope, where a test gives no other.
+fit = functools.partial(likelihood.fit, envelope="time_likelihood")
+select_degree = functools.partial(likelihood.select_degree, envelope="time_likelihood")
 
 
 @pytest.fixture
@@ -215,16 +221,17 @@ def test_time_search_never_decreases(x64):
 
 
 def test_unbounded_joint_fit_raises():
-    with pytest.raises(ValueError, match=r"floor: expected a positive number where power \(d-1\) > 2"):
-        fit(_points(), time="joint", power=2.0, floor=0.0)
+    with pytest.raises(ValueError, match=r"envelope: expected a floor above 0 where power \(d-1\) > 2"):
+        fit(_points(), time="joint", envelope=TimeLikelihood(2.0))
 
 
 def test_a_floor_bounds_the_ridge(x64):
     # Three far times: without a floor the curve may run through them, and their likelihood has no end.
     x = jnp.concatenate([_points(40), jnp.array([[1.0, 2.0, 40.0], [0.0, 1.0, -35.0], [2.0, 0.0, 60.0]])])
-    result = fit(x, degree=2, power=2.0, floor=1e-3, time="joint")
+    result = fit(x, degree=2, envelope=TimeLikelihood(2.0, 1e-3), time="joint")
     assert jnp.isfinite(result.log_likelihood)
-    assert FitStatus(int(result.status)) is FitStatus.OK
+    assert result.success
+    assert result.message == "The fit succeeded."
     assert result.distribution.time_scale > 0.1
 
 
@@ -233,7 +240,7 @@ def test_a_floor_bounds_the_ridge(x64):
 
 def test_bootstrap_matches_known_standard_errors(x64):
     n = 50
-    result = fit(_points(n, power=0.0), degree=1, power=0.0).check()  # own is joint where a = 1
+    result = fit(_points(n, power=0.0), degree=1, envelope="constant").check()  # own is joint where a = 1
     replicates = bootstrap(result, jax.random.key(0), 300)
     scale = float(result.distribution.time_scale)
     errors = replicates.standard_errors
@@ -289,6 +296,7 @@ def test_degenerate_data_have_a_status_and_nan(x64):
     results = jax.jit(jax.vmap(lambda x, w: fit(x, degree=2, weights=w)))(x, weights)
     expected = [FitStatus.SINGULAR_COVARIANCE if key == "collinear" else key for key in cases]
     assert [FitStatus(int(s)) for s in results.status] == expected
+    assert results.success.tolist() == [status == FitStatus.OK for status in expected]
     dist = results.distribution
     for leaf in (dist.loc, dist.scale_tril, dist.time_loc, dist.fold.coefficients, results.log_likelihood):
         assert jnp.isfinite(leaf[0]).all()
@@ -298,7 +306,10 @@ def test_degenerate_data_have_a_status_and_nan(x64):
 def test_check_names_the_remedy():
     with pytest.raises(ValueError, match=r"TOO_FEW_POINTS.*Lower degree"):
         fit(jnp.zeros((1, 3)), degree=2).check()
-    assert int(fit(jnp.zeros((0, 3)), degree=2).status) == FitStatus.TOO_FEW_POINTS
+    empty = fit(jnp.zeros((0, 3)), degree=2)
+    assert int(empty.status) == FitStatus.TOO_FEW_POINTS
+    assert not empty.success
+    assert empty.message.startswith("TOO_FEW_POINTS: degree + d points")
 
 
 @pytest.mark.parametrize(
@@ -312,8 +323,8 @@ def test_check_names_the_remedy():
         ({"time_loc": 0.5}, "time_loc, time_scale: expected both or none"),
         ({"weights": np.ones(3)}, "weights: expected shape"),
         ({"weights": -np.ones(5)}, "weights: expected numbers >= 0"),
-        ({"power": -1.0}, "power: expected"),
-        ({"floor": 1.0}, "floor: expected"),
+        ({"envelope": "flat"}, "envelope: expected one of"),
+        ({"envelope": 1.0}, "envelope: expected an envelope or one of constant, time_likelihood, got 1.0"),
     ],
 )
 def test_invalid_arguments_raise(options, message):
@@ -322,6 +333,19 @@ def test_invalid_arguments_raise(options, message):
 
 
 # --- the degree ---------------------------------------------------------------------------------------------
+
+
+def test_the_default_envelope_is_constant(x64):
+    """As that of `FoldedGaussianMixture`, and not the paper's: see `foldgauss.envelope`."""
+    result = likelihood.fit(_points(), degree=1).check()
+    assert isinstance(result.distribution.envelope, Constant)
+    beta, _, errors = _numpy_fit(_points(), np.ones(60), 1, *_own_time(_points()), 0.0, 0.0)
+    np.testing.assert_allclose(result.distribution.loc, beta[0], rtol=1e-10)
+    np.testing.assert_allclose(result.standard_errors.loc, errors[0], rtol=1e-10)
+
+
+def _own_time(x):
+    return float(x[:, -1].mean()), float(x[:, -1].std())
 
 
 @pytest.mark.slow  # it compiles for long

@@ -510,7 +510,7 @@ WRONG = {
     "components: one": lambda: FoldedMixture(
         FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0), weights=[1.0]
     ),
-    "x: two": lambda: _mixture().log_prob(jnp.zeros(2)),
+    "value: two": lambda: _mixture().log_prob(jnp.zeros(2)),
     "indices: all": lambda: _mixture().condition([0, 1, 2], jnp.zeros(3)),
     "indices: all of space": lambda: _mixture().condition_time(0.3).condition([0, 1], jnp.zeros(2)),
     "indices: none such": lambda: _mixture().marginal([3]),

@@ -8,7 +8,6 @@ import pytest
 
 pytest.importorskip("sklearn")
 from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikelihood
-from foldgauss.estimator.em.loop import EMStatus
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.gradient_fit import fit_gradient
 from foldgauss.estimator.model_selection import _assign_folds, select_mixture
@@ -65,7 +64,8 @@ def test_gradient_fit_matches_em():
     x = _two_parabolas()
     em = FoldedGaussianMixture(2, degree=2, random_state=0, tol=1e-6, max_iter=200).fit(x)
     result = fit_gradient(_start(), x, steps=600)
-    assert result.status == EMStatus.NOT_CONVERGED
+    assert result.success
+    assert result.message == "All 600 steps were taken."
     assert result.log_likelihoods[-1] > result.log_likelihoods[0] + 1
     np.testing.assert_allclose(result.log_likelihoods[-1], em.score(x), atol=0.01)
 
@@ -90,11 +90,12 @@ def test_gradient_fit_never_returns_nan():
     x = _two_parabolas()
     x[3] = np.nan
     result = fit_gradient(_start(), x, steps=5)
-    assert result.status == EMStatus.NOT_FINITE
+    assert not result.success
+    assert "not finite in step" in result.message
     assert np.isfinite(result.mixture.components.loc).all()
     weights = np.ones(len(x))
     weights[3] = 0  # is not there
-    assert fit_gradient(_start(), x, steps=5, sample_weight=weights).status == EMStatus.NOT_CONVERGED
+    assert fit_gradient(_start(), x, steps=5, sample_weight=weights).success
 
 
 @pytest.mark.slow

@@ -1,7 +1,9 @@
 """Batch dimensions, dtypes and checks of modules whose `leaf_ranks` are their leaves' ranks without batch axes."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 import equinox as eqx
 import jax
@@ -14,6 +16,41 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
+
+
+class BatchModule(eqx.Module):
+    """A module with leading batch dimensions on all leaves, whose fields are annotated with their shapes."""
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        """Rank of each leaf (in the order of `jax.tree.leaves`) without batch dimensions.
+
+        By the annotations: `Float[Array, "*batch degree d-1"]` has rank 2, a field that is a module the ranks of its
+        own leaves; static fields and None have none. Override it for fields of other types.
+        """
+        ranks = []
+        for name, rank in _declared_ranks(type(self)):
+            value = getattr(self, name)
+            if isinstance(value, eqx.Module):
+                ranks += value.leaf_ranks
+            elif value is not None:
+                if rank is None:
+                    expected, got = 'annotated as Float[Array, "*batch ..."]', f"field {name} without its shape"
+                    raise invalid(type(self).__name__, expected=expected, got=got, cure="Or override leaf_ranks.")
+                ranks.append(rank)
+        return tuple(ranks)
+
+
+@functools.cache
+def _declared_ranks(cls: type) -> list[tuple[str, int | None]]:
+    """Names of the fields that are not static, and the ranks in their annotations without batch dimensions."""
+    found = []
+    for field in dataclasses.fields(cls):
+        if not field.metadata.get("static"):
+            kinds = [kind for kind in (field.type, *get_args(field.type)) if hasattr(kind, "dim_str")]
+            names = [name for kind in kinds for name in kind.dim_str.split() if not name.startswith(("*", "..."))]
+            found.append((field.name, len(names) if kinds else None))
+    return found
 
 
 def _batch_rank(parts: list[tuple[Array, int]]) -> int:

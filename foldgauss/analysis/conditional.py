@@ -67,21 +67,21 @@ class TimeDensity(eqx.Module):
     def batch_shape(self) -> tuple[int, ...]:
         return self.log_normalizer.shape
 
-    def log_prob(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+    def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log p(t | s)."""
-        t = as_value(t, self.values.dtype)
-        shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
-        t = jnp.broadcast_to(t, shape)[..., None]
-        joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), t], axis=-1))
+        value = as_value(value, self.values.dtype)
+        shape = jnp.broadcast_shapes(value.shape, self.batch_shape)
+        value = jnp.broadcast_to(value, shape)[..., None]
+        joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), value], axis=-1))
         return jnp.where(jnp.isneginf(joint), -jnp.inf, joint - jnp.broadcast_to(self.log_normalizer, shape))
 
-    def pdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+    def pdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """p(t | s)."""
-        return jnp.exp(self.log_prob(t))
+        return jnp.exp(self.log_prob(value))
 
-    def cdf(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
+    def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(time <= t | s)."""
-        return self._elementwise(Panels.cdf, self._tau(as_value(t, self.values.dtype)))
+        return self._elementwise(Panels.cdf, self._tau(as_value(value, self.values.dtype)))
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """The quantile: the inverse of `cdf`, -inf at 0 and +inf at 1."""
@@ -155,19 +155,19 @@ class TimeMixture(eqx.Module):
     def batch_shape(self) -> tuple[int, ...]:
         return batch_shape_of([*ranked_leaves(self.parent), (self.values, 1)])
 
-    def log_prob(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
+    def log_prob(self, value: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """log p(x | given)."""
-        x = self._checked(x)
+        value = self._checked(value)
         if self.keeps_time:
-            log_joint = self.parent.log_prob(self._with_values(x))
+            log_joint = self.parent.log_prob(self._with_values(value))
         else:
-            log_joint = self._space_integral(x)[0]
+            log_joint = self._space_integral(value)[0]
         log_given = jnp.broadcast_to(self._log_normalizer, log_joint.shape)
         return jnp.where(jnp.isneginf(log_joint), -jnp.inf, log_joint - log_given)
 
-    def pdf(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
+    def pdf(self, value: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """p(x | given)."""
-        return jnp.exp(self.log_prob(x))
+        return jnp.exp(self.log_prob(value))
 
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """Estimated relative error of `pdf(x)`: that of its integrals over time.
@@ -181,17 +181,17 @@ class TimeMixture(eqx.Module):
         given = jnp.zeros(shape, x.dtype) if self.time is None else jnp.broadcast_to(self.time.error_estimate, shape)
         return given if self.keeps_time else given + self._space_integral(x)[1]
 
-    def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
+    def cdf(self, value: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x | given), where there is only one coordinate."""
         if self.event_shape != (1,):
             raise invalid("cdf", expected="one coordinate", got=f"{self.event_shape[0]}", cure="Use marginal([i]).cdf.")
-        x = self._checked(x)
+        value = self._checked(value)
         if self.keeps_time:
-            return self.time.cdf(x[..., 0])
-        infinite = jnp.isinf(x)
-        log_mass = map_over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, x)), 1))
+            return self.time.cdf(value[..., 0])
+        infinite = jnp.isinf(value)
+        log_mass = map_over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, value)), 1))
         mass = jnp.clip(jnp.exp(log_mass - jnp.broadcast_to(self._log_normalizer, log_mass.shape)), 0, 1)
-        infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, x))
+        infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, value))
         return jnp.where(infinite, (last > 0).astype(mass.dtype), mass)
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
@@ -262,7 +262,7 @@ class TimeMixture(eqx.Module):
 
     def _checked(self, x):
         x = as_value(x, self.values.dtype)
-        check_event("x", x, self.event_shape)
+        check_event("value", x, self.event_shape)
         return x
 
     def _with_values(self, x):

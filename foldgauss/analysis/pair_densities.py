@@ -29,10 +29,6 @@ class _QuickTimeLikelihood(AbstractEnvelope):
     power: Float[Array, "*#batch"]
     floor: Float[Array, "*#batch"] | None  # None is 0
 
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return (0,) if self.floor is None else (0, 0)
-
     def log_a(self, t, *, time_loc, time_scale):
         largest = float(jnp.finfo(t.dtype).max) * 1e-3  # avoids inf - inf and 0 * inf
         tau = (t - time_loc) / time_scale

@@ -8,13 +8,14 @@ not of the panels' edges.
 from collections.abc import Callable
 from functools import cache, partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
+
+from foldgauss._numerics.batch import BatchModule
 
 __all__ = [
     "KRONROD_NODES",
@@ -89,7 +90,7 @@ def normal_rule() -> tuple[np.ndarray, np.ndarray]:
     return z, weights / weights.sum()
 
 
-class Panels(eqx.Module):
+class Panels(BatchModule):
     """Panels of an adaptive integral of exp(log_f), sorted, with log_f at the 15 nodes of each.
 
     A panel may be integrated in another variable, in which a narrow peak is smooth: `log_half` and `log_values` are of
@@ -108,8 +109,6 @@ class Panels(eqx.Module):
     nodes: Float[Array, "*batch panels 15"]
     log_half: Float[Array, "*batch panels"]
     log_values: Float[Array, "*batch panels 15"]
-
-    leaf_ranks = (1, 1, 2, 1, 2)
 
     @property
     def log_weights(self) -> Float[Array, "*batch panels 15"]:

@@ -12,7 +12,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import CallableEnvelope
-from foldgauss.estimator.em.loop import EMStatus
 from foldgauss.mixture import FoldedMixture
 
 __all__ = ["GradientFit", "fit_gradient"]
@@ -21,12 +20,15 @@ _LEARNING_RATE = 1e-2
 
 
 class GradientFit(NamedTuple):
-    """The mixture of the last step with a finite loss; the mean log-likelihood before each step; and the status:
-    NOT_CONVERGED means that all steps were taken."""
+    """The mixture of the last step with a finite loss, the mean log-likelihood before each step, and how it ended.
+
+    `success` and `message` are those of `scipy.optimize.OptimizeResult`: success means that all steps were taken.
+    """
 
     mixture: FoldedMixture
     log_likelihoods: np.ndarray
-    status: EMStatus
+    success: bool
+    message: str
 
 
 class _Raw(NamedTuple):
@@ -66,7 +68,7 @@ def fit_gradient(
         result = fit_gradient(start, x, steps=2000)
 
     **Source:** eq:foldgauss; Kingma and Ba 2015. **Raises:** ValueError naming the parameter. A loss that is not finite
-    ends the fit with `status` NOT_FINITE.
+    ends the fit without `success`.
     """
     if not isinstance(mixture, FoldedMixture) or mixture.logits.ndim != 1:
         raise invalid("mixture", expected="one FoldedMixture", got=type(mixture).__name__, cure="No batch of mixtures.")
@@ -94,11 +96,12 @@ def fit_gradient(
         step_key = jax.random.fold_in(key, number)
         new, state, value, current, finite = _step(raw, state, mixture, x, weights, step_key, optimizer, batch_size)
         if not finite:
-            return GradientFit(last, np.array(values), EMStatus.NOT_FINITE)
+            message = f"The loss or a parameter was not finite in step {number + 1}: lower the learning rate."
+            return GradientFit(last, np.array(values), False, message)
         raw, last = new, current
         if number < steps:
             values.append(float(value))
-    return GradientFit(last, np.array(values), EMStatus.NOT_CONVERGED)
+    return GradientFit(last, np.array(values), True, f"All {steps} steps were taken.")
 
 
 def _is_finite(mixture: FoldedMixture) -> Bool[Array, ""]:

@@ -22,6 +22,7 @@ from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
+from foldgauss.estimator.parameter_checks import make_envelope
 from foldgauss.estimator.profile_likelihood import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
@@ -151,11 +152,22 @@ class Fit(eqx.Module):
         center = dist.condition_time(t).loc
         return center - half, center + half
 
+    @property
+    def success(self) -> Bool[Array, ""]:
+        """Whether `status` is OK."""
+        return self.status == FitStatus.OK
+
+    @property
+    def message(self) -> str:
+        """What `status` means, and what to do about it; of a single fit, not under tracing."""
+        status = FitStatus(int(self.status))
+        return f"{status.name}: {_CURES[status]}" if status else "The fit succeeded."
+
     def check(self) -> "Fit":
         """Return this fit if its status is OK. **Raises:** ValueError with the status and a remedy."""
-        status = FitStatus(int(self.status))
-        if status is not FitStatus.OK:
-            raise invalid("x", expected="points that determine the fit", got=status.name, cure=_CURES[status])
+        if not self.success:
+            got, cure = self.message.split(": ", 1)
+            raise invalid("x", expected="points that determine the fit", got=got, cure=cure)
         return self
 
 
@@ -163,9 +175,7 @@ def fit(
     x: Float[ArrayLike, "n d"],
     *,
     degree: int = 1,
-    power: float = 1.0,
-    floor: float = 1e-3,
-    envelope: AbstractEnvelope | None = None,
+    envelope: AbstractEnvelope | str = "constant",
     time: str = "own",
     time_loc: ArrayLike | None = None,
     time_scale: ArrayLike | None = None,
@@ -183,9 +193,10 @@ def fit(
     * for `time="own"` their marginal estimates, weighted mean and standard deviation of t;
     * for `time="joint"` a local maximum of the joint likelihood, by BFGS from those estimates; there may be several.
 
-    The envelope is `TimeLikelihood(power, floor)`; `power=0` is a constant one, and `envelope` replaces it. The floor
-    is a *modeling* choice, and kept in the fitted distribution: without one the density on the ridge is unbounded
-    where `power (d-1) > 2`, and outlying times make a joint likelihood degenerate.
+    `envelope` is "constant", "time_likelihood" (`TimeLikelihood(power=1, floor=1e-3)`) or any envelope. It is not
+    fitted. Why the default is not the paper's: see `foldgauss.envelope`. A floor is a *modeling* choice, and kept in
+    the fitted distribution: without one the density on the ridge is unbounded where `power (d-1) > 2`, and outlying
+    times make a joint likelihood degenerate.
 
     **Shapes:** x (n, d), time last; `weights` (n,), frequency weights: 2 repeats a point, 0 leaves it out (such a row
     may hold NaN). A single fit; use `jax.vmap` for many. `covariance` is "full" or "diagonal" (the paper's).
@@ -199,7 +210,7 @@ def fit(
     `vmap`; see `Fit.check`.
     """
     degree = _check_degree("degree", degree)
-    plan = _make_plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance)
+    plan = _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance)
     return _fit(plan, plan.weights, jnp.int32(degree))
 
 
@@ -231,12 +242,12 @@ class _Plan(eqx.Module):
     covariance: str = eqx.field(static=True)
 
 
-def _make_plan(x, degree, power, floor, envelope, time, time_loc, time_scale, weights, covariance) -> _Plan:
+def _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance) -> _Plan:
     check_one_of("time", time, ("own", "joint"))
     check_one_of("covariance", covariance, ("full", "diagonal"))
     x = _check_points(x)
     weights = _check_weights(weights, x)
-    envelope = TimeLikelihood(power, floor) if envelope is None else envelope
+    envelope = make_envelope(envelope)
     given = _check_time(time_loc, time_scale, x.dtype)
     if given is None and time == "joint":
         _check_bounded(envelope, x.shape[1])
@@ -468,7 +479,7 @@ def select_degree(
 
     **Shapes:** x (n, d); `options` are those of `fit`, the same for every degree.
 
-    **Example:** `select_degree(x, 6, "bic", power=1.0).degree`
+    **Example:** `select_degree(x, 6, "bic").degree`
 
     **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on an unknown criterion, or if no
     degree can be fitted.
@@ -553,8 +564,8 @@ def _check_bounded(envelope: AbstractEnvelope, dim: int) -> None:
     if not isinstance(envelope, TimeLikelihood) or isinstance(envelope.floor, jax.core.Tracer):
         return
     if float(envelope.floor) == 0 and float(envelope.power) * (dim - 1) > 2:
-        cure = "The likelihood is unbounded on the ridge: pass floor=1e-3, or time='own'."
-        raise invalid("floor", expected="a positive number where power (d-1) > 2", got=0, cure=cure)
+        cure = "The likelihood is unbounded on the ridge: pass TimeLikelihood(power, floor=1e-3), or time='own'."
+        raise invalid("envelope", expected="a floor above 0 where power (d-1) > 2", got="floor 0", cure=cure)
 
 
 def _check_degree(name: str, value) -> int:

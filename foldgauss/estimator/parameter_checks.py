@@ -38,11 +38,7 @@ def check_parameters(estimator) -> None:
     check_one_of("covariance_type", estimator.covariance_type, _COVARIANCES)
     check_one_of("init_params", estimator.init_params, tuple(INITIALIZERS))
     check_one_of("criterion", estimator.criterion, ("bic", "aic"))
-    if isinstance(estimator.envelope, str):
-        check_one_of("envelope", estimator.envelope, tuple(_ENVELOPES))
-    elif not isinstance(estimator.envelope, AbstractEnvelope):
-        cure = "as_envelope(f)."
-        raise invalid("envelope", expected="an envelope or its name", got=repr(estimator.envelope), cure=cure)
+    make_envelope(estimator.envelope)
     if estimator.devices > len(jax.devices()):
         expected, cure = f"at most {len(jax.devices())}", "See jax.devices()."
         raise invalid("devices", expected=expected, got=estimator.devices, cure=cure)
@@ -105,5 +101,11 @@ def invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
 
 
 def make_envelope(envelope) -> AbstractEnvelope:
-    """The envelope itself, or the one with this name."""
-    return _ENVELOPES[envelope]() if isinstance(envelope, str) else envelope
+    """The envelope itself, or the one with this name. Raises ValueError for anything else."""
+    if isinstance(envelope, str):
+        check_one_of("envelope", envelope, tuple(_ENVELOPES))
+        return _ENVELOPES[envelope]()
+    if not isinstance(envelope, AbstractEnvelope):
+        expected, cure = f"an envelope or one of {', '.join(_ENVELOPES)}", "as_envelope(f)."
+        raise invalid("envelope", expected=expected, got=repr(envelope), cure=cure)
+    return envelope

@@ -29,7 +29,9 @@ def assert_near(found, frames, priors, starts, lengths):
         std = prior.std() * length
         assert found.mean()[k] == pytest.approx(start + length * prior.mean(), abs=5e-3 * std)
         assert found.std()[k] == pytest.approx(std, rel=3e-3)
-        np.testing.assert_allclose(found.interval(0.9)[:, k], start + length * prior.ppf([0.05, 0.95]), atol=5e-3 * std)
+        np.testing.assert_allclose(
+            np.stack(found.interval(0.9))[:, k], start + length * prior.ppf([0.05, 0.95]), atol=5e-3 * std
+        )
 
 
 def by_quadrature(curves, increments, far: float, points: int):
@@ -85,7 +87,9 @@ def test_frames_far_apart_are_gaussian():
     np.testing.assert_allclose(found.std()[1:-1], widths, rtol=2e-3)
     normal = scipy.stats.norm(means, widths)
     for level in (0.5, 0.9):
-        np.testing.assert_allclose(found.interval(level)[:, 1:-1], normal.interval(level), atol=5e-3 * widths.min())
+        np.testing.assert_allclose(
+            np.stack(found.interval(level))[:, 1:-1], normal.interval(level), atol=5e-3 * widths.min()
+        )
     # The evidence: each Gaussian's integral, and the prior's constant 5!.
     constant = np.log(widths * np.sqrt(2 * np.pi)).sum() + np.log(24)
     assert found.log_evidence == pytest.approx(constant, abs=5e-3)

@@ -38,7 +38,7 @@ from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import FitRun, clip_warnings, missed_psnr, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState, running_psnr
@@ -274,10 +274,11 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         psnr = config.economy.psnr
         plan += ", pruned by description length" if psnr is None else f", the smallest at {psnr:g} dB"
     growing = "" if config.growth is None else " at the start"
+    at_most = "up to " if num > most_alive(config, clip.num_frames, height, width) else ""
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
-        f"{' with alpha' if clip.has_alpha else ''}, {num:,} Gaussians of degree {config.degree}{growing}, "
+        f"{' with alpha' if clip.has_alpha else ''}, {at_most}{num:,} Gaussians of degree {config.degree}{growing}, "
         f"{plan}, {computed}",
         soft_wrap=True,
     )

@@ -15,7 +15,7 @@ from foldgauss.cli.shared.tables import format_count, print_figures
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
 
 
 def fit_in_segments(
@@ -144,6 +144,7 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
     num = chosen_num_gaussians(longest, max(lengths), *size, threads=options.threads)
+    at_most = "up to " if num > most_alive(longest, max(lengths), *size, threads=options.threads) else ""
     if display == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
         emit_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
@@ -160,6 +161,6 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     out.print(
         f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
         f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{num:,} Gaussians of degree {config.degree} and {plan}, by {options}",
+        f"{at_most}{num:,} Gaussians of degree {config.degree} and {plan}, by {options}",
         soft_wrap=True,
     )

@@ -56,7 +56,7 @@ class Irregularity:
     high: float
 
 
-def increment_intervals(posterior: FrameTimePosterior, level: float = 0.9) -> IncrementIntervals:
+def increment_intervals(posterior: FrameTimePosterior, level: float = 0.95) -> IncrementIntervals:
     """Means and central intervals of all increments, each draw in units of its own median increment.
 
     An increment between two held frames varies only through the median. Raises ValueError for a level outside (0, 1).

@@ -60,7 +60,7 @@ def plot_times(
     flagged = irregularities(posterior) if flagged is None else flagged
     frames, (even, unit) = np.arange(num_frames), even_times(posterior)
     mean = (posterior.mean() - even) / unit
-    inner, outer = ((posterior.interval(level) - even) / unit for level in (0.5, 0.9))
+    inner, outer = ((np.stack(posterior.interval(level)) - even) / unit for level in (0.5, 0.9))
     upper, lower = axes
     upper.fill_between(frames, *outer, color=_BLUE, alpha=0.25, linewidth=0, label="90%")
     upper.fill_between(frames, *inner, color=_BLUE, alpha=0.45, linewidth=0, label="50%")
@@ -107,7 +107,7 @@ def plot_increments(
     posterior: FrameTimePosterior,
     ax: Any = None,
     *,
-    level: float = 0.9,
+    level: float = 0.95,
     flagged: Sequence[Irregularity] | None = None,
 ) -> Any:
     """Plot each increment in units of the median one, with its central interval; mark duplicated and dropped frames.

@@ -124,15 +124,15 @@ class RefitTimes:
         """Degrees of freedom of each standard deviation."""
         return int(self.unseen.sum()) if self.by_frames else self.replicates - 1
 
-    def interval(self, level: float = 0.9) -> Float64[np.ndarray, "2 num_frames"]:
-        """Bounds of each frame's time: the model's own, and Student's quantile times `std` to both sides, in [0, 1].
+    def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
+        """(low, high) of each frame's time, in [0, 1]: the model's own less and plus Student's quantile times `std`.
 
         Raises ValueError for a level outside (0, 1).
         """
         if not is_within(level, "(0, 1)"):
             raise invalid("level", expected="a number in (0, 1)", got=repr(level))
         reach = scipy.stats.t.ppf((1 + level) / 2, self.freedom) * self.std
-        return np.clip(np.stack([self.own - reach, self.own + reach]), 0.0, 1.0)
+        return np.clip(self.own - reach, 0.0, 1.0), np.clip(self.own + reach, 0.0, 1.0)
 
     def ratio_to(self, std: Float[np.ndarray, " num_frames"]) -> float:
         """Ratio to another `std`: root mean square over frames, except the first and the last.

@@ -76,9 +76,9 @@ class ExactPosterior:
             raise invalid("probability", expected="a number in [0, 1]", got=probability)
         return self._filled([_quantile(*each, probability) for each in zip(self.grids, self.densities, strict=True)])
 
-    def interval(self, level: float) -> Float64[np.ndarray, "2 num_frames"]:
-        """Bounds of the central intervals that contain the probability `level`."""
-        return np.stack([self.quantile((1 - level) / 2), self.quantile((1 + level) / 2)])
+    def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
+        """(low, high) of the central intervals that contain the probability `level`."""
+        return self.quantile((1 - level) / 2), self.quantile((1 + level) / 2)
 
     def sample(self, num: int, seed: int = 0) -> Float64[np.ndarray, "num num_frames"]:
         """Independent draws from the joint posterior, by backward sampling."""

@@ -77,12 +77,12 @@ class FrameTimePosterior:
     def std(self) -> Float64[np.ndarray, " num_frames"]:
         return self._reduce(lambda draws: draws.std(0))
 
-    def interval(self, level: float = 0.9) -> Float64[np.ndarray, "2 num_frames"]:
-        """Bounds of the central intervals that contain the fraction `level` of the draws."""
+    def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
+        """(low, high) of the central intervals that contain the fraction `level` of the draws."""
         if not is_within(level, "(0, 1)"):
             raise invalid("level", expected="a number in (0, 1)", got=short_repr(level))
         bounds = [(1 - level) / 2, (1 + level) / 2]
-        return self._reduce(lambda draws: np.quantile(draws, bounds, axis=0))
+        return tuple(self._reduce(lambda draws: np.quantile(draws, bounds, axis=0)))
 
     def _reduce(self, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Apply a reduction of draws (draws, frames) to batches of frames, without a copy of all draws."""

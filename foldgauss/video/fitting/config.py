@@ -406,6 +406,9 @@ DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
 PIXEL_TIME = 0.4
 #: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
 DENSITY, DENSITY_POWER = 0.0028, 0.85
+#: Gaussians alive per pixel of a frame, at most, likewise: where they live long, more of them leave time for too few
+#: steps.
+ALIVE, ALIVE_POWER = 0.25, 0.55
 #: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
 #: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
@@ -421,7 +424,7 @@ def default_num_gaussians(
 
     It is `DENSITY` x^`DENSITY_POWER` for each pixel of all frames, where a core has x microseconds for each: `minutes`
     times the number of `threads` (default: those of this process), or the time that `steps` take. The model file is
-    never larger than the frames as bytes.
+    never larger than the frames as bytes. `most_alive` may lower it.
     """
     pixels = num_frames * height * width
     if config.economy is not None:
@@ -431,9 +434,25 @@ def default_num_gaussians(
     if steps is not None:
         budgets.append(PIXEL_TIME * steps * config.batch_size / num_frames)
     if config.minutes is not None:
-        budgets.append(60e6 * config.minutes * (threads or num_threads()) / pixels)
+        budgets.append(_time_per_pixel(config, pixels, threads))
     density = min(DENSITY * min(budgets) ** DENSITY_POWER, 3 / bytes_per_gaussian(config.degree))
     return max(round(density * pixels), 1)
+
+
+def most_alive(config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None) -> float:
+    """The largest mean number of Gaussians alive in a frame at the start, where `minutes` choose their number.
+
+    It is `ALIVE` x^`ALIVE_POWER` for each pixel of a frame, x as in `default_num_gaussians`; else infinite. How many
+    are alive depends on the motion in the clip: `initialize` lowers the number by it.
+    """
+    if config.minutes is None or config.num_gaussians is not None or config.economy is not None:
+        return math.inf
+    return height * width * ALIVE * _time_per_pixel(config, num_frames * height * width, threads) ** ALIVE_POWER
+
+
+def _time_per_pixel(config: FitConfig, pixels: int, threads: int | None) -> float:
+    """Microseconds of a core that `minutes` have for each pixel of all frames."""
+    return 60e6 * config.minutes * (threads or num_threads()) / pixels
 
 
 def bytes_per_gaussian(degree: int) -> int:

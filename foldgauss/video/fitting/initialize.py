@@ -1,6 +1,7 @@
 """The initial Gaussians of a fit: drawn from the detail and the colors of the clip; or uniformly, as published."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import cv2
@@ -64,13 +65,15 @@ def initialize(
     motion: Motion | None = None,
     opacity: float = START_OPACITY,
     with_static: bool = False,
+    most_alive: float = math.inf,
 ) -> FoldedSplats:
     """Initial splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
     Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
     density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
     fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. With `with_static`,
-    starts whose pixel never changes are static Gaussians, behind the others.
+    starts whose pixel never changes are static Gaussians, behind the others. There are fewer than `num_gaussians` where
+    more than `most_alive` would be alive in a frame on average.
     """
     rng = np.random.default_rng([seed, 0])
     num_frames = len(frames)
@@ -82,6 +85,9 @@ def initialize(
     pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MAX_PILOTS // num_frames), 1))
     _, spread = make(pilot, draw_positions(pilot, density_of, rng)[0])
     chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
+    first, last = find_lifetimes(times[pilot], spread, times)
+    lifetime = np.average(last - first, weights=chance[pilot])  # in frames
+    num_gaussians = max(round(min(num_gaussians, most_alive * num_frames / lifetime)), 1)
     if num_gaussians < FEW_STARTS * num_frames:  # random frames would leave out whole intervals
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
@@ -266,10 +272,15 @@ def _draw(density: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     return np.minimum(np.searchsorted(summed, uniform * summed[-1], side="right"), len(density) - 1)
 
 
+def find_lifetimes(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first frame in which each Gaussian is alive, and the one after the last."""
+    first, last = time - TAU_MAX * spread, time + TAU_MAX * spread
+    return np.searchsorted(times, first), np.searchsorted(times, last, side="right")
+
+
 def count_alive(time: np.ndarray, spread: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Gaussians alive at each of the frames."""
-    first = np.searchsorted(times, time - TAU_MAX * spread)
-    last = np.searchsorted(times, time + TAU_MAX * spread, side="right")
+    first, last = find_lifetimes(time, spread, times)
     step = np.bincount(first, minlength=len(times) + 1) - np.bincount(last, minlength=len(times) + 1)
     return np.cumsum(step)[:-1]
 

@@ -22,7 +22,7 @@ from foldgauss.video.fitting.budget import (
     next_level,
     starts_level,
 )
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.fitting.optical_flow import Motion, motion_finder
@@ -280,6 +280,7 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity, "with_static": config.economy is not None}
+    clip["most_alive"] = most_alive(config, *frames.shape[:3])
     return initialize(frames, num, envelope=envelope_of(config), **clip, **shape)
 
 
