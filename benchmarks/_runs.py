@@ -74,7 +74,13 @@ def kept_setting(path: Path | None, name: str) -> Any:
 
 def told(run: Run) -> str:
     """A run in one line."""
-    shown = {"psnr": "{:.2f} dB", "gaussians": "{:,} Gaussians", "steps": "{:,} steps", "seconds": "{:.0f} s"}
+    shown = {
+        "psnr": "{:.2f} dB",
+        "gaussians": "{:,} Gaussians",
+        "steps": "{:,} steps",
+        "seconds": "{:.0f} s",
+        "killed": "killed: {}",
+    }
     return ", ".join(form.format(run[name]) for name, form in shown.items() if name in run)
 
 

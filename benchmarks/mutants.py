@@ -1,0 +1,245 @@
+"""Mutation testing: does the quick suite notice small mistakes in the core modules?
+
+    python -m benchmarks.mutants [--num N] [--seed S] [--workers W] [--only MODULE ...] [--json FILE]
+
+A mutant is one changed operator, comparison, constant, condition or argument. N of them (300) are drawn with a seed,
+evenly over the modules of `TARGETS`, and each runs the test files of its module (`-m "not slow"`, until the first
+failure). A mutant is killed where a test fails or the tests take `TIMEOUT` seconds. Messages, annotations, docstrings
+and definitions of types are not mutated.
+
+With --json each mutant that is done is kept there, and the same command continues after it. Survivors are listed with
+their lines: each is either equivalent, or shows what no test checks.
+"""
+
+import argparse
+import ast
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import SimpleQueue
+from typing import NamedTuple
+
+from benchmarks import _common
+from benchmarks._common import console
+from benchmarks._runs import Run, Runs
+
+ROOT = Path(__file__).parent.parent
+#: Seconds that the tests of a mutant may take.
+TIMEOUT = 900
+#: The modules, and the test files of each, those that take the least time first.
+TARGETS = {
+    "distribution": ["test_distribution", "test_distribution_normalisation", "test_distribution_extremes"],
+    "analysis/conditional": ["test_distribution_conditional"],
+    "envelope": ["test_envelope", "test_distribution"],
+    "fold": ["test_fold", "test_distribution"],
+    "mixture": ["test_mixture"],
+    "estimator/em/loop": ["test_em", "test_em_chunks"],
+    "estimator/em/m_step": ["test_em"],
+    "estimator/em/statistics": ["test_em", "test_em_chunks"],
+    "render/_cpu_kernels": ["render/test_cpu", "render/test_weights"],
+    "video/models/conditioning": ["video/test_conditioning"],
+    "video/models/frame_times": ["video/test_frame_times"],
+    "video/fitting/adam": ["video/test_adam", "video/test_fit"],
+    "io/models/compact": ["io/test_compact"],
+    "io/models/range_coder": ["io/test_range_coder"],
+}
+_COMPARISONS = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+}
+_OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult}
+_OPERATORS |= {ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.And: ast.Or, ast.Or: ast.And}
+#: Names of methods and functions that are exchanged.
+_CALLS = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "any": "all", "all": "any"}
+_CALLS |= {"sin": "cos", "cos": "sin", "cumsum": "cumprod", "floor": "ceil", "ceil": "floor"}
+
+
+class Mutant(NamedTuple):
+    """The `index`-th place of a module that can be mutated."""
+
+    module: str
+    index: int
+    line: int
+    change: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.module}:{self.line}:{self.index} {self.change}"
+
+
+class _Mutator(ast.NodeTransformer):
+    """Counts the places of a tree that can be mutated, and changes that of number `wanted`."""
+
+    def __init__(self, wanted: int = -1):
+        self.wanted, self.found = wanted, []
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.arg | ast.JoinedStr):
+            return node
+        if isinstance(node, ast.AnnAssign):  # a field or a variable, whose annotation is left alone
+            node.value = node.value and self.visit(node.value)
+            return node
+        if isinstance(node, ast.Assign) and any(getattr(one, "id", "").startswith("__") for one in node.targets):
+            return node
+        if isinstance(node, ast.FunctionDef):
+            node.args.defaults = [self.visit(one) for one in node.args.defaults]
+            node.args.kw_defaults = [one and self.visit(one) for one in node.args.kw_defaults]
+            node.body = [self.visit(one) for one in node.body]
+            return node
+        if isinstance(node, ast.Call) and _is_message(node):
+            return node
+        for change, mutated in _mutations(node):
+            self.found.append((node.lineno, change))
+            if len(self.found) - 1 == self.wanted:
+                return ast.copy_location(mutated, node)
+        return self.generic_visit(node)
+
+
+def _is_message(node: ast.Call) -> bool:
+    name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+    return name in ("invalid", "warn", "TypeVar", "field", "short_repr") or name.startswith("check_")
+
+
+def _mutations(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """What a node can be changed to, in words and as a node."""
+    match node:
+        case ast.Compare(left, [op], rest) if type(op) in _COMPARISONS:
+            new = _COMPARISONS[type(op)]()
+            yield f"{type(op).__name__} -> {type(new).__name__}", ast.Compare(left, [new], rest)
+        case ast.BinOp(left, op, right) if type(op) in _OPERATORS:
+            new = _OPERATORS[type(op)]()
+            yield f"{type(op).__name__} -> {type(new).__name__}", ast.BinOp(left, new, right)
+        case ast.BoolOp(op, values):
+            new = _OPERATORS[type(op)]()
+            yield f"{type(op).__name__} -> {type(new).__name__}", ast.BoolOp(new, values)
+        case ast.UnaryOp(ast.USub() | ast.Not() | ast.Invert(), operand):
+            yield f"{type(node.op).__name__} dropped", operand
+        case ast.Constant(bool() as value):
+            yield f"{value} -> {not value}", ast.Constant(not value)
+        case ast.Constant(int() as value):
+            yield f"{value} -> {value + 1}", ast.Constant(value + 1)
+        case ast.Constant(float() as value):
+            yield f"{value} -> {2 * value + 1}", ast.Constant(2 * value + 1)
+        case ast.If(test, body, orelse):
+            yield "if never", ast.If(ast.Constant(False), body, orelse)
+        case ast.IfExp(test, body, orelse):
+            yield "if always", body
+        case ast.Call(ast.Attribute(value, name, ctx), args, keywords) if name in _CALLS:
+            yield f"{name} -> {_CALLS[name]}", ast.Call(ast.Attribute(value, _CALLS[name], ctx), args, keywords)
+        case ast.Call(ast.Attribute(value, "where", ctx), [test, first, second], keywords):
+            yield "where swapped", ast.Call(ast.Attribute(value, "where", ctx), [test, second, first], keywords)
+        case ast.AugAssign(target, op, value) if type(op) in _OPERATORS:
+            new = _OPERATORS[type(op)]()
+            yield f"{type(op).__name__}= -> {type(new).__name__}=", ast.AugAssign(target, new, value)
+
+
+def find_mutants(module: str) -> list[Mutant]:
+    mutator = _Mutator()
+    mutator.visit(ast.parse((ROOT / "foldgauss" / f"{module}.py").read_text()))
+    return [Mutant(module, index, *place) for index, place in enumerate(mutator.found)]
+
+
+def mutate(source: str, index: int) -> str:
+    """The source with its `index`-th place changed; comments are lost."""
+    return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
+
+
+def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:
+    """`num` mutants, as many of every module as there are, one module after the other in turn."""
+    shuffled = [
+        random.Random(f"{seed} {name}").sample(found, len(found)) for name in modules if (found := find_mutants(name))
+    ]
+    in_turn = [found[k] for k in range(max(map(len, shuffled))) for found in shuffled if k < len(found)]
+    return in_turn[:num]
+
+
+def run_tests(folder: Path, module: str) -> tuple[bool, str]:
+    """Whether the tests of a module pass in a copy of the checkout, and the last line that they print."""
+    files = [f"tests/{name}.py" for name in TARGETS[module]]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "--no-header", "--durations=0", *files]
+    env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1")
+    try:
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT)
+    except subprocess.TimeoutExpired:
+        return False, f"more than {TIMEOUT} s"
+    lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return done.returncode == 0, (lines or done.stdout.splitlines() or [""])[-1]
+
+
+def try_mutant(mutant: Mutant, folder: Path) -> Run:
+    path = folder / "foldgauss" / f"{mutant.module}.py"
+    source = path.read_text()
+    try:
+        path.write_text(mutate(source, mutant.index))
+        passed, last = run_tests(folder, mutant.module)
+    finally:
+        path.write_text(source)
+    code = source.splitlines()[mutant.line - 1].strip()
+    return {"killed": not passed, "by": "" if passed else last, "code": code, "module": mutant.module}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    options = _common.parse(_parser(), arguments)
+    modules = list(TARGETS) if options.only is None else options.only
+    mutants = draw(options.num, options.seed, modules)
+    runs = Runs(options.json, {"seed": options.seed})
+    left = [mutant for mutant in mutants if mutant.name not in runs.done]
+    with tempfile.TemporaryDirectory() as parent, ThreadPoolExecutor(options.workers) as pool:
+        folders: SimpleQueue[Path] = SimpleQueue()
+        for k in range(options.workers):
+            folder = Path(parent) / str(k)
+            shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "__pycache__", "site"))
+            folders.put(folder)
+        for module in dict.fromkeys(mutant.module for mutant in left):
+            passed, last = run_tests(Path(parent) / "0", module)
+            if not passed:
+                raise SystemExit(f"{module}: its tests fail without a change: {last}")
+
+        def one(mutant: Mutant) -> None:
+            folder = folders.get()
+            try:
+                runs.get(mutant.name, lambda: try_mutant(mutant, folder))
+            finally:
+                folders.put(folder)
+
+        list(pool.map(one, left))
+    show({mutant.name: runs.done[mutant.name] for mutant in mutants}, options.json)
+
+
+def show(rows: dict[str, Run], path: Path | None) -> None:
+    table = _common.table("Mutants", "module", "mutants", "killed", "fraction")
+    figures = {}
+    for module in dict.fromkeys(row["module"] for row in rows.values()):
+        killed = [row["killed"] for row in rows.values() if row["module"] == module]
+        figures |= {f"mutants_{module}": len(killed), f"killed_{module}": sum(killed)}
+        table.add_row(module, str(len(killed)), str(sum(killed)), f"{sum(killed) / len(killed):.0%}")
+    killed = sum(row["killed"] for row in rows.values())
+    table.add_row("all", str(len(rows)), str(killed), f"{killed / len(rows):.1%}")
+    console.print(table)
+    for name, row in rows.items():
+        if not row["killed"]:
+            console.print(f"survived: {name}\n    {row['code']}", soft_wrap=True, highlight=False, markup=False)
+    _common.finish(None, figures | {"mutants": len(rows), "killed": killed}, _common.describe_machine())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _common.parser(__doc__)
+    parser.add_argument("--num", type=_common.whole, default=300, metavar="N", help="[300]")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="[0]")
+    parser.add_argument("--workers", type=_common.whole, default=1, metavar="W", help="[1]")
+    parser.add_argument("--only", nargs="+", choices=list(TARGETS), metavar="MODULE", help="[all]")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
