@@ -183,6 +183,10 @@ def _rendering(names, folder):
     np.testing.assert_allclose(names["trace"].image, np.moveaxis(image, -1, 0), atol=1e-6)
     np.testing.assert_allclose(1 - names["trace"].transmittance, names["alpha"], atol=1e-6)
     assert np.mean((names["better"] - target) ** 2) < 0.5 * np.mean((image - target) ** 2)
+    np.testing.assert_allclose(names["white"], np.asarray(image) + 1 - np.asarray(names["alpha"])[..., None], atol=1e-6)
+    np.testing.assert_allclose(names["camera"].intrinsics((90, 160)), names["K"], rtol=1e-5)
+    seen = np.asarray(names["opaque"]) > 0.1
+    assert 1 < np.asarray(names["depth"])[seen].min() < 4 < np.asarray(names["depth"])[seen].max() < 7
     for other in ("added", "sharp", "soft", "aside", "from_above"):
         assert np.isfinite(names[other]).all()
         assert np.abs(names[other] - image).max() > 0.05

@@ -1,5 +1,6 @@
 """The public function `render`: checks its arguments, chooses an engine, and is differentiable under jit and vmap."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -34,7 +35,9 @@ def render(
     compositing: str = "over",
     engine: str = "auto",
     options: RenderOptions | None = None,
-) -> Float[Array, "height width channels"]:
+    return_alpha: bool = False,
+    return_depth: bool = False,
+) -> Float[Array, "height width channels"] | tuple[Array, ...]:
     r"""Render an image of two-dimensional splats by alpha compositing front to back.
 
     $$ C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j) $$
@@ -49,11 +52,16 @@ def render(
       far); "reference" (dense, slow); or "auto": "cpu" if JAX's default device is a CPU and "cpu" supports the
       options, else "xla".
     - `options`: cutoffs and tiling, `RenderOptions`.
+    - `return_alpha`: also return alpha, (height, width): sum_i alpha_i T_i, which is 1 - T_end up to rounding.
+    - `return_depth`: also return the expected depth, (height, width), in model units along the camera's axis:
+      sum_i alpha_i T_i z_i / sum_i alpha_i T_i with z the `splats.depth` that `project` sets; 0 where alpha is 0. This
+      is gsplat's mode "ED"; its "D", the sum without the division, is the product of depth and alpha.
 
-    Returns (height, width, channels) in the dtype of `splats.mean`. Differentiable in every leaf of `splats` and in
-    `background`. A splat with a parameter that is not finite is left out and gets no gradient. Raises ValueError for an
-    unknown option, a size below 1, shapes that do not match or colors without a channel, and RuntimeError in a process
-    that was forked after JAX had started.
+    Returns the image, (height, width, channels), in the dtype of `splats.mean`; or a tuple of image, alpha and depth
+    without what was not asked for. Differentiable in every leaf of `splats` and in `background`. A splat with a
+    parameter that is not finite is left out and gets no gradient. Raises ValueError for an unknown option, a size below
+    1, shapes that do not match, colors without a channel, alpha or depth with compositing "sum", and depth of splats
+    without one; RuntimeError in a process that was forked after JAX had started.
 
     Example: `render(Splats2D(mean, factor, opacity, color), (160, 320))`.
 
@@ -90,7 +98,30 @@ def render(
         pallas.check_options(options)
     # Engine "xla" is not compiled here: it sizes its lists by concrete values where it can.
     run = _run_compiled if engine == "cpu" else _run_engine
-    return run(splats, background, tuple(map(int, size)), compositing, engine, options)
+    how = (tuple(map(int, size)), compositing, engine, options)
+    if not (return_alpha or return_depth):
+        return run(splats, background, *how)
+    _check_weighted(splats, compositing, return_depth)
+    # Images of the same weights: alpha is that of color 1, and the sum of weighted depths that of color z, both over 0.
+    added = [jnp.ones_like(splats.opacity), *([splats.depth] if return_depth else [])]
+    color = jnp.concatenate([splats.color, jnp.stack(added, -1).astype(splats.color.dtype)], -1)
+    behind = jnp.concatenate([background, jnp.zeros(len(added), dtype)])
+    image = run(dataclasses.replace(splats, color=color), behind, *how)
+    alpha = image[..., channels]
+    outputs = [image[..., :channels], *([alpha] if return_alpha else [])]
+    if return_depth:
+        outputs.append(image[..., -1] / jnp.where(alpha > 0, alpha, jnp.ones_like(alpha)))
+    return tuple(outputs)
+
+
+def _check_weighted(splats: Splats2D, compositing: str, depth: bool) -> None:
+    """Raise unless the image has an alpha, and the splats depths if they are needed."""
+    if compositing != "over":
+        cure = "A sum has no transmittance; the image of colors of 1 is the sum of its alphas."
+        raise invalid("compositing", expected="'over' for alpha and depth", got=repr(compositing), cure=cure)
+    if depth and splats.depth is None:
+        cure = "foldgauss.render.project sets them."
+        raise invalid("splats.depth", expected="a depth of each splat, shape (num,)", got=None, cure=cure)
 
 
 def _run_engine(splats, background, size, compositing, engine, options):

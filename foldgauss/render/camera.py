@@ -5,6 +5,7 @@ longer side is 1. The published code's (x, y, z) is (x, z, -y) here, and its uni
 to the plane.
 """
 
+import dataclasses
 import math
 from numbers import Real
 
@@ -28,6 +29,8 @@ NEAR = 0.01
 #: The Jacobian is evaluated no farther out than this times the half field of view, as in the published 3DGS.
 TANGENT_LIMIT = 1.3
 ORDERS = ("depth", "array")
+#: The largest error of an entry of R R^T and of a viewmat's last row: matrices in text files often have four digits.
+ROTATION_TOLERANCE = 1e-3
 
 
 class Gaussians3D(eqx.Module):
@@ -78,6 +81,43 @@ class Gaussians3D(eqx.Module):
         turn = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
         return cls.from_flat(Splats2D(mean, turn * scale[..., None, :], opacity, color), thickness=thickness)
 
+    @classmethod
+    def from_quaternions(
+        cls,
+        mean: Float[Array, "num 3"],
+        quaternion: Float[Array, "num 4"],
+        scale: Float[Array, "num 3"],
+        opacity: Float[Array, " num"],
+        color: Float[Array, "num channels"],
+    ) -> "Gaussians3D":
+        """Create Gaussians from the parameters of 3DGS: F = R(quaternion) diag(scale).
+
+        `quaternion` is (w, x, y, z) of any length but 0: it is normalized here. `scale` has standard deviations along
+        the Gaussian's axes, and `opacity` is in [0, 1], as gsplat takes them. The parameters of 3DGS, also those in its
+        files, are log(scale) and logit(opacity): pass `jnp.exp(scale)` and `jax.nn.sigmoid(opacity)`.
+
+        Raises ValueError for shapes that do not match, a quaternion of length 0 (NaN under tracing) and a negative
+        scale. Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 6.
+        """
+        for name, value, width in (("quaternion", quaternion, 4), ("scale", scale, 3)):
+            if np.shape(value) != (*np.shape(mean)[:-1], width):
+                expected = f"shape (num, {width}) for means of shape {np.shape(mean)}"
+                raise invalid(name, expected=expected, got=f"shape {np.shape(value)}")
+        turns, scales = concrete_value(quaternion), concrete_value(scale)
+        if turns is not None and (turns == 0).all(-1).any():
+            raise invalid("quaternion", expected="(w, x, y, z) of a length above 0", got="zeros")
+        if scales is not None and (scales < 0).any():
+            cure = "3DGS stores their logarithms: pass jnp.exp(scale)."
+            raise invalid("scale", expected="standard deviations >= 0", got=f"a least of {scales.min()}", cure=cure)
+        w, x, y, z = jnp.moveaxis(_unit(jnp.asarray(quaternion)), -1, 0)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        rotation = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+        return cls(mean, rotation * jnp.asarray(scale)[..., None, :], opacity, color)
+
     def to_flat(self) -> Splats2D:
         """The orthogonal projection on the plane z = 0: the marginal of (x, y), inverse of `from_flat`.
 
@@ -91,22 +131,26 @@ class Camera(eqx.Module):
 
     Shapes: `rotation` (3, 3) takes world directions to the camera's axes, its rows; `position` (3,) in model space;
     `fov` () is the frame's horizontal field of view in radians. `aspect` is that frame's height / width (None: the
-    image's own); an image of another aspect is covered by the frame as in `Splats2D.to_pixels`.
+    image's own); an image of another aspect is covered by the frame as in `Splats2D.to_pixels`. `lens` (3,) is the
+    ratio of the vertical to the horizontal focal length, and the principal point's offset from the frame's center in
+    frame widths (right, down); None is (1, 0, 0). See `from_matrices` for the matrices of OpenCV and gsplat.
     """
 
     rotation: Float[Array, "3 3"]
     position: Float[Array, "3"]
     fov: Float[Array, ""]
     aspect: float | None = eqx.field(static=True, default=None)
+    lens: Float[Array, "3"] | None = None
 
     def __check_init__(self) -> None:
-        shapes = [getattr(leaf, "shape", None) for leaf in (self.rotation, self.position, self.fov)]
+        leaves = (self.rotation, self.position, self.fov, *([] if self.lens is None else [self.lens]))
+        shapes = [getattr(leaf, "shape", None) for leaf in leaves]
         if any(shape is None for shape in shapes):
             return  # placeholders, as inside tree transformations
         batch = shapes[2]
-        if shapes != [(*batch, 3, 3), (*batch, 3), batch]:
-            expected, got = "shapes (3, 3), (3,), ()", ", ".join(map(str, shapes))
-            raise invalid("rotation, position, fov", expected=expected, got=got)
+        if shapes != [(*batch, 3, 3), (*batch, 3), batch, (*batch, 3)][: len(shapes)]:
+            expected, got = "shapes (3, 3), (3,), (), (3,)", ", ".join(map(str, shapes))
+            raise invalid("rotation, position, fov, lens", expected=expected, got=got)
         if self.aspect is not None:
             check_aspect(self.aspect)
         fov = concrete_value(self.fov)
@@ -162,6 +206,40 @@ class Camera(eqx.Module):
         right = jnp.where(undetermined, jnp.nan, _unit(across))
         return cls(jnp.stack([right, jnp.cross(forward, right), forward]), eye, _as_float(fov), aspect)
 
+    @classmethod
+    def from_matrices(cls, viewmat: ArrayLike, K: ArrayLike, size: tuple[int, int]) -> "Camera":
+        r"""A camera from its matrices in the convention of OpenCV, COLMAP and gsplat: x right, y down, z forward.
+
+        $$ (x, y, z) = R X + t, \quad u = f_x x / z + c_x, \quad v = f_y y / z + c_y $$
+
+        - `viewmat`: (4, 4), [[R, t], [0, 1]], from world to camera: R a rotation, t in the unit of the Gaussians.
+        - `K`: (3, 3), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], in pixels of an image of `size` = (height, width). The two
+          focal lengths may differ and the principal point may be anywhere; there is no skew and no lens distortion.
+        - `size`: that of the image K belongs to. Of the same aspect, images of other sizes show the same.
+
+        Pixel centers are at +0.5, as in COLMAP and gsplat. OpenCV's calibration has them at whole numbers: add 0.5 to
+        its cx and cy. `viewmat` and `intrinsics(size)` return the matrices. Differentiable in both matrices.
+
+        Raises ValueError for other shapes, an R that is no rotation (scaled, mirrored), focal lengths that are not
+        above 0, and skew; values are not checked under tracing.
+
+        Example: `project(gaussians, Camera.from_matrices(viewmat, K, (480, 640)), (480, 640))`.
+        """
+        check_size(size)
+        viewmat, K = _as_float(viewmat), _as_float(K)
+        _check_viewmat(viewmat)
+        _check_intrinsics(K)
+        height, width = size
+        rotation, shift = viewmat[:3, :3], viewmat[:3, 3]
+        middle = jnp.asarray([width / 2, height / 2], K.dtype)
+        return cls(
+            rotation,
+            -jnp.matmul(rotation.T, shift, precision="highest"),
+            2 * jnp.arctan(width / 2 / K[0, 0]),
+            height / width,
+            jnp.concatenate([K[1:2, 1] / K[0, 0], (K[:2, 2] - middle) / width]),
+        )
+
     def orbit(self, azimuth: ArrayLike, elevation: ArrayLike = 0.0, *, target: ArrayLike = (0.0, 0.0, 0.0)) -> "Camera":
         """This camera rotated about `target`: first by `elevation` about x, then by `azimuth` about the vertical.
 
@@ -180,15 +258,32 @@ class Camera(eqx.Module):
         turn = jnp.matmul(about_y, about_x, precision="highest")
         position = target + jnp.matmul(turn, self.position - target, precision="highest")
         rotation = jnp.matmul(self.rotation, turn.T, precision="highest")
-        return Camera(rotation, position, self.fov, self.aspect)
+        return dataclasses.replace(self, rotation=rotation, position=position)
 
     def focal(self, size: tuple[int, int]) -> Float[Array, ""]:
-        """Focal length in pixels of an image of `size` = (height, width)."""
+        """Horizontal focal length in pixels of an image of `size` = (height, width)."""
+        return self._frame_width(size) / (2 * jnp.tan(self.fov / 2))
+
+    def intrinsics(self, size: tuple[int, int]) -> Float[Array, "3 3"]:
+        """The matrix K in pixels of an image of `size` = (height, width); see `from_matrices`."""
+        focal = self.focal(size)
+        lens = jnp.asarray([1, 0, 0], focal.dtype) if self.lens is None else self.lens
+        center = jnp.asarray([size[1] / 2, size[0] / 2], lens.dtype) + self._frame_width(size) * lens[1:]
+        zero, one = jnp.zeros_like(focal), jnp.ones_like(focal)
+        return jnp.stack([focal, zero, center[0], zero, focal * lens[0], center[1], zero, zero, one]).reshape(3, 3)
+
+    @property
+    def viewmat(self) -> Float[Array, "4 4"]:
+        """The matrix from world to camera; see `from_matrices`."""
+        shift = -jnp.matmul(self.rotation, self.position, precision="highest")
+        last = jnp.asarray([[0, 0, 0, 1]], shift.dtype)
+        return jnp.concatenate([jnp.concatenate([self.rotation, shift[:, None]], 1), last])
+
+    def _frame_width(self, size: tuple[int, int]) -> float:
+        """Pixels of the frame's width in an image of `size`."""
         check_size(size)
-        height, width = size
-        aspect = height / width if self.aspect is None else self.aspect
-        frame_width = pixels_per_unit(size, aspect=aspect) * min(1.0, 1 / aspect)
-        return frame_width / (2 * jnp.tan(self.fov / 2))
+        aspect = size[0] / size[1] if self.aspect is None else self.aspect
+        return pixels_per_unit(size, aspect=aspect) * min(1.0, 1 / aspect)
 
 
 def project(
@@ -201,8 +296,9 @@ def project(
     \quad J = \tfrac{f}{z} \begin{bmatrix} 1 & 0 & -x/z \\ 0 & 1 & -y/z \end{bmatrix}
     $$
 
-    with (x, y, z) the mean in the camera's axes W and f the focal length in pixels; in J alone x/z and y/z are clipped
-    to 1.3 times the half field of view, as the linearization diverges beyond.
+    with (x, y, z) the mean in the camera's axes W and f the focal length in pixels, by row where the camera has two; in
+    J alone x/z and y/z are clipped to 1.3 times the half field of view about the image's center, as the linearization
+    diverges beyond. The splats' `depth` is z.
 
     - `order`: "depth", front to back by z, array order where depths are equal; or "array", unchanged. In a fitted
       image the compositing order is the array order: use "array" for its flat Gaussians at a slant, as "depth" would
@@ -232,21 +328,25 @@ def project(
         raise invalid("gaussians, camera", expected=expected, got=got, cure=cure)
     dtype = gaussians.mean.dtype
     rotation, position = camera.rotation.astype(dtype), camera.position.astype(dtype)
-    focal, middle = camera.focal(size).astype(dtype), jnp.asarray([size[1] / 2, size[0] / 2], dtype)
+    intrinsics, middle = camera.intrinsics(size).astype(dtype), jnp.asarray([size[1] / 2, size[0] / 2], dtype)
+    focal, center = jnp.diagonal(intrinsics)[:2], intrinsics[:2, 2]
 
     view = jnp.sum(rotation[None] * (gaussians.mean - position[None])[:, None, :], -1)
     depth = view[:, 2]
     seen = depth > near
     safe_depth = jnp.where(seen, depth, jnp.ones_like(depth))
     tangent = view[:, :2] / safe_depth[:, None]
-    limit = (TANGENT_LIMIT * middle / focal)[None]
-    held = jnp.clip(tangent, -limit, limit)
-    jacobian = (focal / safe_depth)[:, None, None] * (rotation[None, :2] - held[..., None] * rotation[None, 2:])
+    limit, ahead = TANGENT_LIMIT * middle / focal, (middle - center) / focal
+    held = jnp.clip(tangent, (ahead - limit)[None], (ahead + limit)[None])
+    jacobian = (focal[None] / safe_depth[:, None])[..., None] * (
+        rotation[None, :2] - held[..., None] * rotation[None, 2:]
+    )
     splats = Splats2D(
-        focal * tangent + middle[None],
+        focal[None] * tangent + center[None],
         square_factor(jnp.matmul(jacobian, gaussians.factor, precision="highest")),
         jnp.where(seen, gaussians.opacity, jnp.zeros_like(gaussians.opacity)),
         gaussians.color,
+        depth,
     )
     if order == "array":
         return splats
@@ -301,6 +401,39 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
     sign_cos = jnp.where((which == 1) | (which == 2), -1.0, 1.0).astype(angle.dtype)
     sign_sin = jnp.where(which >= 2, -1.0, 1.0).astype(angle.dtype)
     return sign_cos * jnp.where(odd, sin, cos), sign_sin * jnp.where(odd, cos, sin)
+
+
+def _check_viewmat(viewmat: Float[Array, "4 4"]) -> None:
+    """Raise unless it is a rigid motion; traced values are not checked."""
+    if viewmat.shape != (4, 4):
+        cure = "Append the row (0, 0, 0, 1) to [R, t]; use jax.vmap for several cameras."
+        raise invalid("viewmat", expected="shape (4, 4)", got=f"shape {viewmat.shape}", cure=cure)
+    matrix = concrete_value(viewmat)
+    if matrix is None:
+        return
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=ROTATION_TOLERANCE):
+        cure = "It multiplies columns (x, y, z, 1): transpose a matrix for rows."
+        raise invalid("viewmat", expected="a last row (0, 0, 0, 1)", got=matrix[3], cure=cure)
+    error, det = np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max(), np.linalg.det(matrix[:3, :3])
+    if not (error <= ROTATION_TOLERANCE and det > 0 and np.isfinite(matrix).all()):
+        got = f"one with max |R R^T - 1| = {error:.3g} and determinant {det:.3g}"
+        cure = "Move a scale into the Gaussians; an axis that is mirrored must be so in them, too."
+        raise invalid("viewmat", expected="a rotation R and finite numbers", got=got, cure=cure)
+
+
+def _check_intrinsics(K: Float[Array, "3 3"]) -> None:
+    """Raise unless it is a pinhole without skew; traced values are not checked."""
+    if K.shape != (3, 3):
+        cure = "For several cameras use jax.vmap."
+        raise invalid("K", expected="shape (3, 3)", got=f"shape {K.shape}", cure=cure)
+    matrix = concrete_value(K)
+    if matrix is None:
+        return
+    pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
+    if not (np.array_equal(matrix, pinhole) and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.isfinite(matrix).all()):
+        expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy above 0"
+        cure = "Undistort images with cv2.undistort and a new camera matrix without skew."
+        raise invalid("K", expected=expected, got=matrix.tolist(), cure=cure)
 
 
 def _check_angle(parameter: str, angle: ArrayLike) -> None:

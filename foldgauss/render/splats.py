@@ -23,7 +23,9 @@ class Splats2D(eqx.Module):
     $$ \alpha_i(x) = \rho_i \exp(-\tfrac12 (x - m_i)^T (F_i F_i^T)^{-1} (x - m_i)) $$
 
     Shapes: `mean` (num, 2) as (x right, y down); `factor` (num, 2, 2), any F with covariance F F^T (a
-    rotation times scales, or a Cholesky factor); `opacity` (num,) in [0, 1]; `color` (num, channels).
+    rotation times scales, or a Cholesky factor); `opacity` (num,) in [0, 1]; `color` (num, channels);
+    `depth` (num,) along the camera's axis in model units, set by `project`, or None. Only an expected depth depends on
+    it: the order is the array's.
     Units: `render` takes pixels, with pixel centers at +0.5; `to_pixels` converts from model space, where the
     frame's center is the origin and its longer side has length 1.
     """
@@ -32,9 +34,13 @@ class Splats2D(eqx.Module):
     factor: Float[Array, "num 2 2"]
     opacity: Float[Array, " num"]
     color: Float[Array, "num channels"]
+    depth: Float[Array, " num"] | None = None
 
     def __check_init__(self) -> None:
         check_shapes(self, mean=(2,), factor=(2, 2))
+        opacity, depth = (getattr(leaf, "shape", None) for leaf in (self.opacity, self.depth))
+        if None not in (opacity, depth) and depth != opacity:
+            raise invalid("depth", expected=f"shape {opacity}, that of opacity", got=f"shape {depth}")
 
     def to_pixels(self, size: tuple[int, int], *, aspect: float | None = None) -> "Splats2D":
         """Convert from model space to pixels of an image of `size` = (height, width).
@@ -45,7 +51,7 @@ class Splats2D(eqx.Module):
         scale = pixels_per_unit(size, aspect=aspect)
         height, width = size
         center = jnp.asarray([[width / 2, height / 2]], self.mean.dtype)
-        return Splats2D(self.mean * scale + center, self.factor * scale, self.opacity, self.color)
+        return Splats2D(self.mean * scale + center, self.factor * scale, self.opacity, self.color, self.depth)
 
 
 def check_shapes(splats: eqx.Module, **geometry: tuple[int, ...]) -> None:

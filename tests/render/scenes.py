@@ -1,5 +1,7 @@
 """Random splats of every temper, for the engines to agree on; and what their gradients must be."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,9 +43,7 @@ def check_slope(loss, splats: Splats2D, leaf: str, *, rtol: float) -> None:
     direction = jnp.asarray(np.random.default_rng(3).normal(size=gradient.shape))
 
     def along(step):
-        leaves = {name: getattr(splats, name) for name in ("mean", "factor", "opacity", "color")}
-        leaves[leaf] = leaves[leaf] + step * direction
-        return loss(Splats2D(**leaves))
+        return loss(dataclasses.replace(splats, **{leaf: getattr(splats, leaf) + step * direction}))
 
     numeric = (along(1e-5) - along(-1e-5)) / 2e-5
     np.testing.assert_allclose(jnp.sum(gradient * direction), numeric, rtol=rtol)

@@ -739,7 +739,7 @@ def test_times_beyond_the_clip_are_no_times(times):
     for video in (MODEL, E.rotate(1.0).video()):
         with pytest.raises(ValueError, match=r"^times: expected a list of times in \[0, 1\], got .*frame_times"):
             next(video.frames(times))
-        with pytest.raises(ValueError, match=r"^t: expected a time in"):
+        with pytest.raises(ValueError, match=r"^time: expected a time in"):
             video.render("x")
 
 

@@ -12,7 +12,7 @@ from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.model_file import read_header
-from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, project, render
+from foldgauss.render import Camera, Gaussians3D, RenderOptions, project, render
 from foldgauss.video import Clock, EditedVideo, VideoModel, edit, layers
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
@@ -84,7 +84,7 @@ def test_layers_are_composited_front_to_back():
             expected = np.concatenate([getattr(ahead, name), getattr(behind, name)])
             np.testing.assert_array_equal(getattr(together, name), expected)
     # By the slow judge.
-    slow = render(Splats2D(*map(jnp.asarray, dataclasses.astuple(both.at(0.31)))), SIZE, engine="reference")
+    slow = render(jax.tree.map(jnp.asarray, both.at(0.31)), SIZE, engine="reference")
     np.testing.assert_allclose(both.render(0.31), slow, atol=1e-2)
     assert apart(both, layers(back, front), 0.31) > 0.05
     assert apart(layers(edit(front).vanish().video(), back), back, 0.31) == 0
@@ -242,6 +242,9 @@ KEPT = {
     "time": lambda e: e.retime(shift=0.5).retime(clock=Clock((0, 0.3, 1), (0.2, 0.9, 0)), **SPAN).freeze(2),
     "space": lambda e: e.place(depth=0.3, rotate=(0.1, 0.2, 0.3), about=(0, 0), **SPAN).place(depth=1),
     "camera": lambda e: e.seen_from(Camera.front(ASPECT).orbit(0.3)),
+    "camera by matrices": lambda e: e.seen_from(
+        Camera.from_matrices(Camera.front(ASPECT).viewmat, [[70, 0, 30], [0, 80, 25], [0, 0, 1]], SIZE)
+    ),
     "camera of the picture's aspect": lambda e: e.seen_from(Camera.look_at((0.1, 0.2, -1.4))),
 }
 

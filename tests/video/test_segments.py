@@ -224,7 +224,7 @@ def test_what_is_given_for_one_time():
             np.testing.assert_array_equal(found.opacity, expected.opacity)
     np.testing.assert_array_equal(clip.render(0.3), np.moveaxis(image(clip, 0.3), 0, -1))
     for wrong in (-0.1, 1.5, "soon"):
-        with pytest.raises(ValueError, match=r"^t: expected a time in \[0, 1\]"):
+        with pytest.raises(ValueError, match=r"^time: expected a time in \[0, 1\]"):
             clip.render(wrong)
 
 

@@ -209,7 +209,8 @@ def _describe_camera(camera: Camera | Callable | None) -> dict | None:
     if not isinstance(camera, Camera):
         cure = "Write the images, or save with seen_from(None) and set the camera again."
         raise model_file_error("camera", expected="a Camera, which can be saved", got="a function", cure=cure)
-    return {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
+    about = {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
+    return about if camera.lens is None else about | {"lens": True}
 
 
 def _edited_skeleton(header: dict) -> EditedVideo:
@@ -229,8 +230,9 @@ def _camera_skeleton(header: dict | None) -> Camera | None:
     if header is None:
         return None
     check_one_of("camera's dtype", header["dtype"], ("float32", "float64"))
-    leaves = (jax.ShapeDtypeStruct(shape, np.dtype(header["dtype"])) for shape in ((3, 3), (3,), ()))
-    return jax.eval_shape(partial(Camera, aspect=header["aspect"]), *leaves)
+    shapes = {"rotation": (3, 3), "position": (3,), "fov": ()} | ({"lens": (3,)} if header.get("lens") else {})
+    leaves = {name: jax.ShapeDtypeStruct(shape, np.dtype(header["dtype"])) for name, shape in shapes.items()}
+    return jax.eval_shape(partial(Camera, aspect=header["aspect"]), **leaves)
 
 
 _FORMS = {

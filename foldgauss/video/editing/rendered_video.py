@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from foldgauss._runtime import notebook_hooks
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.video_model import check_time
+from foldgauss.video.models.video_model import choose_time
 
 
 class RenderedVideo:
@@ -17,13 +17,18 @@ class RenderedVideo:
 
     def render(
         self: Any,
-        t: float,
+        time: float | None = None,
         size: tuple[int, int] | None = None,
         *,
+        frame: int | None = None,
+        seconds: float | None = None,
         background: tuple[float, float, float] = BLACK,
     ) -> Float[np.ndarray, "height width 3"]:
-        """The image at any time t in [0, 1], values about [0, 1], over `background`; as `VideoRenderer`, in NumPy."""
-        check_time(t)
+        """The image at one moment, values about [0, 1], over `background`; as `VideoRenderer`, in NumPy.
+
+        Exactly one of `time`, `frame` and `seconds` says which, as for `VideoModel.render`, which has the errors, too.
+        """
+        t = choose_time(self, time, frame, seconds)
         return np.moveaxis(VideoRenderer(self, size, background=background).image(t), 0, -1)
 
     def frames(

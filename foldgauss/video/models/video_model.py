@@ -1,6 +1,7 @@
 """The fitted video: folded splats, frame times and rendering options."""
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -11,14 +12,14 @@ from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, check_background
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.splats import FoldedSplats
 
@@ -26,16 +27,41 @@ from foldgauss.video.models.splats import FoldedSplats
 ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 
-def check_time(t: float) -> None:
+def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times.times()[k].") -> None:
     """Raise unless t is a time in [0, 1], if its value is known."""
     check_not_forked()
     try:
         value = concrete_value(jnp.asarray(t))
     except (TypeError, ValueError):
-        raise invalid("t", expected="a time in [0, 1]", got=short_repr(t)) from None
+        raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
     if value is not None and not ((value >= 0) & (value <= 1)).all():
-        cure = "Frame k is at frame_times.times()[k]."
-        raise invalid("t", expected="a time in [0, 1]", got=value, cure=cure)
+        raise invalid(name, expected="a time in [0, 1]", got=value, cure=cure)
+
+
+def choose_time(video: RenderableVideo, time: float | None, frame: int | None, seconds: float | None) -> float:
+    """The time in [0, 1] of the one argument that is not None; `VideoModel.render` documents them and the errors."""
+    given = [name for name, value in (("time", time), ("frame", frame), ("seconds", seconds)) if value is not None]
+    if len(given) != 1:
+        raise TypeError(
+            f"render: expected exactly one of time, frame and seconds, got {' and '.join(given) or 'none'}."
+        )
+    if time is not None:
+        check_time(time, "time", "Frame k is render(frame=k), second s of the clip render(seconds=s).")
+        return time
+    num, cure = video.num_frames, "For what lies between frames use time or seconds."
+    if frame is not None:
+        if not is_integer(frame, -math.inf):
+            raise invalid("frame", expected="the number of a frame", got=short_repr(frame), cure=cure)
+        if not -num <= frame < num:
+            raise IndexError(f"frame: expected a number from {-num} to {num - 1} of {num} frames, got {frame}.")
+        position = float(frame % num)
+    else:
+        if not is_within(seconds, f"[0, {num / video.fps}]"):
+            expected = f"seconds in [0, {num / video.fps:g}], as {num} frames at {video.fps:g} a second last"
+            raise invalid("seconds", expected=expected, got=short_repr(seconds))
+        position = float(min(seconds * video.fps, num - 1))
+    times, before = video.frame_times.times(), int(position)
+    return times[before] + (position - before) * (times[min(before + 1, num - 1)] - times[before])
 
 
 def check_model(model: object) -> None:
@@ -105,19 +131,29 @@ class VideoModel(eqx.Module):
 
     def render(
         self,
-        t: float,
+        time: float | None = None,
         size: tuple[int, int] | None = None,
         *,
+        frame: int | None = None,
+        seconds: float | None = None,
         engine: str = "auto",
         background: tuple[float, float, float] = BLACK,
     ) -> Float[Array, "height width 3"]:
-        """The image at any time t in [0, 1], values about [0, 1], over `background`; see `foldgauss.render.render`.
+        """The image at one moment, values about [0, 1], over `background`; see `foldgauss.render.render`.
 
-        In the gap of a cut it is the nearer shot's. Frame k is at `frame_times.times()[k]`.
+        The moment is one of these; in the gap of a cut the nearer shot is shown:
+
+        - `time`: in [0, 1], of the model.
+        - `frame`: frame k at its learned time, `frame_times.times()[k]`; negative numbers count from the end.
+        - `seconds`: of the clip, in [0, num_frames / fps]. Frame k is at k / fps, and times between frames are
+          interpolated; the last frame is shown to the end.
+
+        Raises TypeError unless exactly one is given, IndexError for a frame that the clip does not have, and ValueError
+        for another time, seconds or size. Example: `model.render(frame=-1)`.
         """
         size = self.size if size is None else size
         check_size(size)
-        check_time(t)
+        t = choose_time(self, time, frame, seconds)
         t = snap_to_shots(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
         behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)

@@ -1,0 +1,104 @@
+"""`render` of all videos by time, by frame and by seconds: the same moments, and what is none."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from soft_models import soft_model
+
+from foldgauss.video import FrameTimes, SegmentedVideo, edit, times_at
+from foldgauss.video.models.frame_times import make_time_logits
+from foldgauss.video.models.renderer import VideoRenderer
+
+NUM = 7
+
+
+def learned_model(logits=None):
+    """Uneven frame times, at 8 frames a second."""
+    logits = 0.5 * np.random.default_rng(0).standard_normal(NUM - 1) if logits is None else logits
+    return dataclasses.replace(
+        soft_model(num_frames=len(logits) + 1), frame_times=FrameTimes(np.float32(logits)), fps=8.0
+    )
+
+
+VIDEOS = {
+    "model": learned_model,
+    "edited": lambda: edit(learned_model()).rotate(0.3, frames=(2, 4)).video(),
+    "segmented": lambda: SegmentedVideo.from_models([(0, learned_model()), (5, learned_model())]),
+    "with a cut": lambda: learned_model(make_time_logits(NUM, [3])),
+    "edited, with a cut": lambda: edit(learned_model(make_time_logits(NUM, [3]))).rotate(0.3, frames=(2, 4)).video(),
+    "one frame": lambda: learned_model(np.zeros(0)),
+}
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_frames_are_those_of_their_learned_times(name):
+    video = VIDEOS[name]()
+    times, num = np.asarray(video.frame_times.times()), video.num_frames
+    images = [np.asarray(video.render(frame=k)) for k in range(num)]
+    for k, image in enumerate(images):
+        np.testing.assert_array_equal(image, video.render(times[k]))
+        np.testing.assert_array_equal(image, video.render(time=times[k]))
+        np.testing.assert_array_equal(image, video.render(frame=np.int64(k - num)))
+        np.testing.assert_allclose(image, np.moveaxis(VideoRenderer(video).image(times[k]), 0, -1), atol=2e-5)
+        np.testing.assert_allclose(video.render(seconds=k / video.fps), image, atol=1e-5)
+    assert num == 1 or np.abs(images[1] - images[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_seconds_between_frames(name):
+    """As `times_at` interpolates frame positions; the last frame stays until the clip's end."""
+    video = VIDEOS[name]()
+    times, num = np.asarray(video.frame_times.times()), video.num_frames
+    for position in np.arange(0.25, num - 1, 0.75):
+        at = video.render(times_at(times, position))
+        np.testing.assert_allclose(video.render(seconds=position / video.fps), at, atol=1e-5)
+    for seconds in ((num - 0.5) / video.fps, num / video.fps):
+        np.testing.assert_array_equal(video.render(seconds=seconds), video.render(frame=-1))
+    np.testing.assert_array_equal(video.render(seconds=0), video.render(0.0))
+
+
+def test_size_is_still_the_second_argument():
+    for video in (VIDEOS["model"](), VIDEOS["edited"]()):
+        small = video.render(0.5, (20, 30))
+        assert small.shape == (20, 30, 3)
+        assert video.render(frame=3, size=(20, 30), background=(1, 1, 1)).shape == (20, 30, 3)
+
+
+@pytest.mark.parametrize("name", ["model", "edited", "segmented"])
+def test_errors(name):
+    video = VIDEOS[name]()
+    num = video.num_frames
+    with pytest.raises(TypeError, match=r"expected exactly one of time, frame and seconds, got none\.$"):
+        video.render()
+    with pytest.raises(TypeError, match=r"expected exactly one of time, frame and seconds, got time and frame\.$"):
+        video.render(0.0, frame=0)
+    with pytest.raises(TypeError, match=r"got frame and seconds\.$"):
+        video.render(frame=0, seconds=0)
+    for k in (num, -num - 1):
+        message = rf"^frame: expected a number from -{num} to {num - 1} of {num} frames, got {k}\.$"
+        with pytest.raises(IndexError, match=message):
+            video.render(frame=k)
+    for k in (2.5, "1", True):
+        with pytest.raises(ValueError, match=r"^frame: expected the number of a frame, got .*use time or seconds"):
+            video.render(frame=k)
+    for seconds in (-0.1, num / 8 + 0.01, float("nan"), "x"):
+        with pytest.raises(
+            ValueError, match=rf"^seconds: expected seconds in \[0, {num / 8:g}\], as {num} frames at 8"
+        ):
+            video.render(seconds=seconds)
+    with pytest.raises(ValueError, match=r"^time: expected a time in \[0, 1\], got 5.*render\(frame=k\)"):
+        video.render(5)
+
+
+@pytest.mark.parametrize("moment", [{"frame": 2}, {"seconds": 0.3}])
+def test_learned_times_have_gradients(moment):
+    def loss(logits):
+        model = dataclasses.replace(learned_model(), frame_times=FrameTimes(logits))
+        return jnp.sum(model.render(**moment) ** 2)
+
+    gradient = jax.jit(jax.grad(loss))(jnp.asarray(learned_model().frame_times.logits))
+    assert bool(jnp.isfinite(gradient).all())
+    assert float(jnp.abs(gradient).max()) > 1e-4
