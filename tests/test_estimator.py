@@ -109,6 +109,60 @@ def test_linear_folds_match_scikit_learn(kind, degree):
     assert (ours.n_iter_, ours.converged_) == (theirs.n_iter_, theirs.converged_)
 
 
+@pytest.mark.parametrize("kind", ["full", "diag", "spherical", "tied"])
+def test_precisions_invert_the_unfolded_covariances(kind):
+    x, time = _blobs(), 1
+    fitted = _quiet(FoldedGaussianMixture(K, degree=2, covariance_type=kind, time_column=time, random_state=0), x)
+    covariances = np.zeros((K, 3, 3))
+    covariances[:, [[0], [2]], [0, 2]] = fitted.space_covariances_
+    covariances[:, time, time] = fitted.time_scales_**2
+    shape = (K, 3, 3) if kind in ("full", "tied") else (K, 3)
+    assert fitted.precisions_.shape == fitted.precisions_cholesky_.shape == shape
+    dense = [z if z.ndim == 3 else z[:, :, None] * np.eye(3) for z in (fitted.precisions_, fitted.precisions_cholesky_)]
+    np.testing.assert_allclose(dense[0], np.linalg.inv(covariances), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(dense[1] @ dense[1].swapaxes(1, 2), dense[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(np.tril(dense[1], -1), 0)
+    # What the density uses: whitened with its envelope a = 1, un-folded points are standard normal.
+    u = (fitted.time_means_ - x[:, time, None])[:, :, None, None]
+    path = fitted.locs_ + (u ** np.arange(1, 3)[:, None] * fitted.fold_coefficients_).sum(2)
+    z = np.insert(x[:, None, [0, 2]] - path, time, -u[:, :, 0, 0], axis=2)
+    square = np.einsum("nka,kab,nkb->nk", z, dense[0], z)
+    log_density = 0.5 * (np.linalg.slogdet(dense[0])[1] - square - 3 * np.log(2 * np.pi)) + np.log(fitted.weights_)
+    np.testing.assert_allclose(np.logaddexp.reduce(log_density, 1), fitted.score_samples(x), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("kind", "num"), [("full", 1), ("diag", K)])
+def test_precisions_without_a_fold_match_scikit_learn(kind, num):
+    x = _blobs()
+    centered = x - x.mean(0)
+    if kind == "full":  # space independent of time
+        x[:, :2] -= np.outer(centered[:, 2], centered[:, 2] @ centered[:, :2]) / (centered[:, 2] @ centered[:, 2])
+    same = {"covariance_type": kind, "reg_covar": 0, "tol": 0, "max_iter": 30, "means_init": x[:num]}
+    same |= {"weights_init": np.full(num, 1 / num), "precisions_init": np.tile(np.ones(3), (num, 1))}
+    if kind == "full":
+        same["precisions_init"] = np.eye(3)[None]
+    theirs = _quiet(GaussianMixture(num, **same), x)
+    ours = _quiet(FoldedGaussianMixture(num, degree=0, reg_relative=0, **same), x)
+    for name in ("weights_", "means_", "precisions_", "precisions_cholesky_"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-6, atol=1e-8)
+
+
+def test_transform_names_responsibilities():
+    """As `LatentDirichletAllocation.transform`, in the container of `set_output`."""
+    pandas, x = pytest.importorskip("pandas"), _blobs()
+    fitted = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0), x)
+    names = [f"foldedgaussianmixture{k}" for k in range(K)]
+    assert fitted.get_feature_names_out().tolist() == names
+    np.testing.assert_array_equal(fitted.transform(x), fitted.predict_proba(x))
+    table = fitted.set_output(transform="pandas").transform(x)
+    assert isinstance(table, pandas.DataFrame)
+    assert table.columns.tolist() == names
+    with pytest.raises(ValueError, match="X: expected rows, got chunks"):
+        fitted.transform([x, x])
+    with pytest.raises(NotFittedError):
+        FoldedGaussianMixture().get_feature_names_out()
+
+
 def test_to_mixture_samples_conditions_in_the_users_columns():
     """Time may be any column; what is fitted is the same."""
     x = _blobs()

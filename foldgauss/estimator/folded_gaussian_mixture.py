@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from sklearn.base import BaseEstimator, DensityMixin
+from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, DensityMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
@@ -19,6 +19,7 @@ from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import Constant
 from foldgauss.estimator.chunks import Chunks, is_chunked, open_chunks, summarize_rows
+from foldgauss.estimator.em.cholesky import inverse_lower
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import draw_subset, initialize, params_from_gaussians, restrict_covariances
 from foldgauss.estimator.em.loop import EMStatus, Run, broadcast_degrees, run_em, select_best
@@ -32,9 +33,9 @@ from foldgauss.estimator.parameter_checks import (
     check_column,
     check_parameters,
     check_sizes,
-    invert_precisions,
     make_envelope,
 )
+from foldgauss.estimator.precisions import invert_precisions, unfolded_precisions
 from foldgauss.estimator.prediction import (
     FittedParameters,
     compute_log_densities,
@@ -65,7 +66,7 @@ _MAX_SINGLE_DEGREE = 6
 _MAX_SPACING = 0.01
 
 
-class FoldedGaussianMixture(DensityMixin, BaseEstimator):
+class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, DensityMixin, BaseEstimator):
     """A mixture of Folded-Gaussians, fitted by expectation maximisation.
 
         p(x) = sum_k w_k N(t | m_k, sigma_k^2) N(s | loc_k + f_k(m_k - t), a_k(t) Sigma_k),   x = (s, t)
@@ -106,6 +107,12 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     in X, `locs_` (K, d-1), `space_covariances_` (K, d-1, d-1), `time_means_`, `time_scales_` (K,), `fold_coefficients_`
     (K, q, d-1) with row j - 1 for u^j, u = m_k - t, `degrees_` (K,), `lower_bound_`, `lower_bounds_`, `n_iter_`,
     `converged_`, `status_` (`EMStatus`), `n_features_in_`.
+
+    `precisions_` and `precisions_cholesky_` are of the components *un-folded*, as their density uses them: P_k is the
+    inverse of the covariance of (s - f_k(m_k - t), t) where a = 1, block-diagonal in Sigma_k and sigma_k^2, columns as
+    in X, and P_k = U_k U_k^T with U_k upper-triangular. (K, d, d), and (K, d) for "diag" and "spherical"; the
+    variances of time are neither tied nor those of space. Only where all f_k = 0 and a = 1 is P_k the inverse of
+    `covariances_[k]`, which `precisions_init` takes.
 
     **Example:**
 
@@ -352,13 +359,18 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         with enable_dtype(params.curve.dtype):
             mixture = to_mixture(params, self._scaling, self._envelope)
             means, covariances = mixture.components.moments()
-            back = np.argsort(self._order_columns(means.shape[-1]))
+            order = self._order_columns(means.shape[-1])
+            back = np.argsort(order)
             self.means_ = np.asarray(means)[:, back]
             self.covariances_ = np.asarray(covariances)[:, back][:, :, back]
             components = mixture.components
             self.locs_, tril = np.asarray(components.loc), np.asarray(components.scale_tril)
             self.time_means_, self.time_scales_ = np.asarray(components.time_loc), np.asarray(components.time_scale)
             self.fold_coefficients_ = np.asarray(components.fold.coefficients)
+            factor = np.asarray(inverse_lower(components.scale_tril))
+        self.precisions_, self.precisions_cholesky_ = unfolded_precisions(
+            factor, self.time_scales_, order, self.covariance_type
+        )
         self.space_covariances_ = tril @ tril.swapaxes(-1, -2)
         self.weights_ = np.exp(params.log_weights) / np.exp(params.log_weights).sum()
         self.degrees_ = np.asarray(model.degrees)
@@ -456,6 +468,16 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         y = self._scaled(X)
         with enable_dtype(y.dtype):
             return self._responsibilities(y)
+
+    def transform(self, X) -> Float[np.ndarray, "n k"]:
+        """`predict_proba` of rows, as features named foldedgaussianmixture0, ... in the container of `set_output`."""
+        if is_chunked(X):
+            raise invalid("X", expected="rows", got="chunks", cure="predict_proba takes chunks.")
+        return self.predict_proba(X)
+
+    @property
+    def _n_features_out(self) -> int:
+        return len(self.weights_)
 
     def _responsibilities(self, y):
         points = make_points(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
