@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
     from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood, plain_envelope
     from foldgauss.estimator import FoldedGaussianMixture as FoldedGaussianMixture
+    from foldgauss.estimator import FoldedMixtureRegressor as FoldedMixtureRegressor
     from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
     from foldgauss.mixture import FoldedMixture, GaussianMixture
 
@@ -27,7 +28,7 @@ for _kind, _location in {
 
 __version__ = "0.1.0"
 
-# Without `FoldedGaussianMixture`, which needs scikit-learn: `from foldgauss import *` works without the extra.
+# Without those of `estimator`, which need scikit-learn: `from foldgauss import *` works without the extra.
 __all__ = [
     "CallableEnvelope",
     "CallableFold",
@@ -51,7 +52,7 @@ _HOMES = {
     "distribution": ("FoldedGaussian", "Gaussian", "Normal"),
     "analysis.divergence": ("kl_divergence",),
     "envelope": ("CallableEnvelope", "Constant", "TimeLikelihood", "plain_envelope"),
-    "estimator": ("FoldedGaussianMixture",),
+    "estimator": ("FoldedGaussianMixture", "FoldedMixtureRegressor"),
     "fold": ("CallableFold", "FourierFold", "PolynomialFold", "SplineFold", "ZeroFold"),
     "mixture": ("FoldedMixture", "GaussianMixture"),
 }

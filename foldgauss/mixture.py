@@ -41,7 +41,7 @@ from foldgauss.analysis.mixture_weights import (
 from foldgauss.analysis.pair_densities import map_in_chunks, move_components_first, pair_log_prob
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import CallableFold
-from foldgauss.gaussian import Gaussian
+from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["AbstractMixture", "FoldedMixture", "GaussianMixture", "IntegratedMixture", "TimePosterior"]
 
@@ -329,6 +329,14 @@ class GaussianMixture(_WeightedMixture):
         """The other coordinates, in ascending order, given these; exact. As `FoldedMixture.condition`."""
         return _conditioned(self, indices, values)
 
+    def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
+        """P(coordinate <= x), for a single coordinate. **Raises:** ValueError if there are several."""
+        return _cdf(self.weights, _as_normal(self.components), self._checked(x)[..., 0])
+
+    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch 1"]:
+        """The quantile of a single coordinate, the inverse of `cdf`, as `TimePosterior.icdf`. **Raises:** as `cdf`."""
+        return _icdf(self.weights, _as_normal(self.components), as_value(q, self.logits.dtype))[..., None]
+
 
 class IntegratedMixture(AbstractMixture):
     """A mixture of `TimeMixture`: some coordinates of a `FoldedMixture`, its time integrated out numerically.
@@ -388,11 +396,11 @@ class TimePosterior(AbstractMixture):
 
     def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(time <= t | s)."""
-        return _cdf(self, self._checked(value))
+        return _cdf(self.weights, self.components, self._checked(value))
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """The quantile, the inverse of `cdf`, by bisection; -inf at 0 and +inf at 1. It has no gradient."""
-        return _icdf(self, self._checked(q))
+        return _icdf(self.weights, self.components, self._checked(q))
 
 
 def _mixture_of(components, logits: Array) -> AbstractMixture:
@@ -497,30 +505,37 @@ def _log_evidence(components, rest, indices: tuple[int, ...], values: Array) -> 
     return components.marginal(tuple(indices[i] for i in order)).log_prob(values[..., order])
 
 
-@eqx.filter_jit
-def _cdf(posterior: TimePosterior, t: Array) -> Array:
-    return jnp.clip(weighted_sum(posterior.weights, posterior.components.cdf(t[..., None])), 0, 1)
+def _as_normal(components: Gaussian) -> Normal:
+    if components.event_shape != (1,):
+        got = f"event_shape {components.event_shape}"
+        raise invalid("mixture", expected="a single coordinate", got=got, cure="Take marginal([i]) first.")
+    return Normal(components.loc[..., 0], components.stddev[..., 0], validate_args=False)
 
 
 @eqx.filter_jit
-def _icdf(posterior: TimePosterior, q: Array) -> Array:
+def _cdf(weights: Array, components: Normal | TimeDensity, t: Array) -> Array:
+    return jnp.clip(weighted_sum(weights, components.cdf(t[..., None])), 0, 1)
+
+
+@eqx.filter_jit
+def _icdf(weights: Array, components: Normal | TimeDensity, q: Array) -> Array:
     """Bisection between the least and the greatest of the components' quantiles."""
-    quantiles, _ = lax.stop_gradient((posterior.components.icdf(q[..., None]), q))
-    (weights,) = align([(posterior.weights, 0)], quantiles.ndim)
-    low = jnp.where(weights > 0, quantiles, jnp.inf).min(-1)
-    high = jnp.where(weights > 0, quantiles, -jnp.inf).max(-1)
+    quantiles, _ = lax.stop_gradient((components.icdf(q[..., None]), q))
+    (aligned,) = align([(weights, 0)], quantiles.ndim)
+    low = jnp.where(aligned > 0, quantiles, jnp.inf).min(-1)
+    high = jnp.where(aligned > 0, quantiles, -jnp.inf).max(-1)
     q = jnp.broadcast_to(q, low.shape)
 
     def halve(_, bounds):
         low, high = bounds
         middle = low + 0.5 * (high - low)
-        below = _cdf(posterior, middle) < q
+        below = _cdf(weights, components, middle) < q
         return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
     steps = jnp.finfo(q.dtype).nmant + 8
     inner = jnp.isfinite(low) & jnp.isfinite(high)
     found = lax.fori_loop(0, steps, halve, (jnp.where(inner, low, 0), jnp.where(inner, high, 0)))[1]
-    return lax.stop_gradient(jnp.where(jnp.isnan(weights).any(-1), jnp.nan, jnp.where(inner, found, low)))
+    return lax.stop_gradient(jnp.where(jnp.isnan(aligned).any(-1), jnp.nan, jnp.where(inner, found, low)))
 
 
 # --- sampling ------------------------------------------------------------------------------------------------

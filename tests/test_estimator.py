@@ -109,6 +109,45 @@ def test_linear_folds_match_scikit_learn(kind, degree):
     assert (ours.n_iter_, ours.converged_) == (theirs.n_iter_, theirs.converged_)
 
 
+@pytest.mark.parametrize("kind", ["full", "diag", "spherical", "tied"])
+def test_precisions_invert_the_covariances(kind):
+    fitted = _quiet(FoldedGaussianMixture(K, degree=2, covariance_type=kind, time_column=1, random_state=0), _blobs())
+    assert fitted.precisions_.shape == fitted.precisions_cholesky_.shape == (K, 3, 3)
+    np.testing.assert_allclose(fitted.precisions_ @ fitted.covariances_, np.tile(np.eye(3), (K, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        fitted.precisions_cholesky_ @ fitted.precisions_cholesky_.swapaxes(1, 2), fitted.precisions_, rtol=1e-9
+    )
+    np.testing.assert_array_equal(np.tril(fitted.precisions_cholesky_, -1), 0)
+
+
+@pytest.mark.parametrize("time", [-1, 0])
+def test_precisions_of_a_full_gaussian_match_scikit_learn(time):
+    """With `degree=1` and a = 1 the model is scikit-learn's."""
+    x = _blobs()
+    same = {"reg_covar": 0, "tol": 0, "max_iter": 30, "means_init": x[:K], "weights_init": np.full(K, 1 / K)}
+    same |= {"precisions_init": np.tile(np.eye(3), (K, 1, 1))}
+    theirs = _quiet(GaussianMixture(K, **same), x)
+    ours = _quiet(FoldedGaussianMixture(K, degree=1, reg_relative=0, time_column=time, **same), x)
+    for name in ("weights_", "means_", "precisions_", "precisions_cholesky_"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-5, atol=1e-7)
+
+
+def test_transform_names_responsibilities():
+    """As `LatentDirichletAllocation.transform`, in the container of `set_output`."""
+    pandas, x = pytest.importorskip("pandas"), _blobs()
+    fitted = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0), x)
+    names = [f"foldedgaussianmixture{k}" for k in range(K)]
+    assert fitted.get_feature_names_out().tolist() == names
+    np.testing.assert_array_equal(fitted.transform(x), fitted.predict_proba(x))
+    table = fitted.set_output(transform="pandas").transform(x)
+    assert isinstance(table, pandas.DataFrame)
+    assert table.columns.tolist() == names
+    with pytest.raises(ValueError, match="X: expected rows, got chunks"):
+        fitted.transform([x, x])
+    with pytest.raises(NotFittedError):
+        FoldedGaussianMixture().get_feature_names_out()
+
+
 def test_to_mixture_samples_conditions_in_the_users_columns():
     """Time may be any column; what is fitted is the same."""
     x = _blobs()

@@ -113,6 +113,8 @@ def _estimator(names, folder):
     assert names["mixture"].converged_
     assert names["mixture"].score(names["x"]) > 0.5
     np.testing.assert_array_equal(np.concatenate(names["labels"]), names["mixture"].predict(names["x"]))
+    assert names["regressor"].score(names["times"], names["heights"]) > 0.85
+    assert ((names["low"] < names["heights"]) & (names["heights"] < names["high"])).mean() > 0.85
 
 
 def _extending(names, folder):

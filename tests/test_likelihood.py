@@ -70,12 +70,12 @@ def test_hermite_polynomials_convert_to_powers():
         np.testing.assert_allclose(hermite(jnp.asarray(v, jnp.float32), degree), powers, rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize("covariance", ["full", "diagonal"])
-def test_closed_form_is_generalised_least_squares(x64, covariance):
+@pytest.mark.parametrize("covariance_type", ["full", "diag"])
+def test_closed_form_is_generalised_least_squares(x64, covariance_type):
     x, weights = _points(), jnp.linspace(0.5, 2.0, 60)
-    result = fit(x, degree=3, weights=weights, time_loc=0.35, time_scale=0.28, covariance=covariance).check()
+    result = fit(x, degree=3, weights=weights, time_loc=0.35, time_scale=0.28, covariance_type=covariance_type).check()
     beta, sigma, errors = _numpy_fit(x, weights, 3, 0.35, 0.28, 1.0, 1e-3)
-    sigma = np.diag(np.diag(sigma)) if covariance == "diagonal" else sigma
+    sigma = np.diag(np.diag(sigma)) if covariance_type == "diag" else sigma
     dist, close = result.distribution, lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
     close(dist.loc, beta[0])
     close(dist.fold.coefficients, beta[1:])
@@ -319,7 +319,7 @@ def test_check_names_the_remedy():
         ({"degree": -1}, "degree: expected a whole number"),
         ({"degree": 1.5}, "degree: expected a whole number"),
         ({"time": "later"}, "time: expected one of"),
-        ({"covariance": "tied"}, "covariance: expected one of"),
+        ({"covariance_type": "diagonal"}, "covariance_type: expected one of"),
         ({"time_loc": 0.5}, "time_loc, time_scale: expected both or none"),
         ({"weights": np.ones(3)}, "weights: expected shape"),
         ({"weights": -np.ones(5)}, "weights: expected numbers >= 0"),

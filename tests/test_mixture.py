@@ -314,6 +314,27 @@ def test_time_posterior(x64):
 # --- weights of zero, and points far away ---------------------------------------------------------------------
 
 
+def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
+    weights, loc, scale = (
+        np.array([0.3, 0.0, 0.7]),
+        np.array([[-1.0, 50.0, 2.0], [0.0, 0.0, 0.0]]),
+        np.array([0.5, 1.0, 2]),
+    )
+    one = GaussianMixture(Gaussian(loc[..., None], scale[:, None, None] * np.eye(1)), weights=np.stack([weights] * 2))
+    x = np.linspace(-4.0, 6.0, 21)
+    expected = (weights * stats.norm.cdf(x[:, None, None], loc, scale)).sum(-1)
+    np.testing.assert_allclose(one.cdf(jnp.asarray(x)[:, None, None]), expected, rtol=1e-12)
+    levels = np.array([1e-6, 0.2, 0.5, 0.999])[:, None]
+    quantiles = one.icdf(levels)
+    assert quantiles.shape == (4, 2, 1)
+    np.testing.assert_allclose(one.cdf(quantiles), np.broadcast_to(levels, (4, 2)), rtol=1e-9)
+    assert np.isneginf(one.icdf(0.0)).all()
+    pair = GaussianMixture(Gaussian(np.zeros((2, 2)), np.eye(2)), weights=[0.5, 0.5])
+    for function in (pair.icdf, lambda _: pair.cdf(jnp.zeros(2))):
+        with pytest.raises(ValueError, match="expected a single coordinate"):
+            function(0.5)
+
+
 def test_a_component_without_weight_is_not_there():
     mixture = FoldedMixture(_components(), weights=[0.7, 0.0, 0.3])
     np.testing.assert_allclose(

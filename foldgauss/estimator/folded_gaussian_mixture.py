@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from sklearn.base import BaseEstimator, DensityMixin
+from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, DensityMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
@@ -32,9 +32,9 @@ from foldgauss.estimator.parameter_checks import (
     check_column,
     check_parameters,
     check_sizes,
-    invert_precisions,
     make_envelope,
 )
+from foldgauss.estimator.precisions import factor_precisions, invert_precisions
 from foldgauss.estimator.prediction import (
     FittedParameters,
     compute_log_densities,
@@ -65,7 +65,7 @@ _MAX_SINGLE_DEGREE = 6
 _MAX_SPACING = 0.01
 
 
-class FoldedGaussianMixture(DensityMixin, BaseEstimator):
+class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, DensityMixin, BaseEstimator):
     """A mixture of Folded-Gaussians, fitted by expectation maximisation.
 
         p(x) = sum_k w_k N(t | m_k, sigma_k^2) N(s | loc_k + f_k(m_k - t), a_k(t) Sigma_k),   x = (s, t)
@@ -106,6 +106,9 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
     in X, `locs_` (K, d-1), `space_covariances_` (K, d-1, d-1), `time_means_`, `time_scales_` (K,), `fold_coefficients_`
     (K, q, d-1) with row j - 1 for u^j, u = m_k - t, `degrees_` (K,), `lower_bound_`, `lower_bounds_`, `n_iter_`,
     `converged_`, `status_` (`EMStatus`), `n_features_in_`.
+
+    `precisions_` (K, d, d) are the inverses of `covariances_`, and `precisions_cholesky_` (K, d, d) upper-triangular U
+    with U U^T = `precisions_`: scikit-learn's for "full", whatever the `covariance_type`, as components bend.
 
     **Example:**
 
@@ -345,6 +348,18 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
             weights, (means - scaling.shift) / scale, covariances / (scale[:, None] * scale), degree, dtype
         )
 
+    @property
+    def precisions_cholesky_(self) -> np.ndarray:
+        """Upper-triangular factors U of `precisions_` (K, d, d) = U U^T. Raises LinAlgError for a singular one."""
+        check_is_fitted(self)
+        return factor_precisions(self.covariances_)
+
+    @property
+    def precisions_(self) -> np.ndarray:
+        """Inverses of `covariances_`, (K, d, d). Raises LinAlgError for a singular one."""
+        factor = self.precisions_cholesky_
+        return factor @ factor.swapaxes(-1, -2)
+
     def _set_fitted(self, run: Run, model: Model) -> None:
         """Set the fitted attributes, in NumPy."""
         params = Parameters(*(np.asarray(z) for z in run.params))
@@ -352,7 +367,8 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         with enable_dtype(params.curve.dtype):
             mixture = to_mixture(params, self._scaling, self._envelope)
             means, covariances = mixture.components.moments()
-            back = np.argsort(self._order_columns(means.shape[-1]))
+            order = self._order_columns(means.shape[-1])
+            back = np.argsort(order)
             self.means_ = np.asarray(means)[:, back]
             self.covariances_ = np.asarray(covariances)[:, back][:, :, back]
             components = mixture.components
@@ -456,6 +472,16 @@ class FoldedGaussianMixture(DensityMixin, BaseEstimator):
         y = self._scaled(X)
         with enable_dtype(y.dtype):
             return self._responsibilities(y)
+
+    def transform(self, X) -> Float[np.ndarray, "n k"]:
+        """`predict_proba` of rows, as features named foldedgaussianmixture0, ... in the container of `set_output`."""
+        if is_chunked(X):
+            raise invalid("X", expected="rows", got="chunks", cure="predict_proba takes chunks.")
+        return self.predict_proba(X)
+
+    @property
+    def _n_features_out(self) -> int:
+        return len(self.weights_)
 
     def _responsibilities(self, y):
         points = make_points(y, np.ones(len(y), y.dtype), len(self._params.time_loc))

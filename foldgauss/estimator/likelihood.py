@@ -50,7 +50,7 @@ _CURES = {
     FitStatus.SINGULAR_TIME: "all times are equal, or time_scale is not positive: the fold is undetermined.",
     FitStatus.SINGULAR_DESIGN: "the times do not determine the polynomial (too few distinct ones). Lower degree.",
     FitStatus.SINGULAR_COVARIANCE: "the points lie on the curve, or a space coordinate is determined by the others. "
-    "Drop it, use covariance='diagonal', or lower degree.",
+    "Drop it, use covariance_type='diag', or lower degree.",
     FitStatus.NOT_CONVERGED: "the maximization over time_loc and time_scale stopped early. Scale x, or raise floor.",
 }
 
@@ -97,7 +97,7 @@ class Fit(eqx.Module):
     triangle_inverse: Float[Array, "k k"]
     residual_scale: Float[Array, " d-1"]
     time: str = eqx.field(static=True)
-    covariance: str = eqx.field(static=True)
+    covariance_type: str = eqx.field(static=True)
 
     def _repr_png_(self) -> bytes | None:
         """The distribution's image, which notebooks show."""
@@ -115,7 +115,7 @@ class Fit(eqx.Module):
     @property
     def num_parameters(self) -> int:
         """Free parameters: the curve, Sigma, and time unless it was given."""
-        return _num_parameters(self.degree, self.residual_scale.shape[-1], self.time, self.covariance)
+        return _num_parameters(self.degree, self.residual_scale.shape[-1], self.time, self.covariance_type)
 
     @property
     def bic(self) -> Float[Array, ""]:
@@ -180,7 +180,7 @@ def fit(
     time_loc: ArrayLike | None = None,
     time_scale: ArrayLike | None = None,
     weights: Float[ArrayLike, " n"] | None = None,
-    covariance: str = "full",
+    covariance_type: str = "full",
 ) -> Fit:
     """Fit a Folded-Gaussian with a polynomial fold by maximum (weighted) likelihood.
 
@@ -199,7 +199,7 @@ def fit(
     times make a joint likelihood degenerate.
 
     **Shapes:** x (n, d), time last; `weights` (n,), frequency weights: 2 repeats a point, 0 leaves it out (such a row
-    may hold NaN). A single fit; use `jax.vmap` for many. `covariance` is "full" or "diagonal" (the paper's).
+    may hold NaN). A single fit; use `jax.vmap` for many. `covariance_type` is "full" or "diag" (the paper's).
 
     **dtype:** that of x. **Units:** those of x.
 
@@ -210,7 +210,7 @@ def fit(
     `vmap`; see `Fit.check`.
     """
     degree = _check_degree("degree", degree)
-    plan = _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance)
+    plan = _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance_type)
     return _fit(plan, plan.weights, jnp.int32(degree))
 
 
@@ -239,19 +239,21 @@ class _Plan(eqx.Module):
     envelope: AbstractEnvelope
     degree: int = eqx.field(static=True)
     time: str = eqx.field(static=True)
-    covariance: str = eqx.field(static=True)
+    covariance_type: str = eqx.field(static=True)
 
 
-def _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance) -> _Plan:
+def _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance_type) -> _Plan:
     check_one_of("time", time, ("own", "joint"))
-    check_one_of("covariance", covariance, ("full", "diagonal"))
+    check_one_of("covariance_type", covariance_type, ("full", "diag"))
     x = _check_points(x)
     weights = _check_weights(weights, x)
     envelope = make_envelope(envelope)
     given = _check_time(time_loc, time_scale, x.dtype)
     if given is None and time == "joint":
         _check_bounded(envelope, x.shape[1])
-    return _Plan(x, weights, given, cast(envelope, x.dtype), degree, time if given is None else "given", covariance)
+    return _Plan(
+        x, weights, given, cast(envelope, x.dtype), degree, time if given is None else "given", covariance_type
+    )
 
 
 @eqx.filter_jit
@@ -261,7 +263,7 @@ def _fit(plan: _Plan, weights: Float[Array, " n"], used: Int[Array, ""]) -> Fit:
     time_loc, time_scale = _estimate_time(data) if plan.given is None else plan.given
     singular_time = ~(time_scale > 0)
     time_scale = jnp.where(singular_time, 1, time_scale)
-    diagonal = plan.covariance == "diagonal"
+    diagonal = plan.covariance_type == "diag"
     profile = Profile(data.t, data.y, data.weights, plan.envelope, used, plan.degree, diagonal)
     converged, steps = jnp.array(True), jnp.zeros((), jnp.int32)
     if plan.time == "joint":
@@ -348,7 +350,7 @@ def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, u
         triangle_inverse=solve_upper_matrix(triangle, jnp.eye(len(triangle), dtype=triangle.dtype)),
         residual_scale=unbiased * _norm(space.tril) * data.scale,
         time=plan.time,
-        covariance=plan.covariance,
+        covariance_type=plan.covariance_type,
     )
 
 
@@ -361,8 +363,8 @@ def _norm(rows):
     return jnp.sqrt((rows * rows).sum(-1))
 
 
-def _num_parameters(degree: int, dim: int, time: str, covariance: str) -> int:
-    of_sigma = dim if covariance == "diagonal" else dim * (dim + 1) // 2
+def _num_parameters(degree: int, dim: int, time: str, covariance_type: str) -> int:
+    of_sigma = dim if covariance_type == "diag" else dim * (dim + 1) // 2
     return (degree + 1) * dim + of_sigma + (0 if time == "given" else 2)
 
 
@@ -451,7 +453,7 @@ def _bootstrap(result: Fit, keys, num_points: int, batch_size: int) -> Replicate
 
     def replicate(key):
         x = dist.sample(key, (num_points,))
-        plan = _Plan(x, weights, given, dist.envelope, degree, result.time, result.covariance)
+        plan = _Plan(x, weights, given, dist.envelope, degree, result.time, result.covariance_type)
         refit = _fit(plan, weights, jnp.int32(degree))
         return Replicates(refit.distribution, refit.status)
 
@@ -508,7 +510,7 @@ def _penalize(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
     degrees = range(plan.degree + 1)
     fits = jax.vmap(lambda used: _fit(plan, plan.weights, used))(jnp.arange(len(degrees), dtype=jnp.int32))
     dim = plan.x.shape[1] - 1
-    free = jnp.array([_num_parameters(k, dim, plan.time, plan.covariance) for k in degrees], plan.x.dtype)
+    free = jnp.array([_num_parameters(k, dim, plan.time, plan.covariance_type) for k in degrees], plan.x.dtype)
     return _CRITERIA[criterion](fits.log_likelihood, free, fits.num_points)
 
 

@@ -9,7 +9,7 @@ from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_with
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.estimator.em.initialization import INITIALIZERS
 
-__all__ = ["check_array", "check_column", "check_parameters", "check_sizes", "invert_precisions", "make_envelope"]
+__all__ = ["check_array", "check_column", "check_parameters", "check_sizes", "make_envelope"]
 
 _COVARIANCES = ("full", "diag", "spherical", "tied")
 _ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
@@ -80,24 +80,6 @@ def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     if value.shape != shape:
         raise invalid(name, expected=f"shape {shape}", got=f"shape {value.shape}", cure="One entry per component.")
     return value
-
-
-def invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
-    """Covariances (k, d, d) from precisions in scikit-learn's shape for each kind of covariance."""
-    shape = {"full": (num, dim, dim), "tied": (dim, dim), "diag": (num, dim), "spherical": (num,)}[kind]
-    precisions = check_array("precisions_init", precisions, shape)
-    eye = np.eye(dim)
-    if kind == "spherical":
-        precisions = precisions[:, None, None] * eye
-    if kind == "diag":
-        precisions = precisions[:, :, None] * eye
-    precisions = np.broadcast_to(precisions, (num, dim, dim))
-    symmetric = np.allclose(precisions, precisions.swapaxes(-1, -2))
-    if not (symmetric and (np.linalg.eigvalsh(precisions) > 0).all()):
-        raise invalid(
-            "precisions_init", expected="symmetric and positive definite", got="others", cure="Invert covariances."
-        )
-    return np.linalg.inv(precisions)
 
 
 def make_envelope(envelope) -> AbstractEnvelope:
