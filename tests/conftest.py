@@ -1,10 +1,19 @@
 """House rules of the whole suite: promotion raises, so a shape or dtype slip is a failing test."""
 
+import os
+import shutil
 import signal
+import tempfile
 import threading
 
-import jax
-import pytest
+# What is compiled is kept for the run, for all its processes: most modules compile the same small functions. It must be
+# set before JAX is imported; the workers of pytest-xdist inherit it.
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
+_own_cache = None if _CACHE in os.environ else os.environ.setdefault(_CACHE, tempfile.mkdtemp(prefix="foldgauss-jax-"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 # A shell starts what runs in its background without Ctrl-C, and our tests of Ctrl-C are heirs to that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
@@ -12,6 +21,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_threa
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_unconfigure():
+    if _own_cache is not None:
+        shutil.rmtree(_own_cache, ignore_errors=True)
 
 
 @pytest.fixture(autouse=True, scope="module")
