@@ -514,8 +514,11 @@ def test_arviz_has_all_draws(small):
 
 
 def test_arviz_before_and_after_1_0_have_the_same_groups(small, monkeypatch):
+    arviz = import_optional("arviz")
+    if not arviz.__version__.startswith("0."):
+        pytest.skip("ArviZ has no InferenceData any more")
     before = small.to_arviz()
-    monkeypatch.delattr(import_optional("arviz"), "InferenceData")
+    monkeypatch.setattr(arviz, "__version__", "1.0.0")
     after = small.to_arviz()
     assert type(after).__name__ == "DataTree"
     assert after.attrs == before.attrs
@@ -546,7 +549,7 @@ def test_arviz_statistics_of_known_chains(small):
     for frame in (1, 2, 3):
         chains = autoregressive(2 * AR_WALKERS, rng).reshape(2, AR_WALKERS, AR_STEPS)
         times[..., frame] += spread * np.moveaxis(chains, 1, 2)
-    drawn = dataclasses.replace(small, times=times).to_arviz().posterior["t"].isel(frame=slice(1, 4))
+    drawn = dataclasses.replace(small, times=times).to_arviz()["posterior"]["t"].isel(frame=slice(1, 4)).to_dataset()
     truth = 2 * AR_WALKERS * AR_STEPS * (1 - AR_CORRELATION) / (1 + AR_CORRELATION)
     np.testing.assert_allclose(arviz.ess(drawn)["t"], truth, rtol=0.1)
     np.testing.assert_allclose(arviz.rhat(drawn)["t"], 1, atol=0.01)

@@ -78,12 +78,14 @@ def simulated_ranks(
     assumed_noise: str | FrameNoise | None = None,
     correlation: float | None = None,
     steps: int = STEPS,
+    eight_bits: bool = False,
 ) -> SimulatedRanks:
     """Ranks over `replicates` simulated videos of `num_frames` frames whose times are drawn from the prior.
 
     Frames are images of `model` plus Gaussian noise of standard deviation `noise.scale`: white, or smoothed by a
-    Gaussian of `correlation` pixels' standard deviation and rescaled. They are neither rounded nor clipped. Profiles
-    are computed as by `likelihood_profiles` with `assumed_noise`: "effective", "score" or "independent", which estimate
+    Gaussian of `correlation` pixels' standard deviation and rescaled. They are neither rounded nor clipped, or with
+    `eight_bits` both, as those of a video; clipping takes noise away from black and white. Profiles are computed as by
+    `likelihood_profiles` with `assumed_noise`: "effective", "score" or "independent", which estimate
     it, or a FrameNoise (default: `noise`). `sampler`: "exact", or "emcee" with `steps` steps.
 
     Images are cached between replicates, up to 1 GB: with exact sampling small models take milliseconds per replicate.
@@ -110,7 +112,11 @@ def simulated_ranks(
         rng = np.random.default_rng(seeds)
         times = increments.draw_prior(rng, 1)[0]
         frames = cache.simulate_frames(times, noise.scale, correlation, rng)
-        builder = ProfileBuilder(_SimulatedResiduals(cache, frames))
+        if eight_bits:
+            rounded = np.rint(255 * np.moveaxis(frames, 1, -1)).clip(0, 255).astype(np.uint8)
+            builder = ProfileBuilder(Residuals(model, rounded))
+        else:
+            builder = ProfileBuilder(_SimulatedResiduals(cache, frames))
         builder.compare_coarse()
         log_prob = FrameTimeLogProb(builder.build(assumed).curves, increments)
         sample, success = _sample_posterior(log_prob, sampler, draws, steps, int(rng.integers(2**31)))

@@ -126,7 +126,7 @@ class FrameTimePosterior:
         }
         posterior = xarray.Dataset(arrays, coords | places)
         statistics = xarray.Dataset({"lp": (("chain", "draw"), lp)}, coords)
-        if hasattr(arviz, "InferenceData"):
+        if int(arviz.__version__.split(".")[0]) < 1:
             return arviz.InferenceData(posterior=posterior, sample_stats=statistics, attrs=attrs)
         groups = {"/": xarray.Dataset(attrs=attrs), "posterior": posterior, "sample_stats": statistics}
         return xarray.DataTree.from_dict(groups)

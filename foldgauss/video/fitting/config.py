@@ -406,9 +406,9 @@ DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
 PIXEL_TIME = 0.4
 #: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
 DENSITY, DENSITY_POWER = 0.0028, 0.85
-#: Gaussians alive per pixel of a frame, at most, likewise: where they live long, more of them leave time for too few
-#: steps.
-ALIVE, ALIVE_POWER = 0.25, 0.55
+#: Gaussians alive in a frame, at most: for a frame of one pixel and one microsecond; it grows by these powers of the
+#: time, likewise, and of the pixels. Where they live long, more of them leave time for too few steps.
+ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 5.3, 0.55, 0.75
 #: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
 #: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
@@ -442,12 +442,13 @@ def default_num_gaussians(
 def most_alive(config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None) -> float:
     """The largest mean number of Gaussians alive in a frame at the start, where `minutes` choose their number.
 
-    It is `ALIVE` x^`ALIVE_POWER` for each pixel of a frame, x as in `default_num_gaussians`; else infinite. How many
-    are alive depends on the motion in the clip: `initialize` lowers the number by it.
+    It is `ALIVE` x^`ALIVE_POWER` p^`ALIVE_PIXEL_POWER`, x as in `default_num_gaussians`, for frames of p pixels; else
+    infinite. How many are alive depends on the motion in the clip: `initialize` lowers the number by it.
     """
     if config.minutes is None or config.num_gaussians is not None or config.economy is not None:
         return math.inf
-    return height * width * ALIVE * _time_per_pixel(config, num_frames * height * width, threads) ** ALIVE_POWER
+    time = _time_per_pixel(config, num_frames * height * width, threads)
+    return ALIVE * time**ALIVE_POWER * (height * width) ** ALIVE_PIXEL_POWER
 
 
 def _time_per_pixel(config: FitConfig, pixels: int, threads: int | None) -> float:
