@@ -50,13 +50,20 @@ def _gaussian_mixture(x: Rows, seed: int, effort: Effort) -> Fitted:
 
 
 def _bayesian_mixture(x: Rows, seed: int, effort: Effort) -> Fitted:
-    """A Dirichlet process' mixture at its default priors; components of less than one point are not counted."""
+    """A Dirichlet process' mixture at its default priors; components of less than one point are not counted.
+
+    Scored is the mixture of the posterior's mean weights, means and covariances: the class's own `score_samples` sums
+    exponentials of expected logarithms, which are less than a density.
+    """
     model = BayesianGaussianMixture(
         n_components=effort.components, n_init=effort.starts, max_iter=effort.max_iter, random_state=seed
     ).fit(x)
     used, dim = int((model.weights_ * len(x) >= 1).sum()), x.shape[1]
     parameters = used * (dim + dim * (dim + 1) // 2) + used - 1
-    return Fitted(model.score_samples, parameters, model.converged_, f"{used} components")
+    mixture = GaussianMixture(effort.components)
+    mixture.weights_, mixture.means_, mixture.covariances_ = model.weights_, model.means_, model.covariances_
+    mixture.precisions_cholesky_ = np.linalg.inv(np.linalg.cholesky(model.covariances_)).swapaxes(1, 2)
+    return Fitted(mixture.score_samples, parameters, model.converged_, f"{used} components")
 
 
 def _kernel_density(x: Rows, seed: int, effort: Effort) -> Fitted:
