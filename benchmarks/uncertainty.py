@@ -12,7 +12,8 @@
 - unseen: every second frame of the clip is fitted, and the frames between are looked for: are they half way between
   the times of their neighbours, if the clip's playback speed is regular?
 - calibration: ranks of true times in simulated videos of a small synthetic scene, with right noise, noise assumed 1.5
-  times too great and too small, frames of 8 bits, and smoothed noise; coverage of 50% and 90% intervals; `--plot` draws the ranks.
+  times too great and too small, frames of 8 bits, and smoothed noise; coverage of 50% and 90% intervals; `--plot`
+  draws the ranks.
 - retimed: that scene drawn at a smooth warp of times, with noise: are the warp's times in the intervals, given the
   true splats, and given splats that were fitted to a uniform clip or, times learned with them, to the warped clip?
 """
