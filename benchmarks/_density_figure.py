@@ -61,7 +61,8 @@ def _densities(axes: np.ndarray, x: np.ndarray, methods: list[str], effort: Effo
         for ax in axes:
             ax.axis("off")
         if len(axes):
-            axes[0].text(0, 0.5, "densities of three columns are not drawn", fontsize=8, color=GREY)
+            note = axes[0].text(0, 0.5, "densities of three columns are not drawn", fontsize=8, color=GREY)
+            note.set_in_layout(False)  # it may be wider than its column
         return
     across, up = (np.linspace(*_limits(x[:, column]), GRID) for column in (-1, 0))
     grid = np.stack([part.ravel() for part in np.meshgrid(up, across, indexing="ij")], -1)
