@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.spatial
 
 pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
@@ -16,7 +17,7 @@ from sklearn.utils import estimator_checks
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.estimator import folded_gaussian_mixture as estimator
-from foldgauss.estimator.em.loop import ANNEALING_STEPS
+from foldgauss.estimator.em.loop import ANNEALING_STEPS, SETTLING_STEPS
 from foldgauss.estimator.folded_gaussian_mixture import EMStatus, FoldedGaussianMixture
 
 K, N = 3, 300
@@ -238,7 +239,10 @@ def test_annealing_ends_at_temperature_one():
     """No run ends before it is cold; plain EM from its end hardly moves."""
     x, _ = _tracks()
     options = {"degree": 3, "random_state": 0}
-    assert _quiet(FoldedGaussianMixture(K, annealing=0.1, tol=1e9, **options), x).n_iter_ == ANNEALING_STEPS + 1
+    assert (
+        _quiet(FoldedGaussianMixture(K, annealing=0.1, tol=1e9, **options), x).n_iter_
+        == ANNEALING_STEPS + SETTLING_STEPS
+    )
     assert _quiet(FoldedGaussianMixture(K, annealing=1.0, tol=1e9, **options), x).n_iter_ == 2
     fitted = _quiet(FoldedGaussianMixture(K, annealing=0.1, **options), x)
     bound = fitted.lower_bound_
@@ -246,6 +250,15 @@ def test_annealing_ends_at_temperature_one():
     assert abs(again.lower_bound_ - bound) < 1e-2
     cut = _quiet(FoldedGaussianMixture(K, annealing=0.1, max_iter=10, **options), x)
     assert cut.status_ == EMStatus.NOT_CONVERGED
+
+
+def test_annealed_components_separate_before_a_fit_converges():
+    """On two concentric rings all components coincide when temperature 1 is reached."""
+    rng = np.random.default_rng(0)
+    angles, radii = rng.uniform(0, 2 * np.pi, 500), rng.choice([1.0, 2.0], 500) + 0.05 * rng.normal(size=500)
+    x = np.stack([radii * np.cos(angles), radii * np.sin(angles)], 1)
+    fitted = _quiet(FoldedGaussianMixture(K, annealing=0.1, random_state=0), x)
+    assert scipy.spatial.distance.pdist(fitted.means_).min() > 0.1
 
 
 @pytest.mark.slow

@@ -51,8 +51,8 @@ def test_estimated_noise_is_calibrated():
 def test_ranks_through_frames_of_eight_bits():
     """The frames of a video: rounded, clipped, and compared as those are.
 
-    Seeds 2 to 4 were fixed before they were run. With 300 replicates one of six quantities leaves its envelope at
-    seed 0, and with seeds 0 to 4 together; with frames that are not rounded none does.
+    Seeds 2 to 4 were fixed before they were run. Noise that is clipped at black shifts frames 1 and 4 by 0.07 of their
+    standard deviations; 3,000 replicates show it, 900 rarely do.
     """
     parts = [ranks(eight_bits=True, seed=seed) for seed in (2, 3, 4)]
     found = dataclasses.replace(parts[0], ranks=np.concatenate([part.ranks for part in parts]))

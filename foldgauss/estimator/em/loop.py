@@ -31,6 +31,8 @@ __all__ = ["EMStatus", "Run", "State", "broadcast_degrees", "log_likelihood", "r
 _ARMIJO = 1e-4
 #: Steps from the first inverse temperature to 1.
 ANNEALING_STEPS = 50
+#: Steps at temperature 1 before an annealed run may converge: components that coincide there separate slowly at first.
+SETTLING_STEPS = 20
 #: Mean log-likelihoods that differ by less than this many epsilons of their dtype count as equal.
 _ROUNDING = 64
 #: While annealing, centers are perturbed by this fraction of their standard deviation, so that coinciding components
@@ -210,9 +212,10 @@ def run_em(
     """Run EM from every start (leading axis) in one program, or one for each block; `total` is the sum of weights.
 
     A component with less mass than `least_mass` is reset to half of the heaviest one, at most as often as there are
-    components. A run has converged when the mean log-likelihood changes by less than `tol`, at temperature 1, without a
-    reset, and with no larger predicted gain rejected.
+    components. A run has converged when the mean log-likelihood changes by less than `tol`, at temperature 1 (for at
+    least `SETTLING_STEPS` steps if annealed), without a reset, and with no larger predicted gain rejected.
     """
+    first_end = 2 if annealing == 1.0 else ANNEALING_STEPS + SETTLING_STEPS
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
     step_all = _step_over_blocks if isinstance(points, Blocks) else _step_restarts
     before, lasts = states, np.full(restarts, -np.inf)
@@ -226,7 +229,7 @@ def run_em(
         new, info = step_all(states, jnp.asarray(done), points, envelope, model, beta)
         values, rejected = np.asarray(info.log_likelihood) / total, np.asarray(info.rejected) / total
         broken = ~done & ~np.isfinite(values)
-        small = (np.abs(values - lasts) < tol) & (rejected < max(tol, 1e-12)) & annealed & (number > 1)
+        small = (np.abs(values - lasts) < tol) & (rejected < max(tol, 1e-12)) & (number >= first_end)
         lasts, running = np.where(done, lasts, values), ~done
         for r in np.flatnonzero(running):
             histories[r].append(float(values[r]))

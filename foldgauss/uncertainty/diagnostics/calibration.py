@@ -84,9 +84,10 @@ def simulated_ranks(
 
     Frames are images of `model` plus Gaussian noise of standard deviation `noise.scale`: white, or smoothed by a
     Gaussian of `correlation` pixels' standard deviation and rescaled. They are neither rounded nor clipped, or with
-    `eight_bits` both, as those of a video; clipping takes noise away from black and white. Profiles are computed as by
-    `likelihood_profiles` with `assumed_noise`: "effective", "score" or "independent", which estimate
-    it, or a FrameNoise (default: `noise`). `sampler`: "exact", or "emcee" with `steps` steps.
+    `eight_bits` both, as those of a video; noise clipped at black or white is no longer centered, which shifts times a
+    little. Profiles are computed as by `likelihood_profiles` with `assumed_noise`: "effective", "score" or
+    "independent", which estimate it, or a FrameNoise (default: `noise`). `sampler`: "exact", or "emcee" with `steps`
+    steps.
 
     Images are cached between replicates, up to 1 GB: with exact sampling small models take milliseconds per replicate.
 
