@@ -139,8 +139,9 @@ def test_the_model_comes_back_from_the_page(tmp_path):
     again = load_video_model(tmp_path / "out.fgz")
     assert again.num_gaussians == NUM
     np.testing.assert_allclose(again.splats.opacity_logit, model.splats.opacity_logit, atol=0.02)  # in their order
+    own, found = VideoRenderer(model), VideoRenderer(again)
     for t in (0.0, 0.37, 1.0):
-        assert np.abs(np.asarray(again.render(t)) - np.asarray(model.render(t))).mean() < 0.5 / 255
+        assert np.abs(found.image(t) - own.image(t)).mean() < 0.5 / 255
 
 
 def test_a_compact_file_goes_in_as_it_is(tmp_path):
@@ -156,7 +157,7 @@ def test_gaussians_beyond_proportion_get_even_steps():
     thin[5] = -40.0, -45.0
     model = eqx.tree_at(lambda m: m.splats.log_scale, model, thin)
     again = dequantize(quantize_finely(model))
-    np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=0.02)
+    np.testing.assert_allclose(VideoRenderer(again).image(0.4), VideoRenderer(model).image(0.4), atol=0.02)
 
 
 def test_the_original_goes_in_as_pictures():
@@ -260,22 +261,15 @@ def opened(browser, tmp_path):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return {
-        how: fit(waves(), FitConfig(num_gaussians=300, steps=60, compositing=how), fps=12).model
-        for how in ("over", "sum")
-    }
+    return fit(waves(7), FitConfig(num_gaussians=300, steps=60), fps=12).model
 
 
 MODELS = {
-    "fitted": lambda fitted: fitted["over"],
-    "sum": lambda fitted: fitted["sum"],
-    "moved": lambda fitted: (
-        edit(fitted["over"]).move((0.1, 0.05)).scale(0.7, about=(0, 0)).rotate(0.4, about=(0, 0)).video()
-    ),
-    "layers": lambda fitted: layers(edit(fitted["over"]).scale(0.4, about=(0, 0)).video(), fitted["over"]),
+    "moved": lambda fitted: edit(fitted).move((0.1, 0.05)).scale(0.7, about=(0, 0)).rotate(0.4, about=(0, 0)).video(),
+    "layers": lambda fitted: layers(edit(fitted).scale(0.4, about=(0, 0)).video(), fitted),
+    "sum": lambda fitted: soft_model(compositing="sum", options=RenderOptions()),
     "power 2, exact": lambda fitted: soft_model(power=2.0),
-    "power 1": lambda fitted: soft_model(power=1.0, options=RenderOptions()),
-    "floor, no path": lambda fitted: soft_model(floor=0.1, degree=0, options=RenderOptions()),
+    "power 1, floor, no path": lambda fitted: soft_model(power=1.0, floor=0.1, degree=0, options=RenderOptions()),
     "degree 4, round": lambda fitted: soft_model(degree=4, options=RenderOptions(support_radius=1.5)),
     "scale cutoff": lambda fitted: _with(soft_model(options=RenderOptions()), scale_cutoff=0.03),
     "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(make_time_logits(7, (3,)))),
@@ -371,8 +365,8 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     box = page.page.locator("#canvas").bounding_box()
     scale = min(box["width"] / SIZE[1], box["height"] / SIZE[0])
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    seen = model.at(jnp.float32(0.5))
-    x, y = map(float, np.median(np.asarray(seen.mean)[OBJECT], axis=0))
+    seen = eqx.filter_jit(lambda own: own.at(jnp.float32(0.5)).mean)(model)
+    x, y = map(float, np.median(np.asarray(seen)[OBJECT], axis=0))
     at = (middle[0] + (x - SIZE[1] / 2) * scale, middle[1] + (y - SIZE[0] / 2) * scale)
     page.page.mouse.move(*at)
     page.page.mouse.down()
@@ -804,7 +798,7 @@ def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     )
     ran = subprocess.run(["node", "run.js"], cwd=tmp_path, check=True, timeout=60, capture_output=True, text=True)
     found = json.loads(ran.stdout)
-    splats = load_video_model(path).splats.at(jnp.float32(0.3))
+    splats = eqx.filter_jit(lambda own: own.at(jnp.float32(0.3)))(load_video_model(path).splats)
     which = np.array([one["i"] for one in found])
     np.testing.assert_array_equal(which, np.flatnonzero(splats.opacity))
     np.testing.assert_allclose([(one["x"], one["y"]) for one in found], splats.mean[which], atol=1e-5)
