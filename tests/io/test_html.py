@@ -242,6 +242,10 @@ def browser():
         yield found
 
 
+#: By default pages are small, which are quickly drawn; a large one is for what is done on the picture by hand.
+SMALL, LARGE = ({"viewport": {"width": width, "height": height}} for width, height in ((400, 400), (900, 640)))
+
+
 @pytest.fixture
 def opened(browser, tmp_path):
     """Opens pages, and holds at the end that they said nothing and asked for nothing."""
@@ -249,7 +253,7 @@ def opened(browser, tmp_path):
 
     def open_page(model, *, original=None, **options):
         path = write_html(tmp_path / f"{len(pages)}.html", model, original=original)
-        pages.append(Opened(browser, path, **options))
+        pages.append(Opened(browser, path, **SMALL | options))
         return pages[-1].ready()
 
     yield open_page
@@ -359,7 +363,7 @@ def test_it_plays_and_stops_at_the_end(opened):
 
 def test_what_is_brushed_can_vanish_and_come_back(opened):
     model = soft_model(options=RenderOptions())
-    page = opened(model)
+    page = opened(model, **LARGE)
     before = page.picture(0.5)
     page.page.keyboard.press("b")
     box = page.page.locator("#canvas").bounding_box()
@@ -421,7 +425,7 @@ def test_what_is_brushed_is_followed_through_the_clip(opened):
 def test_the_original_is_shown_beside_it(opened):
     model, clip = soft_model(), np.zeros((7, *SIZE, 3), np.uint8)
     clip[..., 1] = 200
-    page = opened(model, original=clip)
+    page = opened(model, original=clip, **LARGE)
 
     def shot():
         page.settle()
@@ -466,7 +470,7 @@ def test_a_phone_has_room_for_all_of_it(opened):
 
 
 def test_buttons_have_names_and_themes_change(opened):
-    page = opened(soft_model(), color_scheme="light").page
+    page = opened(soft_model(), color_scheme="light", **LARGE).page
     nameless = """[...document.querySelectorAll("button, select, input")]
         .filter((own) => !(own.ariaLabel || own.textContent.trim() || own.labels?.length)).map((own) => own.id)"""
     assert page.evaluate(nameless) == []
@@ -523,7 +527,6 @@ def test_the_player_works_in_a_notebooks_frame(browser, tmp_path):
 
 # ------------------------------------------------------------------------------------------ a clip in segments
 
-SMALL = {"viewport": {"width": 400, "height": 400}}  # quickly drawn
 #: Spans 0:7, 4:10 and 7:12, whose fades meet: between frames 6 and 7 three are seen; 12:16 and 16:19 after cuts.
 FIRSTS, LENGTHS, WHOLE = (0, 4, 7, 12, 16), (7, 6, 5, 4, 3), 19
 
@@ -574,7 +577,7 @@ def test_segments_that_no_page_holds_are_told(monkeypatch):
 def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     """Inside, in fades, of three at once, at cuts of both kinds, between frames, to and fro over the seams."""
     video = segmented(compositing=compositing)
-    page, play = opened(video, **SMALL), VideoRenderer(video)
+    page, play = opened(video), VideoRenderer(video)
     many = {len(video.weights(position)) for position in (2, 4, 6.5)}
     assert many == {1, 2, 3}
     positions = [0, 2.3, 3.4, 4, 5.25, 6.5, 6.8, 7, 9, 9.6, 10, 11.4, 11.5, 13.4, 13.6, 15, 15.6, 18]
@@ -597,7 +600,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
 def test_few_segments_are_held_whatever_the_length(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
     video = SegmentedVideo.from_models(parts)
-    page, play = opened(video, **SMALL), VideoRenderer(video)
+    page, play = opened(video), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
     page.page.evaluate("foldgauss.player.segments.most = 0")
     for position, held in ((27, [3, 4, 5]), (51, [0, 7, 8]), (0, [0, 1, 2]), (30, [3, 4, 5, 6]), (15, [1, 2, 3])):
@@ -611,7 +614,7 @@ def test_few_segments_are_held_whatever_the_length(opened):
 def test_controls_work_on_the_whole_clip(opened):
     clip = np.zeros((WHOLE, *SIZE, 3), np.uint8)
     clip[..., 1] = 12 * np.arange(WHOLE)[:, None, None]
-    page = opened(segmented(), original=clip, **SMALL)
+    page = opened(segmented(), original=clip)
     keyboard, text = page.page.keyboard, page.page.locator
     page.until("foldgauss.stats.decoded.length === 5")
     assert "19 frames in 5 segments" in text("#facts").inner_text()
@@ -639,7 +642,7 @@ def test_controls_work_on_the_whole_clip(opened):
 
 
 def test_play_goes_over_the_seams(opened):
-    page = opened(segmented(), **SMALL)
+    page = opened(segmented())
     page.page.evaluate(
         """() => {
           const { player } = foldgauss, draw = player.draw;
@@ -671,7 +674,7 @@ _HELD_BACK = """() => {
 
 def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     video = segmented()
-    page, play = opened(video, **SMALL), VideoRenderer(video)
+    page, play = opened(video), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate(_HELD_BACK)
     page.page.evaluate("foldgauss.seek(2 / 18)")
@@ -717,7 +720,7 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
 
 def test_the_brush_acts_on_the_segment_seen(opened):
     video = segmented()
-    page = opened(video)
+    page = opened(video, **LARGE)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate("foldgauss.player.segments.most = 0")
     page.page.keyboard.press("b")

@@ -276,13 +276,10 @@ def test_kinds_match_the_stored_model():
 
 
 def test_absent_parameters_never_move():
-    frames = disc(lambda s: (15 + 50 * s, 24))
-    config = FitConfig(num_gaussians=200, steps=300, economy=Economy(rounds=2, first_fraction=0.3, last_fraction=0.4))
-    for state, info in fit_steps(frames, config):
-        pass
-    at, kinds = columns(config.degree), state.kinds
-    powers = np.repeat(np.arange(1, config.degree + 1), 2)
-    assert (get_degrees(kinds) < config.degree).any()
+    _, model, state, _ = fitted("line")
+    at, kinds = columns(model.degree), state.kinds
+    powers = np.repeat(np.arange(1, model.degree + 1), 2)
+    assert (get_degrees(kinds) < model.degree).any()
     assert (state.rows[:, at["coefficients"]][powers > get_degrees(kinds)[:, None]] == 0).all()
     assert is_static(kinds).any()
     assert is_opaque(kinds).any()
@@ -419,7 +416,7 @@ def test_one_gaussian_always_stays():
 
 def test_count_of_parameters_is_that_of_the_file():
     """Of each kind, one Gaussian among others of its own, so that kinds are told."""
-    model = _fitted_model()
+    _, model, _, _ = fitted("parabola")
     kinds = find_kinds(pack(model.splats), model.degree)
     assert len(np.unique(kinds)) > 5
     alone = dataclasses.replace(model.splats, color_dc=distinct(model, 3), log_scale=distinct(model, 2))
@@ -430,11 +427,6 @@ def test_count_of_parameters_is_that_of_the_file():
 
 def distinct(model, width) -> np.ndarray:
     return np.random.default_rng(0).normal(size=(model.num_gaussians, width)).astype(np.float32)
-
-
-def _fitted_model():
-    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
-    return fit(frames, FitConfig(num_gaussians=400, steps=300, economy=Economy())).model
 
 
 def test_cost_of_opaque_is_as_predicted(scene, mean_scores):
