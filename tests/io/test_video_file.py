@@ -635,9 +635,7 @@ for name in names:
         print(name, type(error).__name__, len(os.listdir(folder)))
 """
     names = ["out.mp4", "out.webm", "out.gif", "out", "out.png"]
-    ran = subprocess.run(
-        [sys.executable, "-c", program, tmp_path, *names], capture_output=True, text=True, timeout=60
-    )
+    ran = subprocess.run([sys.executable, "-c", program, tmp_path, *names], capture_output=True, text=True, timeout=60)
     assert ran.stderr == ""
     told = [line.split() for line in ran.stdout.splitlines()]
     assert [name for name, _, _ in told] == names

@@ -67,8 +67,6 @@ GROWING = FitConfig(
     sparse_updates=False,
     growth=GROWTH,
     scale_rates_by_size=False,
-    initialization="uniform",
-    follow_motion=False,
     engine="xla",
 )
 
