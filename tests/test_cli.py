@@ -138,7 +138,7 @@ def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
 def test_folder_of_images_in_natural_order(tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
-    for k, frame in enumerate(blobs(11)):
+    for k, frame in zip((0, 1, 2, 9, 10, 11), blobs(), strict=True):
         write_image(folder / f"img{k}.png", frame)
     assert run("fit", folder, "--out", tmp_path / "m.safetensors", *QUICK, "--degree", "1", "--batch-size", "2") == 0
     assert run("evaluate", tmp_path / "m.safetensors", folder) == 0
@@ -347,21 +347,22 @@ def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
 
 
 def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
-    """The real clip, fewer steps."""
-    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=5000, steps=40))
+    """The real clip, fewer frames and steps."""
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=2000, steps=40))
+    monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
     assert run("demo", "--out", tmp_path) == 0
     names = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["mean_psnr"] > 22
-    assert len(figures["psnr"]) == 24
-    assert read_video(tmp_path / "reconstruction.mp4").frames.shape == (24, 160, 320, 3)
+    assert len(figures["psnr"]) == 6
+    assert read_video(tmp_path / "reconstruction.mp4").frames.shape == (6, 160, 320, 3)
     assert "mean PSNR" in capsys.readouterr().out
 
 
 def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
-    monkeypatch.setattr(demonstration, "FRAMES", (0, 4))
+    monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
     (tmp_path / "model.safetensors").write_bytes(b"mine")
     for record in (None, b"\xff", b"[]", b'{"psnr": [], "ssim": []}'):  # none, and none of a demo
         if record is not None:
@@ -376,13 +377,13 @@ def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "model.safetensors").read_bytes() == b"mine"
     (tmp_path / "notes.txt").rename(tmp_path / ".hidden")
     assert run("demo", "--out", tmp_path) == 0
-    assert load_video_model(tmp_path / "model.safetensors").num_frames == 4
+    assert load_video_model(tmp_path / "model.safetensors").num_frames == 6
     assert run("demo", "--out", tmp_path / ".hidden") == 1  # a file
 
 
 def test_a_demo_that_was_stopped_is_replaced_by_the_next(tmp_path, monkeypatch):
     monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
-    monkeypatch.setattr(demonstration, "FRAMES", (0, 4))
+    monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
 
     def stopped(*given):
         raise OSError("stopped")
@@ -474,16 +475,13 @@ def test_killed_at_any_moment_and_resumed(work, tmp_path):
     target, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
     options = ["--gaussians", "400", "--steps", "300", "--quiet"]
     command = [sys.executable, "-c", KEEPING_EVERY_STEP, "fit", work / "clip.mp4", "--out", target, *options]
-    steps = []
-    for turn in range(2):
-        process = subprocess.Popen([*command, *["--resume"] * (turn > 0)])
-        while process.poll() is None and not (kept.exists() and _step_of(kept) > 100 * turn + 37):
-            time.sleep(0.01)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        assert not target.exists()
-        steps.append(_step_of(kept))
-    assert 37 < steps[0] < steps[1] < 300
+    process = subprocess.Popen(command)
+    while process.poll() is None and not (kept.exists() and _step_of(kept) > 37):
+        time.sleep(0.01)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert not target.exists()
+    assert 37 < _step_of(kept) < 300
     assert run(*command[3:], "--resume") == 0
     whole = tmp_path / "whole.safetensors"
     assert run("fit", work / "clip.mp4", "--out", whole, *options) == 0

@@ -21,11 +21,11 @@ def ramp(num_frames, height, width, depth=np.uint8):
 CLIPS = {
     "one": ramp(1, 24, 32),
     "two, 16 bits": ramp(2, 24, 32, np.uint16),
-    "tiny": ramp(3, 8, 8),
+    "tiny": ramp(2, 8, 8),
     "line": ramp(2, 1, 600),
     "column": ramp(2, 600, 1),
-    "white": np.full((3, 24, 32, 3), 255, np.uint8),
-    "black": np.zeros((3, 24, 32, 3), np.uint8),
+    "white": np.full((2, 24, 32, 3), 255, np.uint8),
+    "black": np.zeros((2, 24, 32, 3), np.uint8),
 }
 QUICK = ("--gaussians", 300, "--steps", 60)
 

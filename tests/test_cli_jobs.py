@@ -42,9 +42,9 @@ def clips(tmp_path_factory):
     """Three that can be fitted, one of them a folder, and one that cannot."""
     folder = tmp_path_factory.mktemp("clips")
     for k in range(2):
-        write_video(folder / f"clip{k}.mp4", pictures(8, k), 10.0)
+        write_video(folder / f"clip{k}.mp4", pictures(15, k), 10.0)  # as many as a segment of the long one has
     (folder / "frames").mkdir()
-    for k, picture in enumerate(pictures(8, 5.0)):
+    for k, picture in enumerate(pictures(15, 5.0)):
         write_image(folder / "frames" / f"{k}.png", picture)
     (folder / "broken.mp4").write_text("no video at all")
     (folder / "notes.txt").write_text("about these clips")

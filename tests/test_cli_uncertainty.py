@@ -145,7 +145,7 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no
 
 def test_without_colours_less_is_known(work, done, tmp_path, no_pictures):
     target = tmp_path / "results"
-    assert run(*arguments(work, target, *SHORT, "--level", "colors")) == 0
+    assert run(*arguments(work, target, *SHORT, "--steps", "60", "--level", "colors")) == 0
     told = (target / "summary.md").read_text()
     assert "their colors are integrated out" in told
     assert "their colours" not in (done / "summary.md").read_text()

@@ -1,4 +1,4 @@
-"""A few hundred hostile files for each parser at every run of the suite, and 220,000 with `pytest -m slow`.
+"""A hundred hostile files for each parser at every run of the suite, and 220,000 with `pytest -m slow`.
 
 All of it: `python -m tests.fuzz`.
 """
@@ -20,7 +20,7 @@ from .target import Broken, Target, judge
 from .targets import TARGETS
 from .worker import Run
 
-CASES = 150
+CASES = 100
 #: Kernels as Python want a process of their own.
 QUICK = [name for name, target in TARGETS.items() if not target.environment]
 

@@ -77,7 +77,7 @@ KINDS = {
     "uneven.mp4": ["-vf", "setpts='PTS+30*eq(mod(N,5),4)/25/TB/50+gt(N,60)/TB'", "-vsync", "vfr", *X264, "-g", "30"],
     "turned.mp4": [*X264, "-g", "30", "-metadata:s:v", "rotate=90"],
 }
-SPANS = [(0, 7), (40, 52), (83, 84), (110, 120), (17, 30)]
+SPANS = [(0, 7), (83, 84), (110, 120), (17, 30)]
 
 
 def _same(got, expected):
@@ -115,7 +115,7 @@ def test_spans_are_what_decoding_from_the_start_gives(tmp_path, name):
     _described(index, clip)
     assert index.cuts == Motion.from_frames(clip.frames).find_cuts()
     _as_read(index, path)
-    _as_read(index, path, SPANS[1:3], size=(20, 30))
+    _as_read(index, path, SPANS[1:2], size=(20, 30))
     np.testing.assert_array_equal(LazyFrames(index, run=7)[:], clip.frames)
 
 
@@ -185,11 +185,11 @@ def test_cuts_are_found_in_passing(long, long_index):
 
 @pytest.mark.parametrize("name", ["bunny", "bikes", "carphone"])
 def test_sample_clips(name):
-    path = sample_clip(name)
-    clip, index = read_video(path, frames=(0, 40)), index_video(path, frames=(0, 40))
+    path, stop = sample_clip(name), 33 if name == "bikes" else 12
+    clip, index = read_video(path, frames=(0, stop)), index_video(path, frames=(0, stop))
     _described(index, clip)
     assert index.cuts == Motion.from_frames(clip.frames).find_cuts() == ([30] if name == "bikes" else [])
-    _as_read(index, path, [(30, 33)], size=(60, 100))
+    _as_read(index, path, [(stop - 3, stop)], size=(60, 100))
 
 
 def test_cuts_of_a_stream_are_those_of_the_clip():

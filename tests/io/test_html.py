@@ -139,8 +139,9 @@ def test_the_model_comes_back_from_the_page(tmp_path):
     again = load_video_model(tmp_path / "out.fgz")
     assert again.num_gaussians == NUM
     np.testing.assert_allclose(again.splats.opacity_logit, model.splats.opacity_logit, atol=0.02)  # in their order
+    own, found = VideoRenderer(model), VideoRenderer(again)
     for t in (0.0, 0.37, 1.0):
-        assert np.abs(np.asarray(again.render(t)) - np.asarray(model.render(t))).mean() < 0.5 / 255
+        assert np.abs(found.image(t) - own.image(t)).mean() < 0.5 / 255
 
 
 def test_a_compact_file_goes_in_as_it_is(tmp_path):
@@ -156,7 +157,7 @@ def test_gaussians_beyond_proportion_get_even_steps():
     thin[5] = -40.0, -45.0
     model = eqx.tree_at(lambda m: m.splats.log_scale, model, thin)
     again = dequantize(quantize_finely(model))
-    np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=0.02)
+    np.testing.assert_allclose(VideoRenderer(again).image(0.4), VideoRenderer(model).image(0.4), atol=0.02)
 
 
 def test_the_original_goes_in_as_pictures():
@@ -241,6 +242,10 @@ def browser():
         yield found
 
 
+#: By default pages are small, which are quickly drawn; a large one is for what is done on the picture by hand.
+SMALL, LARGE = ({"viewport": {"width": width, "height": height}} for width, height in ((400, 400), (900, 640)))
+
+
 @pytest.fixture
 def opened(browser, tmp_path):
     """Opens pages, and holds at the end that they said nothing and asked for nothing."""
@@ -248,7 +253,7 @@ def opened(browser, tmp_path):
 
     def open_page(model, *, original=None, **options):
         path = write_html(tmp_path / f"{len(pages)}.html", model, original=original)
-        pages.append(Opened(browser, path, **options))
+        pages.append(Opened(browser, path, **SMALL | options))
         return pages[-1].ready()
 
     yield open_page
@@ -260,22 +265,15 @@ def opened(browser, tmp_path):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return {
-        how: fit(waves(), FitConfig(num_gaussians=300, steps=60, compositing=how), fps=12).model
-        for how in ("over", "sum")
-    }
+    return fit(waves(7), FitConfig(num_gaussians=300, steps=60), fps=12).model
 
 
 MODELS = {
-    "fitted": lambda fitted: fitted["over"],
-    "sum": lambda fitted: fitted["sum"],
-    "moved": lambda fitted: (
-        edit(fitted["over"]).move((0.1, 0.05)).scale(0.7, about=(0, 0)).rotate(0.4, about=(0, 0)).video()
-    ),
-    "layers": lambda fitted: layers(edit(fitted["over"]).scale(0.4, about=(0, 0)).video(), fitted["over"]),
+    "moved": lambda fitted: edit(fitted).move((0.1, 0.05)).scale(0.7, about=(0, 0)).rotate(0.4, about=(0, 0)).video(),
+    "layers": lambda fitted: layers(edit(fitted).scale(0.4, about=(0, 0)).video(), fitted),
+    "sum": lambda fitted: soft_model(compositing="sum", options=RenderOptions()),
     "power 2, exact": lambda fitted: soft_model(power=2.0),
-    "power 1": lambda fitted: soft_model(power=1.0, options=RenderOptions()),
-    "floor, no path": lambda fitted: soft_model(floor=0.1, degree=0, options=RenderOptions()),
+    "power 1, floor, no path": lambda fitted: soft_model(power=1.0, floor=0.1, degree=0, options=RenderOptions()),
     "degree 4, round": lambda fitted: soft_model(degree=4, options=RenderOptions(support_radius=1.5)),
     "scale cutoff": lambda fitted: _with(soft_model(options=RenderOptions()), scale_cutoff=0.03),
     "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(make_time_logits(7, (3,)))),
@@ -365,14 +363,14 @@ def test_it_plays_and_stops_at_the_end(opened):
 
 def test_what_is_brushed_can_vanish_and_come_back(opened):
     model = soft_model(options=RenderOptions())
-    page = opened(model)
+    page = opened(model, **LARGE)
     before = page.picture(0.5)
     page.page.keyboard.press("b")
     box = page.page.locator("#canvas").bounding_box()
     scale = min(box["width"] / SIZE[1], box["height"] / SIZE[0])
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    seen = model.at(jnp.float32(0.5))
-    x, y = map(float, np.median(np.asarray(seen.mean)[OBJECT], axis=0))
+    seen = eqx.filter_jit(lambda own: own.at(jnp.float32(0.5)).mean)(model)
+    x, y = map(float, np.median(np.asarray(seen)[OBJECT], axis=0))
     at = (middle[0] + (x - SIZE[1] / 2) * scale, middle[1] + (y - SIZE[0] / 2) * scale)
     page.page.mouse.move(*at)
     page.page.mouse.down()
@@ -427,7 +425,7 @@ def test_what_is_brushed_is_followed_through_the_clip(opened):
 def test_the_original_is_shown_beside_it(opened):
     model, clip = soft_model(), np.zeros((7, *SIZE, 3), np.uint8)
     clip[..., 1] = 200
-    page = opened(model, original=clip)
+    page = opened(model, original=clip, **LARGE)
 
     def shot():
         page.settle()
@@ -472,7 +470,7 @@ def test_a_phone_has_room_for_all_of_it(opened):
 
 
 def test_buttons_have_names_and_themes_change(opened):
-    page = opened(soft_model(), color_scheme="light").page
+    page = opened(soft_model(), color_scheme="light", **LARGE).page
     nameless = """[...document.querySelectorAll("button, select, input")]
         .filter((own) => !(own.ariaLabel || own.textContent.trim() || own.labels?.length)).map((own) => own.id)"""
     assert page.evaluate(nameless) == []
@@ -529,7 +527,6 @@ def test_the_player_works_in_a_notebooks_frame(browser, tmp_path):
 
 # ------------------------------------------------------------------------------------------ a clip in segments
 
-SMALL = {"viewport": {"width": 400, "height": 400}}  # quickly drawn
 #: Spans 0:7, 4:10 and 7:12, whose fades meet: between frames 6 and 7 three are seen; 12:16 and 16:19 after cuts.
 FIRSTS, LENGTHS, WHOLE = (0, 4, 7, 12, 16), (7, 6, 5, 4, 3), 19
 
@@ -580,7 +577,7 @@ def test_segments_that_no_page_holds_are_told(monkeypatch):
 def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     """Inside, in fades, of three at once, at cuts of both kinds, between frames, to and fro over the seams."""
     video = segmented(compositing=compositing)
-    page, play = opened(video, **SMALL), VideoRenderer(video)
+    page, play = opened(video), VideoRenderer(video)
     many = {len(video.weights(position)) for position in (2, 4, 6.5)}
     assert many == {1, 2, 3}
     positions = [0, 2.3, 3.4, 4, 5.25, 6.5, 6.8, 7, 9, 9.6, 10, 11.4, 11.5, 13.4, 13.6, 15, 15.6, 18]
@@ -603,7 +600,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
 def test_few_segments_are_held_whatever_the_length(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
     video = SegmentedVideo.from_models(parts)
-    page, play = opened(video, **SMALL), VideoRenderer(video)
+    page, play = opened(video), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
     page.page.evaluate("foldgauss.player.segments.most = 0")
     for position, held in ((27, [3, 4, 5]), (51, [0, 7, 8]), (0, [0, 1, 2]), (30, [3, 4, 5, 6]), (15, [1, 2, 3])):
@@ -617,7 +614,7 @@ def test_few_segments_are_held_whatever_the_length(opened):
 def test_controls_work_on_the_whole_clip(opened):
     clip = np.zeros((WHOLE, *SIZE, 3), np.uint8)
     clip[..., 1] = 12 * np.arange(WHOLE)[:, None, None]
-    page = opened(segmented(), original=clip, **SMALL)
+    page = opened(segmented(), original=clip)
     keyboard, text = page.page.keyboard, page.page.locator
     page.until("foldgauss.stats.decoded.length === 5")
     assert "19 frames in 5 segments" in text("#facts").inner_text()
@@ -645,7 +642,7 @@ def test_controls_work_on_the_whole_clip(opened):
 
 
 def test_play_goes_over_the_seams(opened):
-    page = opened(segmented(), **SMALL)
+    page = opened(segmented())
     page.page.evaluate(
         """() => {
           const { player } = foldgauss, draw = player.draw;
@@ -677,7 +674,7 @@ _HELD_BACK = """() => {
 
 def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     video = segmented()
-    page, play = opened(video, **SMALL), VideoRenderer(video)
+    page, play = opened(video), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate(_HELD_BACK)
     page.page.evaluate("foldgauss.seek(2 / 18)")
@@ -723,7 +720,7 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
 
 def test_the_brush_acts_on_the_segment_seen(opened):
     video = segmented()
-    page = opened(video)
+    page = opened(video, **LARGE)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate("foldgauss.player.segments.most = 0")
     page.page.keyboard.press("b")
@@ -804,7 +801,7 @@ def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     )
     ran = subprocess.run(["node", "run.js"], cwd=tmp_path, check=True, timeout=60, capture_output=True, text=True)
     found = json.loads(ran.stdout)
-    splats = load_video_model(path).splats.at(jnp.float32(0.3))
+    splats = eqx.filter_jit(lambda own: own.at(jnp.float32(0.3)))(load_video_model(path).splats)
     which = np.array([one["i"] for one in found])
     np.testing.assert_array_equal(which, np.flatnonzero(splats.opacity))
     np.testing.assert_allclose([(one["x"], one["y"]) for one in found], splats.mean[which], atol=1e-5)

@@ -38,7 +38,7 @@ def toy(means, widths, concentration: float = 1.0, nodes: int = 401) -> FrameTim
 
 
 def sampled(log_prob, **settings):
-    return frame_time_posterior(log_prob=log_prob, progress=False, **{"steps": 6000, **settings})
+    return frame_time_posterior(log_prob=log_prob, progress=False, **{"steps": 6000, "ensembles": 2, **settings})
 
 
 def worst_ks(found, cdfs) -> float:
@@ -68,7 +68,7 @@ def agrees(found, tolerance: float = 5.0) -> bool:
 
 @pytest.fixture(scope="module")
 def near():
-    return sampled(toy(*NEAR))
+    return sampled(toy(*NEAR), ensembles=4)
 
 
 def test_few_frames_sample_the_known_posterior(near):
@@ -182,7 +182,7 @@ def test_message_counts_identified_frames():
     assert found.message.endswith(" 2 of 3 frame times are identified.")
 
 
-@pytest.mark.parametrize(("num", "frames"), [(5, [3]), (7, [2, 4]), (7, [1, 3, 4]), (3, None)])
+@pytest.mark.parametrize(("num", "frames"), [(5, [3]), (7, [1, 3, 4]), (3, None)])
 def test_single_frames_between_held_ones(num, frames):
     means = np.linspace(0, 1, num)
     curves = parabolas(means[1:-1], np.full(num - 2, 0.2 / num))
@@ -205,14 +205,14 @@ def test_low_concentration_samples_unresolved_gaps():
     # A thousandth of increments are below 1e-16.
     flat = [np.zeros(61)] * 16
     log_prob = FrameTimeLogProb(ProfileCurves.from_nodes([np.linspace(0, 1, 61)] * 16, flat), free_times(16, 0.2))
-    found = sampled(log_prob, steps=1000)
+    found = sampled(log_prob, steps=400)
     assert (np.diff(found.times) >= 0).all()
     assert np.isfinite(found.logits).all()
     assert np.isfinite(found.to_arviz().sample_stats["lp"].values).all()
 
 
 def test_seeds_reproduce_to_the_bit():
-    one, again, other = (sampled(toy(*NEAR), steps=400, seed=seed) for seed in (3, 3, 4))
+    one, again, other = (sampled(toy(*NEAR), steps=100, ensembles=4, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.times, again.times)
     assert not np.array_equal(one.times[0, -1], other.times[0, -1])
     assert len({each.tobytes() for each in one.times}) == 4
@@ -229,9 +229,9 @@ def test_too_few_steps_are_reported():
 def test_resumed_run_equals_an_uninterrupted_one(tmp_path, blocks):
     log_prob = toy(*NEAR)
     moves = BlockSweep(log_prob, block=2) if blocks else None
-    settings = {"steps": 600, "moves": moves, "seed": 5}
+    settings = {"steps": 60, "thin_by": 1, "moves": moves, "seed": 5}
     whole = sampled(log_prob, **settings)
-    sampled(log_prob, **{**settings, "steps": 300}, backend=tmp_path / "run.h5")
+    sampled(log_prob, **{**settings, "steps": 30}, backend=tmp_path / "run.h5")
     found = sampled(log_prob, **settings, backend=tmp_path / "run.h5")
     np.testing.assert_array_equal(found.times, whole.times)
     again = sampled(log_prob, **settings, backend=tmp_path / "run.h5")

@@ -196,7 +196,7 @@ def test_ssim_matches_the_cpu():
     close(own[..., 0], ssim_map(rendered, target))
 
 
-@pytest.mark.parametrize("units", [RateUnits(), RateUnits(time=0.06), RateUnits(size=0.01), RateUnits(0.06, 0.01)])
+@pytest.mark.parametrize("units", [RateUnits(), RateUnits(0.06, 0.01)])
 def test_adam_matches_the_cpu(units):
     """Of rows with any number of steps behind them, of all kinds; those that took no part stay to the bit."""
     rng, num, width = np.random.default_rng(0), 400, 17
@@ -496,6 +496,15 @@ def test_resuming_keeps_the_bits(config, tmp_path):
     one, other = (jax.tree.map(np.array, own) for own in (state, again))
     for name in ("rows", "first", "second", "counts", "time_logits", "frame_errors"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_relocation():
+    """As by the CPU: at the stated steps, of as many Gaussians as before."""
+    for state, info in fit_steps(FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.2)):
+        if info.step in (20, 35, 50):
+            assert (state.counts == 0).sum() >= 15
+    assert state.num_gaussians == 150
+    assert np.isfinite(state.rows).all()
 
 
 def test_diverging_fit_backs_off():

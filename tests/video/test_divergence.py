@@ -25,6 +25,12 @@ def usual() -> float:
     return evaluate(fit(CLIP, CONFIG).model, CLIP).mean_psnr
 
 
+@pytest.fixture(scope="module")
+def begun() -> float:
+    """dB after one step."""
+    return evaluate(fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model, CLIP).mean_psnr
+
+
 def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
     """dB of a fit whose state is changed after a step."""
     for state, info in fit_steps(CLIP, config):
@@ -35,8 +41,10 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
     return evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("leaf", ["loc", "opacity_logit", "coefficients", "log_time_scale"])
+@pytest.mark.parametrize(
+    ("leaf", "value"),
+    [("loc", np.nan), ("opacity_logit", np.inf), ("coefficients", -np.inf), ("log_time_scale", np.nan)],
+)
 def test_nonfinite_parameter_is_named_and_repaired(usual, leaf, value):
     def spoil(state):
         state.rows[17, columns(CONFIG.degree)[leaf]] = value
@@ -71,12 +79,11 @@ def test_stop_raises_with_the_last_finite_state():
 
 # Of the others a thousand times as much is borne: they come to an end of what they can do.
 @pytest.mark.parametrize("leaf", ["loc", "color_dc", "log_scale", "log_time_scale"])
-def test_too_high_rates_are_lowered_until_the_fit_converges(leaf):
+def test_too_high_rates_are_lowered_until_the_fit_converges(begun, leaf):
     rates = dataclasses.replace(RATES, **{leaf: 1000 * getattr(RATES, leaf)})
     with pytest.warns(DivergenceWarning, match=r"worse than they were|worse than at the start|no finite"):
         model = fit(CLIP, dataclasses.replace(CONFIG, rates=rates, final_rate=0.07)).model
-    start = evaluate(fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model, CLIP).mean_psnr
-    assert evaluate(model, CLIP).mean_psnr > start
+    assert evaluate(model, CLIP).mean_psnr > begun
 
 
 def test_exploding_folds_are_named(usual):
@@ -113,11 +120,11 @@ def _clips():
     rng = np.random.default_rng(0)
     flash = CLIP.copy()
     flash[3] = 255
-    half_black = np.concatenate([np.zeros_like(CLIP), CLIP])
-    hard = np.repeat(CLIP[:1], 8, axis=0)
+    half_black = np.concatenate([np.zeros_like(CLIP[:3]), CLIP[:3]])
+    hard = np.repeat(CLIP[:1], 6, axis=0)
     hard[5] = rng.integers(0, 256, CLIP.shape[1:], np.uint8)
     two = np.stack([np.zeros_like(CLIP[0]), hard[5]])
-    text = np.zeros((3, 48, 64, 4), np.uint8)
+    text = np.zeros((2, 48, 64, 4), np.uint8)
     text[:, 20:28, 10:50, 3] = 255  # black, over what is random
     return {
         "black": np.zeros_like(CLIP),
@@ -125,7 +132,7 @@ def _clips():
         "noise": rng.integers(0, 256, CLIP.shape, np.uint8),
         "flash": flash,
         "half black": half_black,
-        "cut": np.concatenate([CLIP, 255 - CLIP]),
+        "cut": np.concatenate([CLIP[:3], 255 - CLIP[3:]]),
         "one frame": CLIP[:1],
         "one frame of noise": hard,
         "one of two of noise": two,

@@ -19,6 +19,7 @@ from foldgauss.video.fitting.loop import fit_steps, start, to_model
 from foldgauss.video.fitting.pruning.description_length import MAX_OPAQUE_FRACTION, prune_rows, weigh_frames
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
 from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
+from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns, pack
 from foldgauss.video.models.sparse_storage import (
@@ -41,11 +42,11 @@ STEPS = 700
 def fitted(name: str, **changes):
     clips = {
         "one": lambda: still(1),
-        "still": lambda: still(60),
+        "still": lambda: still(24),
         "line": lambda: disc(lambda s: (15 + 50 * s, 24)),
         "parabola": lambda: disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2)),
         "cut": cut,
-        "noise": noise,
+        "noise": lambda: noise(24),
     }
     frames = clips[name]()
     config = FitConfig(num_gaussians=300, steps=STEPS, economy=Economy(), **changes)
@@ -122,12 +123,14 @@ def test_detail_causes_births():
 # ---------------------------------------------------------------------------------------------- the scores
 
 
-def _scene(degree=2, power=1.0, floor=0.0):
+@pytest.fixture(scope="module")
+def scene():
+    """Frames, and the rows of a model fitted to them, which nobody may change."""
     frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2), num_frames=8)
-    config = FitConfig(num_gaussians=120, steps=250, degree=degree, power=power, floor=floor)
-    model = fit(frames, config).model
+    model = fit(frames, FitConfig(num_gaussians=120, steps=250, degree=2, power=1.0)).model
     rows = pack(model.splats)
-    shape = ConditioningSpec(degree, power, floor, SIZE)
+    rows.setflags(write=False)
+    shape = ConditioningSpec(2, 1.0, 0.0, SIZE)
     times = np.asarray(model.frame_times.times())
     drawn = {"compositing": "over", "options": model.options}
     return frames, rows, shape, times, drawn
@@ -164,11 +167,6 @@ def _measured(rows, frames, shape, times, drawn, **how):
     return measure_scores(rows, window, times, shape, _target(frames), **drawn, **how)
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return _scene()
-
-
 def _mean_scores(scene, draws=24):
     all_scores = [_measured(*(scene[1], scene[0], *scene[2:]), seed=seed) for seed in range(draws)]
     fields = {
@@ -179,15 +177,28 @@ def _mean_scores(scene, draws=24):
     return dataclasses.replace(all_scores[0], **fields)
 
 
+@pytest.fixture(scope="module")
+def mean_scores(scene):
+    """Against the clip."""
+    return _mean_scores(scene)
+
+
+@pytest.fixture(scope="module")
+def own(scene):
+    """The model's own pictures, and the scores against them."""
+    pictures = _pictures(*scene[1:])
+    return pictures, _mean_scores((pictures, *scene[1:]))
+
+
 def test_scores_have_the_errors_of_the_frames(scene):
     frames, rows, shape, times, drawn = scene
     scores = _measured(rows, frames, shape, times, drawn)
     assert scores.squared_error == pytest.approx(_error(rows, frames, shape, times, drawn), rel=1e-4)
 
 
-def test_cost_of_removal_is_as_predicted(scene):
+def test_cost_of_removal_is_as_predicted(scene, mean_scores):
     frames, rows, shape, times, drawn = scene
-    scores, before = _mean_scores(scene), _error(rows, frames, shape, times, drawn)
+    scores, before = mean_scores, _error(rows, frames, shape, times, drawn)
     chosen = np.argsort(-scores.second_order)[:: len(rows) // 12]
     cost = [_error(np.delete(rows, i, 0), frames, shape, times, drawn) - before for i in chosen]
     told = scores.added_by_removal[chosen]
@@ -197,11 +208,10 @@ def test_cost_of_removal_is_as_predicted(scene):
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_cost_of_a_lower_degree_is_as_predicted(scene, degree):
+def test_cost_of_a_lower_degree_is_as_predicted(scene, own, degree):
     """Against the pictures themselves, where nothing but the path is wrong, and by little."""
-    _, rows, shape, times, drawn = scene
-    own = _pictures(rows, shape, times, drawn)
-    scores, at, pixels = _mean_scores((own, *scene[1:])), columns(shape.degree), pixels_per_unit(SIZE)
+    (_, rows, shape, times, drawn), (pictures, scores) = scene, own
+    at, pixels = columns(shape.degree), pixels_per_unit(SIZE)
     place = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2) * pixels
     added, path = scores.lower_degree(place.astype(float), degree, np.arange(len(rows)))
     assert (path[:, degree + 1 :] == 0).all()
@@ -210,7 +220,7 @@ def test_cost_of_a_lower_degree_is_as_predicted(scene, degree):
         changed = rows.copy()
         changed[i, at["loc"]] = path[i, 0] / pixels
         changed[i, at["coefficients"]] = (path[i, 1:] / pixels).ravel()
-        ratios.append(_error(changed, own, shape, times, drawn) / added[i])
+        ratios.append(_error(changed, pictures, shape, times, drawn) / added[i])
     assert len(ratios) >= 6
     assert 0.6 < np.median(ratios) < 1.4
 
@@ -239,8 +249,8 @@ def test_lower_degree_path_is_optimal(degree):
     np.testing.assert_allclose(lower[0, : degree + 1], path[: degree + 1] + best.reshape(-1, 2), rtol=1e-3, atol=1e-4)
 
 
-def test_correlated_errors_count_once():
-    frames, rows, shape, times, drawn = _scene()
+def test_correlated_errors_count_once(scene):
+    frames, rows, shape, times, drawn = scene
     same = np.repeat(frames[:1], 8, 0)
     still_rows = rows.copy()
     still_rows[:, columns(2)["coefficients"]] = 0
@@ -266,13 +276,10 @@ def test_kinds_match_the_stored_model():
 
 
 def test_absent_parameters_never_move():
-    frames = disc(lambda s: (15 + 50 * s, 24))
-    config = FitConfig(num_gaussians=200, steps=300, economy=Economy(rounds=2, first_fraction=0.3, last_fraction=0.4))
-    for state, info in fit_steps(frames, config):
-        pass
-    at, kinds = columns(config.degree), state.kinds
-    powers = np.repeat(np.arange(1, config.degree + 1), 2)
-    assert (get_degrees(kinds) < config.degree).any()
+    _, model, state, _ = fitted("line")
+    at, kinds = columns(model.degree), state.kinds
+    powers = np.repeat(np.arange(1, model.degree + 1), 2)
+    assert (get_degrees(kinds) < model.degree).any()
     assert (state.rows[:, at["coefficients"]][powers > get_degrees(kinds)[:, None]] == 0).all()
     assert is_static(kinds).any()
     assert is_opaque(kinds).any()
@@ -380,18 +387,17 @@ def test_scores_are_linear_in_the_weights(scene):
     assert all_scores[0].psnr == all_scores[2].psnr
 
 
-def test_cost_of_another_shape_is_as_predicted(scene):
+def test_cost_of_another_shape_is_as_predicted(scene, own):
     """Against the pictures themselves, one axis longer by a little."""
-    _, rows, shape, times, drawn = scene
-    own = _pictures(rows, shape, times, drawn)
-    scores, at = _mean_scores((own, *scene[1:])), columns(shape.degree)["log_scale"]
+    (_, rows, shape, times, drawn), (pictures, scores) = scene, own
+    at = columns(shape.degree)["log_scale"]
     for axis in (0, 1):
         chosen = np.argsort(-scores.by_axes[:, axis])[: len(rows) // 2 : 4]
         cost = []
         for i in chosen:
             changed = rows.copy()
             changed[i, at.start + axis] += 0.05
-            cost.append(_error(changed, own, shape, times, drawn))
+            cost.append(_error(changed, pictures, shape, times, drawn))
         ratios = np.array(cost) / (0.05**2 * scores.by_axes[chosen, axis])
         assert 0.8 < np.median(ratios) < 1.25
 
@@ -403,14 +409,14 @@ def test_one_gaussian_always_stays():
     update_windows(rows, np.arange(3), window)
     shape = ConditioningSpec(3, 1.0, 0.0, SIZE)
     times = np.asarray(model.frame_times.times())
-    scores = measure_scores(rows, window, times, shape, _target(noise()), compositing="over", options=model.options)
+    scores = measure_scores(rows, window, times, shape, _target(noise(24)), compositing="over", options=model.options)
     dear = Economy(bits=1e12, most_dropped=1.0)
     assert len(prune_rows(rows, np.full(3, 3, np.uint8), scores, dear, degree=3, pixels=80.0).stay) == 1
 
 
 def test_count_of_parameters_is_that_of_the_file():
     """Of each kind, one Gaussian among others of its own, so that kinds are told."""
-    model = _fitted_model()
+    _, model, _, _ = fitted("parabola")
     kinds = find_kinds(pack(model.splats), model.degree)
     assert len(np.unique(kinds)) > 5
     alone = dataclasses.replace(model.splats, color_dc=distinct(model, 3), log_scale=distinct(model, 2))
@@ -423,16 +429,11 @@ def distinct(model, width) -> np.ndarray:
     return np.random.default_rng(0).normal(size=(model.num_gaussians, width)).astype(np.float32)
 
 
-def _fitted_model():
-    frames = disc(lambda s: (15 + 50 * s, 12 + 96 * (s - 0.5) ** 2))
-    return fit(frames, FitConfig(num_gaussians=400, steps=300, economy=Economy())).model
-
-
-def test_cost_of_opaque_is_as_predicted(scene):
+def test_cost_of_opaque_is_as_predicted(scene, mean_scores):
     """Exactly, for one at a time: pictures are linear in an opacity."""
     frames, rows, shape, times, drawn = scene
     at = columns(shape.degree)["opacity_logit"].start
-    scores, before = _mean_scores(scene), _error(rows, frames, shape, times, drawn)
+    scores, before = mean_scores, _error(rows, frames, shape, times, drawn)
     told = scores.added_by_opaque(1 / (1 + np.exp(-rows[:, at].astype(float))))
     chosen = np.flatnonzero(told > 0)[:: max(len(rows) // 15, 1)]
     cost = []
@@ -445,9 +446,9 @@ def test_cost_of_opaque_is_as_predicted(scene):
     assert np.abs(told[chosen] - cost).max() < 0.25 * max(map(abs, cost))
 
 
-def test_few_become_opaque_in_one_round():
+def test_few_become_opaque_in_one_round(scene):
     """However dear a number: what is behind one solid Gaussian depends on the others."""
-    frames, rows, shape, times, drawn = _scene()
+    frames, rows, shape, times, drawn = scene
     scores, kinds = _measured(rows, frames, shape, times, drawn), np.full(len(rows), shape.degree, np.uint8)
     how = {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
     made = prune_rows(rows, kinds, scores, Economy(bits=1e6, most_dropped=1e-9), **how)
@@ -460,8 +461,8 @@ def test_few_become_opaque_in_one_round():
     assert is_opaque(again.kinds).sum() >= is_opaque(made.kinds)[again.stay].sum()  # those that are stay so
 
 
-def test_opacities_stay_without_allow_opaque():
-    frames, rows, shape, times, drawn = _scene()
+def test_opacities_stay_without_allow_opaque(scene):
+    frames, rows, shape, times, drawn = scene
     scores, dear = _measured(rows, frames, shape, times, drawn), Economy(bits=200.0)
     kinds, how = np.full(len(rows), shape.degree, np.uint8), {"degree": shape.degree, "pixels": pixels_per_unit(SIZE)}
     assert is_opaque(prune_rows(rows, kinds, scores, dear, **how).kinds).any()
@@ -537,7 +538,7 @@ def test_rates_decayed_to_zero_stay_zero():
 
 @pytest.mark.parametrize("value", [0, 255])
 def test_clip_of_one_color_is_fitted(value):
-    frames = np.full((6, *SIZE, 3), value, np.uint8)
+    frames = np.full((8, *SIZE, 3), value, np.uint8)
     model = fit(frames, FitConfig(num_gaussians=200, steps=300, economy=Economy())).model
     assert evaluate(model, frames).mean_psnr > 40
     assert model.num_gaussians <= (20 if value == 0 else 300)  # white has to be covered
@@ -555,14 +556,13 @@ def test_description_length_decreases():
     assert length(Economy()) < length(None)
 
 
-def test_large_frames_grow_too():
+def test_large_frames_grow_too(monkeypatch):
     """They are seen at half their size at first, which says nothing of what pays."""
-    frames = np.kron(noise(1)[:, :30, :40], np.ones((1, 8, 8, 1), np.uint8)).repeat(3, 0)
-    counts = [
-        info.num_gaussians
-        for _, info in fit_steps(frames, FitConfig(num_gaussians=60, steps=90, economy=Economy(psnr=60)))
-    ]
-    assert max(counts) > 60
+    monkeypatch.setattr("foldgauss.video.fitting.schedule.MIN_SIDE", 30)
+    frames = np.kron(noise(1)[:, :30, :40], np.ones((1, 2, 2, 1), np.uint8)).repeat(8, 0)
+    config = FitConfig(num_gaussians=60, steps=90, half_fraction=0.3, economy=Economy(psnr=60))
+    assert [level.size for level in plan_levels(config, frames.shape[1:3])] == [(30, 40), (60, 80)]
+    assert max(info.num_gaussians for _, info in fit_steps(frames, config)) > 60
 
 
 # ---------------------------------------------------------------------------------------------- a PSNR asked for
@@ -588,7 +588,7 @@ def test_psnr_of_alpha_is_over_black():
 
 
 def test_unreachable_psnr_is_reported():
-    result = fit(noise(4), FitConfig(num_gaussians=60, steps=60, economy=Economy(psnr=60)))
+    result = fit(noise(8), FitConfig(num_gaussians=60, steps=60, economy=Economy(psnr=60)))
     assert result.history[-1].stopped_by == "steps"
     assert result.history[-1].step == 90  # in vain for half as long again
     assert result.model.num_gaussians <= 4 * 60  # births have an end

@@ -81,7 +81,7 @@ CLIPS = {
     "one bright pixel": (one_bright_pixel(), 48),
     "black and white": (alternating("ABABAB", BLACK_AND_WHITE), 15),
     "two pictures in turn": (alternating("ABABAB", pictures_of(2)), 20),
-    "8x8": (moving_blobs(4, 8, 8), 30),
+    "8x8": (moving_blobs(3, 8, 8), 30),
     "1x1": (moving_blobs(3, 1, 1), 40),
     "1x4096": (moving_blobs(2, 1, 4096), 22),
     "4096x1": (moving_blobs(2, 4096, 1), 22),
@@ -122,8 +122,19 @@ def test_a_short_fit_and_its_file(tmp_path, name):
     assert evaluate(kept, frames) == scores
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
-@pytest.mark.parametrize("name", ["one frame", "all white", "black and white", "8x8", "1x4096"])
+#: Each setting at two extremes or more, each extreme with three settings or more.
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        *[(name, "between, target") for name in ("one frame", "all white", "black and white", "8x8", "1x4096")],
+        *[(name, "two cameras, batches") for name in ("one frame", "all white", "8x8")],
+        *[(name, "standard") for name in ("all white", "1x4096")],
+        *[(name, "sum") for name in ("one frame", "black and white")],
+        *[(name, "degree 0") for name in ("all white", "1x4096")],
+        *[(name, "degree 7") for name in ("one frame", "black and white")],
+        *[(name, "at rest") for name in ("one frame", "8x8")],
+    ],
+)
 def test_every_setting_at_the_extremes(name, setting):
     frames, least = CLIPS[name]
     config = FitConfig(**({"num_gaussians": 300, "steps": 60} | SETTINGS[setting]))
@@ -216,7 +227,7 @@ def test_slide_show_has_no_gaps():
 
 
 @pytest.mark.parametrize(
-    ("num_frames", "cuts"), [(2, [1]), (3, [2]), (5, [1, 3]), (9, [2, 3, 5, 6, 8]), (6, [1, 2, 3]), (8, [3])]
+    ("num_frames", "cuts"), [(2, [1]), (3, [2]), (9, [1, 3, 5, 7]), (9, [2, 3, 5, 6, 8]), (6, [1, 2, 3]), (9, [3])]
 )
 def test_gaps_exist_only_where_they_are_detected_as_cuts(num_frames, cuts):
     logits = make_time_logits(num_frames, cuts)
@@ -228,12 +239,12 @@ def test_gaps_exist_only_where_they_are_detected_as_cuts(num_frames, cuts):
 # -------------------------------------------------------------------------------------------------- long
 
 
-def test_five_thousand_frames_and_few_steps():
+@pytest.mark.parametrize("num", [2000, pytest.param(5000, marks=pytest.mark.slow)])
+def test_thousands_of_frames_and_few_steps(num):
     """No frame is left dark, though most of them were never looked at; nor does it take long to begin."""
-    num = 5000
     frames = moving_blobs(50, 8, 8)[np.abs(np.arange(num) % 98 - 49)]
-    result = fit(frames, FitConfig(steps=200, num_gaussians=5000))
-    assert result.history[-1].seconds < 60
+    result = fit(frames, FitConfig(steps=num // 25, num_gaussians=num))
+    assert result.history[-1].seconds < 0.012 * num
     shown = np.stack(list(result.model.frames()))
     assert (shown.mean((1, 2, 3)) > 0.25 * frames.mean((1, 2, 3))).all()
     assert math.isfinite(result.history[-1].psnr)
@@ -264,11 +275,11 @@ def test_starts_are_spread_as_by_the_whole_matrix():
 
 def test_every_stretch_of_a_long_clip_has_starts():
     """By chance alone, with one start in ten frames, one stretch of 60 in four hundred has none."""
-    frames = moving_blobs(10, 16, 16)[np.arange(3000) % 10]
-    config = FitConfig(num_gaussians=300, steps=1, follow_motion=False)
+    frames = moving_blobs(10, 16, 16)[np.arange(2000) % 10]
+    config = FitConfig(num_gaussians=200, steps=1, follow_motion=False)
     model = to_model(start(frames, config), config, (16, 16), 25.0)
     own = np.sort(1 / (1 + np.exp(-model.splats.time_loc_logit)))
-    assert np.diff(own, prepend=0, append=1).max() < 25 / 3000
+    assert np.diff(own, prepend=0, append=1).max() < 25 / 2000
 
 
 # --------------------------------------------------------------------------------------------- judgement
@@ -286,7 +297,7 @@ def test_ssim_of_small_pictures(size):
 
 def test_exact_frames_cost_the_others_no_bits():
     """Half of the frames are black: that they are no longer so to the last bit is no loss of tens of dB."""
-    frames = np.concatenate([moving_blobs(4, *SIZE), constant(0, 4)])
+    frames = np.concatenate([moving_blobs(3, *SIZE), constant(0, 3)])
     model = fit(frames, FitConfig(num_gaussians=500, steps=200)).model
     assert max(evaluate(model, frames).psnr) > EXACT_PSNR
     made = compress(model, frames, max_loss_db=0.3, passes=1)

@@ -67,14 +67,14 @@ def test_learns_a_clip():
     ids=str,
 )
 def test_every_setting_works(changes):
-    frames = moving_blobs(num_frames=4, height=33, width=41)
+    frames = moving_blobs(height=33, width=41)
     model = fit(frames, dataclasses.replace(CONFIG, **({"steps": 30} | changes))).model
     assert all(np.isfinite(leaf).all() for leaf in leaves_of(model))
     if changes.get("num_gaussians") != 1:
         assert evaluate(model, frames).mean_psnr > 18
 
 
-@pytest.mark.parametrize("shape", [(2, 20, 20), (3, 16, 90), (2, 100, 17)])
+@pytest.mark.parametrize("shape", [(2, 20, 20), (2, 16, 90), (2, 100, 17)])
 def test_odd_clips(shape):
     frames = moving_blobs(*shape)
     assert evaluate(fit(frames, CONFIG).model, frames).mean_psnr > 18
@@ -82,7 +82,7 @@ def test_odd_clips(shape):
 
 def test_flat_clip():
     """No gradient anywhere: starts are spread evenly, and one colour is all there is to learn."""
-    frames = np.full((3, 32, 32, 3), 128, np.uint8)
+    frames = np.full((2, 32, 32, 3), 128, np.uint8)
     assert evaluate(fit(frames, CONFIG).model, frames).mean_psnr > 30
 
 
@@ -99,7 +99,7 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def test_a_frame_twice_in_a_batch_counts_twice(monkeypatch):
-    frames, steps, seen = moving_blobs(num_frames=3), [], {}
+    frames, steps, seen = moving_blobs(), [], {}
     for batch in ([1], [1, 1]):
         config = dataclasses.replace(CONFIG, batch_size=len(batch))
         state = start(frames, config)
@@ -138,7 +138,7 @@ def test_finished_state_yields_once():
 
 def test_interpolated_frames_are_learned():
     """Frames never seen come out better than without, and what is told is the quality at frames alone."""
-    finer = panning(9, (2.0, 1.0), height=48, width=64)
+    finer = panning(11, (2.0, 1.0), height=48, width=64)
     seen, never = np.ascontiguousarray(finer[::2]), finer[1::2]
     scores = {}
     for share in (0.0, 0.6):
@@ -181,11 +181,11 @@ def test_resuming_keeps_the_bits(interpolation_fraction):
 def test_frame_times_are_learned():
     """Frames sampled unevenly in time: the learned times move towards the true ones."""
     frames = moving_blobs(num_frames=21)
-    chosen = np.array([0, 1, 2, 3, 4, 12, 20])
+    chosen = np.array([0, 1, 2, 3, 12, 20])
     config = FitConfig(num_gaussians=800, steps=700, degree=1, rates=LearningRates(frame_times=0.02))
     model = fit(frames[chosen], config).model
     times = np.asarray(model.frame_times.times())
-    true, even = chosen / 20, np.linspace(0, 1, 7)
+    true, even = chosen / 20, np.linspace(0, 1, 6)
     assert np.all(np.diff(times) > 0)
     assert np.linalg.norm(times - true) < 0.9 * np.linalg.norm(even - true)
 
@@ -241,26 +241,25 @@ def test_target_psnr_is_neither_missed_nor_overshot(clip):
     """The running PSNR lags, and with alpha is another one; the mean over the frames as shown decides."""
     frames = clip()
     config = dataclasses.replace(CONFIG, steps=1200, target_psnr=24.0)
-    before = {}
+    look, seen = 4 * steps_per_pass(config, len(frames)), []
     for state, info in fit_steps(frames, config):
-        before[info.step] = evaluate(to_model(state, config, frames.shape[1:3], 25.0), frames).mean_psnr
+        if info.step % look == 0:
+            seen.append(evaluate(to_model(state, config, frames.shape[1:3], 25.0), frames).mean_psnr)
     assert info.stopped_by == "target_psnr"
-    assert before[info.step] >= 24
-    look = 4 * steps_per_pass(config, len(frames))
     assert info.step % look == 0
-    looked_at = [value for step, value in before.items() if step % look == 0 and step < info.step]
-    assert max(looked_at, default=0) < 24
+    assert seen[-1] >= 24
+    assert max(seen[:-1], default=0) < 24
 
 
 def test_a_fit_by_minutes_resumes_exactly():
     """A fit by minutes that was stopped goes on by the plan that it had: to the same bits as if it had not been."""
-    frames, config = moving_blobs(), dataclasses.replace(CONFIG, steps=None, minutes=0.2)
+    frames, config = moving_blobs(), dataclasses.replace(CONFIG, steps=None, minutes=0.1)
     tick = lambda: itertools.count(step=1 / 128).__next__  # noqa: E731  every reading of the clock is 1/128 s later
     kept = None
     for state, info in fit_steps(frames, config, clock=tick()):
         if state.planned_step and kept is None:
             kept = jax.tree.map(np.array, state)
-    assert state.seconds == pytest.approx(12, rel=0.02)
+    assert state.seconds == pytest.approx(6, rel=0.02)
     assert state.plan == info.step
     assert kept.step < state.step
     for again, _ in fit_steps(frames, config, kept, clock=tick()):

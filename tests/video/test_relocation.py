@@ -175,7 +175,7 @@ def test_minutes_relocate_three_times_whatever_the_plan(monkeypatch):
 
 def test_resuming_across_relocations_keeps_the_bits():
     whole = [(state.rows.copy(), info.psnr) for state, info in fit_steps(FRAMES, CONFIG)]
-    for stop in (23, 24, 41, 42):  # before and after the first two
+    for stop in (23, 24, 42):  # before and after the first, after the second
         for state, _ in fit_steps(FRAMES, CONFIG):
             if state.step == stop:
                 break
@@ -185,19 +185,10 @@ def test_resuming_across_relocations_keeps_the_bits():
             assert info.psnr == psnr
 
 
-def test_a_fit_by_a_device_relocates_too():
-    config = dataclasses.replace(CONFIG, engine="xla", steps=100, relocated_fraction=0.2)
-    for state, info in fit_steps(FRAMES, config):
-        if info.step in (20, 35, 50):
-            assert (state.counts == 0).sum() >= 30
-    assert state.num_gaussians == 300
-    assert np.isfinite(state.rows).all()
-
-
 def test_relocation_finds_what_the_start_missed():
     """Colored rectangles flash in one frame: moved Gaussians improve it by 2 to 3 dB."""
-    frames, rng = moving_blobs(8), np.random.default_rng(0)
-    frames[5, 8:40, 14:50] = rng.integers(0, 255, (4, 3, 3)).astype(np.uint8).repeat(8, 0).repeat(12, 1)
+    frames, rng = moving_blobs(), np.random.default_rng(0)
+    frames[4, 8:40, 14:50] = rng.integers(0, 255, (4, 3, 3)).astype(np.uint8).repeat(8, 0).repeat(12, 1)
     worst = {}
     for fraction in (0.0, 0.1):
         config = FitConfig(num_gaussians=150, steps=600, relocated_fraction=fraction, error_fraction=0)
