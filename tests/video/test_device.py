@@ -139,8 +139,9 @@ def test_step_of_growing_batches_matches_the_cpu():
 @pytest.mark.slow
 def test_coarse_step_matches_the_cpu(monkeypatch):
     monkeypatch.setattr("foldgauss.video.fitting.schedule.MIN_SIDE", 16)
-    assert [level.size for level in plan_levels(CONFIG, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
-    compare_steps(CONFIG, 0.1, level=0)
+    config = dataclasses.replace(CONFIG, half_fraction=0.3)
+    assert [level.size for level in plan_levels(config, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
+    compare_steps(config, 0.1, level=0)
 
 
 @pytest.mark.slow
