@@ -126,7 +126,7 @@ def gradients(engine):
     return jax.tree.map(np.asarray, jax.jit(jax.grad(loss))(splats))
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
 def test_gradients_agree_with_reference(engine):
     found, truth = gradients(engine), gradients("reference")
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(truth), strict=True):

@@ -288,7 +288,7 @@ def test_single_precision_at_any_size(world, thickness):
 # --- order -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seen_from", [project, view])
+@pytest.mark.parametrize("seen_from", [pytest.param(project, marks=pytest.mark.slow), view])
 def test_equal_depths_keep_array_order(seen_from):
     """1003 Gaussians in one place, from a slant: an odd number, so that the vectorised loop has a remainder."""
     num = 1003

@@ -19,6 +19,7 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, api, 
 
 #: Engine "pallas" takes no ceiling of 1 and, interpreted, long to compile: test_pallas.py. Here "auto" is "cpu".
 OTHERS = ["cpu", "xla", "reference"]
+SLOW_XLA = ["cpu", pytest.param("xla", marks=pytest.mark.slow), "reference"]
 LEAVES = ("mean", "factor", "opacity", "color")
 BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
 OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, transmittance_stop=0.0)}
@@ -238,7 +239,7 @@ def test_splats_that_are_not_finite_are_left_out(engine, leaf, value):
     assert not any(np.asarray(one)[3].any() for one in jax.tree.leaves(grads[0]))
 
 
-@pytest.mark.parametrize("engine", OTHERS)
+@pytest.mark.parametrize("engine", SLOW_XLA)
 def test_degenerate_splats_give_finite_images(engine):
     """Non-finite or singular splats are not drawn; the others are."""
     splats, size = scene("plain")
@@ -317,8 +318,9 @@ def test_a_second_call_compiles_nothing(caplog):
             assert caplog.records  # so they are seen
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
-@pytest.mark.parametrize("channels", [1, 5])
+@pytest.mark.parametrize(
+    ("engine", "channels"), [("cpu", 1), ("cpu", 5), ("xla", 5), pytest.param("xla", 1, marks=pytest.mark.slow)]
+)
 def test_channels(engine, channels):
     splats, size = scene("plain")
     color = np.random.default_rng(0).uniform(size=(len(splats.mean), channels)).astype(np.float32)
@@ -329,8 +331,14 @@ def test_channels(engine, channels):
     np.testing.assert_allclose(draw(Splats2D(*map(jnp.asarray, leaves)), size, engine=engine), truth, atol=1e-5)
 
 
-@pytest.mark.parametrize("engine", OTHERS)
-@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize(
+    ("compositing", "engine"),
+    [
+        *(("over", engine) for engine in OTHERS),
+        *(("sum", engine) for engine in ("cpu", "reference")),
+        pytest.param("sum", "xla", marks=pytest.mark.slow),
+    ],
+)
 def test_exact_options_match_the_equation(engine, compositing):
     """The picture by its definition, in NumPy and double precision, with opacities of 0 and 1."""
     with jax.enable_x64(True):
