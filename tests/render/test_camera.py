@@ -1,11 +1,13 @@
 """Cameras: where points and shapes land, which covers which, the mirror image, and gradients."""
 
+import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import draw
 
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.camera import TANGENT_LIMIT, Camera, Gaussians3D, project, square_factor
@@ -15,13 +17,21 @@ SIZE = (48, 96)
 SMOOTH = RenderOptions(alpha_cutoff=1e-8, transmittance_stop=0.0)
 
 
+#: As compiled programs: of separate operations each would be compiled for each shape. All flat scenes are of one size.
+view = jax.jit(project, static_argnames=("size", "order", "near"))
+flatten = jax.jit(Gaussians3D.to_flat)
+from_scale_angle = jax.jit(Gaussians3D.from_scale_angle)
+flat_factor = jax.jit(square_factor)
+orbit, look_at = jax.jit(Camera.orbit), jax.jit(Camera.look_at, static_argnames="aspect")
+
+
 def flat_scene(num=120, *, seed=0, aspect=0.5, dtype=np.float32, thickness=1e-7, thinnest=0.01):
     """Overlapping flat Gaussians that fill the frame and stick out of it."""
     rng = np.random.default_rng(seed)
     mean = rng.uniform(-0.55, 0.55, (num, 2)) * [min(1, 1 / aspect), min(1, aspect)]
     scale = np.exp(rng.uniform(np.log(thinnest), np.log(0.08), (num, 2)))
     leaves = mean, scale, rng.uniform(0, 2 * np.pi, num), rng.uniform(0.2, 1, num), rng.uniform(0, 1, (num, 3))
-    return Gaussians3D.from_scale_angle(*(jnp.asarray(leaf, dtype) for leaf in leaves), thickness=thickness)
+    return from_scale_angle(*(jnp.asarray(leaf, dtype) for leaf in leaves), thickness=thickness)
 
 
 def deep_scene(num=40, *, seed=0, dtype=np.float64):
@@ -34,30 +44,29 @@ def deep_scene(num=40, *, seed=0, dtype=np.float64):
 
 
 def cast(tree, dtype):
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtype)), tree)
 
 
 def covariance(splats):
-    return splats.factor @ jnp.swapaxes(splats.factor, -1, -2)
+    factor = np.asarray(splats.factor)
+    return factor @ factor.mT
 
 
 # --- the front camera is the picture ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("aspect", "size"), [(0.5, (160, 320)), (2.0, (320, 160)), (1.0, (64, 64)), (0.5, (200, 100)), (2.0, (100, 300))]
-)
+@pytest.mark.parametrize(("aspect", "size"), [(0.5, (160, 320)), (0.5, (200, 100)), (2.0, (100, 300))])
 def test_front_camera_is_to_pixels(aspect, size):
     """Means exactly; covariances up to thickness^2 (f/d)^2 u u^T, with u the tangent of the ray."""
     with jax.enable_x64(True):
         gaussians = flat_scene(aspect=aspect, dtype=np.float64, thickness=1e-3)
-        flat, camera = gaussians.to_flat().to_pixels(size, aspect=aspect), Camera.front(aspect)
-        seen = project(gaussians, camera, size)
+        flat, camera = flatten(gaussians).to_pixels(size, aspect=aspect), Camera.front(aspect)
+        seen = view(gaussians, camera, size)
         np.testing.assert_allclose(seen.mean, flat.mean, atol=1e-10)
-        focal = camera.focal(size)
+        focal = float(camera.focal(size))
         limit = TANGENT_LIMIT * np.asarray([size[1], size[0]]) / 2 / focal
-        tangent = np.clip((flat.mean - jnp.asarray([[size[1] / 2, size[0] / 2]])) / focal, -limit, limit)
-        across = 1e-3 * focal / -camera.position[2] * tangent
+        tangent = np.clip((np.asarray(flat.mean) - [size[1] / 2, size[0] / 2]) / focal, -limit, limit)
+        across = 1e-3 * focal / -float(camera.position[2]) * tangent
         truth = covariance(flat) + across[:, :, None] * across[:, None, :]
         np.testing.assert_allclose(covariance(seen), truth, rtol=1e-9, atol=1e-9)
         for name in ("opacity", "color"):
@@ -67,9 +76,10 @@ def test_front_camera_is_to_pixels(aspect, size):
 @pytest.mark.parametrize("engine", ["reference", "cpu"])
 def test_front_camera_renders_the_flat_image(engine):
     gaussians = flat_scene()
-    flat = render(gaussians.to_flat().to_pixels(SIZE), SIZE, engine=engine, options=SMOOTH)
-    seen = render(project(gaussians, Camera.front(0.5), SIZE), SIZE, engine=engine, options=SMOOTH)
-    np.testing.assert_allclose(seen, flat, atol=5e-6)
+    flat = dataclasses.replace(flatten(gaussians).to_pixels(SIZE), depth=jnp.zeros(120))
+    seen = view(gaussians, Camera.front(0.5), SIZE)
+    pictures = (draw(splats, SIZE, engine=engine, options=SMOOTH) for splats in (seen, flat))
+    np.testing.assert_allclose(*pictures, atol=5e-6)
 
 
 def test_published_geometry():
@@ -83,12 +93,12 @@ def test_published_geometry():
 @pytest.mark.parametrize("thickness", [0.0, 1e-7, 1e-3])
 def test_to_flat_inverts_from_flat(thickness):
     rng = np.random.default_rng(0)
-    leaves = rng.normal(size=(30, 2)), rng.normal(size=(30, 2, 2)), rng.uniform(size=30), rng.uniform(size=(30, 3))
+    leaves = rng.normal(size=(120, 2)), rng.normal(size=(120, 2, 2)), rng.uniform(size=120), rng.uniform(size=(120, 3))
     splats = Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
     gaussians = Gaussians3D.from_flat(splats, thickness=thickness)
-    np.testing.assert_array_equal(gaussians.mean[:, 2], 0)
-    np.testing.assert_allclose(jnp.linalg.norm(gaussians.factor[:, 2], axis=-1), thickness, rtol=1e-6)
-    back = gaussians.to_flat()
+    np.testing.assert_array_equal(np.asarray(gaussians.mean)[:, 2], 0)
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(gaussians.factor)[:, 2], axis=-1), thickness, rtol=1e-6)
+    back = flatten(gaussians)
     np.testing.assert_allclose(covariance(back), covariance(splats), rtol=2e-6, atol=2e-6)
     for name in ("mean", "opacity", "color"):
         np.testing.assert_array_equal(getattr(back, name), getattr(splats, name))
@@ -110,28 +120,30 @@ def test_opposing_camera_shows_the_mirror_image(engine, seed):
     """To 1e-6 where splats are wider than 3 px: a position of 96 px is known to 4e-6 px in float32."""
     gaussians = flat_scene(seed=seed, thinnest=0.03)
     front, mirror = (
-        render(project(gaussians, camera, SIZE), SIZE, engine=engine, options=SMOOTH)
+        np.asarray(draw(view(gaussians, camera, SIZE), SIZE, engine=engine, options=SMOOTH))
         for camera in (Camera.front(0.5), Camera.opposing(0.5))
     )
-    assert jnp.abs(front - mirror[:, ::-1]).max() <= 1e-6
-    assert jnp.abs(front - mirror).max() > 0.1  # the comparison has power
+    assert np.abs(front - mirror[:, ::-1]).max() <= 1e-6
+    assert np.abs(front - mirror).max() > 0.1  # the comparison has power
 
 
-@pytest.mark.parametrize(("aspect", "size"), [(0.5, (48, 96)), (2.0, (96, 48)), (0.6, (50, 50))])
+@pytest.mark.parametrize(("aspect", "size"), [(2.0, (96, 48)), (0.6, (50, 50))])
 def test_mirror_in_double_precision(aspect, size):
     with jax.enable_x64(True):
         gaussians = flat_scene(aspect=aspect, dtype=np.float64)
-        splats = [project(gaussians, camera(aspect), size) for camera in (Camera.front, Camera.opposing)]
-        front, mirror = (render(one, size, engine="reference") for one in splats)
+        splats = [view(gaussians, camera(aspect), size) for camera in (Camera.front, Camera.opposing)]
+        front, mirror = (np.asarray(draw(one, size, engine="reference")) for one in splats)
         np.testing.assert_allclose(front, mirror[:, ::-1], atol=1e-12)
         np.testing.assert_array_equal(splats[0].color, splats[1].color)  # ties: array order in both
 
 
 def test_opposing_camera_reverses_layers():
-    gaussians = flat_scene(2)
-    layers = Gaussians3D(gaussians.mean.at[:, 2].set(jnp.asarray([0.1, -0.1])), *jax.tree.leaves(gaussians)[1:])
-    front, behind = (project(layers, camera(0.5), SIZE).color for camera in (Camera.front, Camera.opposing))
-    np.testing.assert_array_equal(front, layers.color[::-1])
+    gaussians = flat_scene()
+    mean = np.array(gaussians.mean)
+    mean[:, 2] = np.linspace(0.1, -0.1, len(mean))
+    layers = dataclasses.replace(gaussians, mean=jnp.asarray(mean))
+    front, behind = (view(layers, camera(0.5), SIZE).color for camera in (Camera.front, Camera.opposing))
+    np.testing.assert_array_equal(front, np.asarray(layers.color)[::-1])
     np.testing.assert_array_equal(behind, layers.color)
 
 
@@ -140,7 +152,7 @@ def test_opposing_camera_reverses_layers():
 
 def seen_at(point, camera):
     one = Gaussians3D(jnp.asarray([point]), jnp.eye(3)[None] * 0.01, jnp.ones(1), jnp.ones((1, 3)))
-    return np.asarray(project(one, camera, SIZE).mean[0]) - [SIZE[1] / 2, SIZE[0] / 2]
+    return np.asarray(view(one, camera, SIZE).mean)[0] - [SIZE[1] / 2, SIZE[0] / 2]
 
 
 def test_right_and_down():
@@ -165,17 +177,17 @@ def test_orbit_goes_right_and_up(angles, position):
     np.testing.assert_allclose(looking.rotation, camera.rotation, atol=1e-6)
 
 
-@pytest.mark.parametrize("wrap", [lambda function: function, jax.jit])
-@pytest.mark.parametrize("quarters", range(-6, 7))
-def test_quarter_turns_are_exact(quarters, wrap):
-    camera = wrap(lambda angle: Camera.front(0.5).orbit(angle))(quarters * math.pi / 2)
-    cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters % 4]
-    np.testing.assert_array_equal(camera.rotation, [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-    np.testing.assert_array_equal(np.asarray(camera.position) == 0, [sin == 0, True, cos == 0])
+@pytest.mark.parametrize("turned", [Camera.orbit, orbit])
+def test_quarter_turns_are_exact(turned):
+    for quarters in range(-6, 7):
+        camera = turned(Camera.front(0.5), quarters * math.pi / 2)
+        cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters % 4]
+        np.testing.assert_array_equal(camera.rotation, [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], str(quarters))
+        np.testing.assert_array_equal(np.asarray(camera.position) == 0, [sin == 0, True, cos == 0], str(quarters))
 
 
 def test_orbit_gradient_at_a_quarter_turn():
-    gradient = jax.jacfwd(lambda angle: Camera.front(0.5).orbit(angle).position)(jnp.asarray(math.pi))
+    gradient = jax.jit(jax.jacfwd(lambda angle: Camera.front(0.5).orbit(angle).position))(jnp.asarray(math.pi))
     distance = float(-Camera.front(0.5).position[2])
     np.testing.assert_allclose(gradient, [-distance, 0, 0], atol=1e-6)
 
@@ -200,27 +212,28 @@ def random_cameras(count, seed=3):
     for _ in range(count):
         eye = rng.normal(size=3)
         eye *= rng.uniform(1.5, 3) / np.linalg.norm(eye)
-        yield Camera.look_at(eye, rng.uniform(-0.2, 0.2, 3), up=rng.normal(size=3), fov=rng.uniform(0.3, 1.2))
+        yield look_at(eye, rng.uniform(-0.2, 0.2, 3), up=rng.normal(size=3), fov=rng.uniform(0.3, 1.2))
 
 
 def test_projection_is_the_pinhole_and_its_jacobian():
     """The oracle is a pinhole written from eye and axes, differentiated by JAX, with the dense covariance."""
+
+    def pinhole(camera, point):
+        right, down, forward = ((point - camera.position) @ axis for axis in camera.rotation)
+        scale = SIZE[1] / 2 / jnp.tan(camera.fov / 2) / forward
+        return jnp.stack([SIZE[1] / 2 + scale * right, SIZE[0] / 2 + scale * down])
+
+    oracle, slope = (jax.jit(jax.vmap(one, (None, 0))) for one in (pinhole, jax.jacfwd(pinhole, 1)))
     with jax.enable_x64(True):
         scene = deep_scene()
-        scene = Gaussians3D(0.3 * scene.mean, scene.factor, scene.opacity, scene.color)  # inside the clamp
+        scene = dataclasses.replace(scene, mean=0.3 * scene.mean)  # inside the clamp
         for camera in random_cameras(5):
-
-            def pinhole(point, camera=camera):
-                right, down, forward = ((point - camera.position) @ axis for axis in camera.rotation)
-                scale = SIZE[1] / 2 / jnp.tan(camera.fov / 2) / forward
-                return jnp.stack([SIZE[1] / 2 + scale * right, SIZE[0] / 2 + scale * down])
-
-            seen = project(scene, camera, SIZE, order="array")
-            np.testing.assert_allclose(seen.mean, jax.vmap(pinhole)(scene.mean), rtol=1e-12)
-            half_field = jnp.asarray([[SIZE[1] / 2, SIZE[0] / 2]])
-            assert (jnp.abs(seen.mean - half_field) < TANGENT_LIMIT * half_field).all()
-            root = jax.vmap(jax.jacfwd(pinhole))(scene.mean) @ scene.factor
-            np.testing.assert_allclose(covariance(seen), root @ jnp.swapaxes(root, 1, 2), rtol=1e-10, atol=1e-10)
+            seen = view(scene, camera, SIZE, order="array")
+            np.testing.assert_allclose(seen.mean, oracle(camera, scene.mean), rtol=1e-12)
+            half_field = np.asarray([SIZE[1] / 2, SIZE[0] / 2])
+            assert (np.abs(np.asarray(seen.mean) - half_field) < TANGENT_LIMIT * half_field).all()
+            root = np.asarray(slope(camera, scene.mean)) @ np.asarray(scene.factor)
+            np.testing.assert_allclose(covariance(seen), root @ root.mT, rtol=1e-10, atol=1e-10)
 
 
 def test_jacobian_is_clipped():
@@ -230,10 +243,11 @@ def test_jacobian_is_clipped():
     edge = TANGENT_LIMIT * SIZE[1] / 2 / focal * depth
     mean = jnp.asarray([[edge, 0.0, 0.0], [5 * edge, 0.0, 0.0], [0.9 * edge, 0.0, 0.0]])
     ball = Gaussians3D(mean, jnp.tile(0.05 * jnp.eye(3), (3, 1, 1)), jnp.ones(3), jnp.ones((3, 3)))
-    at_edge, beyond, inside = covariance(project(ball, camera, SIZE))
+    seen = view(ball, camera, SIZE, order="array")
+    at_edge, beyond, inside = covariance(seen)
     np.testing.assert_allclose(beyond, at_edge, rtol=1e-5)
     assert inside[0, 0] < 0.97 * at_edge[0, 0]
-    np.testing.assert_allclose(project(ball, camera, SIZE).mean[1, 0], SIZE[1] / 2 + 5 * TANGENT_LIMIT * 48, rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(seen.mean)[1, 0], SIZE[1] / 2 + 5 * TANGENT_LIMIT * 48, rtol=1e-5)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e-4, 1e-7, 0.0])
@@ -245,29 +259,27 @@ def test_square_factor(ratio, size):
     columns = np.asarray(turn[:, :2] * (size * np.asarray([1, ratio, ratio**2])), np.float32)
     wide = columns.astype(np.float64)
     truth = wide @ np.swapaxes(wide, 1, 2)
-    factor = np.asarray(square_factor(jnp.asarray(columns)), np.float64)
+    factor = np.asarray(flat_factor(jnp.asarray(columns)), np.float64)
     np.testing.assert_allclose(factor @ np.swapaxes(factor, 1, 2) / size**2, truth / size**2, atol=5e-7)
     area = np.linalg.norm(np.cross(wide[:, 0], wide[:, 1]), axis=-1) / size**2
     most = (np.linalg.norm(wide[:, :, 0], axis=1) * np.linalg.norm(wide[:, :, 1], axis=1)).max() / size**2
     np.testing.assert_allclose(np.abs(np.linalg.det(factor)) / size**2, area, atol=1e-6 * most)
 
 
-@pytest.mark.parametrize("world", [1e-6, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("world", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("thickness", [0.0, 1e-7, 1e-2])
 def test_single_precision_at_any_size(world, thickness):
     """A whole scene scaled, needles of 1e4:1 in it, from a slant: float32 against float64, width and length."""
     rng = np.random.default_rng(1)
-    scale = np.exp(rng.uniform(np.log(0.02), np.log(0.1), (60, 2))) * [1, 1e-4]
-    leaves = rng.uniform(-0.4, 0.4, (60, 2)), scale, rng.uniform(0, 6.28, 60), np.ones(60), np.ones((60, 3))
-    gaussians = Gaussians3D.from_scale_angle(
-        *(jnp.asarray(leaf, jnp.float32) for leaf in leaves), thickness=thickness * 0.01
-    )
-    gaussians = Gaussians3D(world * gaussians.mean, world * gaussians.factor, gaussians.opacity, gaussians.color)
-    camera = Camera.front(0.5).orbit(0.9, 0.4)
-    camera = Camera(camera.rotation, world * camera.position, camera.fov, 0.5)
-    seen = project(gaussians, camera, SIZE, near=0.01 * world, order="array")
+    scale = np.exp(rng.uniform(np.log(0.02), np.log(0.1), (120, 2))) * [1, 1e-4]
+    leaves = rng.uniform(-0.4, 0.4, (120, 2)), scale, rng.uniform(0, 6.28, 120), np.ones(120), np.ones((120, 3))
+    gaussians = from_scale_angle(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves), thickness=thickness * 0.01)
+    gaussians = dataclasses.replace(gaussians, mean=world * gaussians.mean, factor=world * gaussians.factor)
+    camera = orbit(Camera.front(0.5), 0.9, 0.4)
+    camera = dataclasses.replace(camera, position=world * camera.position)
+    seen = view(gaussians, camera, SIZE, near=0.0, order="array")
     with jax.enable_x64(True):
-        truth = project(cast(gaussians, np.float64), cast(camera, np.float64), SIZE, near=0.01 * world, order="array")
+        truth = view(cast(gaussians, np.float64), cast(camera, np.float64), SIZE, near=0.0, order="array")
     np.testing.assert_allclose(seen.mean, truth.mean, atol=1e-4)
     one, other = (np.linalg.svd(np.asarray(s.factor, np.float64), compute_uv=False) for s in (seen, truth))
     np.testing.assert_allclose(one, other, rtol=2e-5)
@@ -276,13 +288,13 @@ def test_single_precision_at_any_size(world, thickness):
 # --- order -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrap", [lambda function: function, jax.jit])
-def test_equal_depths_keep_array_order(wrap):
+@pytest.mark.parametrize("seen_from", [pytest.param(project, marks=pytest.mark.slow), view])
+def test_equal_depths_keep_array_order(seen_from):
     """1003 Gaussians in one place, from a slant: an odd number, so that the vectorised loop has a remainder."""
     num = 1003
-    leaves = jnp.tile(jnp.asarray([[0.13, 0.27, 0.31]]), (num, 1)), jnp.tile(0.01 * jnp.eye(3), (num, 1, 1))
-    same = Gaussians3D(*leaves, jnp.linspace(0, 1, num), jnp.ones((num, 3)))
-    seen = wrap(lambda scene: project(scene, Camera.front(0.5).orbit(0.7, 0.3), SIZE))(same)
+    leaves = np.tile([0.13, 0.27, 0.31], (num, 1)), np.tile(0.01 * np.eye(3), (num, 1, 1)), np.linspace(0, 1, num)
+    same = Gaussians3D(*(jnp.asarray(leaf, jnp.float32) for leaf in (*leaves, np.ones((num, 3)))))
+    seen = seen_from(same, orbit(Camera.front(0.5), 0.7, 0.3), SIZE)
     np.testing.assert_array_equal(seen.opacity, same.opacity)
 
 
@@ -290,44 +302,46 @@ def test_depth_order_and_array_order():
     with jax.enable_x64(True):
         scene = deep_scene()
         camera = next(random_cameras(1))
-        depth = (scene.mean - camera.position[None]) @ camera.rotation[2]
+        depth = (np.asarray(scene.mean) - np.asarray(camera.position)) @ np.asarray(camera.rotation)[2]
         nearest_first = np.argsort(depth)
         assert (nearest_first != np.arange(depth.size)).any()
-        by_depth, as_they_come = (project(scene, camera, SIZE, order=order) for order in ("depth", "array"))
+        by_depth, as_they_come = (view(scene, camera, SIZE, order=order) for order in ("depth", "array"))
         np.testing.assert_array_equal(as_they_come.color, scene.color)
         for one, other in zip(jax.tree.leaves(by_depth), jax.tree.leaves(as_they_come), strict=True):
-            np.testing.assert_array_equal(one, other[nearest_first])
+            np.testing.assert_array_equal(one, np.asarray(other)[nearest_first])
 
 
 def test_flat_image_at_a_slant_needs_array_order():
     """One splat covers another of its plane from everywhere in front; by depth of centres it does not."""
     disc = (jnp.asarray([[0.0, 0.0], [0.05, 0.0]]), jnp.full((2, 2), 0.1), jnp.zeros(2), jnp.ones(2))
-    gaussians = Gaussians3D.from_scale_angle(*disc, jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
-    camera = Camera.front(0.5).orbit(0.01)  # the second is nearer by 5e-4
-    array, depth = (render(project(gaussians, camera, SIZE, order=order), SIZE) for order in ("array", "depth"))
+    gaussians = from_scale_angle(*disc, jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
+    camera = orbit(Camera.front(0.5), 0.01)  # the second is nearer by 5e-4
+    array, depth = (draw(view(gaussians, camera, SIZE, order=order), SIZE) for order in ("array", "depth"))
     assert array[24, 48, 0] > 0.95
     assert depth[24, 48, 0] < 0.5
 
 
 def test_nothing_behind_the_camera_is_rendered():
-    z = jnp.asarray([-5.0, -1.388888, -1.38, 0.0, jnp.nan, jnp.inf])
-    mean = jnp.stack([jnp.zeros(6), jnp.zeros(6), z], -1)
-    scene = Gaussians3D(mean, jnp.tile(0.1 * jnp.eye(3), (6, 1, 1)), jnp.full(6, 0.5), jnp.ones((6, 3)))
-    seen = project(scene, Camera.front(0.5), SIZE, order="array")
+    mean = np.zeros((6, 3), np.float32)
+    mean[:, 2] = -5.0, -1.388888, -1.38, 0.0, np.nan, np.inf
+    leaves = np.tile(0.1 * np.eye(3), (6, 1, 1)), np.full(6, 0.5), np.ones((6, 3))
+    scene = Gaussians3D(jnp.asarray(mean), *(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
+    camera = Camera.front(0.5)
+    seen = view(scene, camera, SIZE, order="array")
     np.testing.assert_array_equal(seen.opacity, [0, 0, 0, 0.5, 0, 0.5])
-    closer = project(scene, Camera.front(0.5), SIZE, order="array", near=0.001)
+    closer = view(scene, camera, SIZE, order="array", near=0.001)
     np.testing.assert_array_equal(closer.opacity, [0, 0, 0.5, 0.5, 0, 0.5])
-    picture = render(project(scene, Camera.front(0.5), SIZE), SIZE)
-    only = render(jax.tree.map(lambda leaf: leaf[3:4], seen), SIZE)
+    picture = draw(view(scene, camera, SIZE), SIZE)
+    only = draw(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[3:4]), seen), SIZE)
     np.testing.assert_allclose(picture, only, atol=1e-6)
 
     def brightness(mean):
-        scene_ = Gaussians3D(mean, scene.factor, scene.opacity, scene.color)
-        return jnp.sum(render(project(scene_, Camera.front(0.5), SIZE), SIZE))
+        return jnp.sum(render(project(dataclasses.replace(scene, mean=mean), camera, SIZE), SIZE))
 
-    gradient = jax.jit(jax.grad(brightness))(mean.at[4:].set(-9.0))
-    assert bool(jnp.isfinite(gradient).all())
-    np.testing.assert_array_equal(gradient[:3], 0)
+    mean[4:] = -9
+    gradient = jax.jit(jax.grad(brightness))(jnp.asarray(mean))
+    assert np.isfinite(gradient).all()
+    np.testing.assert_array_equal(np.asarray(gradient)[:3], 0)
 
 
 # --- gradients -------------------------------------------------------------------------------------------------
@@ -337,36 +351,36 @@ def smooth_loss(scene, camera):
     """Of the mean and the covariance: any loss of a picture depends on the factor only so."""
     seen = project(scene, camera, SIZE, order="array")
     weights = jnp.asarray([[1.0, 0.7], [-0.4, 1.3]])
-    means, shapes = jnp.sin(seen.mean / 30) * weights[:1], jnp.arctan(covariance(seen) / 20) * weights[None]
+    means, shapes = jnp.sin(seen.mean / 30) * weights[:1], jnp.arctan(seen.factor @ seen.factor.mT / 20) * weights[None]
     return jnp.sum(means) + jnp.sum(shapes) + jnp.sum(seen.opacity[:, None] * seen.color)
 
 
-def check_gradient(loss, tree, *, rtol=1e-6, step=1e-6):
-    loss = jax.jit(loss)
+def check_gradient(slope, tree, *, rtol=1e-6, step=1e-6):
+    """`slope` is a compiled `value_and_grad`."""
     leaves, structure = jax.tree.flatten(tree)
-    gradient = jax.tree.leaves(jax.grad(loss)(tree))
+    gradient = [np.asarray(leaf) for leaf in jax.tree.leaves(slope(tree)[1])]
     rng = np.random.default_rng(0)
     for k, leaf in enumerate(leaves):
-        direction = jnp.asarray(rng.normal(size=leaf.shape))
+        direction = rng.normal(size=leaf.shape)
+        above, below = (
+            slope(jax.tree.unflatten(structure, [*leaves[:k], jnp.asarray(np.asarray(leaf) + by), *leaves[k + 1 :]]))[0]
+            for by in (step * direction, -step * direction)
+        )
+        assert np.isfinite(gradient[k]).all()
+        numeric = (above - below) / (2 * step)
+        np.testing.assert_allclose(np.sum(gradient[k] * direction), numeric, rtol=rtol, atol=1e-6, err_msg=str(k))
 
-        def along(step, k=k, leaf=leaf, direction=direction):
-            return loss(jax.tree.unflatten(structure, [*leaves[:k], leaf + step * direction, *leaves[k + 1 :]]))
 
-        numeric = (along(step) - along(-step)) / (2 * step)
-        exact = jnp.sum(gradient[k] * direction)
-        assert bool(jnp.isfinite(gradient[k]).all())
-        np.testing.assert_allclose(exact, numeric, rtol=rtol, atol=1e-6, err_msg=str(k))
-
-
+smooth_slope = jax.jit(jax.value_and_grad(lambda tree: smooth_loss(*tree)))
 #: name: (thickness, scales, camera)
 VIEWS = {
-    "slanted": (1e-3, (0.05, 0.02), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
-    "flat, slanted": (0.0, (0.05, 0.02), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
-    "flat, edge-on": (0.0, (0.05, 0.02), lambda: Camera.front(0.5).orbit(math.pi / 2)),
-    "flat, edge-on from above": (0.0, (0.05, 0.02), lambda: Camera.front(0.5).orbit(0.0, math.pi / 2)),
-    "a line": (0.0, (0.05, 0.0), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
-    "points": (0.0, (0.0, 0.0), lambda: Camera.front(0.5).orbit(0.5, 0.3)),
-    "thin, edge-on": (1e-7, (0.05, 0.02), lambda: Camera.front(0.5).orbit(math.pi / 2)),
+    "slanted": (1e-3, (0.05, 0.02), lambda: orbit(Camera.front(0.5), 0.5, 0.3)),
+    "flat, slanted": (0.0, (0.05, 0.02), lambda: orbit(Camera.front(0.5), 0.5, 0.3)),
+    "flat, edge-on": (0.0, (0.05, 0.02), lambda: orbit(Camera.front(0.5), math.pi / 2)),
+    "flat, edge-on from above": (0.0, (0.05, 0.02), lambda: orbit(Camera.front(0.5), 0.0, math.pi / 2)),
+    "a line": (0.0, (0.05, 0.0), lambda: orbit(Camera.front(0.5), 0.5, 0.3)),
+    "points": (0.0, (0.0, 0.0), lambda: orbit(Camera.front(0.5), 0.5, 0.3)),
+    "thin, edge-on": (1e-7, (0.05, 0.02), lambda: orbit(Camera.front(0.5), math.pi / 2)),
 }
 
 
@@ -377,85 +391,85 @@ def test_gradients_by_finite_differences(view):
     with jax.enable_x64(True):
         rng = np.random.default_rng(5)
         leaves = rng.uniform(-0.2, 0.2, (6, 2)), np.tile(scales, (6, 1)), rng.uniform(0, 6, 6), rng.uniform(size=6)
-        scene = Gaussians3D.from_scale_angle(*map(jnp.asarray, leaves), jnp.ones((6, 3)), thickness=thickness)
-        camera = camera()
-        check_gradient(lambda tree: smooth_loss(*tree), (scene, camera))
+        scene = from_scale_angle(*map(jnp.asarray, leaves), jnp.ones((6, 3)), thickness=thickness)
+        check_gradient(smooth_slope, (scene, camera()))
 
 
 def test_gradient_of_an_image():
     with jax.enable_x64(True):
-        scene, camera = flat_scene(10, dtype=np.float64, thickness=1e-5), Camera.front(0.5).orbit(0.6, 0.2)
+        scene, camera = flat_scene(10, dtype=np.float64, thickness=1e-5), orbit(Camera.front(0.5), 0.6, 0.2)
         weights = jnp.asarray(np.random.default_rng(2).normal(size=(*SIZE, 3)))
         options = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1 - 1e-12, transmittance_stop=0.0)
 
         def loss(tree):
             return jnp.sum(render(project(*tree, SIZE), SIZE, engine="reference", options=options) * weights)
 
-        check_gradient(loss, (scene, camera), rtol=1e-5)
+        check_gradient(jax.jit(jax.value_and_grad(loss)), (scene, camera), rtol=1e-5)
 
 
-@pytest.mark.parametrize("engine", ["cpu", "reference"])
-@pytest.mark.parametrize("thickness", [0.0, 1e-7])
-def test_single_precision_gradients_are_finite_edge_on(engine, thickness):
-    scene = flat_scene(20, thickness=thickness)
-    camera = Camera.front(0.5).orbit(math.pi / 2)
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("reference", marks=pytest.mark.slow)])
+def test_single_precision_gradients_are_finite_edge_on(engine):
+    camera = orbit(Camera.front(0.5), math.pi / 2)
 
-    def loss(tree):
+    @jax.jit
+    @jax.value_and_grad
+    def slope(tree):
         return jnp.sum(render(project(*tree, SIZE), SIZE, engine=engine) ** 2)
 
-    value, gradients = jax.jit(jax.value_and_grad(loss))((scene, camera))
-    assert value > 1
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
+    for thickness in (0.0, 1e-7):
+        value, gradients = slope((flat_scene(thickness=thickness), camera))
+        assert value > 1, thickness
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients)), thickness
 
 
 # --- transformations and errors --------------------------------------------------------------------------------
 
 
 def test_no_gaussians():
-    scene = jax.tree.map(lambda leaf: leaf[:0], flat_scene())
-    seen = project(scene, Camera.front(0.5).orbit(0.3), SIZE)
+    scene = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:0]), flat_scene())
+    seen = view(scene, orbit(Camera.front(0.5), 0.3), SIZE)
     assert seen.factor.shape == (0, 2, 2)
-    assert float(jnp.abs(render(seen, SIZE)).max()) == 0
-    assert scene.to_flat().factor.shape == (0, 2, 2)
+    assert not np.asarray(draw(seen, SIZE)).any()
+    assert flatten(scene).factor.shape == (0, 2, 2)
 
 
 def test_vmap_over_cameras_and_scenes():
-    scene = flat_scene(20)
+    scene = flat_scene()
     angles = jnp.asarray([0.0, 0.4, math.pi])
-    cameras = jax.vmap(lambda angle: Camera.front(0.5).orbit(angle))(angles)
+    cameras = jax.jit(jax.vmap(lambda angle: Camera.front(0.5).orbit(angle)))(angles)
     many = jax.jit(jax.vmap(lambda camera: project(scene, camera, SIZE)))(cameras)
-    scenes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf[::-1]]), scene)
+    scenes = jax.tree.map(lambda leaf: jnp.asarray(np.stack([leaf, leaf[::-1]])), jax.tree.map(np.asarray, scene))
     both = jax.jit(jax.vmap(lambda one: project(one, Camera.front(0.5), SIZE)))(scenes)
     for k, angle in enumerate(angles):
-        alone = project(scene, Camera.front(0.5).orbit(angle), SIZE)
-        np.testing.assert_allclose(many.mean[k], alone.mean, atol=2e-5)
-        np.testing.assert_array_equal(many.color[k], alone.color)
-    np.testing.assert_array_equal(both.color[1], scene.color[::-1])
+        alone = view(scene, orbit(Camera.front(0.5), angle), SIZE)
+        np.testing.assert_allclose(np.asarray(many.mean)[k], alone.mean, atol=2e-5)
+        np.testing.assert_array_equal(np.asarray(many.color)[k], alone.color)
+    np.testing.assert_array_equal(np.asarray(both.color)[1], np.asarray(scene.color)[::-1])
     eyes = jnp.asarray([[0.0, 0, -1], [1, 0, -1]])
-    assert jax.vmap(Camera.look_at)(eyes).rotation.shape == (2, 3, 3)
+    assert jax.jit(jax.vmap(Camera.look_at))(eyes).rotation.shape == (2, 3, 3)
 
 
 def test_compiles_once():
     traces = []
 
     @jax.jit
-    def view(scene, camera):
+    def seen_from(scene, camera):
         traces.append(1)
         return project(scene, camera, SIZE)
 
     for angle in (0.0, 0.1, math.pi):
-        view(flat_scene(seed=int(angle)), Camera.front(0.5).orbit(angle))
-    view(flat_scene(), Camera.look_at((0.0, 0.0, -2.0), aspect=0.5))
+        seen_from(flat_scene(seed=int(angle)), orbit(Camera.front(0.5), angle))
+    seen_from(flat_scene(), Camera.look_at((0.0, 0.0, -2.0), aspect=0.5))
     assert len(traces) == 1
 
 
 def test_dtypes():
-    scene = flat_scene(5)
-    assert project(scene, Camera.front(0.5), SIZE).mean.dtype == jnp.float32
+    scene = flat_scene()
+    assert view(scene, Camera.front(0.5), SIZE).mean.dtype == jnp.float32
     with jax.enable_x64(True):  # the scene decides
         camera = Camera.front(0.5)
         assert camera.position.dtype == jnp.float64
-        assert {leaf.dtype for leaf in jax.tree.leaves(project(scene, camera, SIZE))} == {jnp.dtype("float32")}
+        assert {leaf.dtype for leaf in jax.tree.leaves(view(scene, camera, SIZE))} == {jnp.dtype("float32")}
 
 
 @pytest.mark.parametrize(
@@ -470,12 +484,12 @@ def test_dtypes():
         (lambda: Camera.look_at((0, -1, 0)), "eye, target, up.*another up"),
         (lambda: Camera.look_at((0, -1)), "eye, target, up"),
         (lambda: Camera(jnp.eye(2), jnp.zeros(3), jnp.ones(())), "rotation, position, fov"),
-        (lambda: project(flat_scene(3), Camera.front(0.5), SIZE, order="back"), "order"),
-        (lambda: project(flat_scene(3), Camera.front(0.5), SIZE, near=-1.0), "near"),
-        (lambda: project(flat_scene(3), Camera.front(0.5), (0, 5)), "size"),
+        (lambda: project(flat_scene(), Camera.front(0.5), SIZE, order="back"), "order"),
+        (lambda: project(flat_scene(), Camera.front(0.5), SIZE, near=-1.0), "near"),
+        (lambda: project(flat_scene(), Camera.front(0.5), (0, 5)), "size"),
         (lambda: Camera.front(0.5).focal((160.0, 320)), "size"),
         (
-            lambda: project(jax.tree.map(lambda x: x[None], flat_scene(3)), Camera.front(0.5), SIZE),
+            lambda: project(jax.tree.map(lambda x: x[None], flat_scene()), Camera.front(0.5), SIZE),
             "jax.vmap",
         ),
         (

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import draw
 from scipy.spatial.transform import Rotation
-from test_camera import check_gradient, covariance, deep_scene, smooth_loss
+from test_camera import check_gradient, covariance, deep_scene, orbit, smooth_loss, view
 
-from foldgauss.render import Camera, Gaussians3D, project, render
+from foldgauss.render import Camera, Gaussians3D
 from foldgauss.render.camera import TANGENT_LIMIT
 
 SIZE = (480, 640)
@@ -38,7 +39,7 @@ def test_points_are_those_of_opencv(seed):
     for wide, tolerance in ((True, 1e-8), (False, 2e-3)):  # float32 has some 3e-5 px, and the angles' rounding
         with jax.enable_x64(wide):
             camera = Camera.from_matrices(viewmat(rotation, shift), K, SIZE)
-            seen = project(Gaussians3D(*(jnp.asarray(leaf, float) for leaf in leaves)), camera, SIZE, order="array")
+            seen = view(Gaussians3D(*(jnp.asarray(leaf, float) for leaf in leaves)), camera, SIZE, order="array")
             np.testing.assert_allclose(seen.mean, truth[:, 0], atol=tolerance)
             np.testing.assert_allclose(seen.depth, (points @ rotation.T + shift)[:, 2], rtol=1e-5)
 
@@ -48,7 +49,7 @@ def test_covariance_is_that_of_the_jacobian():
     with jax.enable_x64(True):
         rotation, shift = random_pose()
         gaussians = deep_scene()
-        seen = project(gaussians, Camera.from_matrices(viewmat(rotation, shift), K, SIZE), SIZE, order="array")
+        seen = view(gaussians, Camera.from_matrices(viewmat(rotation, shift), K, SIZE), SIZE, order="array")
         for k, point in enumerate(np.asarray(gaussians.mean)):
             _, derivatives = cv2.projectPoints(point[None], cv2.Rodrigues(rotation)[0], shift, K, None)
             root = derivatives[:, 3:6] @ rotation @ np.asarray(gaussians.factor[k])  # by t, which moves as R X does
@@ -62,9 +63,9 @@ def test_shapes_are_held_beyond_the_image_on_both_sides():
         margin = (TANGENT_LIMIT - 1) * SIZE[1] / 2
         edges = np.array([(-margin - K[0, 2]) / K[0, 0], (SIZE[1] + margin - K[0, 2]) / K[0, 0]])
         x = np.array([edges[0], 1.5 * edges[0], 0.99 * edges[0], edges[1], 1.5 * edges[1], 0.99 * edges[1]])
-        mean = jnp.asarray(np.stack([x, 0 * x, 0 * x], -1))
-        ball = Gaussians3D(mean, jnp.tile(0.1 * jnp.eye(3), (6, 1, 1)), jnp.ones(6), jnp.ones((6, 3)))
-        width = np.asarray(covariance(project(ball, camera, SIZE, order="array")))[:, 0, 0]
+        leaves = np.stack([x, 0 * x, 0 * x], -1), np.tile(0.1 * np.eye(3), (6, 1, 1)), np.ones(6), np.ones((6, 3))
+        ball = Gaussians3D(*map(jnp.asarray, leaves))
+        width = covariance(view(ball, camera, SIZE, order="array"))[:, 0, 0]
         np.testing.assert_allclose(width[[1, 4]], width[[0, 3]], rtol=1e-9)
         assert (width[[2, 5]] < 0.999 * width[[0, 3]]).all()
 
@@ -86,12 +87,12 @@ def test_matrices_there_and_back(wide):
 def test_matrices_of_other_cameras():
     """What has no matrix of its own: the front camera, turned; one matrix more shows the same image."""
     gaussians, size = deep_scene(dtype=np.float32), (48, 96)
-    camera = Camera.front(0.5).orbit(0.4, 0.2)
+    camera = orbit(Camera.front(0.5), 0.4, 0.2)
     same = Camera.from_matrices(camera.viewmat, camera.intrinsics(size), size)
-    np.testing.assert_allclose(camera.intrinsics(size)[:2, 2], [48, 24])
-    pictures = [render(project(gaussians, one, size), size) for one in (camera, same)]
+    np.testing.assert_allclose(np.asarray(camera.intrinsics(size))[:2, 2], [48, 24])
+    pictures = [draw(view(gaussians, one, size), size) for one in (camera, same)]
     np.testing.assert_allclose(*pictures, atol=1e-4)
-    turned = Camera.from_matrices(viewmat(*random_pose()), K, SIZE).orbit(0.3)
+    turned = orbit(Camera.from_matrices(viewmat(*random_pose()), K, SIZE), 0.3)
     np.testing.assert_allclose(turned.intrinsics(SIZE), K, rtol=1e-5)
 
 
@@ -100,22 +101,24 @@ def test_gradients():
     with jax.enable_x64(True):
         gaussians, world = deep_scene(), jnp.asarray(viewmat(*random_pose()))
 
-        def loss(tree):
+        @jax.jit
+        @jax.value_and_grad
+        def slope(tree):
             pose, focal = tree
             matrix = jnp.asarray(K).at[0, 0].set(focal)
             shifted = world.at[:3, 3].add(pose)
             return smooth_loss(gaussians, Camera.from_matrices(shifted, matrix, (48, 96)))
 
-        check_gradient(loss, (jnp.zeros(3), jnp.asarray(80.0)))
+        check_gradient(slope, (jnp.zeros(3), jnp.asarray(80.0)))
 
 
 def test_vmap_over_matrices():
-    worlds = jnp.stack([jnp.asarray(viewmat(*random_pose(seed)), jnp.float32) for seed in range(3)])
-    cameras = jax.vmap(lambda one: Camera.from_matrices(one, K, SIZE))(worlds)
+    worlds = np.stack([viewmat(*random_pose(seed)) for seed in range(3)]).astype(np.float32)
+    cameras = jax.jit(jax.vmap(lambda one: Camera.from_matrices(one, K, SIZE)))(worlds)
     gaussians = deep_scene(dtype=np.float32)
-    many = jax.jit(jax.vmap(lambda one: project(gaussians, one, SIZE, order="array")))(cameras)
-    alone = project(gaussians, Camera.from_matrices(worlds[1], K, SIZE), SIZE, order="array")
-    np.testing.assert_allclose(many.mean[1], alone.mean, atol=1e-2)
+    many = jax.jit(jax.vmap(lambda one: view(gaussians, one, SIZE, order="array")))(cameras)
+    alone = view(gaussians, Camera.from_matrices(worlds[1], K, SIZE), SIZE, order="array")
+    np.testing.assert_allclose(np.asarray(many.mean)[1], alone.mean, atol=1e-2)
 
 
 def changed(matrix, **entries):
@@ -190,11 +193,13 @@ def test_gradient_by_quaternions_and_scales():
         mean, quaternion, scale, opacity, color = map(jnp.asarray, parameters(4))
         weights = jnp.asarray(np.random.default_rng(1).normal(size=(4, 3, 3)))
 
-        def loss(tree):
+        @jax.jit
+        @jax.value_and_grad
+        def slope(tree):
             factor = Gaussians3D.from_quaternions(mean, *tree, opacity, color).factor
             return jnp.sum(weights * (factor @ factor.mT))
 
-        check_gradient(loss, (quaternion, scale))
+        check_gradient(slope, (quaternion, scale))
 
 
 def test_quaternion_errors():

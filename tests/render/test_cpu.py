@@ -2,18 +2,15 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
+import judge
 import numba as nb
 import numpy as np
 import pytest
 from scenes import scene
 
 from foldgauss._runtime import threads as _threads
-from foldgauss.render import RenderOptions, Splats2D, cpu
+from foldgauss.render import RenderOptions, cpu
 from foldgauss.render import _cpu_kernels as kernels
-from foldgauss.render.footprint import pixel_centers
-from foldgauss.render.reference import render_reference, splat_alpha
 
 NAMES = ("mean", "factor", "opacity", "color", "background")
 
@@ -30,49 +27,16 @@ def leaves_of(kind, channels=3, *, dtype=np.float32, change=None):
     return [leaf.astype(dtype) for leaf in leaves], size
 
 
-def judge(leaves, size, weights, compositing, options):
-    """Picture, planar, and gradients of <picture, weights> from the reference in double precision."""
-    with jax.enable_x64(True):
-        wide, weights = [jnp.asarray(leaf, jnp.float64) for leaf in leaves], jnp.asarray(weights, jnp.float64)
-
-        def loss(*leaves):
-            splats = Splats2D(*leaves[:4])
-            picture = render_reference(splats, size, leaves[4], compositing=compositing, options=options)
-            return jnp.sum(jnp.moveaxis(picture, -1, 0) * weights), picture
-
-        grads, picture = jax.jit(jax.grad(loss, tuple(range(5)), has_aux=True))(*wide)
-    return np.moveaxis(np.asarray(picture), -1, 0), [np.asarray(one) for one in grads]
-
-
-def near_a_threshold(leaves, size, options):
-    """Pixels where an alpha is so near to where it is dropped, capped or stopped that float32 may fall either way."""
-    loose = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1.0, low_pass=options.low_pass)
-    with jax.enable_x64(True):
-        splats = Splats2D(*(jnp.asarray(leaf, jnp.float64) for leaf in leaves[:4]))
-        raw = jax.lax.map(lambda one: splat_alpha(one, pixel_centers(size, jnp.float64), loose), splats)
-        kept = jax.lax.map(lambda one: splat_alpha(one, pixel_centers(size, jnp.float64), options), splats)
-        near = np.abs(np.asarray(raw) / options.alpha_cutoff - 1) < 1e-4
-        if options.support_radius is not None:
-            edge = np.asarray(splats.opacity)[:, None, None] * np.exp(-(options.support_radius**2) / 2)
-            near |= np.abs(np.asarray(raw) / edge - 1) < 1e-4
-        if options.alpha_ceiling < 1:
-            near |= np.abs(np.asarray(raw) / options.alpha_ceiling - 1) < 1e-5
-        light = np.cumprod(1 - np.asarray(kept), axis=0)
-    # With stop 0 the light never falls to it but where an alpha is 1 exactly, which both sides see.
-    stop = options.transmittance_stop
-    return (near | (np.abs(light - stop) < 1e-3 * stop)).any(axis=0)
-
-
 def assert_agrees(leaves, size, compositing="over", options=None):
     """Picture and gradients against the judge, the pixels near a threshold aside."""
     options = RenderOptions() if options is None else options
     weights = np.random.default_rng(1).normal(size=(leaves[4].size, *size)).astype(np.float32)
-    avoid = near_a_threshold(leaves, size, options)
+    avoid = judge.near_a_threshold(leaves[:4], size, options)
     assert avoid.mean() < 0.5
     weights[:, avoid] = 0
-    truth, true_grads = judge(leaves, size, weights, compositing, options)
+    true_grads, truth = judge.grads_and_picture(leaves, size, np.moveaxis(weights, 0, -1), compositing, options)
     trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-    difference = np.abs(trace.image - truth)[:, ~avoid]
+    difference = np.abs(np.moveaxis(trace.image, 0, -1) - truth)[~avoid]
     assert difference.max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
     for name, one, other in zip(NAMES, cpu.backward(trace, weights), true_grads, strict=True):
         scale = max(1.0, np.abs(other).max(initial=0))
@@ -148,10 +112,7 @@ def test_visibility(kind, compositing):
     plain = cpu.forward(*leaves, size, compositing=compositing, options=options)
     assert plain.visibility is None
     np.testing.assert_array_equal(trace.image, plain.image)
-    splats = Splats2D(*map(jnp.asarray, leaves[:4]))
-    if len(leaves[2]):
-        alpha = jax.lax.map(lambda one: splat_alpha(one, pixel_centers(size, jnp.float32), options), splats)
-    alpha = np.asarray(alpha if len(leaves[2]) else np.zeros((0, *size)), np.float64)
+    alpha = judge.alphas(leaves[:4], size, options)
     light, weights, drawn = np.ones(size), np.zeros_like(alpha), np.zeros_like(alpha)
     for k, own in enumerate(alpha):
         drawn[k] = own * (light > options.transmittance_stop)
@@ -234,7 +195,7 @@ def test_trimmed_lists_keep_the_gradient():
     leaves, size = leaves_of("curtain")
     weights = np.ones((3, *size), np.float32)
     trace = cpu.forward(*leaves, size)
-    used = max(int(stop.max()) for _, _, stop in trace.lists)
+    used = max(int((stop - start[:-1]).max()) for start, _, stop in trace.lists)  # the longest list
     assert used < len(leaves[0])
     seen = cpu.backward(trace, weights)
     assert not seen[3][-1].any()

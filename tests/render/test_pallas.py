@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import KINDS, scene
-from test_engines import BACKGROUND, grads_and_picture, judged, weights_for
+from scenes import KINDS, draw, scene
+from test_engines import BACKGROUND, OPTIONS, grads_and_picture, judged, weights_for
 
 from foldgauss.render import RenderOptions, Splats2D, pallas, render, tiles
 
-OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, transmittance_stop=0.0)}
-QUICK = [("plain", "over", "default"), ("plain", "sum", "sharp")]
+QUICK = [("plain", "sum", "sharp")]  # "over" is that of several rounds
 CASES = [
     pytest.param(kind, *how, marks=[] if (kind, *how) in QUICK else [pytest.mark.slow])  # each compiles for seconds
     for how in (("over", "default"), ("over", "sharp"), ("sum", "default"), ("sum", "sharp"))
@@ -24,7 +23,7 @@ def check(grads, picture, judgement, tolerance=2e-5):
     avoid, true_grads, truth = judgement
     difference = np.abs(picture - truth)
     assert difference[~avoid].max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
-    for one, other in zip(jax.tree.leaves(grads), jax.tree.leaves(true_grads), strict=True):
+    for one, other in zip(jax.tree.leaves(grads), true_grads, strict=True):
         size_of = max(1.0, np.abs(other).max(initial=0))
         np.testing.assert_allclose(one / size_of, other / size_of, atol=tolerance)
 
@@ -43,22 +42,16 @@ def test_agrees_with_reference(kind, compositing, options):
 )
 def test_several_rounds_equal_one(tile):
     """What does not fit into the lists at once is drawn later; of many rounds not every start is kept."""
-    splats, size = scene("huge")
-    judgement = judged("huge", "over", "default")
-    num_tiles = -(-size[0] // tile) * -(-size[1] // tile)
-    rounds = len(splats.mean) if tile == 16 else 4
-    options = RenderOptions(list_capacity=max(num_tiles * len(splats.mean) // rounds, num_tiles), tile_size=tile)
-    leaves = splats.mean, splats.factor, splats.opacity, splats.color, BACKGROUND
+    splats, size = scene("plain")
+    judgement = judged("plain", "over", "default")
+    options = RenderOptions(list_capacity=-(-size[0] // tile) * -(-size[1] // tile), tile_size=tile)  # the least
+    leaves = *jax.tree.leaves(splats), BACKGROUND
     plan = pallas._plan(leaves, size, "over", options)
-    if tile == 16:
-        number, *_ = jax.jit(functools.partial(pallas._forward, plan))(leaves)
-        assert int(number) > tiles.STORED_ROUNDS
-    grads, picture = grads_and_picture("pallas", size, "over", options, *leaves_for(splats, judgement, size))
+    assert tiles._count_slots(plan, *leaves[:3]) > tiles.STORED_ROUNDS * plan.capacity  # so many rounds and more
+    grads, picture = grads_and_picture(
+        "pallas", size, "over", options, splats, BACKGROUND, weights_for(size, judgement[0])
+    )
     check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
-
-
-def leaves_for(splats, judgement, size):
-    return splats, BACKGROUND, weights_for(size, judgement[0])
 
 
 @pytest.mark.slow
@@ -111,7 +104,7 @@ def test_dtypes(dtype):
         picture = render(splats, size, engine="pallas")
         assert picture.dtype == dtype
         wide = jax.tree.map(lambda leaf: leaf.astype(np.float64), splats)
-        np.testing.assert_allclose(picture, render(wide, size, engine="reference"), atol=2e-3)
+        np.testing.assert_allclose(picture, draw(wide, size, engine="reference"), atol=2e-3)
 
 
 @pytest.mark.slow

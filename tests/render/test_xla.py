@@ -1,30 +1,30 @@
 """What is the XLA engine's own: lists and rounds, tiles, long lists, retraces; scenes as hard as they come."""
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
+import judge
 import numpy as np
 import pytest
-from scenes import check_slope, scene
+from scenes import check_slopes, scene
+from scenes import draw as compiled_draw
+from test_engines import BACKGROUND, LEAVES, grads_and_picture, weights_for
 
 from foldgauss.render import RenderOptions, Splats2D, render, tiles, xla
 
-BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
 draw = functools.partial(render, engine="xla", background=BACKGROUND)
 
 
-def picture_and_grads(draw, splats, weights):
-    def loss(splats):
-        picture = draw(splats)
-        return jnp.sum(picture * weights), picture
+#: With a cutoff that hides no error, and compiled once for most tests.
+SMOOTH = RenderOptions(alpha_cutoff=1e-6)
 
-    grads, picture = jax.jit(jax.grad(loss, has_aux=True))(splats)
+
+def picture_and_grads(splats, size, compositing="over", options=SMOOTH):
+    """With a random incoming gradient; the picture first, the background's gradient last."""
+    grads, picture = grads_and_picture("xla", size, compositing, options, splats, BACKGROUND, weights_for(size))
     return picture, *jax.tree.leaves(grads)
-
-
-def weights_for(size, dtype=np.float32):
-    return jnp.asarray(np.random.default_rng(1).normal(size=(*size, 3)).astype(dtype))
 
 
 def check_same(ones, others, tolerance):
@@ -34,43 +34,32 @@ def check_same(ones, others, tolerance):
         np.testing.assert_allclose(one / scale, other / scale, atol=tolerance)
 
 
-def check_against_reference(splats, size, tolerance=2e-5, **how):
-    """Picture and gradients, the judge in double precision on the same numbers."""
-    weights = weights_for(size)
-    ones = picture_and_grads(lambda s: render(s, size, engine="xla", **how), splats, weights)
-    with jax.enable_x64(True):
-        wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), splats)
-        others = picture_and_grads(
-            lambda s: render(s, size, engine="reference", **how), wide, weights.astype(jnp.float64)
-        )
-        check_same(ones, others, tolerance)
-
-
-@pytest.mark.parametrize(
-    ("kind", "compositing"),
-    [
-        pytest.param("plain", "over", marks=pytest.mark.slow),
-        pytest.param("needles", "sum", marks=pytest.mark.slow),
-        ("curtain", "over"),
-    ],
-)
-def test_rounds_change_nothing(kind, compositing):
-    """With room for a few splats at a time, drawn in many rounds, the picture and the gradients are the same."""
+@pytest.mark.parametrize("kind", ["plain", "curtain"])
+def test_rounds_and_tiles_change_nothing(kind):
+    """With other tiles, and room for a few splats at a time, drawn in many rounds, all is the same."""
     splats, size = scene(kind)
-    weights, results = weights_for(size), []
-    for capacity in (None, 64):
-        options = RenderOptions(list_capacity=capacity)
-        how = functools.partial(draw, size=size, compositing=compositing, options=options)
-        results.append(picture_and_grads(how, splats, weights))
-    check_same(*results, 1e-5)
+    few = picture_and_grads(splats, size, options=dataclasses.replace(SMOOTH, tile_size=7, list_capacity=80))
+    check_same(picture_and_grads(splats, size), few, 1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("capacity", [None, 64])
+@pytest.mark.parametrize("tile_size", [None, 4, 7, 32])
+@pytest.mark.parametrize(("kind", "compositing"), [("plain", "over"), ("needles", "sum"), ("curtain", "over")])
+def test_each_of_rounds_and_tiles_changes_nothing(kind, compositing, tile_size, capacity):
+    splats, size = scene(kind)
+    least = -(-size[0] // (tile_size or xla.TILE_SIZE)) * -(-size[1] // (tile_size or xla.TILE_SIZE))
+    options = dataclasses.replace(SMOOTH, tile_size=tile_size, list_capacity=capacity and max(capacity, least))
+    found = picture_and_grads(splats, size, compositing, options)
+    check_same(picture_and_grads(splats, size, compositing), found, 1e-5)
 
 
 def test_capacity_does_not_change_the_image(monkeypatch):
     """Eager, too: the room is counted, and bounded."""
     splats, size = scene("huge")
-    truth = draw(splats, size)
+    truth, *_ = picture_and_grads(splats, size)
     monkeypatch.setattr(tiles, "MAX_SLOTS", 64)
-    np.testing.assert_allclose(draw(splats, size), truth, atol=1e-6)
+    np.testing.assert_allclose(draw(splats, size, options=SMOOTH), truth, atol=1e-6)
 
 
 def counted(monkeypatch, name):
@@ -96,7 +85,7 @@ def test_a_few_wide_splats_take_one_round_inside_jit():
     leaves = rng.uniform(0, 320, (num, 2)), np.tile(300 * np.eye(2), (num, 1, 1)), np.full(num, 0.1), np.ones((num, 3))
     leaves = [jnp.asarray(leaf, jnp.float32) for leaf in (*leaves, BACKGROUND)]
     jax.eval_shape(lambda leaves: plans.append(xla._plan(leaves, size, "over", RenderOptions())), leaves)
-    _, (*_, rounds) = xla._render_fwd(plans[0], leaves)
+    _, (*_, rounds) = jax.jit(xla._render_fwd, static_argnums=0)(plans[0], leaves)
     assert int(rounds) == 1
     jax.eval_shape(lambda leaves: plans.append(xla._plan(leaves, (8, 8), "over", RenderOptions())), leaves)
     assert plans[1].capacity < 2 * num  # but no more than that
@@ -121,57 +110,49 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     check_same(*grads, 1e-5)
 
 
-@pytest.mark.parametrize("size", [(40, 40), (44, 43)])
-def test_pixels_outside_the_image_count_as_finished(size, monkeypatch):
+def test_pixels_outside_the_image_count_as_finished(monkeypatch):
     """Tiles that reach beyond the picture are left once dark like others."""
-    splats, _ = scene("curtain")
-    leaves, calls = leaves_of(splats), counted(monkeypatch, "_load")
-    picture, _ = xla._render_fwd(xla._plan(leaves, size, "over", RenderOptions()), leaves)
+    splats, size = scene("curtain")[0], (44, 43)
+    num = 4 * len(splats.mean)
+    leaves = [jnp.asarray(np.concatenate([leaf] * 4)) for leaf in map(np.asarray, jax.tree.leaves(splats))] + [
+        BACKGROUND
+    ]
+    calls = counted(monkeypatch, "_load")
+    plan = xla._plan(leaves, size, "over", RenderOptions())
+    picture, _ = jax.jit(lambda leaves: xla._render_fwd(plan, leaves))(leaves)
     jax.effects_barrier()
     assert picture.shape == (*size, 3)
-    assert 0 < len(calls) < len(splats.mean) / xla.CHUNK / 4
-
-
-@pytest.mark.parametrize(
-    "tile_size", [pytest.param(4, marks=pytest.mark.slow), 7, pytest.param(32, marks=pytest.mark.slow)]
-)
-def test_tile_size_changes_nothing(tile_size):
-    splats, size = scene("plain")
-    weights = weights_for(size)
-    results = [
-        picture_and_grads(functools.partial(draw, size=size, options=RenderOptions(tile_size=tile)), splats, weights)
-        for tile in (None, tile_size)
-    ]
-    check_same(*results, 1e-5)
+    assert 0 < len(calls) < num / xla.CHUNK / 4
 
 
 @pytest.mark.slow
 def test_batches_of_tiles(monkeypatch):
     """Cut into many small batches, the last of them not full, the picture is the same."""
     splats, size = scene("plain")
-    weights, how = weights_for(size), functools.partial(draw, size=size)
-    whole = picture_and_grads(how, splats, weights)
+    whole = picture_and_grads(splats, size)
+    jax.clear_caches()
     monkeypatch.setattr(xla, "BATCH_PIXELS", {"cpu": 700, "other": 700})
-    check_same(picture_and_grads(lambda s: how(s), splats, weights), whole, 1e-5)
+    check_same(picture_and_grads(splats, size), whole, 1e-5)
+    jax.clear_caches()
 
 
 @pytest.mark.slow
 def test_unrolled_chunks(monkeypatch):
     """The form for GPUs gives the same."""
     splats, size = scene("plain")
-    weights, how = weights_for(size), functools.partial(draw, size=size, options=RenderOptions(tile_size=6))
-    whole = picture_and_grads(how, splats, weights)
+    whole = picture_and_grads(splats, size, options=dataclasses.replace(SMOOTH, tile_size=6))
     jax.clear_caches()
     monkeypatch.setattr(xla, "_unroll", lambda: 4)
-    check_same(picture_and_grads(lambda s: how(s), splats, weights), whole, 1e-5)
+    check_same(picture_and_grads(splats, size, options=dataclasses.replace(SMOOTH, tile_size=6)), whole, 1e-5)
     jax.clear_caches()
 
 
 def test_a_hundred_thousand_splats_on_one_pixel():
     """Against the closed form: n equal alphas leave (1 - alpha)^n of the light."""
     num, alpha = 100_000, 1e-5
-    mean, factor = jnp.full((num, 2), 8.5), jnp.tile(0.2 * jnp.eye(2), (num, 1, 1))
-    color = jnp.ones((num, 3)).at[num // 2 :].set(0.0)
+    mean, factor = np.full((num, 2), 8.5), np.tile(0.2 * np.eye(2), (num, 1, 1))
+    color = (np.arange(num) < num // 2)[:, None]
+    mean, factor, color = (jnp.asarray(leaf, jnp.float32) for leaf in (mean, factor, color))
     options = RenderOptions(alpha_cutoff=1e-8, low_pass=0.0)
 
     def center(opacity):
@@ -181,77 +162,71 @@ def test_a_hundred_thousand_splats_on_one_pixel():
     behind_half = np.exp(num / 2 * np.log1p(-alpha))
     assert float(value) == pytest.approx(1 - behind_half, rel=1e-4)
     # Splat i of the white half takes light from the white ones behind it: T_i (1 - B_i) = (1 - alpha)^(n/2 - 1).
-    np.testing.assert_allclose(gradient[: num // 2], behind_half, rtol=2e-3)
-    np.testing.assert_allclose(gradient[num // 2 :], 0, atol=1e-3)
+    np.testing.assert_allclose(np.asarray(gradient)[: num // 2], behind_half, rtol=2e-3)
+    np.testing.assert_allclose(np.asarray(gradient)[num // 2 :], 0, atol=1e-3)
 
 
-@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
 def test_long_needles(compositing):
-    """1e4 : 1, at all angles."""
-    rng = np.random.default_rng(0)
-    angle = rng.uniform(0, np.pi, 40)
+    """1e4 : 1, at all angles; the judge in double precision on the same numbers."""
+    rng, num, size = np.random.default_rng(0), 150, (50, 70)
+    angle = rng.uniform(0, np.pi, num)
     turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(-1, 2, 2)
     factor = turn * np.asarray([3000.0, 0.3])
-    leaves = rng.uniform(0, 50, (40, 2)), factor, rng.uniform(0.1, 0.9, 40), rng.uniform(0, 1, (40, 3))
-    splats = Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
+    leaves = rng.uniform(0, 50, (num, 2)), factor, rng.uniform(0.1, 0.9, num), rng.uniform(0, 1, (num, 3))
+    leaves = [np.asarray(leaf, np.float32) for leaf in leaves]
+    found = picture_and_grads(Splats2D(*map(jnp.asarray, leaves)), size, compositing)
+    grads, picture = judge.grads_and_picture([*leaves, BACKGROUND], size, weights_for(size), compositing, SMOOTH)
     # A rounding of the angle moves a needle's flank by 1e-4 px at 3000 px: float32 has no more.
-    check_against_reference(splats, (37, 53), 1e-3, compositing=compositing, options=RenderOptions(alpha_cutoff=1e-6))
+    check_same(found, [picture, *grads], 1e-3)
 
 
-@pytest.mark.parametrize(
-    ("engine", "scale", "bound"),
-    [
-        *(("xla", scale, 1e-5) for scale in (1e-6, 1e-3, 1e3, 1e6)),
-        *(("cpu", scale, 1e-5) for scale in (1e-3, 1e3, 1e6)),
-        ("cpu", 1e-6, 0.05),  # it takes P column - P X along a row, of which float32 then keeps one digit
-    ],
-)
-def test_sizes(engine, scale, bound):
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+def test_sizes(scale):
     """On pixels' centres, so that the smallest are seen at all."""
-    rng = np.random.default_rng(0)
-    mean = rng.integers(0, 30, (50, 2)) + 0.5
-    factor = scale * rng.normal(size=(50, 2, 2))
-    leaves = mean, factor, rng.uniform(0, 1, 50), rng.uniform(0, 1, (50, 3))
-    splats = Splats2D(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
-    options = RenderOptions(low_pass=0.0, alpha_cutoff=1e-6) if scale < 1 else RenderOptions()
-    size = (30, 30)
-    with jax.enable_x64(True):
-        wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), splats)
-        truth = render(wide, size, engine="reference", options=options)
-    np.testing.assert_allclose(render(splats, size, engine=engine, options=options), truth, atol=bound)
+    rng, num, size = np.random.default_rng(0), 50, (30, 30)
+    mean = rng.integers(0, 30, (num, 2)) + 0.5
+    factor = scale * rng.normal(size=(num, 2, 2))
+    leaves = mean, factor, rng.uniform(0, 1, num), rng.uniform(0, 1, (num, 3)), BACKGROUND
+    *leaves, background = (np.asarray(leaf, np.float32) for leaf in leaves)
+    splats, options = Splats2D(*map(jnp.asarray, leaves)), dataclasses.replace(SMOOTH, low_pass=0.0)
+    _, truth = judge.grads_and_picture([*leaves, background], size, np.zeros((*size, 3)), "over", options)
+    # Of the smallest, "cpu" takes P column - P X along a row, of which float32 then keeps one digit.
+    for engine, bound in (("xla", 1e-5), ("cpu", 0.05 if scale == 1e-6 else 1e-5)):
+        picture = compiled_draw(splats, size, engine=engine, background=BACKGROUND, options=options)
+        np.testing.assert_allclose(picture, truth, atol=bound, err_msg=engine)
 
 
 def test_far_outside():
+    """Splats nowhere near the picture are as if they were fully transparent."""
     splats, size = scene("plain")
-    away = jnp.asarray([1e5, -1e5, 1e9, -1e30, 3e38])
-    mean = jnp.concatenate([splats.mean, jnp.stack([away, away[::-1]], -1), jnp.stack([away, 0 * away + 5], -1)])
-    extended = Splats2D(
-        mean,
-        jnp.concatenate([splats.factor, jnp.tile(jnp.eye(2), (10, 1, 1))]),
-        jnp.concatenate([splats.opacity, jnp.ones(10)]),
-        jnp.concatenate([splats.color, jnp.ones((10, 3))]),
-    )
-    weights, how = weights_for(size), functools.partial(draw, size=size)
-    with_them, without = (picture_and_grads(how, one, weights) for one in (extended, splats))
-    np.testing.assert_allclose(with_them[0], without[0], atol=1e-6)
-    for one, other in zip(with_them[1:], without[1:], strict=True):
-        np.testing.assert_allclose(one[: len(other)], other, atol=1e-4)
-        assert not np.asarray(one)[len(other) :].any()
+    mean, factor, opacity, color = map(np.array, jax.tree.leaves(splats))
+    opacity[-10:] = 0
+    without = Splats2D(*map(jnp.asarray, (mean, factor, opacity, color)))
+    away = np.asarray([1e5, -1e5, 1e9, -1e30, 3e38])
+    mean[-10:] = np.concatenate([np.stack([away, away[::-1]], -1), np.stack([away, 0 * away + 5], -1)])
+    factor[-10:], opacity[-10:], color[-10:] = np.eye(2), 1, 1
+    with_them = Splats2D(*map(jnp.asarray, (mean, factor, opacity, color)))
+    (picture, *grads), (truth, *others) = (picture_and_grads(one, size) for one in (with_them, without))
+    np.testing.assert_allclose(picture, truth, atol=1e-6)
+    for one, other in zip(grads, others, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+    assert not any(np.asarray(one)[-10:].any() for one in grads[:4])
 
 
-@pytest.mark.parametrize("leaf", ["mean", "factor", "opacity", "color"])
+@pytest.mark.slow
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-def test_gradient_by_finite_differences(leaf, compositing):
+def test_gradient_by_finite_differences(compositing):
     with jax.enable_x64(True):
         splats, size = scene("plain", dtype=np.float64)
-        splats = jax.tree.map(lambda leaf: leaf[:12], splats)
+        splats = jax.tree.map(lambda leaf: np.asarray(leaf)[:12], splats)
         options = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1.0, transmittance_stop=0.0)  # smooth
-        weights = weights_for(size, np.float64)
+        weights = weights_for(size).astype(jnp.float64)
 
         def loss(splats):
             return jnp.sum(draw(splats, size, compositing=compositing, options=options) * weights)
 
-        check_slope(loss, splats, leaf, rtol=1e-5)
+        check_slopes(loss, splats, LEAVES, rtol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
@@ -276,7 +251,7 @@ def test_retraces():
 
     before = xla._render_jit._cache_size()
     for shift in (0.0, 0.5, 1.0):
-        moved = Splats2D(splats.mean + shift, splats.factor, splats.opacity, splats.color)
+        moved = dataclasses.replace(splats, mean=splats.mean + shift)
         step(moved)
         draw(moved, size)
     assert len(traces) == 1
