@@ -149,7 +149,7 @@ EVERY = {
 
 
 #: Those tested in the quick suite; compiling takes the time.
-QUICK = {"folded", "batched", "normal", "mixture"}
+QUICK = {"batched", "normal", "mixture"}
 
 
 @pytest.fixture(params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY])
