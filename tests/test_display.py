@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from soft_models import NUM, NUM_FRAMES, SIZE, soft_model
+
 from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
 from foldgauss.analysis import notebook as _display
-from foldgauss.video import FitConfig, FitInfo, FitResult, fit
+from foldgauss.video import FitInfo, FitResult
 
 pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
 
@@ -173,14 +175,11 @@ def test_no_second_figure_is_left_behind():
 
 
 def test_fit_result():
-    frames = np.random.default_rng(0).integers(0, 255, (3, 16, 24, 3), np.uint8)
-    result = fit(frames, FitConfig(num_gaussians=20, steps=3, follow_motion=False), every=1)
-    told = repr(result)
-    assert told.startswith("FitResult(3 frames of 16x24, 20 Gaussians; ")
-    assert "dB after 3 steps" in told
-    assert len(told) < 120
+    course = [FitInfo(step, step / 3, 0.1 / step, 20.0 + step, NUM, NUM, 0.5 * step, 1.0, None) for step in (1, 2, 3)]
+    result = FitResult(soft_model(), course)
+    of_what = f"{NUM_FRAMES} frames of {SIZE[0]}x{SIZE[1]}, {NUM} Gaussians"
+    assert repr(result) == f"FitResult({of_what}; 23.00 dB after 3 steps, 1.5 s)"
     assert picture(result._repr_png_()).shape[1] > 400
     empty = FitResult(result.model, [])
-    assert repr(empty) == "FitResult(3 frames of 16x24, 20 Gaussians)"
+    assert repr(empty) == f"FitResult({of_what})"
     assert empty._repr_png_() is None
-    assert isinstance(result.history[0], FitInfo)
