@@ -253,9 +253,13 @@ def test_samples_have_pathwise_gradients():
 # --- gradients and extremes -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dim", [2, pytest.param(10, marks=pytest.mark.slow)])
+# Forward mode takes long to compile; in the quick suite test_distribution_moments.py and test_safe_grad.py use it.
+@pytest.mark.parametrize(
+    ("dim", "forward"),
+    [(2, False), pytest.param(2, True, marks=pytest.mark.slow), pytest.param(10, False, marks=pytest.mark.slow)],
+)
 @pytest.mark.usefixtures("x64")
-def test_gradients_equal_finite_differences(dim):
+def test_gradients_equal_finite_differences(dim, forward):
     rng = np.random.default_rng(0)
     tril = jnp.asarray(np.tril(rng.uniform(0.3, 0.6, (dim, dim))) + np.eye(dim))
     fold = PolynomialFold(rng.normal(size=(2, dim)))
@@ -276,10 +280,8 @@ def test_gradients_equal_finite_differences(dim):
     (_, first, second), (up, first_up, _), (down, first_down, _) = map(derivatives, (0.0, step, -step))
     np.testing.assert_allclose(first, (up - down) / (2 * step), rtol=1e-6)
     np.testing.assert_allclose(second, (first_up - first_down) / (2 * step), rtol=1e-6)
-    if dim == 10:  # forward mode takes too long to compile to try it twice
-        return
-    forward = jax.jit(jax.jacfwd(lambda e: jax.value_and_grad(log_prob)(e)))(0.0)
-    _close(forward, (first, second), 1e-12)
+    if forward:
+        _close(jax.jit(jax.jacfwd(lambda e: jax.value_and_grad(log_prob)(e)))(0.0), (first, second), 1e-12)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
@@ -326,7 +328,7 @@ def test_gradient_saturates_at_the_largest_number():
     np.testing.assert_array_equal(grad, [-np.finfo(np.float32).max, np.finfo(np.float32).max])
 
 
-@pytest.mark.parametrize("fold", [None, ZeroFold(2)])
+@pytest.mark.parametrize("fold", [None, pytest.param(ZeroFold(2), marks=pytest.mark.slow)])
 def test_absurd_times_are_minus_infinity(fold):
     both = jax.vmap(jax.value_and_grad(FoldedGaussian.log_prob, argnums=(0, 1)), in_axes=(None, 0))
     x = jnp.array([[0.0, 1.0, t] for t in (1e20, -1e30, 3e38)])

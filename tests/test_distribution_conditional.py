@@ -12,7 +12,7 @@ from scipy import integrate, stats
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_rule
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import Constant, TimeLikelihood
+from foldgauss.envelope import TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
 
@@ -307,17 +307,6 @@ def test_conditioning_and_marginals_commute():
     )
 
 
-def test_without_fold_and_envelope_all_is_gaussian():
-    dist = _dist(2, fold=ZeroFold(2), envelope=Constant())
-    sigma = TRIL[:2, :2] @ TRIL[:2, :2].T
-    x = jnp.array([[0.2, -0.1], [0.0, 0.3]])
-    time = dist.time_given_space(x)
-    expected = stats.multivariate_normal(LOC[:2], sigma).logpdf(x)
-    np.testing.assert_allclose(time.log_normalizer, expected, rtol=1e-12)
-    np.testing.assert_allclose(time.mean, 0.4, rtol=1e-12)
-    np.testing.assert_allclose(time.variance, 0.09, rtol=1e-10)
-
-
 def _parabola(s, scale, power, dtype):
     """log p(s) where s = 0.1 + 0.8 u + 0.6 u^2, u = -0.3 tau, by trapezoids in long double.
 
@@ -464,7 +453,7 @@ def test_far_points():
     assert (dist.time_given_space(near).error_estimate < 1e-9).all()
 
 
-def test_divergent_densities():
+def test_without_fold_density_is_gaussian_or_diverges():
     # On a ridge that stands still p(s) diverges for power (d-1) >= 2; next to it, or without an envelope, it does not.
     still = _dist(2, jnp.array([1.0, 0.0]), fold=ZeroFold(2)).marginal([0, 1])
     x = LOC[:2] + np.array([[[0.0]], [[1e-3]]])

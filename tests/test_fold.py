@@ -15,7 +15,6 @@ from scipy.interpolate import BSpline
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import AbstractFold, CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold, as_fold
 
-
 #: Jitted once: called eagerly, each operation would be compiled alone.
 APPLY = eqx.filter_jit(lambda fold, u: fold(u))
 
