@@ -24,6 +24,8 @@ TRIL = [[0.3, 0.0], [0.1, 0.2]]
 # Jitted once for the module: most of a test's time would be the compilation of single operations.
 LOG_PROB = eqx.filter_jit(FoldedGaussian.log_prob)
 PDF = eqx.filter_jit(FoldedGaussian.pdf)
+SAMPLE = eqx.filter_jit(FoldedGaussian.sample)
+CONDITION_TIME = eqx.filter_jit(FoldedGaussian.condition_time)
 
 
 @pytest.fixture
@@ -79,8 +81,10 @@ def _twin_log_prob(x, *, loc, tril, time_loc, time_scale, coefficients, power):
 # --- oracles ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-12)])
-@pytest.mark.parametrize("dim", [1, 2, 3, 10])
+@pytest.mark.parametrize(
+    ("dim", "dtype", "tolerance"),
+    [(1, np.float64, 1e-12), (2, np.float64, 1e-12), (10, np.float64, 1e-12), (3, np.float32, 1e-5)],
+)
 def test_without_fold_and_envelope_it_is_a_gaussian(dim, dtype, tolerance):
     rng = np.random.default_rng(dim)
     factor = rng.normal(size=(dim, dim))
@@ -99,7 +103,7 @@ def test_without_fold_and_envelope_it_is_a_gaussian(dim, dtype, tolerance):
 
 
 @settings(max_examples=15, deadline=None)
-@given(degree=st.integers(0, 5), power=st.sampled_from([0.0, 1.0, 2.0]), seed=st.integers(0, 2**20))
+@given(degree=st.sampled_from([0, 1, 4]), power=st.sampled_from([0.0, 1.0, 2.0]), seed=st.integers(0, 2**20))
 def test_log_prob_equals_the_paper_written_out(degree, power, seed):
     rng = np.random.default_rng(seed)
     tril, coefficients = np.tril(rng.uniform(0.3, 1.0, (2, 2))), rng.normal(size=(degree, 2))
@@ -139,14 +143,13 @@ def test_density_integrates_to_one_on_a_plain_grid():
     assert abs(total - 1) < 1e-8
 
 
-@pytest.mark.parametrize("dim", [1, 2])
 @pytest.mark.usefixtures("x64")
-def test_chain_rule(dim):
-    dist = _dist(dim)
-    x = jax.random.normal(jax.random.key(3), (20, dim + 1))
-    conditional, marginal = dist.condition_time(x[:, -1]), dist.time_marginal
+def test_chain_rule():
+    dist = _dist()
+    x = np.random.default_rng(3).normal(size=(20, 3))
+    conditional, marginal = CONDITION_TIME(dist, x[:, -1]), dist.time_marginal
     assert conditional.batch_shape == (20,)
-    assert conditional.event_shape == (dim,)
+    assert conditional.event_shape == (2,)
     assert isinstance(marginal, Normal)
     assert (marginal.batch_shape, marginal.event_shape) == ((), ())
     parts = eqx.filter_jit(lambda s, t: conditional.log_prob(s) + marginal.log_prob(t))(x[:, :-1], x[:, -1])
@@ -155,26 +158,24 @@ def test_chain_rule(dim):
 
 @pytest.mark.usefixtures("x64")
 def test_condition_time_is_the_fold_equation():
-    at = _dist(power=2.0).condition_time(0.7)
-    u = 0.4 - 0.7
-    _close(at.loc, jnp.array([0.1, -0.4]) + u * jnp.array(BEND[0]) + u**2 * jnp.array(BEND[1]), 1e-14)
-    tril = jnp.asarray(TRIL)
-    _close(at.covariance_matrix, jnp.exp(-1.0 * 2 / 2) * tril @ tril.T, 1e-14)
-    _close(at.scale_tril @ at.scale_tril.T, at.covariance_matrix, 1e-14)
-    _close(
-        at.log_prob(jnp.zeros(2)),
-        stats.multivariate_normal(at.loc, at.covariance_matrix).logpdf([0, 0]),
-        1e-12,
-    )
+    at = CONDITION_TIME(_dist(power=2.0), 0.7)
+    u, tril = 0.4 - 0.7, np.array(TRIL)
+    _close(at.loc, np.array([0.1, -0.4]) + u * np.array(BEND[0]) + u**2 * np.array(BEND[1]), 1e-14)
+    covariance, factor = np.asarray(at.covariance_matrix), np.asarray(at.scale_tril)
+    _close(covariance, np.exp(-1.0 * 2 / 2) * tril @ tril.T, 1e-14)
+    _close(factor @ factor.T, covariance, 1e-14)
+    log_prob = jax.jit(lambda at: at.log_prob(jnp.zeros(2)))(at)
+    _close(log_prob, stats.multivariate_normal(at.loc, covariance).logpdf([0, 0]), 1e-12)
 
 
 @pytest.mark.usefixtures("x64")
 def test_normal_is_scipys():
     x = np.linspace(-3, 3, 7)
-    _close(Normal(0.5, 2.0).log_prob(x), stats.norm(0.5, 2.0).logpdf(x), 1e-13)
-    _close(Normal(0.5, 2.0).pdf(x), stats.norm(0.5, 2.0).pdf(x), 1e-13)
-    draws = Normal(jnp.array([0.5, -1.0]), 2.0).sample(jax.random.key(0), (4, 3))
-    assert draws.shape == (4, 3, 2)
+    log_prob, pdf = jax.jit(lambda normal: (normal.log_prob(x), normal.pdf(x)))(Normal(0.5, 2.0))
+    _close(log_prob, stats.norm(0.5, 2.0).logpdf(x), 1e-13)
+    _close(pdf, stats.norm(0.5, 2.0).pdf(x), 1e-13)
+    sample = lambda: Normal(jnp.array([0.5, -1.0]), 2.0).sample(jax.random.key(0), (4, 3))  # noqa: E731
+    assert jax.eval_shape(sample).shape == (4, 3, 2)
 
 
 # --- samples ----------------------------------------------------------------------------------------------
@@ -203,7 +204,7 @@ RIGHT = {
 
 @pytest.fixture(scope="module")
 def draws():
-    return np.asarray(_dist().sample(jax.random.key(11), (100_000,)), np.float64)
+    return np.asarray(SAMPLE(_dist(), jax.random.key(11), (100_000,)), np.float64)
 
 
 def test_unfolded_samples_are_standard_normal(draws):
@@ -245,16 +246,20 @@ def test_samples_have_pathwise_gradients():
         return dist.sample(jax.random.key(0), (5,)).mean()
 
     grad = jax.jit(jax.grad(mean))(_dist())
-    assert all(jnp.isfinite(g).all() for g in jax.tree.leaves(grad))
-    _close(grad.loc, jnp.full(2, 1 / 3), 1e-6)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
+    _close(grad.loc, np.full(2, 1 / 3), 1e-6)
 
 
 # --- gradients and extremes -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dim", [2, pytest.param(10, marks=pytest.mark.slow)])
+# Forward mode takes long to compile; in the quick suite test_distribution_moments.py and test_safe_grad.py use it.
+@pytest.mark.parametrize(
+    ("dim", "forward"),
+    [(2, False), pytest.param(2, True, marks=pytest.mark.slow), pytest.param(10, False, marks=pytest.mark.slow)],
+)
 @pytest.mark.usefixtures("x64")
-def test_gradients_equal_finite_differences(dim):
+def test_gradients_equal_finite_differences(dim, forward):
     rng = np.random.default_rng(0)
     tril = jnp.asarray(np.tril(rng.uniform(0.3, 0.6, (dim, dim))) + np.eye(dim))
     fold = PolynomialFold(rng.normal(size=(2, dim)))
@@ -264,23 +269,26 @@ def test_gradients_equal_finite_differences(dim):
     free = jax.flatten_util.ravel_pytree(  # a direction that leaves the factor lower-triangular
         eqx.tree_at(lambda pair: pair[0].scale_tril, rebuild(free), replace_fn=jnp.tril)
     )[0]
-    log_prob = jax.jit(lambda e: (lambda dist, x: dist.log_prob(x))(*rebuild(vector + e * free)))
-    first, second = jax.jit(jax.grad(log_prob)), jax.jit(jax.jacrev(jax.grad(log_prob)))
-    zero, step = jnp.zeros(()), 1e-5
-    difference = lambda f: (f(zero + step) - f(zero - step)) / (2 * step)  # noqa: E731
-    np.testing.assert_allclose(first(zero), difference(log_prob), rtol=1e-6)
-    np.testing.assert_allclose(second(zero), difference(first), rtol=1e-6)
-    if dim == 10:  # forward mode takes too long to compile to try it twice
-        return
-    _close(jax.jit(jax.jacfwd(log_prob))(zero), first(zero), 1e-12)
-    _close(jax.jit(jax.jacfwd(jax.grad(log_prob)))(zero), second(zero), 1e-12)
+    log_prob = lambda e: (lambda dist, x: dist.log_prob(x))(*rebuild(vector + e * free))  # noqa: E731
+
+    @jax.jit
+    def derivatives(e):
+        (first, second), value = jax.jacrev(lambda e: jax.value_and_grad(log_prob)(e))(e), log_prob(e)
+        return value, first, second
+
+    step = 1e-5
+    (_, first, second), (up, first_up, _), (down, first_down, _) = map(derivatives, (0.0, step, -step))
+    np.testing.assert_allclose(first, (up - down) / (2 * step), rtol=1e-6)
+    np.testing.assert_allclose(second, (first_up - first_down) / (2 * step), rtol=1e-6)
+    if forward:
+        _close(jax.jit(jax.jacfwd(lambda e: jax.value_and_grad(log_prob)(e)))(0.0), (first, second), 1e-12)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
 def test_extremes_are_finite_or_minus_infinity_and_never_nan(dtype):
     axes = ([1.0, 2.0], [0.0, 1e-3], TAUS + [-tau for tau in TAUS], [0, 1e-30, 1e-12, 1e-2, 1, 1e20])
     with jax.enable_x64(dtype == jnp.float64):
-        cases = [jnp.asarray(axis.ravel(), dtype) for axis in np.meshgrid(*axes)]
+        cases = [axis.ravel().astype(dtype) for axis in np.meshgrid(*axes)]
 
         def log_prob(power, floor, tau, residual, dist, moved):
             dist = eqx.tree_at(lambda d: d.envelope, dist, TimeLikelihood(power, floor))
@@ -289,14 +297,14 @@ def test_extremes_are_finite_or_minus_infinity_and_never_nan(dtype):
             return dist.log_prob(jax.lax.stop_gradient(jnp.append(s, t)) + moved)
 
         over = jax.vmap(jax.value_and_grad(log_prob, argnums=(0, 4, 5)), in_axes=(0, 0, 0, 0, None, None))
-        values, grads = jax.jit(over)(*cases, _dist(), jnp.zeros(3, dtype))
+        values, grads = jax.tree.map(np.asarray, jax.jit(over)(*cases, _dist(), jnp.zeros(3, dtype)))
         assert values.dtype == dtype
-        assert (jnp.isfinite(values) | jnp.isneginf(values)).all()
+        assert (np.isfinite(values) | np.isneginf(values)).all()
         for grad in jax.tree.leaves(grads):
-            assert not jnp.isnan(grad).any()
-            assert (grad[jnp.isneginf(values)] == 0).all()
+            assert not np.isnan(grad).any()
+            assert (grad[np.isneginf(values)] == 0).all()
         # On the ridge nothing is far away: the log-density is representable at every tau.
-        assert jnp.isfinite(values[cases[3] == 0]).all()
+        assert np.isfinite(values[np.asarray(cases[3]) == 0]).all()
 
 
 def test_float32_agrees_with_float64_where_the_plain_form_is_nan():
@@ -314,25 +322,26 @@ def test_float32_agrees_with_float64_where_the_plain_form_is_nan():
 
 def test_gradient_saturates_at_the_largest_number():
     at = Gaussian(jnp.zeros(2), jnp.eye(2), log_scale=-49.0)
-    grad = jax.grad(at.log_prob)(jnp.array([1e-3, -1e-4]))  # 1e-3 e^98 is beyond float32, the density is not
-    assert jnp.isfinite(at.log_prob(jnp.array([1e-3, -1e-4])))
+    # 1e-3 e^98 is beyond float32, the density is not.
+    log_prob, grad = jax.jit(jax.value_and_grad(Gaussian.log_prob, argnums=1))(at, jnp.array([1e-3, -1e-4]))
+    assert np.isfinite(log_prob)
     np.testing.assert_array_equal(grad, [-np.finfo(np.float32).max, np.finfo(np.float32).max])
 
 
-@pytest.mark.parametrize("fold", [PolynomialFold(jnp.ones((12, 2))), ZeroFold(2)])
+@pytest.mark.parametrize("fold", [None, pytest.param(ZeroFold(2), marks=pytest.mark.slow)])
 def test_absurd_times_are_minus_infinity(fold):
     both = jax.vmap(jax.value_and_grad(FoldedGaussian.log_prob, argnums=(0, 1)), in_axes=(None, 0))
     x = jnp.array([[0.0, 1.0, t] for t in (1e20, -1e30, 3e38)])
     values, grads = jax.jit(both)(_dist(fold=fold), x)
-    assert jnp.isneginf(values).all()
-    assert all((g == 0).all() for g in jax.tree.leaves(grads))
+    assert np.isneginf(values).all()
+    assert all((np.asarray(g) == 0).all() for g in jax.tree.leaves(grads))
 
 
 def test_nan_in_nan_out():
-    assert jnp.isnan(_dist().log_prob(jnp.array([0.0, jnp.nan, 0.3])))
-    assert jnp.isnan(_dist().log_prob(jnp.array([0.0, 0.0, jnp.nan])))
-    assert jnp.isnan(_dist(loc=jnp.array([0.0, jnp.nan])).log_prob(jnp.zeros(3)))
-    assert jnp.isnan(_dist(time_scale=jnp.nan).log_prob(jnp.zeros(3)))
+    assert np.isnan(LOG_PROB(_dist(), jnp.array([0.0, jnp.nan, 0.3])))
+    assert np.isnan(LOG_PROB(_dist(), jnp.array([0.0, 0.0, jnp.nan])))
+    assert np.isnan(LOG_PROB(_dist(loc=jnp.array([0.0, jnp.nan])), jnp.zeros(3)))
+    assert np.isnan(LOG_PROB(_dist(time_scale=jnp.nan), jnp.zeros(3)))
 
 
 def test_an_envelope_of_minus_infinity_is_no_nan():
@@ -340,7 +349,7 @@ def test_an_envelope_of_minus_infinity_is_no_nan():
         def log_a(self, t, *, time_loc, time_scale):
             return jnp.full(jnp.broadcast_shapes(t.shape, time_loc.shape), -jnp.inf, t.dtype)
 
-    assert jnp.isneginf(_dist(envelope=Nothing()).log_prob(jnp.array([1.0, 1.0, 0.0])))
+    assert np.isneginf(LOG_PROB(_dist(envelope=Nothing()), jnp.array([1.0, 1.0, 0.0])))
 
 
 # --- transformations and batches --------------------------------------------------------------------------
@@ -362,7 +371,7 @@ def test_batches_equal_a_loop_and_vmap():
     loop = [[LOG_PROB(jax.tree.map(itemgetter((i, j)), flat), points[i, j]) for j in range(4)] for i in range(3)]
     assert dist.batch_shape == together.shape == (3, 4)
     _close(double, together, 1e-5)
-    _close(jnp.array(loop), together, 1e-5)
+    _close(loop, together, 1e-5)
     assert jax.eval_shape(lambda: dist.log_prob(jnp.zeros((5, 1, 1, 3)))).shape == (5, 3, 4)
     assert jax.eval_shape(lambda: dist.condition_time(jnp.zeros((7, 1, 1)))).batch_shape == (7, 3, 4)
 
@@ -401,9 +410,8 @@ def test_batch_shape_is_true_under_vmap():
     assert mapped.batch_shape == (6, 4)
     assert jax.vmap(jax.vmap(make))(jnp.zeros((7, 6, 2)), jnp.zeros((7, 6))).batch_shape == (7, 6)
     x = jax.random.normal(jax.random.key(0), (6, 4, 3))
-    loop = jnp.stack(
-        [LOG_PROB(make(jnp.zeros((4, 2)), m), v) for m, v in zip(jnp.linspace(0.0, 1.0, 6), x, strict=True)]
-    )
+    times = np.linspace(0.0, 1.0, 6, dtype=np.float32)
+    loop = [LOG_PROB(make(jnp.zeros((4, 2)), m), v) for m, v in zip(times, np.asarray(x), strict=True)]
     _close(LOG_PROB(mapped, x), loop, 1e-5)
     inside = []
     jax.vmap(lambda d: inside.append(d.batch_shape))(_batched((3, 4)))
@@ -533,5 +541,5 @@ def test_bad_values_name_the_parameter():
 
 
 def test_values_are_not_looked_at_under_tracing_or_on_request():
-    jax.jit(lambda scale: _dist(time_scale=scale).log_prob(jnp.zeros(3)))(-1.0)
+    jax.eval_shape(lambda scale: _dist(time_scale=scale).log_prob(jnp.zeros(3)), -1.0)
     _dist(time_scale=-1.0, validate_args=False)
