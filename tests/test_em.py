@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components
@@ -69,6 +70,13 @@ def _model(covariance="full", floor=0.0, degree=DEGREE, dtype=np.float64):
     return Model(broadcast_degrees(degree, K), jnp.full(3, floor, dtype), covariance)
 
 
+densities = eqx.filter_jit(components.evaluate_densities)
+
+
+def log_density(params, envelope, x):
+    return special.logsumexp(densities(params, envelope, x).log_density, axis=-1)
+
+
 def _run(points, params, envelope, model, total=N, **options):
     starts = jax.tree.map(lambda z: z[None], params)
     return run_em(starts, points, envelope, model, total=total, **options)[0]
@@ -81,9 +89,7 @@ def _run(points, params, envelope, model, total=N, **options):
 def test_density_matches_mixture(x64, power):
     params, x = _params(), _data()
     mixture = to_mixture(params, NO_SCALING, ENVELOPES[power])
-    density = jax.nn.logsumexp(
-        components.evaluate_densities(params, ENVELOPES[power], jnp.asarray(x)).log_density, axis=-1
-    )
+    density = log_density(params, ENVELOPES[power], jnp.asarray(x))
     np.testing.assert_allclose(density, mixture.log_prob(jnp.asarray(x)), rtol=1e-12)
     again = _from_mixture(mixture, NO_SCALING, DEGREE, np.float64)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), again, params)
@@ -95,8 +101,7 @@ def test_density_in_many_space_dimensions(x64):
     parts = (np.log([0.4, 0.6]), np.zeros(2), np.ones(2), rng.normal(size=(2, 3, 9)), tril)
     params, x = components.Parameters(*map(jnp.asarray, parts)), jnp.asarray(rng.normal(size=(5, 10)))
     mixture = to_mixture(params, Scaling(np.zeros(10), np.ones(10)), Constant())
-    density = jax.nn.logsumexp(components.evaluate_densities(params, Constant(), x).log_density, axis=-1)
-    np.testing.assert_allclose(density, mixture.log_prob(x), rtol=1e-12)
+    np.testing.assert_allclose(log_density(params, Constant(), x), mixture.log_prob(x), rtol=1e-12)
 
 
 def test_gram_is_the_sum_over_pairs(x64):
@@ -104,7 +109,7 @@ def test_gram_is_the_sum_over_pairs(x64):
     params, x, weights = _params(), _data(), np.random.default_rng(2).uniform(0, 2, N)
     summed = eqx.filter_jit(lambda points: accumulate(params, ENVELOPES["1"], points))
     sums = summed(make_points(x, weights, K))
-    pairs = components.evaluate_densities(params, ENVELOPES["1"], jnp.asarray(x))
+    pairs = densities(params, ENVELOPES["1"], jnp.asarray(x))
     log_density = np.asarray(pairs.log_density)
     shares = weights[:, None] * np.exp(log_density - np.logaddexp.reduce(log_density, axis=1)[:, None])
     v = np.asarray(pairs.v)
@@ -125,8 +130,13 @@ def test_newton_gain_matches_profile_derivatives(x64, covariance):
     if covariance != "full":
         params = params._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
     points, envelope = make_points(_data(), np.ones(N), K), ENVELOPES["1"]
-    here = eqx.filter_jit(lambda: accumulate(params, envelope, points, order=2))()
-    steps, promise = newton_step(here, model, DEGREE)
+
+    @jax.jit
+    def propose():
+        here = accumulate(params, envelope, points, order=2)
+        return here, *newton_step(here, model, DEGREE)
+
+    here, steps, promise = propose()
 
     @jax.jit
     def value(share):
@@ -144,7 +154,7 @@ def test_changing_the_reference_equals_recomputing(x64):
     here, there, points = _params(), _params(seed=5), make_points(_data(), np.ones(N), K)
     shares = jnp.asarray(np.random.default_rng(3).dirichlet(np.ones(K), points.x.shape[:3]))
     made = eqx.filter_jit(lambda params: accumulate(params, Constant(), points, responsibilities=shares))
-    mapped = change_reference(made(here), here, there)._replace(log_likelihood=made(there).log_likelihood)
+    mapped = jax.jit(change_reference)(made(here), here, there)._replace(log_likelihood=made(there).log_likelihood)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), mapped, made(there))
 
 
@@ -154,13 +164,12 @@ def test_changing_the_reference_equals_recomputing(x64):
 @pytest.mark.parametrize(
     ("power", "covariance"),
     [
-        ("0", "full"),
         ("1", "full"),
         ("1", "tied"),
         ("2", "full"),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
-            for case in [("0", "tied"), ("0", "diag"), ("1", "diag"), ("1", "spherical"), ("2", "tied")]
+            for case in [("0", "full"), ("0", "tied"), ("0", "diag"), ("1", "diag"), ("1", "spherical"), ("2", "tied")]
         ),
     ],
 )
@@ -207,6 +216,8 @@ def test_vectorized_restarts_equal_single_runs(x64):
         alone = _run(points, start, Constant(), _model(), tol=1e-6, max_steps=60)
         assert run.num_steps == alone.num_steps
         np.testing.assert_allclose(run.history, alone.history, rtol=1e-9)
+        assert run.history[-1] > run.history[0] + 0.1  # it did work, and never fell
+        assert (np.diff(run.history) >= -1e-10 * np.abs(run.history[1:])).all()
         np.testing.assert_allclose(run.params.curve, alone.params.curve, rtol=1e-6, atol=1e-9)
     assert select_best(both).log_likelihood == max(run.log_likelihood for run in both)
 
@@ -222,13 +233,10 @@ def test_custom_envelope_can_be_fitted(x64):
 # --- data that determine nothing ----------------------------------------------------------------------------
 
 
-def test_empty_component_is_reset():
-    params = _params(np.float32)
+def test_empty_component_is_reset(x64):
+    params = _params()
     params = params._replace(time_loc=params.time_loc.at[0].set(1e3))  # out of reach: no mass
-    points, model = (
-        make_points(_data().astype(np.float32), np.ones(N, np.float32), K),
-        _model(dtype=np.float32, floor=1e-6),
-    )
+    points, model = make_points(_data(), np.ones(N), K), _model(floor=1e-6)
     left = _run(points, params, Constant(), model, tol=1e-4, max_steps=30)
     assert np.exp(np.asarray(left.params.log_weights))[0] == 0
     assert left.num_resets == 0
@@ -238,25 +246,25 @@ def test_empty_component_is_reset():
     assert run.log_likelihood > left.log_likelihood
 
 
-def test_nan_is_never_convergence():
-    points = make_points(_data().astype(np.float32), np.ones(N, np.float32), K)
-    params = _params(np.float32)
+def test_nan_is_never_convergence(x64):
+    points = make_points(_data(), np.ones(N), K)
+    params = _params()
     broken = params._replace(curve=params.curve.at[0].set(jnp.nan))
-    run = _run(points, broken, Constant(), _model(dtype=np.float32), tol=1e6, max_steps=30)
+    run = _run(points, broken, Constant(), _model(), tol=1e6, max_steps=30)
     assert run.status == EMStatus.NOT_FINITE
     assert select_best([run, run._replace(status=EMStatus.NOT_CONVERGED, log_likelihood=-1e9)]).log_likelihood == -1e9
 
 
-def test_singular_component_sets_status():
-    x = np.repeat(_data()[:K], 20, axis=0).astype(np.float32)  # three points, many times
-    points = make_points(x, np.ones(len(x), np.float32), K)
-    params = _params(np.float32)
+def test_singular_component_sets_status(x64):
+    x = np.repeat(_data()[:K], 20, axis=0)  # three points, many times
+    points = make_points(x, np.ones(len(x)), K)
+    params = _params()
     apart = params._replace(
         curve=params.curve * 0, time_scale=params.time_scale * 0 + 0.5, time_loc=jnp.asarray(x[::20, 2])
     )
     apart = apart._replace(curve=apart.curve.at[:, 0].set(jnp.asarray(x[::20, :2])))
-    run = _run(points, apart, Constant(), _model(dtype=np.float32), total=len(x), tol=1e-3, max_steps=30)
+    run = _run(points, apart, Constant(), _model(), total=len(x), tol=1e-3, max_steps=30)
     assert run.status == EMStatus.SINGULAR
     assert all(np.isfinite(z).all() for z in run.params)
-    floored = _run(points, apart, Constant(), _model(dtype=np.float32, floor=1e-4), total=len(x), max_steps=30)
+    floored = _run(points, apart, Constant(), _model(floor=1e-4), total=len(x), max_steps=30)
     assert floored.status == EMStatus.CONVERGED

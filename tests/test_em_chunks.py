@@ -193,7 +193,7 @@ def test_initialization_draws_the_same_rows(monkeypatch, ordered):
 
 def test_first_of_equal_runs_is_selected():
     """Up to rounding, which hangs on how points are chunked."""
-    params = _fit(X, max_iter=1)._params
+    params = _fit(_tracks(), max_iter=1)._params
     run = loop.Run(params, 2.0, [2.0], 1, loop.EMStatus.CONVERGED, 0)
     broken = run._replace(status=loop.EMStatus.NOT_FINITE, log_likelihood=9.0)
     lost = broken._replace(log_likelihood=-np.inf)
@@ -431,7 +431,7 @@ def test_invalid_dask_arrays_raise():
 
 
 def test_prediction_checks_chunks():
-    fitted = _fit(X, max_iter=1)
+    fitted = _fit(_tracks(), max_iter=1)
     with pytest.raises(ValueError, match="X, chunk 1: expected 2 columns, got 1"):
         fitted.score([X, X[:, :1]])
     with pytest.raises(ValueError, match="X, chunk 0: expected finite numbers"):
@@ -459,7 +459,7 @@ def test_ragged_chunks_share_one_program(monkeypatch):
     sums = loop.accumulate
     monkeypatch.setattr(loop, "accumulate", lambda *args, **options: traced.append(1) or sums(*args, **options))
     for num, cuts in ((N, CUTS), (N, range(3, N, 7)), (N, ()), (450, (449,))):
-        _fit(np.split(_tracks(num), cuts), n_components=4, max_iter=3)  # a number that no other test compiles
+        _fit(np.split(_tracks(num), cuts), n_init=1, degree=0, max_iter=3)  # a degree that no other test compiles
     assert len(traced) == 1
 
 

@@ -3,16 +3,25 @@
 They run with FOLDGAUSS_SMALL=1, which a cell of each reads; their stored outputs are those of the full size.
 """
 
+import ast
+import functools
+import inspect
 import json
 import os
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import foldgauss
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 SWITCH = 'SMALL = os.environ.get("FOLDGAUSS_SMALL") == "1"'
 #: Size limit of a notebook, since it is part of the repository.
 MOST_BYTES = 1_500_000
+#: It takes a few seconds, and runs by default; of the others by default all names and options are checked.
+QUICK = "03_fit_and_edit"
 
 
 def code_of(notebook) -> list:
@@ -51,9 +60,84 @@ def test_stored_outputs(path):
     assert text_of(notebook["cells"][0]).startswith("# ")
 
 
+# --- what they use exists ---------------------------------------------------------------------------------------
+
+
+def _signature(function: ast.FunctionDef) -> set[str] | None:
+    """The names of its parameters; None where it takes any."""
+    given = function.args
+    names = {argument.arg for argument in (*given.posonlyargs, *given.args, *given.kwonlyargs)}
+    return None if given.kwarg else names
+
+
+@functools.cache
+def _own_definitions() -> tuple[set[str], dict[str, list]]:
+    """All names of functions, classes, fields and variables of the package; and its functions' parameters by name."""
+    names, functions = set(), {}
+    for path in Path(foldgauss.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                functions.setdefault(node.name, []).append(_signature(node))
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.add(node.name)
+            if isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+                names.add(node.id if isinstance(node, ast.Name) else node.attr)
+    return names, functions
+
+
+def _resolve(node, imported: dict):
+    """The object that `name` or `name.attribute` is, where the name is imported; None for all else."""
+    if isinstance(node, ast.Name):
+        return imported.get(node.id)
+    if isinstance(node, ast.Attribute):
+        owner = _resolve(node.value, imported)
+        return owner and getattr(owner, node.attr)  # an AttributeError is what is looked for
+    return None
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_names_and_options_that_they_use_exist(path):
+    """What they import is there, calls of it bind, and attributes and options of methods are known by name."""
+    transformer = pytest.importorskip("IPython.core.inputtransformer2", reason="ipykernel comes with the extra test")
+    axes = pytest.importorskip("matplotlib.axes", reason="matplotlib is an optional extra")
+    cells = code_of(json.loads(path.read_text()))
+    code = "\n".join(transformer.TransformerManager().transform_cell(text_of(cell)) for cell in cells)
+    nodes, imported, foreign = list(ast.walk(ast.parse(code))), {}, {"ax", "axes", "figure", "line", "get_ipython"}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom):
+            for name in node.names:
+                exec(f"from {node.module} import {name.name}", imported)
+        if isinstance(node, ast.Import):
+            foreign |= {name.asname or name.name for name in node.names}
+    own, functions = _own_definitions()
+    others = set().union(*map(dir, (axes.Axes, np.ndarray, np.random.Generator, str, list, dict, Path, os.stat_result)))
+    known = own.union(others, *map(dir, imported.values()))
+    for node in nodes:
+        where = ast.unparse(node) if isinstance(node, ast.Attribute | ast.Call) else ""
+        if not where or re.split(r"\W", where)[0] in foreign:
+            continue
+        if isinstance(node, ast.Attribute):
+            assert node.attr in known, where
+        elif not any(isinstance(argument, ast.Starred) for argument in node.args):
+            options = {keyword.arg for keyword in node.keywords} - {None}
+            target = _resolve(node.func, imported)
+            if target is not None:
+                inspect.signature(target).bind_partial(*node.args, **dict.fromkeys(options))
+            elif isinstance(node.func, ast.Attribute) and node.func.attr not in others:
+                takes = functions.get(node.func.attr, [None])
+                assert any(names is None or options <= names for names in takes), where
+
+
+# --- they run ---------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 # Processor seconds at small size, nearly all of it spent in compiling: 45, 55, 11, 28 and 35.
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=() if path.stem == QUICK else pytest.mark.slow) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_it_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     """Small, in a kernel of its own and an empty folder; every cell shows what its stored output shows."""
     nbformat = pytest.importorskip("nbformat", reason="nbformat comes with the extra test")
