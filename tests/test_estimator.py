@@ -122,6 +122,12 @@ def test_covariances_are_of_their_kind_and_precisions_their_inverses(kind, degre
         fitted.precisions_cholesky_ @ fitted.precisions_cholesky_.swapaxes(1, 2), fitted.precisions_, rtol=1e-9
     )
     np.testing.assert_array_equal(np.tril(fitted.precisions_cholesky_, -1), 0)
+    # Whatever their kind, their sizes are those of the residuals, as far as EM has converged.
+    powers = (fitted.time_means_ - x[:, 1:2])[:, :, None] ** np.arange(1, degree + 1)
+    centres = fitted.locs_ + np.einsum("nkj,kjd->nkd", powers, fitted.fold_coefficients_)
+    squares = ((x[:, None, [0, 2]] - centres) ** 2).sum(-1)
+    sizes = np.trace(fitted.space_covariances_, axis1=1, axis2=2)
+    assert (fitted.predict_proba(x) * squares).sum(1).mean() == pytest.approx(fitted.weights_ @ sizes, rel=0.02)
     given = _quiet(mixture.set_params(means_init=np.stack([x[k::K].mean(0) for k in range(K)])), x).space_covariances_
     is_tied, is_diagonal, is_round = (
         np.allclose(given, z, rtol=1e-9, atol=1e-12)
