@@ -92,7 +92,7 @@ def test_a_few_wide_splats_take_one_round_inside_jit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("capacity", "most"), [(200, 2), pytest.param(64, 4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("capacity", "most"), [(1600, 2), (320, 4)])
 def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
     splats, size = scene("huge")
