@@ -96,7 +96,9 @@ def test_a_port_that_is_taken_is_told(served, work):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_a_signal_ends_it_well(work, number, code):
     command = [sys.executable, "-m", "foldgauss", "view", str(work / "model.safetensors"), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

@@ -37,7 +37,13 @@ def test_splits_keep_groups_whole():
     assert (split(data, 1)[0] != train).any()
 
 
-@pytest.mark.parametrize("name", _density_methods.METHODS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ("KernelDensity", "foldgauss, defaults") else pytest.param(name, marks=pytest.mark.slow)
+        for name in _density_methods.METHODS
+    ],
+)
 def test_every_method_is_a_density(name):
     if name == "flow":
         pytest.importorskip("flowjax", reason="needs the extra bench")
@@ -103,6 +109,7 @@ def test_the_best_is_judged_by_paired_differences():
     assert judged["ours_at_the_fewest_parameters"]
 
 
+@pytest.mark.slow
 def test_the_figure_is_drawn(tmp_path):
     pytest.importorskip("matplotlib", reason="needs the extra plot")
     run(tmp_path / "density.json", "--splits", "1", "--figure", str(tmp_path / "density.png"))

@@ -133,10 +133,10 @@ def _edges(modes):
     return np.r_[edges, np.full(500 - edges.size, edges[-1])]
 
 
-@pytest.mark.parametrize(("power", "floor"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)])
-def test_time_given_space_integrates_to_one(power, floor):
+@pytest.mark.parametrize("dim", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_time_given_space_integrates_to_one(dim):
     nodes, weights = np.polynomial.legendre.leggauss(20)
-    for dim in (1, 2):
+    for power, floor in [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]:
         dist = _dist(dim, power, floor)
         # At s = 1.5 the curve of one space coordinate passes at tau = 6.7 too, in a width of 1e-5.
         s = jnp.concatenate([_points(dist, MANY - 1)[:, :-1], jnp.full((1, dim), 1.5)])
@@ -237,6 +237,7 @@ def test_quantiles_and_samples_of_time():
 # --- time integrated out ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_space_marginal_is_the_law_of_the_samples():
     dist = _dist(2)
     marginal = dist.marginal([0])
@@ -406,6 +407,7 @@ def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):
     np.testing.assert_allclose(joint.cdf(t[..., None]), np.repeat(share, MANY, 1), atol=1e2 * eps)
 
 
+@pytest.mark.slow
 def test_the_other_coordinate_where_time_is_known_to_the_last_digit():
     # Two curves (u^2, u + u^2): given s_1 = 0.09, s_2 is -0.21 or 0.39, half each, though s_2 | t is 1e-17 wide.
     fold = PolynomialFold([[0.0, 1.0], [1.0, 1.0]])

@@ -46,6 +46,10 @@ def _dist(power=1.0, floor=0.0, *, time_loc=0.4, time_scale=0.3, bend=BEND, enve
 def test_divergence_from_itself_is_zero():
     for power, floor in [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.1)]:
         np.testing.assert_allclose(KL(_dist(power, floor), _dist(power, floor)), 0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_divergence_from_the_same_envelope_of_ones_own_is_zero():
     for pair in [(_dist(envelope=OwnLikelihood()), _dist()), (_dist(), _dist(envelope=OwnLikelihood()))]:
         np.testing.assert_allclose(KL(*pair), 0, atol=1e-10)
 
@@ -147,6 +151,7 @@ def test_without_fold_and_envelope_it_is_that_of_gaussians():
     np.testing.assert_allclose(KL(p, q), parts, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_eager_divergence_and_its_gradient():
     # Eager, it knows that no floor is in q, and integrates nothing.
     value, slope = jax.value_and_grad(lambda scale: kl_divergence(_dist(), _dist(0.3, time_scale=scale)))(0.4)

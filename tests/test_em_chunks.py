@@ -160,6 +160,7 @@ def test_columns_are_scaled_by_their_standard_deviation():
     _assert_same(whole, parted)
 
 
+@pytest.mark.slow
 def test_float32_chunks_are_fitted_in_float32():
     x = _tracks(dtype=np.float32)
     whole, parted = _fit(x), _fit(np.split(x, CUTS))

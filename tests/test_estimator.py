@@ -83,7 +83,7 @@ def test_passes_quick_checks(check):
         getattr(estimator_checks, check)("FoldedGaussianMixture", estimator)
 
 
-@pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0)])
+@pytest.mark.parametrize(("kind", "degree"), [("full", 1), pytest.param("diag", 0, marks=pytest.mark.slow)])
 def test_linear_folds_match_scikit_learn(kind, degree):
     """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""
     x = _blobs() + np.array([100.0, -5.0, 3.0])
@@ -215,6 +215,7 @@ def test_partial_fit_approaches_fit():
 # --- recovery -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_crossing_tracks_are_found():
     x, labels = _tracks()
     fitted = FoldedGaussianMixture(K, degree=3, init_params="trajectories", annealing=0.1, random_state=0).fit(x)
@@ -434,6 +435,7 @@ def test_normalized_weights_prune_alike():
     assert kept == shares.degrees_.tolist() == [1]
 
 
+@pytest.mark.slow
 def test_degrees_of_a_constant_column_and_of_exact_data():
     rng = np.random.default_rng(0)
     t = rng.normal(size=300)
@@ -539,6 +541,7 @@ def test_small_batches_have_small_effect():
     assert 0 < moved < 0.5
 
 
+@pytest.mark.slow
 def test_conditions_far_from_zero_use_the_fits_dtype():
     rng = np.random.default_rng(0)
     t = rng.uniform(-400, 400, 400)

@@ -64,7 +64,7 @@ def test_passes_quick_checks(check):
         getattr(estimator_checks, check)("FoldedMixtureRegressor", FoldedMixtureRegressor(1, degree=1))
 
 
-@pytest.mark.parametrize(("degree", "used"), [(1, [0, 1, 2]), (0, [0, 2])])
+@pytest.mark.parametrize(("degree", "used"), [(1, [0, 1, 2]), pytest.param(0, [0, 2], marks=pytest.mark.slow)])
 def test_one_linear_component_is_linear_regression(degree, used):
     """Maximum likelihood of a joint Gaussian is least squares; without a fold, on all features but time."""
     rng = np.random.default_rng(0)
@@ -85,7 +85,13 @@ def test_one_linear_component_is_linear_regression(degree, used):
 
 
 @pytest.mark.parametrize(
-    ("time_column", "options"), [(0, {}), (-1, {"degree": 1, "envelope": "time_likelihood", "time_column": -1})]
+    ("time_column", "options"),
+    [
+        (0, {}),
+        pytest.param(
+            -1, {"degree": 1, "envelope": "time_likelihood", "time_column": -1}, marks=pytest.mark.slow, id="last"
+        ),
+    ],
 )
 def test_predictions_match_integrals_of_the_joint_density(time_column, options):
     X, y = _bent(600)

@@ -454,6 +454,7 @@ def test_sigterm_leaves_what_was_there_and_nothing_unfinished(work, tmp_path, mo
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
 def test_sigterm_from_outside_twice(work, tmp_path):
     """As `timeout` sends it, to a process of its own."""

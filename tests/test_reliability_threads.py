@@ -94,8 +94,9 @@ def _pictures(pallas):
     return [*works, lambda: np.stack(list(VideoRenderer(models[0], (90, 150)).frames()))]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("three_threads")
-@pytest.mark.parametrize("pallas", [False, pytest.param(True, marks=pytest.mark.slow)])  # long to compile
+@pytest.mark.parametrize("pallas", [False, True])
 def test_every_engine_from_many_threads_draws_the_same_bits(pallas):
     works = _pictures(pallas)
     truths = [work() for work in works]
@@ -234,7 +235,8 @@ IN_FLIGHT = """
 """
 
 
-@pytest.mark.parametrize("cores", [1, pytest.param(2, marks=pytest.mark.slow)])  # one alone is the harder case
+@pytest.mark.slow
+@pytest.mark.parametrize("cores", [1, 2])
 def test_frames_in_flight_inside_jit(cores):
     done = run_script(IN_FLIGHT, cores, FOLDGAUSS_NUM_THREADS="3")
     assert done.split() == ["vmap", "map", "scan", "grad", "flying", "threads"]
@@ -287,9 +289,8 @@ MAIN = """
 """
 
 
-@pytest.mark.parametrize(
-    "methods", [["fork", "spawn"], pytest.param(["forkserver"], marks=pytest.mark.slow)], ids="+".join
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("methods", [["fork", "spawn"], ["forkserver"]], ids="+".join)
 def test_workers_that_are_started_before_use_or_spawned_make_the_same(tmp_path, methods):
     """Models, distributions, clips and settings travel to those that are spawned."""
     methods = [method for method in methods if method in multiprocessing.get_all_start_methods()]

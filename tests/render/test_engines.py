@@ -319,7 +319,8 @@ def test_a_second_call_compiles_nothing(caplog):
 
 
 @pytest.mark.parametrize(
-    ("engine", "channels"), [("cpu", 1), ("cpu", 5), ("xla", 5), pytest.param("xla", 1, marks=pytest.mark.slow)]
+    ("engine", "channels"),
+    [("cpu", 1), ("cpu", 5), *(pytest.param("xla", num, marks=pytest.mark.slow) for num in (1, 5))],
 )
 def test_channels(engine, channels):
     splats, size = scene("plain")
@@ -359,7 +360,7 @@ def test_exact_options_match_the_equation(engine, compositing):
     np.testing.assert_allclose(picture, truth, atol=1e-6)  # 60 splats dropped at alpha 1e-8
 
 
-@pytest.mark.parametrize("engine", OTHERS)
+@pytest.mark.parametrize("engine", SLOW_XLA)
 def test_support_radius(engine):
     """Inside the radius nothing changes, outside nothing is drawn."""
     splats = Splats2D(jnp.asarray([[20.5, 20.5]]), 4 * jnp.eye(2)[None], jnp.asarray([0.9]), jnp.ones((1, 3)))
@@ -373,7 +374,7 @@ def test_support_radius(engine):
     assert float(whole[20, 30, 0]) > 1 / 255
 
 
-@pytest.mark.parametrize("engine", OTHERS)
+@pytest.mark.parametrize("engine", SLOW_XLA)
 def test_gradient_at_alpha_one(engine):
     """An opaque splat's centre on a pixel's, no ceiling: what lies behind has no light, but alpha has its gradient."""
     with jax.enable_x64(True):

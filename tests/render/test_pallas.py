@@ -37,9 +37,8 @@ def test_agrees_with_reference(kind, compositing, options):
     check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
 
 
-@pytest.mark.parametrize(
-    "tile", [16, pytest.param(8, marks=pytest.mark.slow), pytest.param(32, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("tile", [8, 16, 32])
 def test_several_rounds_equal_one(tile):
     """What does not fit into the lists at once is drawn later; of many rounds not every start is kept."""
     splats, size = scene("plain")

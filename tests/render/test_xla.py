@@ -34,6 +34,7 @@ def check_same(ones, others, tolerance):
         np.testing.assert_allclose(one / scale, other / scale, atol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "curtain"])
 def test_rounds_and_tiles_change_nothing(kind):
     """With other tiles, and room for a few splats at a time, drawn in many rounds, all is the same."""
@@ -147,6 +148,7 @@ def test_unrolled_chunks(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_splats_on_one_pixel():
     """Against the closed form: n equal alphas leave (1 - alpha)^n of the light."""
     num, alpha = 100_000, 1e-5

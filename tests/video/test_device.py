@@ -123,6 +123,7 @@ def test_step_matches_the_cpu(progress):
     assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
 
 
+@pytest.mark.slow
 def test_step_of_growing_batches_matches_the_cpu():
     """Twice the views of a pass, all rows by momentum, statistics, and rows that are not in use."""
     here, there = compare_steps(GROWING, 0.1, outside=7)
@@ -416,6 +417,7 @@ def stepped(state: FitState) -> FitState:
     return state
 
 
+@pytest.mark.slow
 def test_four_devices_match_one(tmp_path):
     """Frames of a batch are shared out; sums over devices differ by rounding alone."""
     flags = "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0"
