@@ -9,7 +9,7 @@ from sklearn.model_selection import GridSearchCV, GroupKFold
 
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.io import datasets
-from foldgauss.video.fitting.optical_flow import Motion
+from foldgauss.video.motion.optical_flow import Motion
 
 #: s = sum_j c_j t^j, two space coordinates: three curves that cross.
 CURVES = np.array(

@@ -34,18 +34,23 @@ ROOT = Path(__file__).parent.parent
 TIMEOUT = 900
 #: The modules, and the test files of each, those that take the least time first.
 TARGETS = {
-    "distribution": ["test_distribution", "test_distribution_normalisation", "test_distribution_extremes"],
+    "distribution": [
+        "test_distribution",
+        "test_distribution_normalisation",
+        "test_distribution_moments",
+        "test_distribution_extremes",
+    ],
     "analysis/conditional": ["test_distribution_conditional"],
     "envelope": ["test_envelope", "test_distribution"],
     "fold": ["test_fold", "test_distribution"],
-    "mixture": ["test_mixture"],
-    "estimator/em/loop": ["test_em", "test_em_chunks"],
-    "estimator/em/m_step": ["test_em"],
-    "estimator/em/statistics": ["test_em", "test_em_chunks"],
-    "render/_cpu_kernels": ["render/test_cpu", "render/test_weights"],
+    "mixture": ["test_mixture", "test_interop"],
+    "estimator/em/loop": ["test_em", "test_em_chunks", "test_estimator"],
+    "estimator/em/m_step": ["test_em", "test_estimator"],
+    "estimator/em/statistics": ["test_em", "test_em_chunks", "test_estimator"],
+    "render/_cpu_kernels": ["render/test_cpu", "render/test_weights", "render/test_engines"],
     "video/models/conditioning": ["video/test_conditioning"],
     "video/models/frame_times": ["video/test_frame_times"],
-    "video/fitting/adam": ["video/test_adam", "video/test_fit"],
+    "video/fitting/adam": ["video/test_adam", "video/test_fit", "video/test_device"],
     "io/models/compact": ["io/test_compact"],
     "io/models/range_coder": ["io/test_range_coder"],
 }

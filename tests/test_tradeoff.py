@@ -25,8 +25,8 @@ from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, evaluate, tradeoff
 from foldgauss.video.fitting.loop import start, to_model
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
+from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,

@@ -1,6 +1,7 @@
 """Videos as folded splats: the model, its fit, edits and compression. Frames are arrays; `foldgauss.io` reads files.
 
-In reading order: `models` (the model, and rendering it), `fitting` (`fit`), `selection` (`select`), `editing` (`edit`),
+In reading order: `models` (the model, and rendering it), `motion` (optical flow, the camera's path, `stabilize`),
+`fitting` (`fit`), `selection` (`select`), `editing` (`edit`),
 `segmented` (long videos in segments), `compression` (`compress`) and `tradeoff` (speed against accuracy).
 """
 
@@ -27,6 +28,8 @@ from foldgauss.video.models.frame_times import (
 from foldgauss.video.models.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
+from foldgauss.video.motion.stabilization import StabilizedVideo, stabilize
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
 from foldgauss.video.segmented.segmented_selection import SegmentedSelection
@@ -46,6 +49,7 @@ from foldgauss.video.selection.selectors import (
 )
 
 __all__ = [
+    "CameraPath",
     "Clock",
     "Compressed",
     "DivergenceWarning",
@@ -71,6 +75,7 @@ __all__ = [
     "SelectedGaussians",
     "Selection",
     "Span",
+    "StabilizedVideo",
     "VideoModel",
     "by_box",
     "by_click",
@@ -82,6 +87,7 @@ __all__ = [
     "contribution",
     "density_image",
     "edit",
+    "estimate_camera_path",
     "evaluate",
     "fit",
     "fit_steps",
@@ -96,6 +102,7 @@ __all__ = [
     "remapped_positions",
     "select",
     "ssim",
+    "stabilize",
     "start_from",
     "times_at",
 ]

@@ -31,7 +31,7 @@ from foldgauss.io import (
 )
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media import indexed_reader, opencv
-from foldgauss.video.fitting.optical_flow import CutFinder, Motion
+from foldgauss.video.motion.optical_flow import CutFinder, Motion
 
 HEIGHT, WIDTH = 48, 64
 

@@ -28,8 +28,8 @@ from foldgauss.video.compression.search import EXACT_PSNR
 from foldgauss.video.fitting.config import chosen_num_gaussians
 from foldgauss.video.fitting.initialize import CORE, ROUNDS, _even_chance
 from foldgauss.video.fitting.loop import start, to_model
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.models.frame_times import is_cut, make_time_logits, snap_to_shots
+from foldgauss.video.motion.optical_flow import Motion
 
 SIZE = (24, 32)
 

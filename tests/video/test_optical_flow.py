@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.video.fitting import optical_flow as motion
-from foldgauss.video.fitting.optical_flow import LONGEST, RIDGES, WINDOW, Motion, Tracks, _fit_powers, fit_folds
+from foldgauss.video.motion import optical_flow as motion
+from foldgauss.video.motion.optical_flow import LONGEST, RIDGES, WINDOW, Motion, Tracks, _fit_powers, fit_folds
 
 
 def panning(num_frames: int, step: tuple[float, float], height: int = 96, width: int = 160, seed: int = 0):

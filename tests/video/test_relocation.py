@@ -10,7 +10,6 @@ from clips import moving_blobs
 from foldgauss.render import cpu
 from foldgauss.video import Economy, FitConfig, Growth, LearningRates, evaluate, fit, fit_steps
 from foldgauss.video.fitting.loop import start
-from foldgauss.video.fitting.optical_flow import motion_finder
 from foldgauss.video.fitting.pruning.relocation import RELOCATED_AT, measure_influence, relocate
 from foldgauss.video.fitting.schedule import COLD, OVERTIME_FACTOR, RateSchedule, choose_views, steps_per_pass
 from foldgauss.video.fitting.state import frame_times
@@ -19,6 +18,7 @@ from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import OPAQUE_BIT, STATIC_BIT, is_static
 from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
+from foldgauss.video.motion.optical_flow import motion_finder
 
 FRAMES = moving_blobs()
 CONFIG = FitConfig(num_gaussians=300, steps=120)

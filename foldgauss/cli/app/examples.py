@@ -63,6 +63,13 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             ),
             Example("Lossless frames, in a folder", "foldgauss render holiday.safetensors --out frames"),
         ),
+        "stabilize": (
+            Example("As a smooth pan, into holiday.stable.mp4", "foldgauss stabilize holiday.safetensors"),
+            Example(
+                "As from a tripod, borders filled from other frames",
+                "foldgauss stabilize holiday.safetensors --fixed --border fill",
+            ),
+        ),
         "view": (
             Example("Play it in the browser", "foldgauss view holiday.safetensors"),
             Example("Next to the clip", "foldgauss view holiday.safetensors --original holiday.mp4"),

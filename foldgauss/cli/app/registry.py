@@ -19,6 +19,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "fit-many": Command("fitting.fit_many", "Fit a model to each clip of a folder, and list those that fail."),
         "view": Command("viewing.view", "Play a model in the browser, until Ctrl-C."),
         "render": Command("viewing.render", "Render a model as a video, also between its frames."),
+        "stabilize": Command("viewing.stabilize", "Render a model as a steadier camera would show it."),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),
         "info": Command("viewing.info", "Show what a model file contains."),
         "figure": Command("viewing.figure", "Make a labeled figure of images from a model: PNG."),

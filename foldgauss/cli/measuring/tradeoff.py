@@ -43,10 +43,10 @@ from foldgauss.jobs.runner import clip_warnings, fit_metadata, mean_scores
 from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, fit_steps
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
     FLOAT16,

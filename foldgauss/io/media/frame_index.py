@@ -28,7 +28,7 @@ from foldgauss.io.media.image_files import image_paths, read_folder
 from foldgauss.io.media.opencv import GrabbedFrame
 from foldgauss.io.media.video_decoding import DecodeReport, decode_file, describe_span, read_video_file
 from foldgauss.io.media.video_reading import choose_reader
-from foldgauss.video.fitting.optical_flow import CutFinder
+from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
 _FORMAT = 1
@@ -218,7 +218,7 @@ def index_video(
 
     `path` and `fps` as in `read_video`, with the same errors. `frames = (A, B)` restricts the clip to frames
     A <= i < B; the index counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`: search for
-    frames that begin a new shot, as `foldgauss.video.fitting.optical_flow.Motion.find_cuts` does.
+    frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.find_cuts` does.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """

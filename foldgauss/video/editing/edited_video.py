@@ -21,9 +21,9 @@ from foldgauss.video.editing.overlays import (
     pad_rows,
     padded_size,
 )
-from foldgauss.video.editing.rendered_video import RenderedVideo
 from foldgauss.video.models.frame_times import FrameTimes, is_cut, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.rendered_video import RenderedVideo
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 
 

@@ -11,8 +11,8 @@ import scipy
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
-from foldgauss.video.fitting.optical_flow import Motion, fit_folds
 from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
+from foldgauss.video.motion.optical_flow import Motion, fit_folds
 
 #: Logarithm of the ratio of the longer axis of a start on a straight edge to the geometric mean of both; the width, in
 #: pixels, of the window in which edges are measured.

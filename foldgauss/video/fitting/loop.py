@@ -25,7 +25,6 @@ from foldgauss.video.fitting.budget import (
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
-from foldgauss.video.fitting.optical_flow import Motion, motion_finder
 from foldgauss.video.fitting.pruning.relocation import is_relocation_due, relocates
 from foldgauss.video.fitting.state import FitState, envelope_of, mean_psnr, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
@@ -35,6 +34,7 @@ from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.sparse_storage import find_initial_kinds, find_kinds
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 
 class FitInfo(NamedTuple):

@@ -13,8 +13,8 @@ from jaxtyping import Float64
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
-from foldgauss.video.editing.rendered_video import RenderedVideo
 from foldgauss.video.models.frame_times import check_frame_before, times_at
+from foldgauss.video.models.rendered_video import RenderedVideo
 from foldgauss.video.models.renderer import PreparedVideo
 from foldgauss.video.models.video_model import VideoModel, check_time
 

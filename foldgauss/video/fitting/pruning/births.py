@@ -11,11 +11,11 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import cpu
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.initialize import SCALE_FACTOR, draw_positions, find_constant, make_splats, make_static
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.schedule import to_planes
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns, pack
+from foldgauss.video.motion.optical_flow import Motion
 
 #: The size of newborns relative to that of evenly spread Gaussians: errors have finer detail than the present image.
 SMALLER = 0.6

@@ -10,7 +10,6 @@ from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.initialize import START_OPACITY
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares, shuffle_into
 from foldgauss.video.fitting.pruning.description_length import (
     PrunedRows,
@@ -24,6 +23,7 @@ from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, me
 from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import clear_absent_moments, count_parameters, find_initial_kinds
+from foldgauss.video.motion.optical_flow import Motion
 
 #: At most so many Gaussians are born in all, in units of those at the start.
 MAX_BORN = 4

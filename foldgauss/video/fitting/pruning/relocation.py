@@ -12,13 +12,13 @@ from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque, is_static
+from foldgauss.video.motion.optical_flow import Motion
 
 #: The fractions of the plan after which Gaussians are relocated.
 RELOCATED_AT = (0.2, 0.35, 0.5)

@@ -9,7 +9,6 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import update_frame_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.optical_flow import Motion, motion_finder
 from foldgauss.video.fitting.pruning.description_length import weigh_frames
 from foldgauss.video.fitting.pruning.pruner import Pruner
 from foldgauss.video.fitting.pruning.relocation import relocate
@@ -34,6 +33,7 @@ from foldgauss.video.models.conditioning import (
     update_windows,
 )
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 
 class CpuStepper:

@@ -8,11 +8,11 @@ import numpy as np
 from foldgauss._runtime.checks import invalid
 from foldgauss.render import pallas
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.optical_flow import Motion
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.jax_stepper import JaxStepper
 from foldgauss.video.fitting.steppers.protocol import Stepper
+from foldgauss.video.motion.optical_flow import Motion
 
 
 def choose_engine(frames: np.ndarray, config: FitConfig, state: FitState | None = None) -> str:

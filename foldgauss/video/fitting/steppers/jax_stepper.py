@@ -12,7 +12,6 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.optical_flow import Motion, motion_finder
 from foldgauss.video.fitting.pruning.relocation import relocate
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
@@ -33,6 +32,7 @@ from foldgauss.video.fitting.steppers.jax_step import (
 )
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.conditioning import ConditioningSpec
+from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
 #: that is not enough it doubles, and steps are compiled anew.

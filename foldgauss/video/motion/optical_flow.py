@@ -91,7 +91,7 @@ class Motion:
             small[k] = cv2.resize(cv2.GaussianBlur(frames[k], (0, 0), 1.0), kept, interpolation=cv2.INTER_AREA)
 
         def match(k: int) -> None:
-            for way, flow in enumerate(_match_both_ways(gray(k), gray(k + 1), preset)):
+            for way, flow in enumerate(both_flows(gray(k), gray(k + 1), preset)):
                 flows[way, k] = cv2.resize(flow * unit, kept, interpolation=cv2.INTER_AREA)
 
         run_tasks(shrink, range(num))
@@ -154,11 +154,11 @@ class Motion:
         ]
         flow, grid, edge = (
             self._interpolate_flow(pair, k, fraction),
-            _grid(rows, columns),
+            pixel_grid(rows, columns),
             np.float32([columns, rows]) - 0.5,
         )
         origins = grid - np.float32(fraction) * flow, grid + np.float32(1 - fraction) * flow
-        moved = [_warp(image, origin).astype(np.float32) for image, origin in zip(pair, origins, strict=True)]
+        moved = [warp_image(image, origin).astype(np.float32) for image, origin in zip(pair, origins, strict=True)]
         inside = [((origin >= -0.5) & (origin < edge)).all(-1) for origin in origins]
         weight = np.where(inside[0] == inside[1], fraction, inside[1]).astype(np.float32)[..., None]
         return (1 - weight) * moved[0] + weight * moved[1]
@@ -176,14 +176,14 @@ class Motion:
         small = [cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA) for image in pair]
         unit = np.float32([columns / self.size[1], rows / self.size[0]])
         there, back = (cv2.resize(own[k].astype(np.float32), (columns, rows)) * unit for own in (self.there, self.back))
-        grid, past, ahead = _grid(rows, columns), np.float32(fraction), np.float32(1 - fraction)
+        grid, past, ahead = pixel_grid(rows, columns), np.float32(fraction), np.float32(1 - fraction)
         flow = ahead * there - past * back
         for _ in range(FLOW_ITERATIONS):
-            from_there = _warp(there, grid - past * flow, cv2.INTER_LINEAR)
-            from_back = _warp(back, grid + ahead * flow, cv2.INTER_LINEAR)
+            from_there = warp_image(there, grid - past * flow, cv2.INTER_LINEAR)
+            from_back = warp_image(back, grid + ahead * flow, cv2.INTER_LINEAR)
             flow = ahead * from_there - past * from_back
-        met = _warp(small[0], grid - past * flow), _warp(small[1], grid + ahead * flow)
-        there, back = _match_both_ways(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in met))
+        met = warp_image(small[0], grid - past * flow), warp_image(small[1], grid + ahead * flow)
+        there, back = both_flows(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in met))
         flow += ahead * there - past * back
         return cv2.resize(flow, (width, height)) * np.float32([width / columns, height / rows])
 
@@ -247,7 +247,7 @@ def _flow_side(height: int, width: int) -> int:
     return FLOW_SIDE if max(height, width) > FLOW_SIDE else FLOW_SIDE // 2
 
 
-def _match_both_ways(
+def both_flows(
     one: np.ndarray, other: np.ndarray, preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
 ) -> tuple[np.ndarray, np.ndarray]:
     """DIS flow between two gray images (rows, columns): (rows, columns, 2) each, in pixels."""
@@ -255,12 +255,12 @@ def _match_both_ways(
     return search.calc(one, other, None), search.calc(other, one, None)
 
 
-def _grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]:
+def pixel_grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]:
     """(x, y) of every pixel, centers at whole numbers, as in OpenCV."""
     return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
 
 
-def _warp(image, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:
+def warp_image(image, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:
     """The image sampled at `origin`; beyond the border, the nearest pixel of it."""
     return cv2.remap(image, origin, None, order, borderMode=cv2.BORDER_REPLICATE)
 

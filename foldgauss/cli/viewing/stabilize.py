@@ -1,0 +1,89 @@
+"""The command `stabilize`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from foldgauss.cli.app.application import WrongUse, app, err, name_option, out, wrong_use
+from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_color, parse_size
+from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.rendering import progress_bar, render_to_file
+from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io.models.video_model import load_video_model
+from foldgauss.video.motion.camera_path import estimate_camera_path
+from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
+
+
+@app.command("stabilize")
+def stabilize_command(
+    model_path: ModelFile,
+    out_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="FILE.mp4, .webm, .gif or .webp; a folder for images "
+            "[default: the model's name in this folder, .stable.mp4].",
+        ),
+    ] = None,
+    smoothing: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Standard deviation of the filter that smooths the camera's path.")
+    ] = SMOOTHING,
+    fixed: Annotated[
+        bool, typer.Option("--fixed", help="The camera stands still: each shot as its middle frame shows it.")
+    ] = False,
+    border: Annotated[
+        str,
+        typer.Option(
+            help=f"Where frames end: crop (enlarge, at most {MAX_ZOOM:g}x), fill (by other frames), keep (background).",
+            autocompletion=complete_choice(BORDERS),
+        ),
+    ] = "crop",
+    size: Size = None,
+    upsample: Upsample = None,
+    fps: Fps = None,
+    speed: Speed = None,
+    background: Annotated[str, typer.Option(metavar="RRGGBB", help="Background color, as ffffff.")] = "000000",
+    overwrite: Overwrite = False,
+) -> None:
+    """Render a model as a steadier camera would show it."""
+    timeline, image_size, background_color = Timeline(upsample, fps, speed), parse_size(size), parse_color(background)
+    if border not in BORDERS:
+        raise wrong_use("--border", expected="one of " + ", ".join(BORDERS), got=border)
+    if out_path is None:
+        out_path = name_after(model_path, f".stable{VIDEO_SUFFIXES[0]}")
+    check_image_path(out_path)
+    if not out_path.is_dir():
+        refuse_input(out_path, "model", model_path)
+        refuse_existing(out_path, overwrite)
+        check_writable(out_path)
+    model = load_video_model(model_path)
+    refuse_huge(image_size or model.size)
+    shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
+    with progress_bar("Estimating the camera's path", model.num_frames) as advance:
+        path = estimate_camera_path(model, on_frame=advance)
+    if len(path.starts) > 1:
+        err.print(f"{len(path.starts)} shots, each on its own; they begin at frames {_list(path.starts)}.")
+    try:
+        video = stabilize(model, smoothing=smoothing, fixed=fixed, border=border, path=path)
+    except ValueError as error:
+        raise WrongUse(name_option(str(error))) from error
+    if border == "crop":
+        out.print(f"Enlarged by {video.zoom:.2f} to hide the borders.")
+    render_to_file(
+        model=video,
+        path=out_path,
+        times=shown,
+        fps=rate,
+        size=image_size,
+        background=background_color,
+        overwrite=overwrite,
+    )
+
+
+def _list(numbers: tuple[int, ...], most: int = 8) -> str:
+    return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")

@@ -1,0 +1,5 @@
+"""Motion in the image: optical flow, the path of the camera, and videos with a steadier camera.
+
+`optical_flow.Motion` holds the flow of a clip and follows points through it. `camera_path.estimate_camera_path` finds
+how the background moves, and `stabilization.stabilize` renders a video as a steadier camera would show it.
+"""

@@ -1,0 +1,159 @@
+"""The path of the camera: affine maps between the frames of a video, estimated from optical flow."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foldgauss._runtime.checks import invalid, is_within
+from foldgauss.video.models.frame_times import is_cut
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
+
+#: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
+SIDE, SPACING = 480, 6
+#: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
+MISS, MISS_FRACTION = 0.3, 0.05
+#: RANSAC: a point follows the camera within this many pixels; iterations at most.
+INLIER, ITERATIONS = 0.7, 2000
+#: The camera's motion between two frames is unknown where less than this fraction of the points is tracked and agrees.
+#: (Between frames of two clips it was 0.02 at most; in a walk through a room, past people close by, 0.2 at least.)
+LEAST_INLIERS = 0.08
+#: Smoothing reaches so many standard deviations to either side.
+REACH = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraPath:
+    """The motion of the background through the frames of a video, as seen in the image.
+
+    Shapes: `matrices` (num_frames, 3, 3), affine maps of points (x, y, 1) of the first frame of a shot to each frame of
+    it, so that the identity begins each shot; `inliers` (num_frames,), the fraction of the points of a grid that follow
+    the map from the frame before, 1 for the first frame of a shot; `times` (num_frames,) in [0, 1]. A shot begins at
+    each of `starts`: at the first frame, after cuts, and where the motion from the frame before is unknown.
+    Units: model space, where the frame's center is the origin and its longer side has length 1.
+    """
+
+    matrices: Float[np.ndarray, "frames 3 3"]
+    inliers: Float[np.ndarray, " frames"]
+    times: Float[np.ndarray, " frames"]
+    starts: tuple[int, ...] = (0,)
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.times)
+
+    @property
+    def shots(self) -> list[tuple[int, int]]:
+        """The first frame of each shot and the one after its last."""
+        return list(itertools.pairwise([*self.starts, self.num_frames]))
+
+    def between(self, frame: int, other: int) -> Float[np.ndarray, "3 3"]:
+        """The map of points of one frame to another of the same shot."""
+        return self.matrices[other] @ np.linalg.inv(self.matrices[frame])
+
+    def held(self) -> Float[np.ndarray, "frames 3 3"]:
+        """The maps of each frame to the middle frame of its shot: the camera stands still."""
+        maps = np.empty_like(self.matrices)
+        for first, stop in self.shots:
+            for k in range(first, stop):
+                maps[k] = self.between(k, (first + stop - 1) // 2)
+        return maps
+
+    def smoothed(self, frames: float) -> Float[np.ndarray, "frames 3 3"]:
+        """The maps of each frame to where a smoother path would show it.
+
+        The path is convolved with a Gaussian of `frames` standard deviation, and continued beyond the ends of a shot by
+        point reflection, so that a camera at constant speed is left as it is. Raises ValueError unless `frames` > 0.
+        Source: Liu et al. 2013, Bundled Camera Paths (without their mesh).
+        """
+        if not is_within(frames, "(0, inf)"):
+            raise invalid("frames", expected="a number > 0", got=frames)
+        reach = int(np.ceil(REACH * frames))
+        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
+        weights /= weights.sum()
+        maps = np.empty_like(self.matrices)
+        for first, stop in self.shots:
+            path = _extend(self.matrices[first:stop], reach)
+            for k in range(stop - first):
+                near = np.einsum("i,ijk->jk", weights, path[k : k + 2 * reach + 1])
+                maps[first + k] = near @ np.linalg.inv(path[k + reach])
+        return maps
+
+
+def _extend(path: Float[np.ndarray, "frames 3 3"], reach: int) -> Float[np.ndarray, "longer 3 3"]:
+    """The path with `reach` more frames at either end, reflected about the end frames, again and again if need be."""
+    while reach > 0 and len(path) > 1:
+        more = min(reach, len(path) - 1)
+        ahead = [path[-1] @ np.linalg.inv(path[-1 - j]) @ path[-1] for j in range(1, more + 1)]
+        behind = [path[0] @ np.linalg.inv(path[j]) @ path[0] for j in range(more, 0, -1)]
+        path, reach = np.stack([*behind, *path, *ahead]), reach - more
+    return np.concatenate([path[:1].repeat(reach, 0), path, path[-1:].repeat(reach, 0)])
+
+
+def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:
+    """The path of the camera in a video, from the optical flow between its own images at the frame times.
+
+    The camera is what most of the image agrees on: affine maps by RANSAC, so that objects that move on their own and
+    cover less than half of the image have no effect. Where too few points agree, another shot begins. `on_frame` is
+    called after each frame.
+
+    **Example:** `estimate_camera_path(model).smoothed(frames=12)`.
+    **Source:** Kroeger et al. 2016 (DIS flow); Fischler and Bolles 1981 (RANSAC).
+    """
+    height, width = video.size
+    scale = min(1.0, SIDE / max(height, width))
+    size = max(16, round(height * scale)), max(16, round(width * scale))
+    times = np.asarray(video.frame_times.times(), np.float64)
+    cut = np.asarray(is_cut(times))
+    matrices, inliers, starts = np.tile(np.eye(3), (len(times), 1, 1)), np.ones(len(times)), [0]
+    to_model = _pixels_to_model(size)
+    to_pixels = np.linalg.inv(to_model)
+    before = None
+    for k, image in enumerate(VideoRenderer(video, size).frames(times.astype(np.float32))):
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if k:
+            found = None if cut[k - 1] else estimate_affine(before, gray)
+            if found is None:
+                starts.append(k)
+            else:
+                step, inliers[k] = found
+                matrices[k] = to_model @ step @ to_pixels @ matrices[k - 1]
+        before = gray
+        on_frame()
+    return CameraPath(matrices, inliers, times, tuple(starts))
+
+
+def estimate_affine(
+    one: UInt8[np.ndarray, "rows columns"], other: UInt8[np.ndarray, "rows columns"]
+) -> tuple[Float[np.ndarray, "3 3"], float] | None:
+    """The affine map that most points of a gray image follow to the next, in pixels, and their fraction of all points.
+
+    None where it is less than `LEAST_INLIERS`.
+    """
+    there, back = both_flows(one, other)
+    part = slice(SPACING // 2, None, SPACING)
+    points, flow = (map[part, part].reshape(-1, 2) for map in (pixel_grid(*one.shape), there))
+    target = points + flow
+    returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
+    inside = ((target >= 0) & (target <= np.float32(one.shape[::-1]) - 1)).all(1)
+    known = inside & (np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T))
+    if known.sum() < max(3, LEAST_INLIERS * len(points)):
+        return None
+    affine, used = cv2.estimateAffine2D(
+        points[known], target[known], ransacReprojThreshold=INLIER, maxIters=ITERATIONS, confidence=0.9999
+    )
+    inliers = float(used.sum() / len(points))
+    if affine is None or inliers < LEAST_INLIERS or np.linalg.det(affine[:, :2]) <= 0:
+        return None
+    return np.vstack([affine, [0, 0, 1]]), inliers
+
+
+def _pixels_to_model(size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    """The map of OpenCV's pixels, whose centers are whole numbers, to model space."""
+    height, width = size
+    unit = max(size)
+    return np.array([[1, 0, 0.5 - width / 2], [0, 1, 0.5 - height / 2], [0, 0, unit]]) / unit

@@ -1,0 +1,235 @@
+"""Stabilization: a video as a steadier camera would show it."""
+
+import dataclasses
+import itertools
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from foldgauss._runtime.checks import invalid, is_within, short_repr
+from foldgauss.render import RenderOptions, Splats2D, pixels_per_unit
+from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.rendered_video import RenderedVideo
+from foldgauss.video.models.renderer import RenderableVideo
+from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
+
+Affine = Float[np.ndarray, "3 3"]
+Border = Literal["crop", "fill", "keep"]
+BORDERS = ("crop", "fill", "keep")
+#: Standard deviation of the smoothed path, in seconds.
+SMOOTHING = 1.0
+#: Largest zoom of a cropped video.
+MAX_ZOOM = 2.0
+#: Beyond the border frames at these distances are shown, the nearest in front; they begin inside the border by this
+#: fraction of the longer side.
+FILL_DISTANCES, OVERLAP = (1, 2, 4, 8, 16, 32, 64), 0.004
+#: Gaussians farther outside a frame than so many standard deviations are not seen in it, and were never compared with
+#: the clip.
+UNSEEN = 3.0
+
+
+def stabilize(
+    video: RenderableVideo,
+    *,
+    smoothing: float = SMOOTHING,
+    fixed: bool = False,
+    border: Border = "crop",
+    path: CameraPath | None = None,
+) -> "StabilizedVideo":
+    """A video as a steadier camera would show it: its Gaussians move against the motion of the camera.
+
+    `smoothing` is the standard deviation, in seconds, of the Gaussian that smooths the path of the camera; a `fixed`
+    camera shows each shot as its middle frame does. Where frames end inside the image, `border` says what is shown:
+
+    - `"crop"`: the image is enlarged until no border is visible, by at most `MAX_ZOOM`.
+    - `"fill"`: what other frames of the shot show there, the nearest in time in front.
+    - `"keep"`: the background.
+
+    `path` is that of `estimate_camera_path(video)`, which takes a rendering of every frame (default: estimated here).
+
+    Raises ValueError for smoothing that is not above 0, an unknown border, a path of another number of frames, a fixed
+    or smooth camera that a crop by `MAX_ZOOM` does not suffice for, and a filled border with compositing "sum".
+    Example: `stabilize(model, border="fill").render(frame=10)`.
+    """
+    if not is_within(smoothing, "(0, inf)"):
+        raise invalid("smoothing", expected="seconds > 0", got=short_repr(smoothing))
+    if border not in BORDERS:
+        raise invalid("border", expected=f"one of {BORDERS}", got=short_repr(border))
+    if border == "fill" and video.compositing == "sum":
+        cure = "Choose crop or keep: sums of several frames have no order in depth."
+        raise invalid("border", expected='"crop" or "keep" with compositing "sum"', got=border, cure=cure)
+    path = estimate_camera_path(video) if path is None else path
+    if path.num_frames != video.num_frames:
+        raise invalid("path", expected=f"that of {video.num_frames} frames", got=path.num_frames)
+    maps = path.held() if fixed else path.smoothed(smoothing * video.fps)
+    zoom = 1.0
+    if border == "crop":
+        zoom = _find_zoom(maps, video.size)
+        if zoom > MAX_ZOOM:
+            cure = "Fill or keep the borders" + ("." if fixed else ", or smooth less.")
+            raise invalid("border", expected=f"a path that a zoom of {MAX_ZOOM:g} suffices for", got="crop", cure=cure)
+    return StabilizedVideo(video, np.diag([zoom, zoom, 1.0]) @ maps, path, border)
+
+
+@dataclasses.dataclass(frozen=True)
+class StabilizedVideo(RenderedVideo):
+    """A video whose images are moved by one affine map for each frame, `maps` (num_frames, 3, 3) in model space.
+
+    Between frames maps are interpolated linearly. It is rendered as any other video. Made by `stabilize`, which
+    documents `border`.
+    """
+
+    video: RenderableVideo
+    maps: Float[np.ndarray, "frames 3 3"]
+    path: CameraPath
+    border: Border = "keep"
+
+    @property
+    def fill(self) -> bool:
+        """Whether other frames are shown beyond the borders."""
+        return self.border == "fill"
+
+    @property
+    def borders_visible(self) -> bool:
+        """Whether images may end inside the output."""
+        return self.border != "crop"
+
+    @property
+    def frame_times(self) -> FrameTimes:
+        return self.video.frame_times
+
+    @property
+    def num_frames(self) -> int:
+        return self.video.num_frames
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.video.size
+
+    @property
+    def fps(self) -> float:
+        return self.video.fps
+
+    @property
+    def options(self) -> RenderOptions:
+        return self.video.options
+
+    @property
+    def compositing(self) -> str:
+        return self.video.compositing
+
+    @property
+    def zoom(self) -> float:
+        """By how much images are enlarged, on average over the frames."""
+        return float(np.sqrt(np.linalg.det(self.maps[:, :2, :2])).mean())
+
+    def prepare(self, size: tuple[int, int]) -> "PreparedStabilizedVideo":
+        """The video prepared for conditioning on many times, for images of `size`."""
+        return PreparedStabilizedVideo(self, size)
+
+    def map_at(self, t: float) -> Affine:
+        """The map of the image at time t, in model space."""
+        k, fraction = self._position(t)
+        return self.maps[k] if fraction == 0 else (1 - fraction) * self.maps[k] + fraction * self.maps[k + 1]
+
+    def path_at(self, t: float) -> Affine:
+        """The map of points of the first frame of the shot to the image at time t, in model space."""
+        k, fraction = self._position(t)
+        matrices = self.path.matrices
+        return matrices[k] if fraction == 0 else (1 - fraction) * matrices[k] + fraction * matrices[k + 1]
+
+    def nearby_frames(self, t: float) -> list[int]:
+        """Frames of the shot that show what is beyond the borders at time t, the nearest first."""
+        k, fraction = self._position(t)
+        nearest = k + round(fraction)
+        first, stop = next((first, stop) for first, stop in self.path.shots if first <= nearest < stop)
+        found = itertools.chain.from_iterable((nearest + distance, nearest - distance) for distance in FILL_DISTANCES)
+        return [j for j in found if first <= j < stop]
+
+    def _position(self, t: float) -> tuple[int, float]:
+        """The frame before t, and the fraction of the way to the next; between two shots, the nearer frame and 0."""
+        times = self.path.times
+        if len(times) == 1:
+            return 0, 0.0
+        k = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
+        fraction = float(np.clip((t - times[k]) / max(times[k + 1] - times[k], 1e-30), 0, 1))
+        if k + 1 in self.path.starts:
+            return k + round(fraction), 0.0
+        return (k + 1, 0.0) if fraction == 1 else (k, fraction)
+
+
+class PreparedStabilizedVideo:
+    """A stabilized video prepared for images of `size`, see `PreparedVideo`."""
+
+    def __init__(self, video: StabilizedVideo, size: tuple[int, int]):
+        self._video, self._prepared = video, video.video.prepare(size)
+        (own_height, own_width), (height, width) = video.size, size
+        scale = pixels_per_unit(size, aspect=own_height / own_width)
+        self._to_pixels = np.array([[scale, 0, width / 2], [0, scale, height / 2], [0, 0, 1]])
+        self._to_model = np.linalg.inv(self._to_pixels)
+        self._half = np.array([own_width, own_height]) / max(video.size) / 2
+
+    def splats(self, t: float) -> Splats2D:
+        """The splats of time t, front to back; NumPy leaves."""
+        return self._moved(self._prepared.splats(t), t)
+
+    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
+        """See `PreparedVideo`."""
+        return [(weight, self._moved(splats, t)) for weight, splats in self._prepared.weighted_splats(t)]
+
+    def _moved(self, splats: Splats2D, t: float) -> Splats2D:
+        to_output = self._to_pixels @ self._video.map_at(t)
+        if not self._video.borders_visible:
+            return _apply(to_output @ self._to_model, splats)
+        parts = [_apply(to_output, self._seen(splats))]
+        if self._video.fill:
+            parts += self._beyond_borders(t, to_output)
+        leaves = [(part.mean, part.factor, part.opacity, part.color) for part in parts]
+        return Splats2D(*map(np.concatenate, zip(*leaves, strict=True)))
+
+    def _beyond_borders(self, t: float, to_output: Affine) -> list[Splats2D]:
+        """What other frames show where the image at time t, and those in front of them, have ended."""
+        video, parts, in_front = self._video, [], [np.eye(3)]
+        here = np.linalg.inv(video.path_at(t))
+        for j in video.nearby_frames(t):
+            to_frame = video.path.matrices[j] @ here  # from the image at t
+            splats = _apply(np.linalg.inv(to_frame), self._seen(self._prepared.splats(float(video.path.times[j]))))
+            inside = [(np.abs(_move_points(other, splats.mean)) < self._half - OVERLAP).all(1) for other in in_front]
+            parts.append(_apply(to_output, _choose(splats, ~np.any(inside, axis=0))))
+            in_front.append(to_frame)
+        return parts
+
+    def _seen(self, splats: Splats2D) -> Splats2D:
+        """The splats of a frame that are seen in it, in model space."""
+        splats = _apply(self._to_model, splats)
+        reach = UNSEEN * np.linalg.norm(splats.factor, axis=(1, 2))
+        return _choose(splats, (np.abs(splats.mean) < self._half + reach[:, None]).all(1))
+
+
+def _choose(splats: Splats2D, which: Bool[np.ndarray, " num"]) -> Splats2D:
+    leaves = splats.mean, splats.factor, splats.opacity, splats.color
+    return Splats2D(*(np.asarray(leaf)[which] for leaf in leaves))
+
+
+def _apply(affine: Affine, splats: Splats2D) -> Splats2D:
+    linear = np.float32(affine[:2, :2])
+    return Splats2D(np.float32(_move_points(affine, splats.mean)), linear @ splats.factor, splats.opacity, splats.color)
+
+
+def _move_points(affine: Affine, points: Float[np.ndarray, "num 2"]) -> Float[np.ndarray, "num 2"]:
+    return points @ affine[:2, :2].T + affine[:2, 2]
+
+
+def _find_zoom(maps: Float[np.ndarray, "frames 3 3"], size: tuple[int, int]) -> float:
+    """The least zoom, to 0.1%, with which every moved image covers the output; just over `MAX_ZOOM` if none does."""
+    half = np.array([size[1], size[0]]) / max(size) / 2
+    corners = np.array(list(itertools.product([-1, 1], [-1, 1]))) * half
+    zooms = 1.001 ** np.arange(np.ceil(np.log(MAX_ZOOM) / np.log(1.001)) + 2)
+
+    def covers(zoom: float) -> bool:
+        inverse = np.linalg.inv(maps)
+        seen = np.einsum("nij,cj->nci", inverse[:, :2, :2], corners / zoom) + inverse[:, None, :2, 2]
+        return bool((np.abs(seen) <= half + 1e-9).all())
+
+    return float(next((zoom for zoom in zooms if covers(zoom)), zooms[-1]))

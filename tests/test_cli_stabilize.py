@@ -1,0 +1,60 @@
+"""`foldgauss stabilize`."""
+
+import numpy as np
+import pytest
+from commands import run
+from tiny_clips import NUM_FRAMES, model_of_12
+
+from foldgauss.io import read_video, save_video_model
+from foldgauss.video import FitConfig, fit
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("stabilize") / "m.safetensors"
+    save_video_model(path, model_of_12())
+    return path
+
+
+def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
+    """Objects move in this clip, the camera does not."""
+    images = tmp_path / "images"
+    assert run("stabilize", model, "--out", images, "--border", "keep", "--upsample", "2") == 0
+    assert "23 frames" in capsys.readouterr().out
+    assert read_video(images).frames.shape == (2 * NUM_FRAMES - 1, 40, 64, 3)
+
+
+def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("stabilize", model, "--fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5") == 0
+    assert read_video(tmp_path / "m.stable.mp4").frames.shape[1:] == (80, 128, 3)
+    assert "12.5 frames per second" in capsys.readouterr().out
+    assert run("stabilize", model) == 2  # exists
+    assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
+    assert run("stabilize", model, "--overwrite", "--smoothing", "0.2") == 0
+    assert "Enlarged by 1.0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--border", "blur"], "--border: expected one of crop, fill, keep, got blur"),
+        (["--smoothing", "0"], "--smoothing: expected seconds > 0, got 0.0"),
+        (["--out", "x.png"], "--out: expected"),
+        (["--size", "0x3"], "--size: expected HxW"),
+    ],
+)
+def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert run("stabilize", model, *options) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_shots_are_named(tmp_path, capsys):
+    """Each frame another picture: no motion is known."""
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (3, 40, 64, 3), np.uint8)
+    save_video_model(tmp_path / "m.safetensors", fit(frames, FitConfig(num_gaussians=200, steps=20), fps=5.0).model)
+    assert run("stabilize", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
+    assert "shots, each on its own; they begin at frames 0, " in capsys.readouterr().err
