@@ -322,7 +322,19 @@ def test_commands_are_listed_as_one_comes_to_need_them(capsys):
     assert run("--help") == 0
     lines = capsys.readouterr().out.partition("─ Commands ")[2].partition("╰")[0].splitlines()[1:]
     named = [found[1] for line in lines if (found := re.match("│ ([a-z-]+) ", line))]
-    expected = ["fit", "fit-many", "view", "render", "evaluate", "info", "figure", "uncertainty", "segment", "edit"]
+    expected = [
+        "fit",
+        "fit-many",
+        "view",
+        "render",
+        "stabilize",
+        "evaluate",
+        "info",
+        "figure",
+        "uncertainty",
+        "segment",
+        "edit",
+    ]
     expected += ["compress", "tradeoff", "export", "import", "doctor", "demo"]
     assert named == expected
     assert not any("..." in line for line in lines)  # none is cut

@@ -83,7 +83,7 @@ def test_passes_quick_checks(check):
         getattr(estimator_checks, check)("FoldedGaussianMixture", estimator)
 
 
-@pytest.mark.parametrize(("kind", "degree"), [("full", 1), pytest.param("diag", 0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0)])
 def test_linear_folds_match_scikit_learn(kind, degree):
     """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""
     x = _blobs() + np.array([100.0, -5.0, 3.0])
