@@ -30,7 +30,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             ),
             Example("A small file", "foldgauss fit holiday.mp4 --economy --max-size-mb 2"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
-            Example("For slow motion", "foldgauss fit holiday.mp4 --interpolation-fraction 0.5"),
+            Example("For slow motion", "foldgauss fit holiday.mp4 --interpolation-fraction 0.3"),
             Example(
                 "A long clip, in segments of 10 seconds, with four processes", "foldgauss fit film.mp4 --workers 4"
             ),
