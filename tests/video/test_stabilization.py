@@ -15,6 +15,7 @@ from foldgauss.video import (
     SegmentedVideo,
     StabilizedVideo,
     VideoModel,
+    edit,
     estimate_camera_path,
     psnr,
     stabilize,
@@ -253,5 +254,11 @@ def test_mistakes_are_told():
             stabilize(model, **{"path": path} | options)
     with pytest.raises(ValueError, match=r'border: expected "crop" or "keep" with compositing "sum"'):
         stabilize(scene(compositing="sum"), border="fill", path=path)
+    with pytest.raises(ValueError, match="video: expected a VideoModel, .* got str"):
+        stabilize("model.safetensors")
+    steady = stabilize(model, border="keep", path=path)
+    assert steady._repr_html_() is None
+    with pytest.raises(ValueError, match="Edit first, and stabilize the edited video"):
+        edit(steady)
     with pytest.raises(ValueError, match="frames: expected a number > 0"):
         path.smoothed(-1)

@@ -168,6 +168,8 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
             cure = "Read a file with foldgauss.io.load_video_model(path)."
         elif type(video).__name__ == "SegmentedVideo":
             cure = ONE_SEGMENT
+        elif type(video).__name__ == "StabilizedVideo":
+            cure = "Edit first, and stabilize the edited video."
         raise invalid("video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cure)
     return EditedVideo((Layer(video),), timeline=0)
 

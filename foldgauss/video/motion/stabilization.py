@@ -48,10 +48,16 @@ def stabilize(
 
     `path` is that of `estimate_camera_path(video)`, which takes a rendering of every frame (default: estimated here).
 
-    Raises ValueError for smoothing that is not above 0, an unknown border, a path of another number of frames, a fixed
+    Raises ValueError for anything but a video, smoothing that is not above 0, an unknown border, a path of another number of frames, a fixed
     or smooth camera that a crop by `MAX_ZOOM` does not suffice for, and a filled border with compositing "sum".
     Example: `stabilize(model, border="fill").render(frame=10)`.
     """
+    if not hasattr(video, "prepare"):
+        expected, cure = (
+            "a VideoModel, EditedVideo or SegmentedVideo",
+            "Load one by foldgauss.io.load_video_model(path).",
+        )
+        raise invalid("video", expected=expected, got=type(video).__name__, cure=cure)
     if not is_within(smoothing, "(0, inf)"):
         raise invalid("smoothing", expected="seconds > 0", got=short_repr(smoothing))
     if border not in BORDERS:
@@ -123,6 +129,9 @@ class StabilizedVideo(RenderedVideo):
     def zoom(self) -> float:
         """By how much images are enlarged, on average over the frames."""
         return float(np.sqrt(np.linalg.det(self.maps[:, :2, :2])).mean())
+
+    def _repr_html_(self) -> None:
+        """None: the player's page has no moving camera."""
 
     def prepare(self, size: tuple[int, int]) -> "PreparedStabilizedVideo":
         """The video prepared for conditioning on many times, for images of `size`."""
