@@ -254,7 +254,7 @@ def test_mistakes_are_told():
             stabilize(model, **{"path": path} | options)
     with pytest.raises(ValueError, match=r'border: expected "crop" or "keep" with compositing "sum"'):
         stabilize(scene(compositing="sum"), border="fill", path=path)
-    with pytest.raises(ValueError, match="video: expected a VideoModel, .* got str"):
+    with pytest.raises(ValueError, match="video: expected a model or another video of it, got str"):
         stabilize("model.safetensors")
     steady = stabilize(model, border="keep", path=path)
     assert steady._repr_html_() is None

@@ -48,16 +48,13 @@ def stabilize(
 
     `path` is that of `estimate_camera_path(video)`, which takes a rendering of every frame (default: estimated here).
 
-    Raises ValueError for anything but a video, smoothing that is not above 0, an unknown border, a path of another number of frames, a fixed
-    or smooth camera that a crop by `MAX_ZOOM` does not suffice for, and a filled border with compositing "sum".
+    Raises ValueError for anything but a video, smoothing that is not above 0, an unknown border, a path of another
+    number of frames, a path that a crop by `MAX_ZOOM` does not suffice for, and a filled border with compositing "sum".
     Example: `stabilize(model, border="fill").render(frame=10)`.
     """
     if not hasattr(video, "prepare"):
-        expected, cure = (
-            "a VideoModel, EditedVideo or SegmentedVideo",
-            "Load one by foldgauss.io.load_video_model(path).",
-        )
-        raise invalid("video", expected=expected, got=type(video).__name__, cure=cure)
+        cure = "Load one by foldgauss.io.load_video_model(path)."
+        raise invalid("video", expected="a model or another video of it", got=type(video).__name__, cure=cure)
     if not is_within(smoothing, "(0, inf)"):
         raise invalid("smoothing", expected="seconds > 0", got=short_repr(smoothing))
     if border not in BORDERS:
