@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Lock
 from typing import NamedTuple
 
 from benchmarks import _common
@@ -30,6 +31,8 @@ from benchmarks._common import console
 from benchmarks._runs import Run, Runs
 
 ROOT = Path(__file__).parent.parent
+#: CPython 3.11's parser counts its recursion wrongly where several threads parse at once.
+_PARSING = Lock()
 #: Seconds that the tests of a mutant may take.
 TIMEOUT = 900
 #: The modules, and the test files of each, those that take the least time first.
@@ -156,7 +159,8 @@ def find_mutants(module: str) -> list[Mutant]:
 
 def mutate(source: str, index: int) -> str:
     """The source with its `index`-th place changed; comments are lost."""
-    return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
+    with _PARSING:
+        return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
 
 
 def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:

@@ -8,12 +8,12 @@ import pytest
 from scipy import special
 
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
-from foldgauss.estimator.em import components
+from foldgauss.estimator.em import components, loop
 from foldgauss.estimator.em.loop import EMStatus, broadcast_degrees, run_em, select_best
 from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
 from foldgauss.estimator.em.online import change_reference
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
-from foldgauss.estimator.em.statistics import Times, accumulate, make_points, step_times
+from foldgauss.estimator.em.statistics import Times, _divide_by_a, accumulate, make_points, step_times
 
 K, N, DEGREE = 3, 200, 2
 NO_SCALING = Scaling(np.zeros(3), np.ones(3))
@@ -121,8 +121,42 @@ def test_gram_is_the_sum_over_pairs(x64):
     np.testing.assert_allclose(split.gram, sums.gram, rtol=1e-10, atol=1e-9)
 
 
+def test_mass_divided_by_a_and_its_derivatives(x64):
+    """Against JAX's own derivatives of mass / a, with log a quadratic in the steps."""
+    linear, square = jnp.array([0.3, -0.7]), jnp.array([[0.4, 0.25], [0.25, -0.6]])
+
+    def log_a(steps):
+        return 0.2 + linear @ steps + 0.5 * steps @ square @ steps
+
+    zero, mass = jnp.zeros(2), jnp.array([[0.8]])
+    terms = [log_a(zero), *linear, square[0, 0], square[0, 1], square[1, 1]]
+    found = _divide_by_a(mass, [jnp.reshape(term, (1, 1)) for term in terms])
+    value = lambda steps: mass[0, 0] * jnp.exp(-log_a(steps))  # noqa: E731
+    hessian = jax.hessian(value)(zero)
+    expected = [value(zero), *jax.grad(value)(zero), hessian[0, 0], hessian[0, 1], hessian[1, 1]]
+    np.testing.assert_allclose(np.ravel(found), expected, rtol=1e-12)
+
+
+def test_jitter_has_its_size_and_changes_with_every_step(x64):
+    """It moves centers alone, by `_JITTER` standard deviations of the component, and differently at each step."""
+    params = _params()
+    state = loop.State(jax.tree.map(lambda z: z[None], params), jnp.ones((1, K)))
+    shifts = [loop._jitter(state, number).params.curve[0] - params.curve for number in (1, 2)]
+    for shift in shifts:
+        np.testing.assert_array_equal(shift[:, 1:], 0)
+        whitened = jnp.linalg.solve(params.tril, shift[:, 0, :, None])
+        assert 0.2 * loop._JITTER < np.abs(whitened).max() < 4 * loop._JITTER
+    assert (shifts[0][:, 0] != shifts[1][:, 0]).all()
+
+
+def test_last_finite_of_a_history_without_one_is_minus_infinity():
+    assert loop._last_finite([1.0, 2.0, np.nan]) == 2.0
+    assert loop._last_finite([np.nan, np.inf]) == -np.inf
+
+
 @pytest.mark.parametrize(
-    "covariance", ["full", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("diag", "spherical", "tied"))]
+    "covariance",
+    ["full", "diag", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("spherical", "tied"))],
 )
 def test_newton_gain_matches_profile_derivatives(x64, covariance):
     """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
