@@ -14,6 +14,7 @@ from foldgauss.io._atomic import check_path
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, FrameRate
 
+MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
 Range = tuple[int | None, int | None]
 PathLike = str | os.PathLike
 #: (prepared frames, frames declared within the range, frame rate, notes)
@@ -152,6 +153,17 @@ def check_frame_size(size: tuple[int, int] | None, parameter: str = "size") -> t
 def check_fps(fps: float) -> None:
     if not is_within(fps, f"(0, {MAX_FPS}]"):
         raise video_error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+
+
+def check_num_pixels(path: Path, size: tuple[int, int] | None) -> None:
+    """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise video_error(
+            "path",
+            expected=f"images of at most {MAX_PIXELS:,} pixels",
+            got=f"{size[0]}x{size[1]} (height x width) in the header of {str(path)!r}",
+            cure="The file is damaged, or must be scaled down first.",
+        )
 
 
 def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:

@@ -25,13 +25,12 @@ from foldgauss.io.media.clip import (
 )
 from foldgauss.io.media.frame_rate import describe_rate, make_increasing
 from foldgauss.io.media.image_files import image_paths, read_folder
-from foldgauss.io.media.opencv import GrabbedFrame
-from foldgauss.io.media.video_decoding import DecodeReport, decode_file, describe_span, read_video_file
+from foldgauss.io.media.video_decoding import DecodeReport, FramePlace, decode_file, describe_span, read_video_file
 from foldgauss.io.media.video_reading import choose_reader
 from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
-_FORMAT = 1
+_FORMAT = 2
 #: What NumPy raises for other files, and our own checks for other arrays.
 _LOAD_ERRORS = (
     OSError,
@@ -60,25 +59,26 @@ class FrameIndex:
     """
 
     # Beyond these, for the reader: `path`, absolute; `start`, the first frame of the range in the file; of all frames
-    # grabbed from the file's first on `milliseconds` and `places`; of those indexed `digests` and `transparent`.
+    # decoded from the file's first on `stamps` and `places`; of those indexed `digests` and `transparent`.
 
     def __init__(
         self,
         about: dict,
-        milliseconds: np.ndarray,
+        stamps: np.ndarray,
         places: np.ndarray,
         digests: np.ndarray,
         transparent: np.ndarray,
         times: np.ndarray | None,
     ):
         self._about = about
-        self.milliseconds, self.places, self.digests, self.transparent = milliseconds, places, digests, transparent
+        self.stamps, self.places, self.digests, self.transparent = stamps, places, digests, transparent
         self.times = times
         self.source: str = about["source"]
         self.path = Path(about["path"])
         self.kind: str = about["kind"]
         self.start: int = about["start"]
         self.names: list[str] = about["names"]
+        self.deinterlace: bool = about["deinterlace"]
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
         self.size: tuple[int, int] = tuple(about["size"])
@@ -87,10 +87,10 @@ class FrameIndex:
         self.cuts: list[int] = list(about["cuts"])
         self.num_frames = len(digests)
         self.has_alpha = bool(transparent.any())
-        self.num_before = len(places) - len(digests)  # frames grabbed before the first one indexed
+        self.num_before = len(places) - len(digests)  # frames decoded before the first one indexed
         self.positions = places[self.num_before :] - self.start
         self.alpha_at_size: dict[tuple[int, int], bool] = {}  # found by the reader
-        self.last_margin = 0  # a place in `indexed_reader.MARGINS`: the one of the last seek
+        self.last_margin = 1  # of the reader's last seek, in frames
 
     def __repr__(self) -> str:
         height, width = self.size
@@ -110,8 +110,9 @@ class FrameIndex:
     @cached_property
     def report(self) -> DecodeReport:
         about = self._about
-        seconds = make_increasing(self.milliseconds.tolist(), about["rate"])
-        return DecodeReport(about["rate"], about["num_total"], tuple(about["shape_notes"]), seconds, about["threads"])
+        time_base, notes = about["time_base"], tuple(about["shape_notes"])
+        seconds = make_increasing((self.stamps * time_base).tolist(), about["rate"])
+        return DecodeReport(about["rate"], about["num_total"], notes, seconds, time_base, about["threads"])
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
@@ -136,7 +137,7 @@ class FrameIndex:
         path = check_path(path)
         arrays = {
             "about": np.frombuffer(json.dumps({"format": _FORMAT, **self._about}).encode(), np.uint8),
-            "milliseconds": self.milliseconds,
+            "stamps": self.stamps,
             "places": self.places,
             "digests": self.digests,
             "transparent": self.transparent,
@@ -172,9 +173,9 @@ class FrameIndex:
 
 
 def _check_shapes(arrays: dict[str, np.ndarray]) -> None:
-    num, num_grabbed = len(arrays["transparent"]), len(arrays["places"])
-    shapes = arrays["digests"].shape, arrays["milliseconds"].shape
-    if not 0 < num <= num_grabbed or shapes != ((num, DIGEST_BYTES), (num_grabbed,)):
+    num, num_passed = len(arrays["transparent"]), len(arrays["places"])
+    shapes = arrays["digests"].shape, arrays["stamps"].shape
+    if not 0 < num <= num_passed or shapes != ((num, DIGEST_BYTES), (num_passed,)):
         raise ValueError("shapes")
 
 
@@ -213,10 +214,11 @@ def index_video(
     fps: float | None = None,
     on_frame: Callable[[], object] = lambda: None,
     find_cuts: bool = True,
+    deinterlace: bool = False,
 ) -> FrameIndex:
     """Decode a clip once, frame by frame, and return its index. Memory: a few frames, and some 100 bytes per frame.
 
-    `path` and `fps` as in `read_video`, with the same errors. `frames = (A, B)` restricts the clip to frames
+    `path`, `fps` and `deinterlace` as in `read_video`, with the same errors. `frames = (A, B)` restricts the clip to
     A <= i < B; the index counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`: search for
     frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.find_cuts` does.
 
@@ -226,19 +228,21 @@ def index_video(
     start, stop = check_range(frames)
     if fps is not None:
         check_fps(fps)
-    record, grabbed, report, names = _FrameRecorder(find_cuts, on_frame), None, None, []
+    record, report, names = _FrameRecorder(find_cuts, on_frame), None, []
     with translate_os_errors(path):
         reader = choose_reader(path)
         if reader is read_video_file:
-            kept, grabbed, report = decode_file(path, start, stop, lambda decoded: list(map(record, decoded)))
+            kept, passed, report = decode_file(
+                path, start, stop, lambda decoded: list(map(record, decoded)), deinterlace=deinterlace
+            )
         else:
             kept, num_declared, rate, notes = reader(path, start, stop, record)
-            grabbed = [GrabbedFrame(start + k, 0.0) for k in range(len(kept))]
+            passed = [FramePlace(start + k, 0) for k in range(len(kept))]
             if reader is read_folder:
                 names = [entry.name for entry in image_paths(path)[start:stop]]
-    milliseconds, places = np.array([one.milliseconds for one in grabbed]), np.array([one.position for one in grabbed])
+    places, stamps = np.array(passed, np.int64).T.copy()
     if report is not None:
-        num_declared, rate, notes = describe_span(report, milliseconds, places.tolist(), len(kept), start, stop)
+        num_declared, rate, notes = describe_span(report, stamps, places.tolist(), len(kept), start, stop)
     if fps is None:
         notes += describe_rate(rate)
     about = {
@@ -255,9 +259,11 @@ def index_video(
         "names": names,
         "rate": float(report.fps if report else rate.fps),
         "num_total": int(report.num_total) if report else 0,
-        "threads": max(report.threads, 0) if report else 0,
+        "time_base": report.time_base if report else 0.0,
+        "threads": report.threads if report else 0,
+        "deinterlace": bool(deinterlace),
         "shape_notes": list(report.notes) if report else [],
     }
     digests = np.frombuffer(bytes(record.digests), np.uint8).reshape(-1, DIGEST_BYTES)
     transparent = np.frombuffer(bytes(record.transparent), np.uint8).astype(bool)
-    return FrameIndex(about, milliseconds, places, digests, transparent, rate.times if fps is None else None)
+    return FrameIndex(about, stamps, places, digests, transparent, rate.times if fps is None else None)

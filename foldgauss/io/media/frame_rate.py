@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container without a usable rate
-MAX_FPS = 1000.0  # time stamps of containers are milliseconds
+MAX_FPS = 1000.0  # time stamps of many containers are milliseconds
 #: Fraction of a frame interval. Times that deviate less from an even grid count as even: time stamps are rounded, in a
 #: GIF to 10 ms.
 OFF_GRID = 1 / 3
@@ -57,12 +57,11 @@ def describe_rate(rate: FrameRate) -> tuple[str, ...]:
     )
 
 
-def make_increasing(milliseconds: list[float], fps: float) -> Float[np.ndarray, " num_frames"]:
+def make_increasing(stamps: list[float], fps: float) -> Float[np.ndarray, " num_frames"]:
     """Strictly increasing times in seconds: stamps that repeat or decrease, as in raw streams, continue at `fps`."""
     seconds: list[float] = []
-    for value in milliseconds:
-        valid = np.isfinite(value) and (not seconds or value / 1000 > seconds[-1])
-        seconds.append(value / 1000 if valid else seconds[-1] + 1 / fps if seconds else 0.0)
+    for value in stamps:
+        seconds.append(value if not seconds or value > seconds[-1] else seconds[-1] + 1 / fps)
     return np.array(seconds)
 
 

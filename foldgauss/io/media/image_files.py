@@ -4,7 +4,8 @@ import mmap
 import re
 import struct
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count, islice
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from PIL import Image
 from foldgauss.io.media.clip import (
     ReadResult,
     VideoError,
+    check_num_pixels,
     check_range_within,
     format_num_bytes,
     format_size,
@@ -24,10 +26,12 @@ from foldgauss.io.media.clip import (
 )
 from foldgauss.io.media.format_detection import is_image_format, min_file_bytes, parse_image_size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, estimate_rate, replace_unusable_rate
-from foldgauss.io.media.opencv import MAX_LOST_FRAMES, check_num_pixels, silence_opencv
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 GIF_DELAY = 100.0  # milliseconds for which browsers show a frame that has no duration of its own
+MAX_FRAMES = 1_000_000  # of an animation
+#: OpenCV's LOG_LEVEL_SILENT, which has no name up to OpenCV 4.
+_LOG_LEVEL_SILENT = 0
 #: What Pillow raises for damaged files.
 _PILLOW_ERRORS = (
     EOFError,
@@ -39,6 +43,18 @@ _PILLOW_ERRORS = (
     struct.error,
     Image.DecompressionBombError,
 )
+
+
+@contextmanager
+def silence_opencv() -> Iterator[None]:
+    """Silence OpenCV's log; the level is per process, so it is restored."""
+    logging = getattr(cv2.utils, "logging", cv2)  # cv2 itself: up to OpenCV 4
+    level = logging.getLogLevel()
+    logging.setLogLevel(_LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(level)
 
 
 # ---------------------------------------------------------------------------------------------- folders
@@ -156,11 +172,11 @@ def read_image(path: Path) -> np.ndarray:
             cure="Convert it to an 8-bit PNG.",
         )
     if image.ndim == 3 and image.shape[2] == 4:
-        return _premultiply(image)
+        return premultiply(image)
     return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
 
 
-def _premultiply(image: np.ndarray) -> np.ndarray:
+def premultiply(image: np.ndarray) -> np.ndarray:
     """Colors times alpha, to nearest, so that the colors of transparent pixels have no effect."""
     alpha = image[..., 3:].astype(np.uint16)
     return np.concatenate([((image[..., :3] * alpha + 127) // 255).astype(np.uint8), image[..., 3:]], axis=-1)
@@ -194,7 +210,7 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
             if animation.format != "GIF" and not getattr(animation, "is_animated", False):
                 return read_image_file(path, start, stop, prepare)
             num_declared = _count_declared_images(animation)
-            for number in islice(count(), min(num_declared or MAX_LOST_FRAMES, stop or MAX_LOST_FRAMES)):
+            for number in islice(count(), min(num_declared or MAX_FRAMES, stop or MAX_FRAMES)):
                 animation.seek(number)
                 animation.load()
                 size = size or animation.size
@@ -204,7 +220,7 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
                 delays.append(animation.info.get("duration") or GIF_DELAY)
                 if number >= start:
                     rgba = np.asarray(animation.convert("RGBA"))
-                    kept.append(prepare(_premultiply(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))))
+                    kept.append(prepare(premultiply(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))))
     except VideoError:
         raise
     except _PILLOW_ERRORS:

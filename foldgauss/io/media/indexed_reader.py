@@ -3,7 +3,6 @@
 import operator
 from collections.abc import Callable, Iterator
 
-import cv2
 import numpy as np
 
 from foldgauss.io.media.clip import (
@@ -17,10 +16,10 @@ from foldgauss.io.media.clip import (
     translate_os_errors,
     video_error,
 )
+from foldgauss.io.media.decoder import DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_index import FrameIndex, digest_frame
 from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import read_images
-from foldgauss.io.media.opencv import GrabbedFrame, decode_frames, grab_frames, open_video, silence_opencv
 from foldgauss.io.media.resizing import convert_channels, make_resizer
 from foldgauss.io.media.video_decoding import describe_span
 from foldgauss.io.media.video_reading import choose_reader
@@ -30,9 +29,6 @@ from foldgauss.io.media.video_reading import choose_reader
 MARGINS = (1, 16, 64, 256, 1024, 4096, 16384)
 #: Distance in frames up to which an open decoder reads on instead of seeking.
 NEAR = 64
-#: Milliseconds within which two time stamps are equal.
-SAME_TIME = 1e-3
-_FROM_START, _FROM_START_DECODING_ALL = "from the start", "from the start, decoding every frame"
 
 
 def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple[int, int] | None = None) -> Clip:
@@ -62,10 +58,8 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
     if index.kind == "video":
         last = index.num_before + high
         end = index.start + (index.num_declared if stop is None else stop)
-        milliseconds, places = index.milliseconds[:last], index.places[:last].tolist()
-        num_declared, rate, notes = describe_span(
-            index.report, milliseconds, places, high - low, index.start + first, end
-        )
+        stamps, places = index.stamps[:last], index.places[:last].tolist()
+        num_declared, rate, notes = describe_span(index.report, stamps, places, high - low, index.start + first, end)
     elif stop is None:
         num_declared = index.num_declared - first
     if index.fixed_fps is not None:
@@ -91,14 +85,14 @@ class IndexedReader:
 
     def __init__(self, index: FrameIndex):
         self.index = index
-        self._capture: cv2.VideoCapture | None = None
-        self._last: int | None = None  # number of the frame grabbed last, among all frames of the file
-        self._next = 0  # number of the next wanted frame, among those indexed
+        self._decoder: VideoDecoder | None = None
+        self._frames: Iterator[DecodedFrame] = iter(())
+        self._last: int | None = None  # number of the frame decoded last, among all frames of the file; None: unknown
 
     def close(self) -> None:
-        if self._capture is not None:
-            self._capture.release()
-        self._capture, self._last = None, None
+        if self._decoder is not None:
+            self._decoder.close()
+        self._decoder, self._last = None, None
 
     def read(
         self, first: int, stop: int, size: tuple[int, int] | None
@@ -161,106 +155,57 @@ class IndexedReader:
         return digest_frame(image) == self.index.digests[number].tobytes()
 
     def _decode_video(self, first: int, stop: int) -> Iterator[np.ndarray]:
-        """BGR frames of a video file, each equal to the indexed one."""
-        self._next = first
-        for way in self._list_ways(first):
-            yield from self._decode_by(way, stop)
-            if self._next == stop:
-                if isinstance(way, int):
-                    self.index.last_margin = way
-                return
+        """BGR or BGRA frames of a video file, each equal to the indexed one."""
+        index, wanted = self.index, first
+        for margin in self._margins(first):
+            if margin is not None:
+                self._restart(index.num_before + wanted - margin)
+            for frame in self._frames:
+                number = self._last = self._find_number(frame.stamp)
+                if number is None or number < index.num_before + wanted:
+                    continue
+                image = frame.to_array()
+                if number > index.num_before + wanted or not self._is_frame(wanted, image):
+                    break
+                yield image
+                wanted += 1
+                if wanted == stop:
+                    index.last_margin = margin or index.last_margin
+                    return
         self.close()
-        raise _changed_error(self.index, self._next)
+        raise _changed_error(index, wanted)
 
-    def _list_ways(self, first: int) -> Iterator[int | str | None]:
-        """Ways to reach a frame, fastest first: None (read on), a place in MARGINS (seek), or from the start."""
+    def _margins(self, first: int) -> Iterator[int | None]:
+        """Ways to reach a frame, fastest first: None (read on), or the number of frames before it at which to seek."""
         index = self.index
-        ahead = index.num_before + first - self._last if self._last is not None else -1
-        can_seek = np.ptp(index.milliseconds) > 0  # a raw stream has no time stamps
+        target = index.num_before + first
+        ahead = target - self._last if self._last is not None else -1
+        can_seek = np.ptp(index.stamps) > 0  # a raw stream has no time stamps
         if 0 < ahead <= NEAR or (ahead > 0 and not can_seek):
             yield None
         if can_seek:
-            for place in range(index.last_margin, len(MARGINS)):
-                if index.num_before + self._next - MARGINS[place] <= 0:
-                    break
-                yield place
-        yield _FROM_START
-        yield _FROM_START_DECODING_ALL
+            yield from (margin for margin in MARGINS if index.last_margin <= margin < target)
+        yield len(index.places)
 
-    def _decode_by(self, way: int | str | None, stop: int) -> Iterator[np.ndarray]:
-        """Wanted frames from the next one on, as far as this way reaches."""
+    def _restart(self, target: int) -> None:
+        """Seek to a frame of the file; from the start where `target` is not positive."""
         index = self.index
-        with silence_opencv():
-            if way in (_FROM_START, _FROM_START_DECODING_ALL):
-                self.close()
-                self._capture, self._last = open_video(index.path, index.report.threads), -1
-            elif way is not None:
-                if self._capture is None:
-                    self._capture = open_video(index.path, index.report.threads)
-                target = index.num_before + self._next
-                self._capture.set(cv2.CAP_PROP_POS_MSEC, index.milliseconds[target - MARGINS[way]])
-                self._last = None
-        if way == _FROM_START_DECODING_ALL:
-            yield from self._decode_all(stop)
-            return
-        grabbed = grab_frames(self._capture, index.report.fps)
-        while self._next < stop:
-            image = self._decode_next(grabbed)
-            if image is None:
-                self._last = None
-                return
-            self._next += 1
-            yield image
+        if target <= 0 or self._decoder is None:
+            self.close()
+            self._decoder = VideoDecoder(index.path, index.report.threads, index.deinterlace)
+            self._last = -1
+        if target > 0:
+            self._decoder.seek(int(index.stamps[target]))
+            self._last = None
+        self._frames = self._decoder.frames()
 
-    def _decode_next(self, grabbed: Iterator[GrabbedFrame]) -> np.ndarray | None:
-        """The next wanted frame; None where it does not follow."""
-        index = self.index
-        target = index.num_before + self._next
-        with silence_opencv():
-            for frame in grabbed:
-                number = self._find_number(frame.milliseconds)
-                if number is None:
-                    if frame.milliseconds > index.milliseconds[target] + SAME_TIME:
-                        break
-                    continue
-                self._last = number
-                if number < target:
-                    continue
-                if number > target:
-                    break
-                found, image = self._capture.retrieve()
-                return image if found and self._is_frame(self._next, image) else None
-        return None
-
-    def _decode_all(self, stop: int) -> Iterator[np.ndarray]:
-        """Wanted frames, decoded exactly as the index was made."""
-        index = self.index
-        start, end = index.start, index.start + int(index.positions[stop - 1]) + 1
-        grabbed: list[GrabbedFrame] = []
-        decoded = decode_frames(self._capture, index.report.fps, start, end, grabbed)
-        number = 0
-        while self._next < stop:
-            with silence_opencv():
-                image = next(decoded, None)
-            if image is None:
-                return
-            number += 1
-            if number <= self._next:
-                continue
-            if not self._is_frame(self._next, image):
-                return
-            self._last = len(grabbed) - 1
-            self._next += 1
-            yield image
-
-    def _find_number(self, milliseconds: float) -> int | None:
-        """Number of the frame with that time stamp among all frames; where several have it, the next one, or the
-        first."""
-        known = self.index.milliseconds
+    def _find_number(self, stamp: int) -> int | None:
+        """Number of the frame with that time stamp among all frames; where several have it, the next one."""
+        known = self.index.stamps
         after = 0 if self._last is None else self._last + 1
-        if self._last is not None and after < len(known) and abs(known[after] - milliseconds) <= SAME_TIME:
+        if self._last is not None and after < len(known) and known[after] == stamp:
             return after
-        near = np.flatnonzero(np.abs(known[after:] - milliseconds) <= SAME_TIME)
+        near = np.flatnonzero(known[after:] == stamp)
         return after + int(near[0]) if len(near) else None
 
 
@@ -282,5 +227,5 @@ def _changed_error(index: FrameIndex, number: int) -> VideoError:
         "path",
         expected=f"the file that was indexed, {index.num_frames} frames with the digest {index.digest}",
         got=f"{str(index.path)!r}, in which frame {number} differs",
-        cure="It has changed, or another OpenCV decodes it: index it again with index_video, or restore the file.",
+        cure="It has changed, or another FFmpeg decodes it: index it again with index_video, or restore the file.",
     )

@@ -1,6 +1,7 @@
 """Reading clips: `read_video` detects the format and chooses the reader."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from foldgauss.io.media.clip import (
@@ -29,6 +30,7 @@ def read_video(
     size: tuple[int, int] | None = None,
     fps: float | None = None,
     center_crop: tuple[int, int] | None = None,
+    deinterlace: bool = False,
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
 
@@ -39,10 +41,11 @@ def read_video(
     and to the right). Frames are decoded one by one: memory is that of the output plus two source frames, and a clip
     that would take over a third of the machine's memory is refused.
 
-    Images of 16 bits are scaled to 8, gray ones get three equal channels. Where any image of a folder, or any frame of
-    an animated GIF, PNG or WebP, is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get an
-    alpha of 255. Other videos with alpha are refused, since decoding drops it, and so are interlaced ones that OpenCV
-    does not convert. Videos are rotated upright. A damaged one yields the frames that decode; see
+    Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. Colors of
+    videos are converted by the matrix and the range that the file declares (BT.601 and limited where it does not), with
+    interpolated chroma. Where any frame is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get
+    an alpha of 255. Interlaced videos are refused, or with `deinterlace` converted to progressive frames (FFmpeg's
+    bwdif, one frame for each). Videos are rotated upright. A damaged one yields the frames that decode; see
     `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
 
     The format is detected from the first bytes, not from the name. No file or address that `path` refers to is opened,
@@ -56,7 +59,10 @@ def read_video(
     if fps is not None:
         check_fps(fps)
     with translate_os_errors(path):
-        kept, num_declared, rate, notes = choose_reader(path)(path, start, stop, prepare)
+        reader = choose_reader(path)
+        if reader is read_video_file:
+            reader = partial(reader, deinterlace=deinterlace)
+        kept, num_declared, rate, notes = reader(path, start, stop, prepare)
     clip_fps, times = (rate.fps, rate.times) if fps is None else (fps, None)
     if fps is None:
         notes += describe_rate(rate)

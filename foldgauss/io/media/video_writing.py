@@ -1,20 +1,20 @@
-"""Writing clips: VP9 videos, animations, folders of images and single images."""
+"""Writing clips: videos, animations, folders of images and single images."""
 
-import os
 from collections.abc import Iterable, Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import check_one_of
-from foldgauss.io._atomic import OutputError, atomic_folder, atomic_path, check_path, check_replaceable, output_error
+from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, check_replaceable, output_error
 from foldgauss.io.media.clip import PathLike, check_fps, format_size, video_error
-from foldgauss.io.media.opencv import silence_opencv
+from foldgauss.io.media.encoder import VIDEO_SUFFIXES, choose_encoding, encode_video
 
-VIDEO_SUFFIXES = (".mp4", ".webm")  # what `write_video` encodes; reading accepts whatever OpenCV decodes
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
 MAX_WEBP_SIDE = 16_383
@@ -29,11 +29,21 @@ def write_video(
     *,
     overwrite: bool = False,
     image_format: str = "png",
+    codec: str | None = None,
+    crf: int | None = None,
+    pixel_format: str | None = None,
 ) -> Path:
     """Write frames, uint8 RGB of shape (height, width, 3), and return the path. No partial file is left on errors.
 
-    `.mp4` and `.webm` are VP9 (profile 0, 4:2:0: half the color resolution), which browsers play: OpenCV's wheel has no
-    H.264 encoder. An odd height or width is padded by repeating its last row or column.
+    The extension selects the container, and unless `codec` is given the codec: `.mp4` H.264, which plays everywhere,
+    `.webm` VP9, `.mov` ProRes, `.mkv` FFV1, which is lossless. `codec` is "h264", "h265", "av1", "vp9", "prores" or
+    "ffv1". `crf` is the constant rate factor: a smaller one makes better and larger files; 16 by default for H.264.
+    `pixel_format` is FFmpeg's name; by default "yuv420p" (half the color resolution) except for ProRes and FFV1. An odd
+    height or width is then padded by repeating its last row or column. Colors are those of BT.709, and the file says
+    so. An MP4 can be played while it is loaded (faststart).
+
+    Frames with alpha, shape (height, width, 4) with colors premultiplied as in `Clip`, go to "vp9" in .webm or .mkv,
+    "prores" and "ffv1".
 
     `.gif` and `.webp` are animations that repeat forever, held in memory until the last frame. A GIF has a palette of
     256 colors for each frame and durations in hundredths of a second, rounded so that the total is kept; more than 50
@@ -42,8 +52,8 @@ def write_video(
     A path without extension, or an existing folder, goes to `write_frames`, with `overwrite` and `image_format`; an
     existing *file* is replaced. `fps` is in (0, 1000].
 
-    Raises `VideoError` for another extension, no frames, or frames of other shapes or types; `OutputError` where the
-    path cannot be written.
+    Raises `VideoError` for another extension, no frames, or frames of other shapes or types, or which the codec does
+    not take; ValueError for options that do not fit together; `OutputError` where the path cannot be written.
     """
     path = check_path(path, "path, frames, fps")
     check_fps(fps)
@@ -51,25 +61,33 @@ def write_video(
         cure = "For a model: model.frames()."
         raise video_error("frames", expected="an iterable of images", got=type(frames).__name__, cure=cure)
     check_one_of("image_format", image_format, IMAGE_FORMATS)
+    suffix = path.suffix.lower()
+    if suffix not in VIDEO_SUFFIXES and (codec, crf, pixel_format) != (None, None, None):
+        got, cure = repr(path.name), f"Take {', '.join(VIDEO_SUFFIXES)}."
+        raise video_error("codec, crf, pixel_format", expected="a video file for them", got=got, cure=cure)
     if path.is_dir() or not path.suffix:
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
-    suffix = path.suffix.lower()
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps))
     if suffix not in VIDEO_SUFFIXES:
         raise video_error(
             "path",
-            expected="a name ending in .mp4, .webm, .gif or .webp, or a folder (no extension) for images",
+            expected="a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images",
             got=repr(path.name),
             cure="For one image: write_image." if suffix == ".png" else "Rename the output.",
         )
-    # OpenCV prints a warning for every VP9 tag in WebM, but none in its superset Matroska, whose header is then
-    # relabeled.
-    with atomic_path(path, suffix=".mkv" if suffix == ".webm" else suffix) as temporary:
-        num_frames = _encode(temporary, _check_frames(frames), float(fps))
-        _check_written(temporary, num_frames, path)
-        if suffix == ".webm":
-            _relabel_as_webm(temporary)
+    frames = _check_frames(frames, channels=(3, 4))
+    first = next(frames)
+    encoding = choose_encoding(suffix, codec, crf, pixel_format, has_alpha=first.shape[2] == 4)
+    with atomic_path(path, suffix=suffix) as temporary:
+        try:
+            encode_video(temporary, chain([first], frames), float(fps), encoding)
+        except OSError as error:
+            raise output_error(path, error) from error
+        except av.FFmpegError as error:
+            expected, got = f"frames that {encoding.codec.encoder} takes", f"{format_size(first.shape)} at {fps:g} fps"
+            cure = f"It says: {error.strerror}. Take another size, rate or codec."
+            raise video_error("frames", expected=expected, got=got, cure=cure) from error
     return path
 
 
@@ -109,19 +127,21 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     return path
 
 
-def _check_frames(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3,)) -> Iterator[np.ndarray]:
     shape = None
     for number, frame in enumerate(frames):
-        frame = _check_frame(frame, shape, f"frames[{number}]")
+        frame = _check_frame(frame, shape, f"frames[{number}]", channels)
         shape = frame.shape
         yield frame
     if shape is None:
         raise video_error("frames", expected="at least 1 frame", got="none")
 
 
-def _check_frame(frame: np.ndarray, shape: tuple | None, parameter: str) -> np.ndarray:
+def _check_frame(
+    frame: np.ndarray, shape: tuple | None, parameter: str, channels: tuple[int, ...] = (3,)
+) -> np.ndarray:
     frame = np.asarray(frame)
-    fits = frame.ndim == 3 and frame.shape[2] == 3 and min(frame.shape) > 0 and frame.dtype == np.uint8
+    fits = frame.ndim == 3 and frame.shape[2] in channels and min(frame.shape) > 0 and frame.dtype == np.uint8
     if not fits or (shape is not None and frame.shape != shape):
         raise video_error(
             parameter,
@@ -182,72 +202,3 @@ def _gif_durations(num_frames: int, fps: float) -> list[int]:
     """Milliseconds of each frame, in whole hundredths of a second, whose sums are the true times rounded."""
     ends = np.rint(100 * np.arange(num_frames + 1) / fps).astype(int)
     return [10 * int(duration) for duration in np.diff(ends)]
-
-
-# -------------------------------------------------------------------------------------------------- VP9
-
-
-def _encode(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
-    """Encode in VP9 and return the number of frames; the extension of `path` selects the container."""
-    code = cv2.VideoWriter.fourcc(*("vp09" if path.suffix.lower() == ".mp4" else "VP90"))
-    writer, num_frames = None, 0
-    with silence_opencv():
-        try:
-            for frame in frames:
-                image = _prepare_for_encoder(frame)
-                if writer is None:
-                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, image.shape[1::-1])
-                if not writer.isOpened():
-                    _check_room(path)
-                    raise OutputError(
-                        "path: expected an OpenCV with FFmpeg's VP9 encoder, got one without. "
-                        "Install opencv-contrib-python-headless from PyPI, or write to a folder."
-                    )
-                writer.write(image)
-                num_frames += 1
-        finally:
-            if writer is not None:
-                writer.release()
-    return num_frames
-
-
-def _check_room(path: Path) -> None:
-    """Raise the system's OSError where not even a few bytes can be written: OpenCV does not report the reason."""
-    path.write_bytes(bytes(4096))
-    with open(path, "rb") as file:
-        os.fsync(file.fileno())
-
-
-def _prepare_for_encoder(frame: np.ndarray) -> np.ndarray:
-    """RGB -> the BGR of even size that OpenCV's writer encodes with the least error."""
-    image = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-    if image.shape[0] % 2 or image.shape[1] % 2:
-        # OpenCV would drop the odd row or column.
-        image = cv2.copyMakeBorder(image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE)
-    # FFmpeg's scaler, as OpenCV calls it, rounds both chroma planes down, which makes red and blue some 1.3 gray levels
-    # too dark: add one level to each. cv2.add saturates.
-    return cv2.add(image, (1, 0, 1, 0))
-
-
-def _check_written(path: Path, num_frames: int, target: Path) -> None:
-    """Count the frames that decode: OpenCV's writer reports no error, not even a full disk.
-
-    The container's own count may be right in a truncated file. Decoding takes a few hundredths of the encoding time.
-    """
-    with silence_opencv():
-        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
-        num_decoded = sum(1 for _ in iter(capture.grab, False))
-        capture.release()
-    if num_decoded != num_frames:
-        raise OutputError(
-            f"path: expected {num_frames} frames in {str(target)!r}, got {num_decoded}. "
-            "The disk may be full, or a size limit reached."
-        )
-
-
-def _relabel_as_webm(path: Path) -> None:
-    """Matroska with VP9 *is* WebM except for the DocType; EBML pads a shorter string with zeros."""
-    with open(path, "r+b") as file:
-        start = file.read(64).index(b"matroska")
-        file.seek(start)
-        file.write(b"webm\0\0\0\0")

@@ -1,0 +1,285 @@
+"""A video decoder restricted to one local file: PyAV, that is FFmpeg's libraries."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.filter import Graph
+from av.stream import Disposition
+from av.video.reformatter import Interpolation
+
+from foldgauss.io.media.clip import VideoError, check_num_pixels, format_num_bytes, read_head, video_error
+from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
+from foldgauss.io.media.image_files import premultiply
+
+MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
+MAX_THREADS = 16
+#: Chroma is interpolated, and rounded to nearest: FFmpeg's default repeats it and rounds it down, which makes each
+#: channel about 1 level too dark.
+CONVERSION = (
+    Interpolation.BILINEAR
+    | Interpolation.ACCURATE_RND
+    | Interpolation.FULL_CHR_H_INT
+    | Interpolation.FULL_CHR_H_INP
+    | Interpolation.BITEXACT
+)
+#: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
+_ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+
+
+@dataclass(frozen=True)
+class DecodedFrame:
+    """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
+    `VideoDecoder.time_base`; 0 for a stream without time stamps."""
+
+    position: int
+    stamp: int
+    decoded: av.VideoFrame
+
+    def to_array(self) -> np.ndarray:
+        """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4)."""
+        has_alpha = any(part.is_alpha for part in self.decoded.format.components)
+        image = self.decoded.to_ndarray(format="bgra" if has_alpha else "bgr24", interpolation=CONVERSION)
+        if has_alpha:
+            opaque = image[..., 3].min() == 255
+            image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
+        quarters = round(self.decoded.rotation / 90) % 4
+        return np.ascontiguousarray(np.rot90(image, quarters)) if quarters else image
+
+
+class VideoDecoder:
+    """An open video file; a context manager.
+
+    `threads`: of FFmpeg's decoder, 0 for its default. How damaged frames decode depends on their number.
+    `deinterlace`: convert interlaced frames to progressive ones (FFmpeg's bwdif), instead of refusing them.
+
+    Raises `VideoError` for a file that does not open, or has too many pixels.
+    """
+
+    def __init__(self, path: Path, threads: int = 0, deinterlace: bool = False):
+        self._path, self._deinterlace, self._container = path, deinterlace, _open_container(path)
+        try:
+            self._stream = _choose_stream(self._container, path)
+            check_num_pixels(path, (self._stream.height, self._stream.width))
+            self._codec = self._choose_codec(threads)
+        except VideoError:
+            self.close()
+            raise
+        self.time_base: Fraction = self._stream.time_base
+        self._last = -1  # position of the frame decoded last
+        self._damaged = False
+        self._stamps: np.ndarray | None = None  # of all packets, in order; found where frames are missing
+
+    def __enter__(self) -> "VideoDecoder":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._container.close()
+
+    @property
+    def fps(self) -> float:
+        """The rate that the container declares; 0 where there is none."""
+        return float(self._stream.guessed_rate or 0)
+
+    @property
+    def threads(self) -> int:
+        return self._codec.thread_count
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Width by height of a pixel; 1 where it is not known."""
+        return float(self._stream.sample_aspect_ratio or 1) or 1.0
+
+    @property
+    def num_declared(self) -> int:
+        """The number of frames that the container counts; 0 where it does not."""
+        return max(self._stream.frames, 0)
+
+    @property
+    def declared_seconds(self) -> float | None:
+        """How long the video is by its container, frames that an edit list hides left out; None where that is unknown.
+
+        The duration of a whole file may be that of its sound. Streams and Ogg derive it from their last packets, and
+        Flash videos declare up to 2 frames more.
+        """
+        kind, stream = self._container.format.name, self._stream
+        if kind in ("flv", "live_flv", "ogg", "mpeg", "mpegts"):
+            return None
+        if stream.duration and stream.duration > 0:
+            return float(stream.duration * stream.time_base)
+        if not self._container.duration or self._container.duration < 0:
+            return None
+        seconds = self._container.duration / av.time_base
+        if not self._container.streams.audio:
+            return seconds
+        # Matroska: each stream's own, written by FFmpeg.
+        hours, _, rest = stream.metadata.get("DURATION", "").partition(":")
+        minutes, _, own = rest.partition(":")
+        try:
+            return min(seconds, 3600 * int(hours) + 60 * int(minutes) + float(own))
+        except ValueError:
+            return None
+
+    def seek(self, stamp: int) -> None:
+        """Continue at the last key frame up to `stamp`; positions are counted from there."""
+        with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
+            self._container.seek(stamp, stream=self._stream)
+        self._codec.flush_buffers()
+        self._last = -1
+
+    def frames(self) -> Iterator[DecodedFrame]:
+        """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones, unless
+        they are to be converted."""
+        decoded = self._decode()
+        for frame in _deinterlace(decoded) if self._deinterlace else self._check_progressive(decoded):
+            self._last = self._find_position(frame.pts)
+            yield DecodedFrame(self._last, frame.pts or 0, frame)
+
+    def _decode(self) -> Iterator[av.VideoFrame]:
+        for packet in self._read_packets():
+            try:
+                found = self._codec.decode(packet)
+            except av.FFmpegError:
+                self._damaged = True
+                continue
+            yield from found
+        # A damaged frame may end the decoding of those buffered; each call passes one.
+        for _ in range(MAX_THREADS + 16):
+            try:
+                yield from self._codec.decode(None)
+                return
+            except av.EOFError:
+                return
+            except av.FFmpegError:
+                self._damaged = True
+
+    def _read_packets(self) -> Iterator[av.Packet]:
+        """The packets of the stream, of which those that cannot be read are left out."""
+        num_errors = 0
+        while num_errors < MAX_ERRORS:
+            try:
+                for packet in self._container.demux(self._stream):
+                    if packet.size:
+                        num_errors = 0
+                        yield packet
+                return
+            except av.FFmpegError:
+                self._damaged, num_errors = True, num_errors + 1
+
+    def _check_progressive(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+        for frame in frames:
+            if frame.interlaced_frame:
+                raise video_error(
+                    "path",
+                    expected="a video of progressive frames",
+                    got=f"one of interlaced fields, {str(self._path)!r}",
+                    cure="Convert it while reading, with deinterlace=True (--deinterlace).",
+                )
+            yield frame
+
+    def _find_position(self, stamp: int | None) -> int:
+        """The position of the next frame: after damage it is found by the time stamps of all packets."""
+        if not self._damaged or stamp is None:
+            return self._last + 1
+        if self._stamps is None:
+            self._stamps = _read_stamps(self._path)
+        place = int(np.searchsorted(self._stamps, stamp))
+        known = place < len(self._stamps) and self._stamps[place] == stamp
+        return max(place, self._last + 1) if known else self._last + 1
+
+    def _choose_codec(self, threads: int) -> av.VideoCodecContext:
+        codec = self._stream.codec_context
+        name = _ALPHA_DECODERS.get(codec.name)
+        if self._stream.metadata.get("alpha_mode") == "1" and name is not None:
+            codec = av.CodecContext.create(name, "r")
+        codec.thread_type = "AUTO"
+        codec.thread_count = threads or min(MAX_THREADS, cv2.getNumberOfCPUs())
+        return codec
+
+
+def _open_container(path: Path) -> av.container.InputContainer:
+    kind = describe_kind(read_head(path))
+    if kind == LIST:
+        raise video_error(
+            "path",
+            expected="a video file or a folder of images",
+            got=f"{kind}, {str(path)!r}",
+            cure="The files that it names are not opened: give the video itself.",
+        )
+    # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
+    options = {"protocol_whitelist": "file", "format_whitelist": DEMUXERS}
+    try:
+        return av.open(f"file:{path.resolve()}", options=options, metadata_errors="replace")
+    except (av.FFmpegError, ValueError) as error:
+        about = format_num_bytes(path) + (f", {kind}" if kind else "")
+        raise video_error(
+            "path",
+            expected="a video file or a folder of images",
+            got=f"{str(path)!r} ({about}), which does not open as a video",
+            cure="Check that it is a video and that its copy or download is complete.",
+        ) from error
+
+
+def _choose_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
+    streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
+    best = container.streams.best("video")
+    if best in streams:
+        return best
+    if streams:
+        return streams[0]
+    if container.streams.video:
+        got = f"audio with a cover image, {str(path)!r}"
+        raise video_error("path", expected="a video", got=got, cure="Give a file with moving images.")
+    got = f"{str(path)!r} ({'audio' if container.streams.audio else 'no video stream'}), which does not open as a video"
+    raise video_error("path", expected="a video file or a folder of images", got=got)
+
+
+def _read_stamps(path: Path) -> np.ndarray:
+    """Time stamps of all packets that are shown, increasing."""
+    with _open_container(path) as container:
+        stream, stamps = _choose_stream(container, path), []
+        try:
+            for packet in container.demux(stream):
+                if packet.size and packet.pts is not None and not packet.is_discard:
+                    stamps.append(packet.pts)
+        except av.FFmpegError:  # the end of what can be read
+            pass
+    return np.unique(np.array(stamps, np.int64))
+
+
+def _deinterlace(frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+    """Interlaced frames converted to progressive ones of the same time; others are passed on."""
+    graph, time_base = None, None
+    for frame in frames:
+        if graph is None:
+            graph, time_base = Graph(), frame.time_base
+            # One frame for each frame; the output's clock would be twice as fast.
+            units = f"settb={time_base.numerator}/{time_base.denominator}"
+            source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=time_base)
+            graph.link_nodes(
+                source,
+                graph.add("bwdif", "mode=send_frame:deint=interlaced"),
+                graph.add("settb", units.removeprefix("settb=")),
+                graph.add("buffersink"),
+            ).configure()
+        graph.push(frame)
+        yield from _pull(graph)
+    if graph is not None:
+        graph.push(None)
+        yield from _pull(graph)
+
+
+def _pull(graph: Graph) -> Iterator[av.VideoFrame]:
+    while True:
+        try:
+            yield graph.pull()
+        except (av.BlockingIOError, av.EOFError):
+            return

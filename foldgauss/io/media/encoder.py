@@ -1,0 +1,145 @@
+"""Video encoders of PyAV, that is of FFmpeg's libraries, and what each of them takes."""
+
+import os
+from collections.abc import Iterator, Mapping
+from fractions import Fraction
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import av
+import numpy as np
+from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer
+from foldgauss.io.media.decoder import CONVERSION
+
+os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
+
+
+class Codec(NamedTuple):
+    """`crf`: its default constant rate factor and the largest one; None for codecs without. `pixel_formats`: those
+    offered, the default first. `alpha_format`: the default of frames with alpha."""
+
+    encoder: str
+    suffixes: tuple[str, ...]
+    pixel_formats: tuple[str, ...]
+    alpha_format: str | None = None
+    crf: tuple[int, int] | None = None
+    options: Mapping[str, str] = MappingProxyType({})
+
+
+CODECS = {
+    "h264": Codec("libx264", (".mp4", ".mov", ".mkv"), ("yuv420p", "yuv444p", "yuv420p10le"), crf=(16, 51)),
+    "h265": Codec(
+        "libx265",
+        (".mp4", ".mov", ".mkv"),
+        ("yuv420p", "yuv444p", "yuv420p10le"),
+        crf=(18, 51),
+        options={"x265-params": "log-level=none"},
+    ),
+    "av1": Codec(
+        "libsvtav1", (".mp4", ".webm", ".mkv"), ("yuv420p", "yuv420p10le"), crf=(20, 63), options={"preset": "6"}
+    ),
+    "vp9": Codec(
+        "libvpx-vp9",
+        (".webm", ".mp4", ".mkv"),
+        ("yuv420p", "yuv444p", "yuva420p"),
+        "yuva420p",
+        (18, 63),
+        {"b": "0", "row-mt": "1", "deadline": "good", "cpu-used": "4"},
+    ),
+    "prores": Codec("prores_ks", (".mov", ".mkv"), ("yuv422p10le", "yuv444p10le", "yuva444p10le"), "yuva444p10le"),
+    "ffv1": Codec("ffv1", (".mkv",), ("bgr0", "bgra", "yuv420p", "yuv444p"), "bgra"),
+}
+#: The codec of each extension unless one is given.
+DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
+VIDEO_SUFFIXES = tuple(DEFAULT_CODECS)
+
+
+class Encoding(NamedTuple):
+    """How a video is encoded, checked by `choose_encoding`."""
+
+    codec: Codec
+    crf: int | None
+    pixel_format: str
+
+
+def choose_encoding(
+    suffix: str, codec: str | None, crf: int | None, pixel_format: str | None, *, has_alpha: bool = False
+) -> Encoding:
+    """The encoding of a video file with this extension. Raises ValueError for options that do not fit together."""
+    name = codec or DEFAULT_CODECS[suffix]
+    check_one_of("codec", name, CODECS)
+    chosen = CODECS[name]
+    if suffix not in chosen.suffixes:
+        fitting = [other for other, one in CODECS.items() if suffix in one.suffixes]
+        cure = f"For {suffix} take {', '.join(fitting)}."
+        raise invalid("codec", expected=f"{name} in one of {', '.join(chosen.suffixes)}", got=f"{suffix}", cure=cure)
+    if crf is not None:
+        if chosen.crf is None:
+            raise invalid("crf", expected=f"none for {name}, which has no such factor", got=f"{crf}")
+        if not (is_integer(crf, 0) and crf <= chosen.crf[1]):
+            raise invalid("crf", expected=f"a whole number from 0 to {chosen.crf[1]} for {name}", got=repr(crf))
+    if pixel_format is None:
+        pixel_format = chosen.pixel_formats[0] if not has_alpha else chosen.alpha_format
+        if pixel_format is None:
+            cure = "Take vp9, prores or ffv1, or composite the frames over a color."
+            raise invalid("codec", expected="one that keeps alpha", got=name, cure=cure)
+    check_one_of("pixel_format", pixel_format, chosen.pixel_formats)
+    if has_alpha and not _has_alpha(pixel_format):
+        cure = f"Take {chosen.alpha_format}." if chosen.alpha_format else "Take the codec vp9, prores or ffv1."
+        raise invalid("pixel_format", expected="one with alpha, as the frames have it", got=pixel_format, cure=cure)
+    return Encoding(chosen, crf if crf is not None else chosen.crf and chosen.crf[0], pixel_format)
+
+
+def _has_alpha(pixel_format: str) -> bool:
+    return any(part.is_alpha for part in av.VideoFormat(pixel_format).components)
+
+
+def encode_video(path: Path, frames: Iterator[np.ndarray], fps: float, encoding: Encoding) -> None:
+    """Encode RGB frames, or premultiplied RGBA ones, which are stored with straight alpha.
+
+    Colors are converted by BT.709 in limited range, and the file says so. An odd height or width is padded by repeating
+    the last row or column where the pixel format has half the color resolution.
+    """
+    rate = Fraction(fps).limit_denominator(100_000)
+    options = dict(encoding.codec.options) | ({} if encoding.crf is None else {"crf": str(encoding.crf)})
+    pixel_format = av.VideoFormat(encoding.pixel_format, 64, 64)
+    matrix = None if pixel_format.is_rgb else Colorspace.ITU709
+    steps = 64 // pixel_format.chroma_height(), 64 // pixel_format.chroma_width()
+    container = av.open(str(path), "w", options={"movflags": "+faststart"} if path.suffix in (".mp4", ".mov") else {})
+    with container:
+        stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
+        stream.pix_fmt = encoding.pixel_format
+        for number, frame in enumerate(frames):
+            image = _pad(frame, steps)
+            if image.shape[2] == 4:
+                image = _straighten(image)
+            if number == 0:
+                stream.height, stream.width = image.shape[:2]
+                if matrix is not None:
+                    _declare_bt709(stream.codec_context)
+            given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
+            given = given.reformat(format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
+            given.pts, given.time_base = number, 1 / rate
+            container.mux(stream.encode(given))
+        container.mux(stream.encode())
+
+
+def _declare_bt709(context: av.VideoCodecContext) -> None:
+    context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+    context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+
+
+def _pad(frame: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
+    """The frame with its last row and column repeated up to multiples of `steps`."""
+    rows, columns = (-side % step for side, step in zip(frame.shape, steps, strict=False))
+    return np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge") if rows or columns else frame
+
+
+def _straighten(image: np.ndarray) -> np.ndarray:
+    """Colors divided by alpha, to nearest; 0 where alpha is 0."""
+    alpha = image[..., 3:].astype(np.uint16)
+    colors = (image[..., :3].astype(np.uint16) * 255 + alpha // 2) // np.maximum(alpha, 1)
+    return np.concatenate([np.minimum(colors, 255).astype(np.uint8), image[..., 3:]], axis=-1)
