@@ -30,7 +30,7 @@ from foldgauss.io import (
     write_video,
 )
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media import indexed_reader, opencv
+from foldgauss.io.media import decoder, indexed_reader, video_decoding
 from foldgauss.video.motion.optical_flow import CutFinder, Motion
 
 HEIGHT, WIDTH = 48, 64
@@ -132,39 +132,38 @@ def long_index(long):
     return index_video(long)
 
 
-class _Counting:
-    """An opened decoder that counts what is asked of it."""
+class _Counting(decoder.VideoDecoder):
+    """A decoder that counts what is asked of it."""
 
-    grabs = retrieves = opened = 0
+    decoded = converted = opened = 0
 
-    def __init__(self, capture):
-        self._capture = capture
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
         _Counting.opened += 1
 
-    def __getattr__(self, name):
-        return getattr(self._capture, name)
+    def frames(self):
+        for frame in super().frames():
+            _Counting.decoded += 1
+            yield _CountedFrame(frame.position, frame.stamp, frame.decoded)
 
-    def grab(self):
-        _Counting.grabs += 1
-        return self._capture.grab()
 
-    def retrieve(self):
-        _Counting.retrieves += 1
-        return self._capture.retrieve()
+class _CountedFrame(decoder.DecodedFrame):
+    def to_array(self):
+        _Counting.converted += 1
+        return super().to_array()
 
 
 @pytest.fixture
 def counting(monkeypatch):
-    _Counting.grabs = _Counting.retrieves = _Counting.opened = 0
-    real = indexed_reader.open_video
-    monkeypatch.setattr(indexed_reader, "open_video", lambda *arguments: _Counting(real(*arguments)))
+    _Counting.decoded = _Counting.converted = _Counting.opened = 0
+    monkeypatch.setattr(indexed_reader, "VideoDecoder", _Counting)
     return _Counting
 
 
 def test_a_span_late_in_a_clip_takes_few_frames(long, long_index, counting):
     found = read_indexed(long_index, 500, 520).frames
-    assert counting.grabs <= 25
-    assert counting.retrieves == 20
+    assert counting.decoded <= 25
+    assert counting.converted == 20
     np.testing.assert_array_equal(found, read_video(long, frames=(500, 520)).frames)
 
 
@@ -174,7 +173,7 @@ def test_going_forward_decodes_each_frame_once(long, long_index, counting):
     for k, frame in enumerate(frames):
         np.testing.assert_array_equal(frame, whole[k])
     assert counting.opened == 1
-    assert counting.grabs == counting.retrieves == 620
+    assert counting.decoded == counting.converted == 620
     assert frames.digest() == hashlib.blake2b(whole, digest_size=16).hexdigest()
 
 
@@ -210,7 +209,7 @@ def test_a_stream_without_times_is_read_on(tmp_path, counting):
     lazy, whole = LazyFrames(index_video(path)), read_video(path).frames
     for first in (3, 100):
         np.testing.assert_array_equal(lazy[first : first + 2], whole[first : first + 2])
-    assert (counting.opened, counting.grabs) == (1, 102)
+    assert (counting.opened, counting.decoded) == (1, 102)
 
 
 def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
@@ -220,10 +219,10 @@ def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
     index = index_video(path)
     thrown_away = []
     for _ in range(2):
-        counting.grabs = counting.retrieves = 0
+        counting.decoded = counting.converted = 0
         _same(read_indexed(index, 277, 279), read_video(path, frames=(277, 279)))
-        assert counting.grabs < 200
-        thrown_away.append(counting.retrieves - 2)
+        assert counting.decoded < 200
+        thrown_away.append(counting.converted - 2)
     assert thrown_away[0] > 0  # they were looked at, and are not as they should be
     assert thrown_away[1] == 0  # for the margin is kept that was needed
 
@@ -252,9 +251,9 @@ def test_damage_is_decoded_as_when_it_was_indexed(tmp_path, monkeypatch):
     at = 6 * len(data) // 10
     data[at : at + 2000] = np.random.default_rng(3).bytes(2000)
     path.write_bytes(data)
-    made, real = [], opencv.open_video
+    made, real = [], decoder.VideoDecoder
     for threads in (1, 3):
-        monkeypatch.setattr(opencv, "open_video", partial(real, threads=threads))
+        monkeypatch.setattr(video_decoding, "VideoDecoder", partial(real, threads=threads))
         made.append((index_video(path), read_video(path)))
     if made[0][0].digest == made[1][0].digest:
         pytest.skip("this FFmpeg makes the same of that damage with any number of threads")
@@ -273,7 +272,10 @@ def test_frames_that_damage_left_out_keep_their_places(tmp_path):
         broken[starts[k] : starts[k] + 30] = bytes(30)
     path.write_bytes(broken)
     clip, index = read_video(path), index_video(path)
-    assert index.positions.tolist() == [*range(10), *range(13, 40)]  # OpenCV passes by the one after a broken one, too
+    assert index.positions.tolist() == [
+        *range(10),
+        *range(13, 40),
+    ]  # FFmpeg's parser passes by the one after a broken one, too
     _as_read(index, path, [(8, 15), (10, 12), (10, 14), (30, 40)])  # none of the second's decodes
     assert index.span(9, 12) == (9, 15)
     np.testing.assert_array_equal(read_indexed(index, *index.span(9, 12)).frames, clip.frames[9:12])
@@ -303,7 +305,7 @@ def test_a_part_of_a_clip_counts_from_its_first_frame(long, counting):
     _described(index, clip)
     assert index.cuts == [300]
     _as_read(index, long, [(0, 5), (200, 220), (350, 360)], start=100)
-    assert counting.grabs < 60  # of 35 frames
+    assert counting.converted == 35  # those from the key frame before a span are only decoded
     np.testing.assert_array_equal(LazyFrames(index, first=350)[:], clip.frames[350:])
     with pytest.raises(VideoError, match="first, stop: expected a range within 0:360"):
         read_indexed(index, 350, 361)
@@ -463,11 +465,14 @@ def test_what_is_refused_is_refused_alike(tmp_path, long):
         assert str(caught.value) == str(expected.value)
 
 
-def test_interlaced_fields_that_do_not_convert_are_refused(tmp_path, monkeypatch, long):
-    path = _encoded(tmp_path / "a.mkv", np.repeat(_moving(1), 20, 0), *X264)
-    monkeypatch.setattr("foldgauss.io.media.video_decoding._can_convert", lambda path, num_frames: False)
+def test_interlaced_clips_are_refused_or_converted(tmp_path):
+    path = _encoded(tmp_path / "a.mkv", _moving(60), *X264, "-g", "20", "-flags", "+ilme+ildct")
     with pytest.raises(VideoError, match="interlaced"):
-        index_video(path)
+        index_video(path, deinterlace=False)
+    index = index_video(path)
+    for first, stop in ((0, 5), (37, 41)):
+        whole = read_video(path, frames=(first, stop))
+        np.testing.assert_array_equal(read_indexed(index, first, stop).frames, whole.frames)
 
 
 @pytest.mark.parametrize("span", [(-1, 3), (3, 3), (5, 2), (0, 621), (620, 621), (620, None)], ids=str)
@@ -607,7 +612,7 @@ def test_what_arrays_refuse_is_refused(long_index):
 
 
 def test_nothing_is_said_on_stderr(tmp_path, long):
-    """Neither OpenCV nor FFmpeg, in a fresh process."""
+    """By the decoder, in a fresh process."""
     data = bytearray(long.read_bytes())
     middle = 2 * len(data) // 5
     data[middle : middle + 2000] = np.random.default_rng(0).bytes(2000)

@@ -224,19 +224,83 @@ def _png_avi(frames):
     return chunk(b"RIFF", b"AVI ", head, chunk(b"LIST", b"movi", *packets))
 
 
-def test_videos_with_alpha_are_refused(tmp_path, clip_file):
-    opaque = np.random.default_rng(0).integers(0, 256, (3, 48, 64, 4)).astype(np.uint8)
-    (tmp_path / "opaque.avi").write_bytes(_png_avi(opaque[..., :3]))
-    np.testing.assert_array_equal(read_video(tmp_path / "opaque.avi").frames, opaque[..., 2::-1])
-    (tmp_path / "clear.avi").write_bytes(_png_avi(opaque))
-    # WebM keeps alpha beside the pictures, and says so in its head: here in place of the name of the writing program.
-    head, mark = clip_file.read_bytes(), b"\x53\xc0\x81\x01"
-    (tmp_path / "clear.webm").write_bytes(head.replace(b"Lavf", mark, 1))
-    assert mark in (tmp_path / "clear.webm").read_bytes()
-    for name in ("clear.avi", "clear.webm"):
-        with pytest.raises(VideoError, match="without alpha") as caught:
-            read_video(tmp_path / name)
-        _one_line(caught, name, "PNGs")
+def test_alpha_of_videos_is_kept(tmp_path):
+    rgba = np.random.default_rng(0).integers(0, 256, (3, 48, 64, 4)).astype(np.uint8)
+    (tmp_path / "opaque.avi").write_bytes(_png_avi(rgba[..., :3]))
+    np.testing.assert_array_equal(read_video(tmp_path / "opaque.avi").frames, rgba[..., 2::-1])
+    (tmp_path / "clear.avi").write_bytes(_png_avi(rgba))
+    clip = read_video(tmp_path / "clear.avi")
+    np.testing.assert_array_equal(clip.frames[..., 3], rgba[..., 3])
+    np.testing.assert_allclose(clip.over_black, rgba[..., 2::-1] * (rgba[..., 3:] / 255), atol=0.51)
+    rgba[..., 3] = 255  # a plane that is opaque everywhere is dropped
+    (tmp_path / "clear.avi").write_bytes(_png_avi(rgba))
+    np.testing.assert_array_equal(read_video(tmp_path / "clear.avi").frames, rgba[..., 2::-1])
+
+
+@pytest.mark.parametrize(("name", "error"), [("a.webm", 1.5), ("a.mkv", 0), ("a.mov", 0.8)])
+def test_alpha_is_written_and_read_back(tmp_path, name, error):
+    """Colors are stored straight, so that programs which composite the file get the same picture."""
+    frames = np.concatenate([_moving(4), np.repeat(_moving(4)[..., :1], 1, -1)], -1)
+    frames[..., :3] = np.rint(frames[..., :3] * (frames[..., 3:] / 255))
+    clip = read_video(write_video(tmp_path / name, frames, 10))
+    assert clip.has_alpha
+    assert np.abs(clip.frames.astype(int) - frames).mean() <= error
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "quality"),
+    [
+        ("a.mp4", {"codec": "h265"}, 34),
+        ("a.mp4", {"codec": "av1"}, 34),
+        ("a.mp4", {"codec": "vp9", "pixel_format": "yuv444p"}, 38),
+        ("a.mp4", {"pixel_format": "yuv420p10le", "crf": 5}, 40),
+        ("a.mkv", {}, np.inf),
+        ("a.mkv", {"pixel_format": "yuv444p"}, 48),
+        ("a.mov", {}, 40),
+        ("a.mov", {"codec": "prores", "pixel_format": "yuv444p10le"}, 45),
+    ],
+)
+def test_codecs_and_pixel_formats(tmp_path, name, options, quality):
+    clip = read_video(write_video(tmp_path / name, _moving(5), 29.97, **options))
+    assert (clip.num_frames, clip.times, clip.notes) == (5, None, ())
+    assert clip.fps == pytest.approx(29.97, rel=1e-3)
+    with np.errstate(divide="ignore"):
+        assert _psnr(clip.frames, _moving(5)) >= quality
+
+
+def test_a_smaller_crf_is_better_and_larger(tmp_path):
+    paths = [write_video(tmp_path / f"{crf}.mp4", _moving(), 10, crf=crf) for crf in (0, 16, 40)]
+    sizes, errors = (
+        [path.stat().st_size for path in paths],
+        [_psnr(read_video(path).frames, _moving()) for path in paths],
+    )
+    assert sizes[0] > sizes[1] > sizes[2]
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):
+    data = write_video(tmp_path / "a.mp4", _moving(), 10).read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("a.mp4", {"codec": "divx"}, ("codec", "h264", "divx")),
+        ("a.mp4", {"codec": "prores"}, ("codec", ".mov", "got .mp4", "take h264")),
+        ("a.mp4", {"crf": 52}, ("crf", "0 to 51", "52")),
+        ("a.mp4", {"crf": 16.5}, ("crf", "whole number", "16.5")),
+        ("a.mkv", {"crf": 16}, ("crf", "none for ffv1")),
+        ("a.mp4", {"pixel_format": "rgb24"}, ("pixel_format", "yuv420p", "rgb24")),
+        ("a.gif", {"crf": 3}, ("codec, crf, pixel_format", "a.gif")),
+        ("a", {"codec": "h264"}, ("codec, crf, pixel_format", "'a'")),
+    ],
+)
+def test_encodings_that_do_not_fit_are_refused(tmp_path, name, options, words):
+    with pytest.raises(ValueError, match="expected") as caught:
+        write_video(tmp_path / name, _moving(), 10, **options)
+    _one_line(caught, *words)
+    assert list(tmp_path.iterdir()) == []
 
 
 def _rgba(num_frames=3):
@@ -467,12 +531,12 @@ def test_webm_says_that_it_is_webm(clip_file):
 
 
 def test_colour_error_of_the_encoder_is_centred(tmp_path):
-    """Without the offset of `_for_encoder`, greys lose about 4 levels of blue here; with it, under 2."""
+    """FFmpeg's default conversion rounds down, which costs each channel about a level both in writing and reading."""
     grey = np.repeat(np.arange(40, 216, 11, dtype=np.uint8), 4)
     frames = np.repeat(np.repeat(grey[None, None, :, None], 32, 1), 3, 3)
     frames = np.repeat(frames, 3, 0)
     error = read_video(write_video(tmp_path / "grey.mp4", frames, 25)).frames.astype(int) - frames
-    assert np.abs(error.mean((0, 1, 2))).max() < 2
+    assert np.abs(error.mean((0, 1, 2))).max() < 0.3
 
 
 def test_folder_of_frames_is_exact(tmp_path):
@@ -593,7 +657,7 @@ _BAD_FRAMES = {
 
 
 @pytest.mark.parametrize("frames", _BAD_FRAMES.values(), ids=_BAD_FRAMES)
-@pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out.gif", "out.webp", "out"])
+@pytest.mark.parametrize("name", ["out.mp4", "out.gif", "out.webp", "out"])
 def test_bad_frames(tmp_path, name, frames):
     with pytest.raises(VideoError) as caught:
         write_video(tmp_path / name, frames, 25)
@@ -620,7 +684,7 @@ def test_output_that_cannot_be_written(tmp_path, name):
 
 
 def test_a_full_disk_is_noticed(tmp_path):
-    """OpenCV says nothing when its writes fail; a limit on file size stands in for the full disk."""
+    """A limit on file size stands in for the full disk."""
     program = """
 import os, resource, sys, numpy
 from foldgauss.io import write_image, write_video

@@ -15,9 +15,12 @@ from av.video.reformatter import Interpolation
 
 from foldgauss.io.media.clip import VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
+from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import premultiply
 
 MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
+MAX_FRAMES = 1 << 31  # a container that declares more is damaged
+MAX_LOST_FRAMES = 1_000_000  # a time stamp that implies a larger gap counts as damaged
 MAX_THREADS = 16
 #: Chroma is interpolated, and rounded to nearest: FFmpeg's default repeats it and rounds it down, which makes each
 #: channel about 1 level too dark.
@@ -56,12 +59,12 @@ class VideoDecoder:
     """An open video file; a context manager.
 
     `threads`: of FFmpeg's decoder, 0 for its default. How damaged frames decode depends on their number.
-    `deinterlace`: convert interlaced frames to progressive ones (FFmpeg's bwdif), instead of refusing them.
+    `deinterlace`: convert interlaced frames to progressive ones (FFmpeg's bwdif); otherwise they are refused.
 
     Raises `VideoError` for a file that does not open, or has too many pixels.
     """
 
-    def __init__(self, path: Path, threads: int = 0, deinterlace: bool = False):
+    def __init__(self, path: Path, threads: int = 0, deinterlace: bool = True):
         self._path, self._deinterlace, self._container = path, deinterlace, _open_container(path)
         try:
             self._stream = _choose_stream(self._container, path)
@@ -71,9 +74,10 @@ class VideoDecoder:
             self.close()
             raise
         self.time_base: Fraction = self._stream.time_base
+        self.has_converted = False  # whether any frame was interlaced
         self._last = -1  # position of the frame decoded last
-        self._damaged = False
-        self._stamps: np.ndarray | None = None  # of all packets, in order; found where frames are missing
+        self._before: int | None = None  # its time stamp
+        self._damaged = False  # since then
 
     def __enter__(self) -> "VideoDecoder":
         return self
@@ -100,8 +104,14 @@ class VideoDecoder:
 
     @property
     def num_declared(self) -> int:
-        """The number of frames that the container counts; 0 where it does not."""
-        return max(self._stream.frames, 0)
+        """The number of frames that the container counts, including those that an edit list hides; 0 where it does not
+        count them."""
+        return self._stream.frames if 0 < self._stream.frames < MAX_FRAMES else 0
+
+    @property
+    def hides_frames(self) -> bool:
+        """Whether an edit list may hide frames that the container counts."""
+        return self._container.format.name.startswith("mov")
 
     @property
     def declared_seconds(self) -> float | None:
@@ -111,7 +121,7 @@ class VideoDecoder:
         Flash videos declare up to 2 frames more.
         """
         kind, stream = self._container.format.name, self._stream
-        if kind in ("flv", "live_flv", "ogg", "mpeg", "mpegts"):
+        if kind in ("flv", "live_flv", "ogg", "mpeg", "mpegts") or (kind == "asf" and self._container.streams.audio):
             return None
         if stream.duration and stream.duration > 0:
             return float(stream.duration * stream.time_base)
@@ -133,13 +143,12 @@ class VideoDecoder:
         with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
             self._container.seek(stamp, stream=self._stream)
         self._codec.flush_buffers()
-        self._last = -1
+        self._last, self._before, self._damaged = -1, None, False
 
     def frames(self) -> Iterator[DecodedFrame]:
-        """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones, unless
-        they are to be converted."""
-        decoded = self._decode()
-        for frame in _deinterlace(decoded) if self._deinterlace else self._check_progressive(decoded):
+        """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones that
+        are not to be converted."""
+        for frame in self._convert_interlaced(self._decode()):
             self._last = self._find_position(frame.pts)
             yield DecodedFrame(self._last, frame.pts or 0, frame)
 
@@ -174,26 +183,35 @@ class VideoDecoder:
             except av.FFmpegError:
                 self._damaged, num_errors = True, num_errors + 1
 
-    def _check_progressive(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+    def _convert_interlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+        """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on."""
+        graph = None
         for frame in frames:
-            if frame.interlaced_frame:
+            if graph is None and not frame.interlaced_frame:
+                yield frame
+                continue
+            if not self._deinterlace:
                 raise video_error(
                     "path",
                     expected="a video of progressive frames",
                     got=f"one of interlaced fields, {str(self._path)!r}",
-                    cure="Convert it while reading, with deinterlace=True (--deinterlace).",
+                    cure="Convert it while reading, with deinterlace=True.",
                 )
-            yield frame
+            graph, self.has_converted = graph or _make_deinterlacer(frame), True
+            graph.push(frame)
+            yield from _pull(graph)
+        if graph is not None:
+            graph.push(None)
+            yield from _pull(graph)
 
     def _find_position(self, stamp: int | None) -> int:
-        """The position of the next frame: after damage it is found by the time stamps of all packets."""
-        if not self._damaged or stamp is None:
-            return self._last + 1
-        if self._stamps is None:
-            self._stamps = _read_stamps(self._path)
-        place = int(np.searchsorted(self._stamps, stamp))
-        known = place < len(self._stamps) and self._stamps[place] == stamp
-        return max(place, self._last + 1) if known else self._last + 1
+        """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
+        lost, frame = 0, 1 / (self._stream.guessed_rate or Fraction(DEFAULT_FPS)) / self.time_base
+        if self._damaged and stamp is not None:
+            before = self._before if self._before is not None else (self._stream.start_time or 0) - frame
+            lost = round((stamp - before) / frame) - 1
+        self._damaged, self._before = False, stamp
+        return self._last + 1 + (lost if 0 < lost < MAX_LOST_FRAMES else 0)
 
     def _choose_codec(self, threads: int) -> av.VideoCodecContext:
         codec = self._stream.codec_context
@@ -242,39 +260,16 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
     raise video_error("path", expected="a video file or a folder of images", got=got)
 
 
-def _read_stamps(path: Path) -> np.ndarray:
-    """Time stamps of all packets that are shown, increasing."""
-    with _open_container(path) as container:
-        stream, stamps = _choose_stream(container, path), []
-        try:
-            for packet in container.demux(stream):
-                if packet.size and packet.pts is not None and not packet.is_discard:
-                    stamps.append(packet.pts)
-        except av.FFmpegError:  # the end of what can be read
-            pass
-    return np.unique(np.array(stamps, np.int64))
-
-
-def _deinterlace(frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
-    """Interlaced frames converted to progressive ones of the same time; others are passed on."""
-    graph, time_base = None, None
-    for frame in frames:
-        if graph is None:
-            graph, time_base = Graph(), frame.time_base
-            # One frame for each frame; the output's clock would be twice as fast.
-            units = f"settb={time_base.numerator}/{time_base.denominator}"
-            source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=time_base)
-            graph.link_nodes(
-                source,
-                graph.add("bwdif", "mode=send_frame:deint=interlaced"),
-                graph.add("settb", units.removeprefix("settb=")),
-                graph.add("buffersink"),
-            ).configure()
-        graph.push(frame)
-        yield from _pull(graph)
-    if graph is not None:
-        graph.push(None)
-        yield from _pull(graph)
+def _make_deinterlacer(frame: av.VideoFrame) -> Graph:
+    graph, clock = Graph(), frame.time_base
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock)
+    # One frame for each frame, and its clock: bwdif's would be twice as fast.
+    nodes = (
+        graph.add("bwdif", "mode=send_frame:deint=interlaced"),
+        graph.add("settb", f"{clock.numerator}/{clock.denominator}"),
+    )
+    graph.link_nodes(source, *nodes, graph.add("buffersink")).configure()
+    return graph
 
 
 def _pull(graph: Graph) -> Iterator[av.VideoFrame]:

@@ -12,6 +12,7 @@ import numpy as np
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer
+from foldgauss.io.media.clip import video_error
 from foldgauss.io.media.decoder import CONVERSION
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
@@ -82,14 +83,11 @@ def choose_encoding(
         if not (is_integer(crf, 0) and crf <= chosen.crf[1]):
             raise invalid("crf", expected=f"a whole number from 0 to {chosen.crf[1]} for {name}", got=repr(crf))
     if pixel_format is None:
-        pixel_format = chosen.pixel_formats[0] if not has_alpha else chosen.alpha_format
-        if pixel_format is None:
-            cure = "Take vp9, prores or ffv1, or composite the frames over a color."
-            raise invalid("codec", expected="one that keeps alpha", got=name, cure=cure)
+        pixel_format = chosen.alpha_format if has_alpha and chosen.alpha_format else chosen.pixel_formats[0]
     check_one_of("pixel_format", pixel_format, chosen.pixel_formats)
     if has_alpha and not _has_alpha(pixel_format):
-        cure = f"Take {chosen.alpha_format}." if chosen.alpha_format else "Take the codec vp9, prores or ffv1."
-        raise invalid("pixel_format", expected="one with alpha, as the frames have it", got=pixel_format, cure=cure)
+        cure = "Take vp9 in a .webm, prores in a .mov or ffv1 in a .mkv, or composite the frames over a color."
+        raise video_error("frames", expected=f"RGB for {name} in {pixel_format}", got="RGBA", cure=cure)
     return Encoding(chosen, crf if crf is not None else chosen.crf and chosen.crf[0], pixel_format)
 
 

@@ -90,7 +90,7 @@ class FrameIndex:
         self.num_before = len(places) - len(digests)  # frames decoded before the first one indexed
         self.positions = places[self.num_before :] - self.start
         self.alpha_at_size: dict[tuple[int, int], bool] = {}  # found by the reader
-        self.last_margin = 1  # of the reader's last seek, in frames
+        self.last_margin = 0  # of the reader's last seek, in frames
 
     def __repr__(self) -> str:
         height, width = self.size
@@ -214,7 +214,7 @@ def index_video(
     fps: float | None = None,
     on_frame: Callable[[], object] = lambda: None,
     find_cuts: bool = True,
-    deinterlace: bool = False,
+    deinterlace: bool = True,
 ) -> FrameIndex:
     """Decode a clip once, frame by frame, and return its index. Memory: a few frames, and some 100 bytes per frame.
 

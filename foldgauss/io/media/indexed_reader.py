@@ -26,7 +26,7 @@ from foldgauss.io.media.video_reading import choose_reader
 
 #: Frames before the wanted one at which a seek aims, in turn: after a seek into the middle of a stream, frames may show
 #: artifacts until the next key frame.
-MARGINS = (1, 16, 64, 256, 1024, 4096, 16384)
+MARGINS = (0, 16, 64, 256, 1024, 4096, 16384)
 #: Distance in frames up to which an open decoder reads on instead of seeking.
 NEAR = 64
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from foldgauss.io.media.clip import ReadResult, check_range_within, format_size, no_frames_error, video_error
-from foldgauss.io.media.decoder import DecodedFrame, VideoDecoder
+from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_rate import (
     DEFAULT_FPS,
     MAX_FPS,
@@ -22,7 +22,7 @@ from foldgauss.io.media.resizing import copy_to_blocks
 
 
 def read_video_file(
-    path: Path, start: int, stop: int | None, prepare: Callable, *, deinterlace: bool = False
+    path: Path, start: int, stop: int | None, prepare: Callable, *, deinterlace: bool = True
 ) -> ReadResult:
     """The frames of a video file."""
     kept, passed, report = decode_file(
@@ -36,7 +36,7 @@ class DecodeReport(NamedTuple):
     """What a pass through a video file finds besides its frames.
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
-    `notes`: about the shape of pixels. `seconds`: increasing times of all frames decoded. `time_base`: seconds, the
+    `notes`: about the shape of pixels and interlacing. `seconds`: increasing times of all frames decoded. `time_base`: seconds, the
     unit of time stamps. `threads`: of the decoder.
     """
 
@@ -61,7 +61,7 @@ def decode_file(
     stop: int | None,
     keep: Callable[[Iterator[np.ndarray]], list],
     *,
-    deinterlace: bool = False,
+    deinterlace: bool = True,
 ) -> tuple[list, list[FramePlace], DecodeReport]:
     """Decode a video file once. Returns what `keep` makes of its BGR or BGRA frames from `start` up to `stop`, the
     places of all frames decoded, and a report. Raises `VideoError` for a file that cannot be read."""
@@ -79,7 +79,10 @@ def decode_file(
         time_base = float(decoder.time_base)
         seconds = make_increasing([one.stamp * time_base for one in passed], fps)
         num_total = max(_count_declared(decoder, seconds, fps, passed[-1].position + 1), passed[-1].position + 1)
-        notes, threads = _describe_pixel_aspect(decoder.pixel_aspect), decoder.threads
+        notes = _describe_pixel_aspect(decoder.pixel_aspect)
+        if decoder.has_converted:
+            notes += ("interlaced frames are converted to progressive ones.",)
+        threads = decoder.threads
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     check_range_within(start, stop, num_total, path)
     if not kept:
@@ -110,11 +113,13 @@ def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_
     Its own count includes frames that an edit list hides, as in an MP4 that was cut without encoding.
     """
     shown, num_declared = decoder.declared_seconds, decoder.num_declared
-    if num_declared and (num_declared <= num_reached or shown is None):
+    if num_declared and not decoder.hides_frames:
         return num_declared
     if shown is None:
-        return num_reached
+        return num_declared or num_reached
     estimated = estimate_num_frames(seconds - seconds[0], shown, fps, num_reached)
+    if estimated >= MAX_FRAMES:  # a damaged header
+        return num_reached
     return min(num_declared, estimated) if num_declared else estimated
 
 

@@ -30,7 +30,7 @@ def read_video(
     size: tuple[int, int] | None = None,
     fps: float | None = None,
     center_crop: tuple[int, int] | None = None,
-    deinterlace: bool = False,
+    deinterlace: bool = True,
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
 
@@ -44,8 +44,8 @@ def read_video(
     Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. Colors of
     videos are converted by the matrix and the range that the file declares (BT.601 and limited where it does not), with
     interpolated chroma. Where any frame is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get
-    an alpha of 255. Interlaced videos are refused, or with `deinterlace` converted to progressive frames (FFmpeg's
-    bwdif, one frame for each). Videos are rotated upright. A damaged one yields the frames that decode; see
+    an alpha of 255. Interlaced frames are converted to progressive ones (FFmpeg's bwdif, one for each), or refused
+    without `deinterlace`. Videos are rotated upright. A damaged one yields the frames that decode; see
     `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
 
     The format is detected from the first bytes, not from the name. No file or address that `path` refers to is opened,
