@@ -19,6 +19,7 @@ from foldgauss.io.exchange.pseudomesh import Pseudomesh, read_pseudomesh, write_
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import Clip, VideoError
+from foldgauss.io.media.encoder import Sound
 from foldgauss.io.media.frame_index import FrameIndex, index_video
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.media.lazy_frames import LazyFrames
@@ -41,6 +42,7 @@ __all__ = [
     "ModelFileError",
     "OutputError",
     "Pseudomesh",
+    "Sound",
     "VideoError",
     "export",
     "frame_gaussians",

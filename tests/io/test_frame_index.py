@@ -144,7 +144,7 @@ class _Counting(decoder.VideoDecoder):
     def frames(self):
         for frame in super().frames():
             _Counting.decoded += 1
-            yield _CountedFrame(frame.position, frame.stamp, frame.decoded)
+            yield _CountedFrame(frame.position, frame.stamp, frame.decoded, frame.size)
 
 
 class _CountedFrame(decoder.DecodedFrame):

@@ -5,12 +5,13 @@ import struct
 import subprocess
 import sys
 
+import av
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from foldgauss.io import Clip, VideoError, read_video, write_frames, write_image, write_video
+from foldgauss.io import Clip, Sound, VideoError, read_video, write_frames, write_image, write_video
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media import resizing
@@ -278,6 +279,66 @@ def test_a_smaller_crf_is_better_and_larger(tmp_path):
     assert errors[0] > errors[1] > errors[2]
 
 
+def _tones(path, at):
+    """Seconds of sound, and the frequency in Hz at each of the given seconds."""
+    with av.open(str(path)) as container:
+        resampler = av.AudioResampler(format="flt", layout="mono", rate=48_000)
+        parts = [part.to_ndarray() for frame in container.decode(audio=0) for part in resampler.resample(frame)]
+    samples = np.concatenate(parts, 1)[0]
+    chosen = [samples[int(48_000 * second) :][:9600] for second in at]
+    return len(samples) / 48_000, [5 * int(np.abs(np.fft.rfft(part * np.hanning(9600))).argmax()) for part in chosen]
+
+
+@pytest.fixture(scope="module")
+def sound_file(tmp_path_factory):
+    """Half a second of 440 Hz, then 1.5 s of 880 Hz."""
+    path, seconds = tmp_path_factory.mktemp("sound") / "sound.m4a", np.arange(96_000) / 48_000
+    samples = 0.3 * np.sin(2 * np.pi * seconds * np.where(seconds < 0.5, 440, 880))
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=48_000, layout="mono")
+        for first in range(0, 96_000, 1024):
+            part = np.zeros((1, 1024), np.float32)
+            part[0, : len(samples[first : first + 1024])] = samples[first : first + 1024]
+            frame = av.AudioFrame.from_ndarray(part, format="fltp", layout="mono")
+            frame.sample_rate, frame.pts = 48_000, first
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "speed", "seconds", "tones"),
+    [
+        ("a.mp4", 0.0, 1.0, 1.0, {0.2: 440, 0.7: 880}),
+        ("a.webm", 0.3, 1.0, 1.0, {0.0: 440, 0.4: 880}),
+        ("a.mov", 0.0, 0.6, 1.0, {0.1: 440, 0.5: 440}),
+        ("a.mkv", 0.0, 0.2, 1.0, {0.1: 440, 0.7: 440}),
+        ("a.mp4", 0.5, 4.0, 0.4, {0.1: 880}),
+    ],
+)
+def test_sound_is_added_and_stretched_at_its_pitch(tmp_path, sound_file, name, start, speed, seconds, tones):
+    path = write_video(tmp_path / name, _moving(10), 10, sound=Sound(sound_file, start, speed))
+    found, heard = _tones(path, tones)
+    assert found == pytest.approx(seconds, abs=0.08)
+    assert heard == pytest.approx(list(tones.values()), abs=10)
+    assert read_video(path).num_frames == read_video(path).num_declared == 10
+
+
+def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
+    out = tmp_path / "a.mp4"
+    for sound, words in (
+        (Sound(clip_file), ("sound: expected a file with sound", "clip.webm")),
+        (Sound(sound_file, -1.0), ("sound.start", "-1.0")),
+        (Sound(sound_file, 0.0, 0.001), ("sound.speed", "0.01 to 100")),
+    ):
+        with pytest.raises(ValueError, match="expected") as caught:
+            write_video(out, _moving(), 10, sound=sound)
+        _one_line(caught, *words)
+    with pytest.raises(FileNotFoundError):
+        write_video(out, _moving(), 10, sound=Sound(tmp_path / "missing.mp4"))
+    assert not out.exists()
+
+
 def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):
     data = write_video(tmp_path / "a.mp4", _moving(), 10).read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")
@@ -292,8 +353,8 @@ def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):
         ("a.mp4", {"crf": 16.5}, ("crf", "whole number", "16.5")),
         ("a.mkv", {"crf": 16}, ("crf", "none for ffv1")),
         ("a.mp4", {"pixel_format": "rgb24"}, ("pixel_format", "yuv420p", "rgb24")),
-        ("a.gif", {"crf": 3}, ("codec, crf, pixel_format", "a.gif")),
-        ("a", {"codec": "h264"}, ("codec, crf, pixel_format", "'a'")),
+        ("a.gif", {"crf": 3}, ("codec, crf, pixel_format, sound", "a.gif")),
+        ("a", {"codec": "h264"}, ("codec, crf, pixel_format, sound", "'a'")),
     ],
 )
 def test_encodings_that_do_not_fit_are_refused(tmp_path, name, options, words):

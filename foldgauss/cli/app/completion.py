@@ -11,7 +11,7 @@ from foldgauss.io.models.video_model import MODEL_SUFFIX
 
 Completion = Callable[[str], list[str]]
 
-#: Suffixes of clips that are completed; others that OpenCV reads can be typed.
+#: Suffixes of clips that are completed; others that are read can be typed.
 CLIP_SUFFIXES = (".mp4", ".webm", ".mov", ".mkv", ".avi", ".m4v", ".y4m", *ANIMATION_SUFFIXES, *IMAGE_SUFFIXES)
 
 

@@ -60,7 +60,7 @@ def read_fitted_clip(
     if has_other_frames(about, clip):
         warn(
             f"the frames of {clip.source} are not those that the model was fitted to ({about.get('clip')}): "
-            "another clip or range, or another version of OpenCV decoded them."
+            "another clip or range, or another decoder read them."
         )
     return clip
 

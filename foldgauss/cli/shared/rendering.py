@@ -3,20 +3,66 @@
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from foldgauss.cli.app.application import err, out, wrong_use
+from foldgauss.cli.app.application import WrongUse, err, name_option, out, wrong_use
+from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
 from foldgauss.cli.shared.tables import format_count
+from foldgauss.cli.shared.timeline import Timeline
+from foldgauss.io.media.encoder import CODECS, Sound
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.lazy_frames import LazyFrames
 from foldgauss.io.media.video_writing import MAX_GIF_FPS, write_image, write_video
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.metrics import Evaluation, evaluate
+
+CodecName = Annotated[
+    str | None,
+    typer.Option(
+        "--codec",
+        help="h264 (default of .mp4), h265, av1, vp9 (of .webm), prores (of .mov) or ffv1 (of .mkv; lossless).",
+        autocompletion=complete_choice(tuple(CODECS)),
+    ),
+]
+Crf = Annotated[
+    int | None, typer.Option(help="Constant rate factor: smaller makes better and larger files [default: h264 16].")
+]
+PixelFormat = Annotated[
+    str | None, typer.Option(metavar="NAME", help="FFmpeg's pixel format, as yuv444p or yuv420p10le.")
+]
+SoundFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--sound",
+        help="File whose sound the video gets, usually the fitted clip; stretched in slow motion, at its pitch.",
+    ),
+]
+
+
+class VideoOptions(NamedTuple):
+    """Options of `write_video` for video files."""
+
+    codec: str | None = None
+    crf: int | None = None
+    pixel_format: str | None = None
+    sound: Sound | None = None
+
+
+def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], fps: float) -> Sound | None:
+    """The sound of the fitted frames in the file `path`. `about`: the model's metadata; `fps`: of the clip."""
+    if path is None:
+        return None
+    if timeline.remap is not None or timeline.chosen is not None or (timeline.speed or 1.0) < 0:
+        raise wrong_use("--sound", expected="a constant speed forwards", got="other times", cure="Leave --sound out.")
+    first = (about.get("frames") or (0,))[0] or 0
+    return Sound(path, first / fps, timeline.speed or 1.0)
+
 
 #: Columns of a progress bar after the elapsed time.
 TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
@@ -66,6 +112,7 @@ def render_to_file(
     background: tuple[float, float, float] = BLACK,
     image_format: str = "png",
     overwrite: bool = False,
+    options: VideoOptions = VideoOptions(),  # noqa: B008
 ) -> None:
     """Write the images at `times` as a video or to a folder, or a single image to a .png."""
     if path.suffix.lower() == IMAGE_SUFFIX and not path.is_dir():
@@ -81,5 +128,12 @@ def render_to_file(
         raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
     with progress_bar("Rendering", len(times)) as advance:
         images = advance_over(model.frames(times, size, background=background), advance)
-        write_video(path, images, min(fps, MAX_FPS), overwrite=overwrite, image_format=image_format)
+        try:
+            write_video(
+                path, images, min(fps, MAX_FPS), overwrite=overwrite, image_format=image_format, **options._asdict()
+            )
+        except ValueError as error:
+            if not str(error).startswith(VideoOptions._fields):
+                raise
+            raise WrongUse(name_option(str(error))) from error
     out.print(f"{path}: {format_count(len(times), 'frame')} at {fps:g} frames per second", soft_wrap=True)

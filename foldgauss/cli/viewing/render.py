@@ -28,7 +28,15 @@ from foldgauss.cli.shared.outputs import (
     refuse_huge,
     refuse_input,
 )
-from foldgauss.cli.shared.rendering import render_to_file
+from foldgauss.cli.shared.rendering import (
+    CodecName,
+    Crf,
+    PixelFormat,
+    SoundFile,
+    VideoOptions,
+    choose_sound,
+    render_to_file,
+)
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample, parse_remap
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
@@ -42,7 +50,7 @@ def render(
         Path | None,
         typer.Option(
             "--out",
-            help="FILE.mp4, .webm, .gif or .webp; a folder for images; FILE.png for one time "
+            help="FILE.mp4, .webm, .mov, .mkv, .gif or .webp; a folder for images; FILE.png for one time "
             "[default: the model's name in this folder, .mp4, or .png for one time].",
         ),
     ] = None,
@@ -71,6 +79,10 @@ def render(
     alpha_cutoff: AlphaCutoff = None,
     support_radius: SupportRadius = None,
     transmittance_stop: TransmittanceStop = None,
+    codec: CodecName = None,
+    crf: Crf = None,
+    pixel_format: PixelFormat = None,
+    sound: SoundFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a video, also between its frames."""
@@ -91,6 +103,7 @@ def render(
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)
     refuse_huge(image_size or model.size)
+    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, read_origin(model_path), model.fps))
     shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
     timeline.warn_of_end(model.num_frames, model.fps)
     render_to_file(
@@ -102,6 +115,7 @@ def render(
         background=background_color,
         image_format=image_format or "png",
         overwrite=overwrite,
+        options=options,
     )
 
 

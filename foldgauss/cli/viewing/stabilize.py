@@ -10,11 +10,20 @@ from foldgauss.cli.app.application import WrongUse, app, err, name_option, out, 
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_color, parse_size
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
-from foldgauss.cli.shared.rendering import progress_bar, render_to_file
+from foldgauss.cli.shared.rendering import (
+    CodecName,
+    Crf,
+    PixelFormat,
+    SoundFile,
+    VideoOptions,
+    choose_sound,
+    progress_bar,
+    render_to_file,
+)
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
-from foldgauss.io.models.video_model import load_video_model
+from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.video.motion.camera_path import estimate_camera_path
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
 
@@ -26,7 +35,7 @@ def stabilize_command(
         Path | None,
         typer.Option(
             "--out",
-            help="FILE.mp4, .webm, .gif or .webp; a folder for images "
+            help="FILE.mp4, .webm, .mov, .mkv, .gif or .webp; a folder for images "
             "[default: the model's name in this folder, .stable.mp4].",
         ),
     ] = None,
@@ -48,6 +57,10 @@ def stabilize_command(
     fps: Fps = None,
     speed: Speed = None,
     background: Annotated[str, typer.Option(metavar="RRGGBB", help="Background color, as ffffff.")] = "000000",
+    codec: CodecName = None,
+    crf: Crf = None,
+    pixel_format: PixelFormat = None,
+    sound: SoundFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a steadier camera would show it."""
@@ -63,6 +76,7 @@ def stabilize_command(
         check_writable(out_path)
     model = load_video_model(model_path)
     refuse_huge(image_size or model.size)
+    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, read_origin(model_path), model.fps))
     shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:
         path = estimate_camera_path(model, on_frame=advance)
@@ -82,6 +96,7 @@ def stabilize_command(
         size=image_size,
         background=background_color,
         overwrite=overwrite,
+        options=options,
     )
 
 

@@ -38,16 +38,21 @@ _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 @dataclass(frozen=True)
 class DecodedFrame:
     """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
-    `VideoDecoder.time_base`; 0 for a stream without time stamps."""
+    `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
+    which a frame of another size is stretched."""
 
     position: int
     stamp: int
     decoded: av.VideoFrame
+    size: tuple[int, int]
 
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4)."""
         has_alpha = any(part.is_alpha for part in self.decoded.format.components)
-        image = self.decoded.to_ndarray(format="bgra" if has_alpha else "bgr24", interpolation=CONVERSION)
+        height, width = self.size
+        image = self.decoded.to_ndarray(
+            width=width, height=height, format="bgra" if has_alpha else "bgr24", interpolation=CONVERSION
+        )
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
@@ -65,7 +70,7 @@ class VideoDecoder:
     """
 
     def __init__(self, path: Path, threads: int = 0, deinterlace: bool = True):
-        self._path, self._deinterlace, self._container = path, deinterlace, _open_container(path)
+        self._path, self._deinterlace, self._container = path, deinterlace, open_container(path)
         try:
             self._stream = _choose_stream(self._container, path)
             check_num_pixels(path, (self._stream.height, self._stream.width))
@@ -74,6 +79,7 @@ class VideoDecoder:
             self.close()
             raise
         self.time_base: Fraction = self._stream.time_base
+        self._size = self._codec.height, self._codec.width
         self.has_converted = False  # whether any frame was interlaced
         self._last = -1  # position of the frame decoded last
         self._before: int | None = None  # its time stamp
@@ -150,7 +156,8 @@ class VideoDecoder:
         are not to be converted."""
         for frame in self._convert_interlaced(self._decode()):
             self._last = self._find_position(frame.pts)
-            yield DecodedFrame(self._last, frame.pts or 0, frame)
+            self._size = self._size if all(self._size) else (frame.height, frame.width)
+            yield DecodedFrame(self._last, frame.pts or 0, frame, self._size)
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         for packet in self._read_packets():
@@ -199,10 +206,10 @@ class VideoDecoder:
                 )
             graph, self.has_converted = graph or _make_deinterlacer(frame), True
             graph.push(frame)
-            yield from _pull(graph)
+            yield from pull_frames(graph)
         if graph is not None:
             graph.push(None)
-            yield from _pull(graph)
+            yield from pull_frames(graph)
 
     def _find_position(self, stamp: int | None) -> int:
         """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
@@ -223,7 +230,8 @@ class VideoDecoder:
         return codec
 
 
-def _open_container(path: Path) -> av.container.InputContainer:
+def open_container(path: Path) -> av.container.InputContainer:
+    """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
     if kind == LIST:
         raise video_error(
@@ -272,7 +280,8 @@ def _make_deinterlacer(frame: av.VideoFrame) -> Graph:
     return graph
 
 
-def _pull(graph: Graph) -> Iterator[av.VideoFrame]:
+def pull_frames(graph: Graph) -> Iterator[av.VideoFrame | av.AudioFrame]:
+    """The frames that a graph of filters has ready."""
     while True:
         try:
             yield graph.pull()

@@ -1,7 +1,9 @@
 """Video encoders of PyAV, that is of FFmpeg's libraries, and what each of them takes."""
 
+import math
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from types import MappingProxyType
@@ -9,11 +11,12 @@ from typing import NamedTuple
 
 import av
 import numpy as np
+from av.filter import Graph
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer
-from foldgauss.io.media.clip import video_error
-from foldgauss.io.media.decoder import CONVERSION
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss.io.media.clip import PathLike, check_readable, video_error
+from foldgauss.io.media.decoder import CONVERSION, open_container, pull_frames
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
 
@@ -55,7 +58,20 @@ CODECS = {
 }
 #: The codec of each extension unless one is given.
 DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
+SAMPLE_RATE = 48_000
 VIDEO_SUFFIXES = tuple(DEFAULT_CODECS)
+
+
+class Sound(NamedTuple):
+    """The sound of a video: that of the file `path` from second `start` on.
+
+    `speed`: the video is played that many times as fast as that file; the sound is stretched, its pitch kept. It ends
+    with the video or with the file, whichever is first.
+    """
+
+    path: PathLike
+    start: float = 0.0
+    speed: float = 1.0
 
 
 class Encoding(NamedTuple):
@@ -95,7 +111,9 @@ def _has_alpha(pixel_format: str) -> bool:
     return any(part.is_alpha for part in av.VideoFormat(pixel_format).components)
 
 
-def encode_video(path: Path, frames: Iterator[np.ndarray], fps: float, encoding: Encoding) -> None:
+def encode_video(
+    path: Path, frames: Iterator[np.ndarray], fps: float, encoding: Encoding, sound: Sound | None = None
+) -> None:
     """Encode RGB frames, or premultiplied RGBA ones, which are stored with straight alpha.
 
     Colors are converted by BT.709 in limited range, and the file says so. An odd height or width is padded by repeating
@@ -110,6 +128,7 @@ def encode_video(path: Path, frames: Iterator[np.ndarray], fps: float, encoding:
     with container:
         stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
         stream.pix_fmt = encoding.pixel_format
+        packets, waiting = _encode_sound(container, sound, path.suffix.lower()), None
         for number, frame in enumerate(frames):
             image = _pad(frame, steps)
             if image.shape[2] == 4:
@@ -122,7 +141,60 @@ def encode_video(path: Path, frames: Iterator[np.ndarray], fps: float, encoding:
             given = given.reformat(format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
             given.pts, given.time_base = number, 1 / rate
             container.mux(stream.encode(given))
+            while (waiting := waiting or next(packets, None)) and waiting.pts * waiting.time_base < (number + 1) / rate:
+                container.mux(waiting)
+                waiting = None
         container.mux(stream.encode())
+
+
+def _encode_sound(container: av.container.OutputContainer, sound: Sound | None, suffix: str) -> Iterator[av.Packet]:
+    """Add a stream of sound to the container; its packets, as they are asked for."""
+    if sound is None:
+        return iter(())
+    stream = container.add_stream("libopus" if suffix == ".webm" else "aac", rate=SAMPLE_RATE, layout="stereo")
+    return _read_sound(stream, sound)
+
+
+def _read_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
+    with open_container(Path(sound.path)) as source:
+        of_file = source.streams.best("audio")
+        graph = Graph()
+        # atempo takes factors from 0.5 to 100.
+        slow = max(0, math.ceil(-math.log2(sound.speed)))
+        tempo = [("atempo", f"{(sound.speed ** (1 / max(slow, 1))):.9f}")] * max(slow, 1)
+        steps = [("atrim", f"start={sound.start}"), ("asetpts", "PTS-STARTPTS"), *tempo]
+        steps += [("aformat", f"sample_fmts={stream.format.name}:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
+        nodes = [graph.add(*step) for step in (*steps, ("abuffersink",))]
+        graph.link_nodes(graph.add_abuffer(template=of_file), *nodes).configure()
+        if stream.codec_context.frame_size:
+            graph.set_audio_frame_size(stream.codec_context.frame_size)
+        for frame in _decode_sound(source, of_file):
+            graph.push(frame)
+            for filtered in pull_frames(graph):
+                yield from stream.encode(filtered)
+        yield from stream.encode()
+
+
+def _decode_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame | None]:
+    """The frames of sound that decode, and None at the end."""
+    for packet in source.demux(stream):
+        with suppress(av.FFmpegError):
+            yield from packet.decode()
+    yield None
+
+
+def check_sound(sound: Sound) -> None:
+    """Raise `VideoError` for a file without sound, ValueError for other values that are refused."""
+    if not is_within(sound.start, "[0, inf)"):
+        raise invalid("sound.start", expected="seconds, at least 0", got=repr(sound.start))
+    if not is_within(sound.speed, "[0.01, 100]"):
+        raise invalid(
+            "sound.speed", expected="a speed from 0.01 to 100", got=f"{sound.speed:g}", cure="Leave sound out."
+        )
+    with open_container(check_readable(sound.path)) as source:
+        if not source.streams.audio:
+            got = f"{str(sound.path)!r}, which has none"
+            raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")
 
 
 def _declare_bt709(context: av.VideoCodecContext) -> None:

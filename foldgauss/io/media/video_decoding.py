@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss.io.media.clip import ReadResult, check_range_within, format_size, no_frames_error, video_error
+from foldgauss.io.media.clip import ReadResult, check_range_within, no_frames_error, video_error
 from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_rate import (
     DEFAULT_FPS,
@@ -36,8 +36,8 @@ class DecodeReport(NamedTuple):
     """What a pass through a video file finds besides its frames.
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
-    `notes`: about the shape of pixels and interlacing. `seconds`: increasing times of all frames decoded. `time_base`: seconds, the
-    unit of time stamps. `threads`: of the decoder.
+    `notes`: about the shape of pixels and interlacing. `seconds`: increasing times of all frames decoded. `time_base`:
+    the unit of time stamps, in seconds. `threads`: of the decoder.
     """
 
     fps: float
@@ -68,7 +68,7 @@ def decode_file(
     passed: list[FramePlace] = []
     with VideoDecoder(path, deinterlace=deinterlace) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
-        kept = keep(_check_same_size(select_frames(decoder.frames(), start, stop, passed), path))
+        kept = keep(select_frames(decoder.frames(), start, stop, passed))
         if not passed:
             raise video_error(
                 "path",
@@ -121,20 +121,6 @@ def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_
     if estimated >= MAX_FRAMES:  # a damaged header
         return num_reached
     return min(num_declared, estimated) if num_declared else estimated
-
-
-def _check_same_size(frames: Iterable[np.ndarray], path: Path) -> Iterator[np.ndarray]:
-    shape = None
-    for number, frame in enumerate(frames):
-        shape = shape or frame.shape[:2]
-        if frame.shape[:2] != shape:
-            raise video_error(
-                "path",
-                expected=f"frames of one size, {format_size(shape)}",
-                got=f"{format_size(frame.shape)} from frame {number} on in {str(path)!r}",
-                cure="Cut the video there, or choose frames=(A, B).",
-            )
-        yield frame
 
 
 # ------------------------------------------------------------------------------------------------ notes

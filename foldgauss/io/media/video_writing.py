@@ -13,7 +13,7 @@ from PIL import Image
 from foldgauss._runtime.checks import check_one_of
 from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, check_replaceable, output_error
 from foldgauss.io.media.clip import PathLike, check_fps, format_size, video_error
-from foldgauss.io.media.encoder import VIDEO_SUFFIXES, choose_encoding, encode_video
+from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
@@ -32,6 +32,7 @@ def write_video(
     codec: str | None = None,
     crf: int | None = None,
     pixel_format: str | None = None,
+    sound: Sound | None = None,
 ) -> Path:
     """Write frames, uint8 RGB of shape (height, width, 3), and return the path. No partial file is left on errors.
 
@@ -41,6 +42,8 @@ def write_video(
     `pixel_format` is FFmpeg's name; by default "yuv420p" (half the color resolution) except for ProRes and FFV1. An odd
     height or width is then padded by repeating its last row or column. Colors are those of BT.709, and the file says
     so. An MP4 can be played while it is loaded (faststart).
+
+    `sound`: that of another file, as `Sound("clip.mp4", start=2.0, speed=0.5)`; stored as AAC, in .webm as Opus.
 
     Frames with alpha, shape (height, width, 4) with colors premultiplied as in `Clip`, go to "vp9" in .webm or .mkv,
     "prores" and "ffv1".
@@ -62,9 +65,9 @@ def write_video(
         raise video_error("frames", expected="an iterable of images", got=type(frames).__name__, cure=cure)
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     suffix = path.suffix.lower()
-    if suffix not in VIDEO_SUFFIXES and (codec, crf, pixel_format) != (None, None, None):
+    if suffix not in VIDEO_SUFFIXES and any(option is not None for option in (codec, crf, pixel_format, sound)):
         got, cure = repr(path.name), f"Take {', '.join(VIDEO_SUFFIXES)}."
-        raise video_error("codec, crf, pixel_format", expected="a video file for them", got=got, cure=cure)
+        raise video_error("codec, crf, pixel_format, sound", expected="a video file for them", got=got, cure=cure)
     if path.is_dir() or not path.suffix:
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
@@ -79,9 +82,11 @@ def write_video(
     frames = _check_frames(frames, channels=(3, 4))
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, has_alpha=first.shape[2] == 4)
+    if sound is not None:
+        check_sound(sound)
     with atomic_path(path, suffix=suffix) as temporary:
         try:
-            encode_video(temporary, chain([first], frames), float(fps), encoding)
+            encode_video(temporary, chain([first], frames), float(fps), encoding, sound)
         except OSError as error:
             raise output_error(path, error) from error
         except av.FFmpegError as error:
