@@ -4,11 +4,11 @@ import contextlib
 import functools
 import io
 import struct
-import tempfile
 import warnings
 from pathlib import Path
 from random import Random
 
+import av
 import cv2
 import h5py
 import numpy as np
@@ -17,7 +17,6 @@ from PIL import Image
 from foldgauss.cli.measuring.profiles_file import load_profiles, save_profiles
 from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.media import format_detection
-from foldgauss.io.media.format_detection import _ASF_AUDIO, _CLUSTER, _MATROSKA_AUDIO
 from foldgauss.io.media.masks import MAX_PIXELS, MAX_PIXELS_PER_BYTE
 from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, ProfileCurves
 from foldgauss.uncertainty.posterior import draws_file
@@ -135,16 +134,14 @@ def _read_picture(path: Path) -> None:
 _READ = {
     f"foldgauss.io.media.{module}": names
     for module, names in {
-        "clip": (ONLY, "check_readable", "read_head", "check_range_within"),
+        "clip": (ONLY, "check_readable", "read_head", "check_range_within", "check_num_pixels"),
         "resizing": (
             ONLY, "make_resizer", "aspect_window", "convert_channels", "unify_channels", "copy_to_blocks",
             "stack_frames",
         ),
-        "opencv": (
-            ONLY, "open_video", "open_silently", "check_num_pixels", "_check_no_alpha", "grab_frames", "decode_frames",
-        ),
+        "decoder": (),
         "image_files": ("natural_sort_key", "_is_jpeg_sequence", "image_size"),
-        "video_decoding": ("_count_shown", "_can_convert"),
+        "video_decoding": (),
         "video_reading": (),
         "format_detection": (),
         "frame_rate": (),
@@ -166,22 +163,48 @@ PICTURES = Target(
 )
 
 
+#: Files that PyAV writes: extension, encoder, pixel format, options.
+_ENCODED = (
+    (".avi", "mjpeg", "yuvj420p", {}), (".mp4", "mpeg4", "yuv420p", {"bf": "2"}), (".ts", "mpeg2video", "yuv420p", {}),
+    (".mkv", "ffv1", "yuva420p", {}), (".webm", "libvpx-vp9", "yuva420p", {}), (".mov", "prores_ks", "yuv422p10le", {}),
+    (".mkv", "libx264", "yuv420p", {"flags": "+ilme+ildct", "bf": "2"}), (".wmv", "wmv2", "yuv420p", {}),
+    (".flv", "flv", "yuv420p", {}), (".mp4", "libx264", "yuv420p", {"movflags": "frag_keyframe+empty_moov"}),
+)  # fmt: skip
+
+
+def _encode(path: Path, frames: np.ndarray, codec: str, pixel_format: str, options: dict[str, str]) -> None:
+    muxing = {name: options[name] for name in ("movflags",) if name in options}
+    with av.open(str(path), "w", options=muxing) as container:
+        rest = {name: value for name, value in options.items() if name not in muxing}
+        stream = container.add_stream(codec, rate=10, options=rest)
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixel_format
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
 @functools.cache
 def _clips() -> tuple[bytes, ...]:
-    rng = np.random.default_rng(0)
-    frames = rng.integers(0, 255, (3, 16, 24, 3), np.uint8)
-    found = []
-    for suffix in (".mp4", ".webm", ".gif"):
-        found.append(written(lambda path: write_video(path, frames, 10), suffix))
-    with tempfile.TemporaryDirectory() as folder:
-        for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v"), ("c.avi", "XVID")):
-            path = str(Path(folder) / name)
-            writer = cv2.VideoWriter(path, cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 10, (24, 16))
-            for frame in frames:
-                writer.write(frame)
-            writer.release()
-            found.append(Path(path).read_bytes())
+    frames = np.random.default_rng(0).integers(0, 255, (5, 16, 24, 3), np.uint8)
+    found = [written(lambda path: write_video(path, frames, 10), suffix) for suffix in (".mp4", ".webm", ".gif")]
+    for suffix, *encoding in _ENCODED:
+        found.append(written(lambda path, how=encoding: _encode(path, frames, *how), suffix))
     return (*found, _with_edits(found[4]))
+
+
+def _with_edits(data: bytes) -> bytes:
+    """An MP4 whose index stands last, with a list of edits in its first track that shows half of it."""
+
+    def into(parent: int, new: bytes) -> None:
+        nonlocal data
+        size = int.from_bytes(data[parent - 4 : parent], "big")
+        data = data[: parent - 4] + (size + len(new)).to_bytes(4, "big") + data[parent:]
+
+    index, track = data.rindex(b"moov"), data.rindex(b"trak")
+    edits = struct.pack(">I4sI4sIIIii", 36, b"edts", 28, b"elst", 0, 1, 100, 0, 1 << 16)
+    into(index, edits)
+    into(track, edits)
+    return data[: track + 4] + edits + data[track + 4 :]
 
 
 def _clip_body(data: bytes) -> int:
@@ -204,26 +227,11 @@ _OTHERS = (
 )  # fmt: skip
 
 
-def _with_edits(data: bytes) -> bytes:
-    """An MP4 whose index stands last, with a list of edits in its first track that shows half of it."""
-
-    def into(parent: int, new: bytes) -> None:
-        nonlocal data
-        size = int.from_bytes(data[parent - 4 : parent], "big")
-        data = data[: parent - 4] + (size + len(new)).to_bytes(4, "big") + data[parent:]
-
-    index, track = data.rindex(b"moov"), data.rindex(b"trak")
-    edits = struct.pack(">I4sI4sIIIii", 36, b"edts", 28, b"elst", 0, 1, 100, 0, 1 << 16)
-    into(index, edits)
-    into(track, edits)
-    return data[: track + 4] + edits + data[track + 4 :]
-
-
 #: What may stand in a header, and what is asked of it.
 _MARKS = (
-    _MATROSKA_AUDIO,
-    _CLUSTER,
-    _ASF_AUDIO,
+    b"\x83\x81\x02",  # Matroska: the type of a track, sound
+    b"\x1f\x43\xb6\x75",  # Matroska: a cluster
+    b"\x53\xc0\x81\x01",  # Matroska: alpha beside the frames
     b"soun",
     b"vide",
     b"mvex",
@@ -273,16 +281,12 @@ VIDEO = Target(
 
 
 def _read_head(path: Path) -> None:
-    """All that is asked of a file's first bytes, and of an index, without decoding."""
-    size, head = path.stat().st_size, path.read_bytes()[: format_detection.HEAD_BYTES]
-    for ask in ("is_image_format", "may_be_animation", "has_alpha_plane", "has_frame_count"):
+    """All that is asked of a file's first bytes, without decoding."""
+    head = path.read_bytes()[: format_detection.HEAD_BYTES]
+    for ask in ("is_image_format", "may_be_animation"):
         getattr(format_detection, ask)(head)
-    format_detection.has_reliable_duration(head, size)
     claimed = format_detection.parse_image_size(head)
     assert claimed is None or format_detection.min_file_bytes(head, claimed) >= 0
-    with open(path, "rb") as file:
-        shown = format_detection.read_shown_seconds(file)
-    assert shown is None or shown > 0
     kind = format_detection.describe_kind(head)
     if kind is not None:
         raise ValueError(f"expected a video or an image, got {kind}")

@@ -78,7 +78,7 @@ class VideoDecoder:
         except VideoError:
             self.close()
             raise
-        self.time_base: Fraction = self._stream.time_base
+        self.time_base = self._stream.time_base or Fraction(1, 1000)
         self._size = self._codec.height, self._codec.width
         self.has_converted = False  # whether any frame was interlaced
         self._last = -1  # position of the frame decoded last
@@ -192,7 +192,7 @@ class VideoDecoder:
 
     def _convert_interlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
         """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on."""
-        graph = None
+        graph, of_graph = None, None
         for frame in frames:
             if graph is None and not frame.interlaced_frame:
                 yield frame
@@ -204,12 +204,13 @@ class VideoDecoder:
                     got=f"one of interlaced fields, {str(self._path)!r}",
                     cure="Convert it while reading, with deinterlace=True.",
                 )
-            graph, self.has_converted = graph or _make_deinterlacer(frame), True
+            kind = frame.height, frame.width, frame.format.name
+            if graph is None or kind != of_graph:
+                yield from flush_frames(graph)
+                graph, of_graph, self.has_converted = _make_deinterlacer(frame, self.time_base), kind, True
             graph.push(frame)
             yield from pull_frames(graph)
-        if graph is not None:
-            graph.push(None)
-            yield from pull_frames(graph)
+        yield from flush_frames(graph)
 
     def _find_position(self, stamp: int | None) -> int:
         """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
@@ -255,7 +256,11 @@ def open_container(path: Path) -> av.container.InputContainer:
 
 
 def _choose_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
+    known = [one for one in container.streams.video if one.codec_context is not None]
+    if container.streams.video and not known:
+        got, cure = f"an unknown one in {str(path)!r}", "Convert it with ffmpeg."
+        raise video_error("path", expected="a video whose codec is known here", got=got, cure=cure)
+    streams = [one for one in known if not one.disposition & Disposition.attached_pic]
     best = container.streams.best("video")
     if best in streams:
         return best
@@ -268,8 +273,8 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
     raise video_error("path", expected="a video file or a folder of images", got=got)
 
 
-def _make_deinterlacer(frame: av.VideoFrame) -> Graph:
-    graph, clock = Graph(), frame.time_base
+def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction) -> Graph:
+    graph = Graph()
     source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock)
     # One frame for each frame, and its clock: bwdif's would be twice as fast.
     nodes = (
@@ -278,6 +283,13 @@ def _make_deinterlacer(frame: av.VideoFrame) -> Graph:
     )
     graph.link_nodes(source, *nodes, graph.add("buffersink")).configure()
     return graph
+
+
+def flush_frames(graph: Graph | None) -> Iterator[av.VideoFrame | av.AudioFrame]:
+    """The last frames of a graph of filters, if there is one."""
+    if graph is not None:
+        graph.push(None)
+        yield from pull_frames(graph)
 
 
 def pull_frames(graph: Graph) -> Iterator[av.VideoFrame | av.AudioFrame]:
