@@ -525,6 +525,14 @@ def test_bare_sequences_of_jpegs_are_refused(tmp_path, name):
     assert read_video(tmp_path / "photo.jpg").num_frames == 1
 
 
+def test_frames_of_an_avi_are_shown_in_their_order(tmp_path):
+    """It has no times of its own, and B-frames are decoded before those that they follow."""
+    _ffmpeg("-c:v", "libx264", "-crf", "5", "-bf", "2", tmp_path / "a.avi", frames=_waves(12))
+    clip = read_video(tmp_path / "a.avi")
+    assert (clip.num_frames, clip.num_declared, clip.fps, clip.times) == (12, 12, 10, None)
+    assert np.abs(clip.frames.astype(int) - _waves(12)).mean() < 3
+
+
 @pytest.mark.parametrize("kind", ["matroska", "webm", "mpegts", "flv"])
 def test_streams_from_a_pipe(tmp_path, kind):
     codec = {"matroska": "ffv1", "webm": "libvpx-vp9", "mpegts": "mpeg2video", "flv": "flv"}[kind]

@@ -155,9 +155,10 @@ class VideoDecoder:
         """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones that
         are not to be converted."""
         for frame in self._convert_interlaced(self._decode()):
-            self._last = self._find_position(frame.pts)
+            stamp = self._find_stamp(frame)
+            self._last = self._find_position(stamp)
             self._size = self._size if all(self._size) else (frame.height, frame.width)
-            yield DecodedFrame(self._last, frame.pts or 0, frame, self._size)
+            yield DecodedFrame(self._last, stamp or 0, frame, self._size)
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         for packet in self._read_packets():
@@ -211,6 +212,12 @@ class VideoDecoder:
             graph.push(frame)
             yield from pull_frames(graph)
         yield from flush_frames(graph)
+
+    def _find_stamp(self, frame: av.VideoFrame) -> int | None:
+        """AVI stores no times: FFmpeg numbers its packets, in the order of decoding."""
+        if self._container.format.name != "avi":
+            return frame.pts
+        return frame.dts if frame.dts is not None or self._before is None else self._before + 1
 
     def _find_position(self, stamp: int | None) -> int:
         """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
