@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+import wave
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -71,6 +73,38 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "400" in told
     assert "power 1" in told
+
+
+def test_render_chooses_the_encoding(work, tmp_path, capsys):
+    model = work / "model.safetensors"
+    sizes = []
+    for crf in (0, 40):
+        out = tmp_path / f"{crf}.mp4"
+        assert run("render", model, "--out", out, "--codec", "h265", "--pixel-format", "yuv444p", "--crf", crf) == 0
+        sizes.append(out.stat().st_size)
+        with av.open(str(out)) as container:
+            codec = container.streams.video[0].codec_context
+            assert (codec.name, codec.pix_fmt) == ("hevc", "yuv444p")
+    assert sizes[0] > sizes[1]
+    with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", ""))
+        sound.writeframes(bytes(8000))
+    slow = ("--out", tmp_path / "slow.mp4", "--speed", "0.5", "--sound", tmp_path / "sound.wav")
+    assert run("render", model, *slow) == 0
+    with av.open(str(tmp_path / "slow.mp4")) as container:
+        assert len(container.streams.audio) == 1
+    capsys.readouterr()
+    for options, words in (
+        (("--out", tmp_path / "a.mp4", "--crf", "52"), "--crf: expected a whole number from 0 to 51"),
+        (("--out", tmp_path / "a.gif", "--codec", "h264"), "--codec: expected a video file"),
+        (("--out", tmp_path / "a.mp4", "--pixel-format", "rgb24"), "--pixel-format: expected one of"),
+        (("--out", tmp_path / "a.mp4", "--sound", tmp_path / "0.mp4"), "--sound: expected a file with sound"),
+        (("--out", tmp_path / "a.mp4", "--sound", tmp_path / "no.mp4"), "which is missing"),
+        (("--out", tmp_path / "a.mp4", "--speed", "-1", "--sound", tmp_path / "sound.wav"), "forwards"),
+    ):
+        assert run("render", model, *options) == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "a.mp4").exists()
 
 
 def test_other_rates_speeds_and_times(work, tmp_path, capsys):

@@ -60,6 +60,8 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
         return None
     if timeline.remap is not None or timeline.chosen is not None or (timeline.speed or 1.0) < 0:
         raise wrong_use("--sound", expected="a constant speed forwards", got="other times", cure="Leave --sound out.")
+    if not path.is_file():
+        raise wrong_use("--sound", expected="a file", got=f"{str(path)!r}, which is missing")
     first = (about.get("frames") or (0,))[0] or 0
     return Sound(path, first / fps, timeline.speed or 1.0)
 

@@ -238,7 +238,7 @@ class VideoDecoder:
         return codec
 
 
-def open_container(path: Path) -> av.container.InputContainer:
+def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputContainer:
     """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
     if kind == LIST:
@@ -249,7 +249,7 @@ def open_container(path: Path) -> av.container.InputContainer:
             cure="The files that it names are not opened: give the video itself.",
         )
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
-    options = {"protocol_whitelist": "file", "format_whitelist": DEMUXERS}
+    options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
         return av.open(f"file:{path.resolve()}", options=options, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:

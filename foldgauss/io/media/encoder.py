@@ -17,6 +17,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import PathLike, check_readable, video_error
 from foldgauss.io.media.decoder import CONVERSION, open_container, pull_frames
+from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
 
@@ -156,7 +157,7 @@ def _encode_sound(container: av.container.OutputContainer, sound: Sound | None, 
 
 
 def _read_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
-    with open_container(Path(sound.path)) as source:
+    with open_container(Path(sound.path), SOUND_DEMUXERS) as source:
         of_file = source.streams.best("audio")
         graph = Graph()
         # atempo takes factors from 0.5 to 100.
@@ -191,7 +192,7 @@ def check_sound(sound: Sound) -> None:
         raise invalid(
             "sound.speed", expected="a speed from 0.01 to 100", got=f"{sound.speed:g}", cure="Leave sound out."
         )
-    with open_container(check_readable(sound.path)) as source:
+    with open_container(check_readable(sound.path), SOUND_DEMUXERS) as source:
         if not source.streams.audio:
             got = f"{str(sound.path)!r}, which has none"
             raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")

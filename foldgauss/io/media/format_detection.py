@@ -10,6 +10,7 @@ DEMUXERS = (
     "mov,matroska,avi,flv,live_flv,asf,asf_o,mpeg,mpegts,mpegvideo,m4v,h261,h263,h264,hevc,vvc,evc,obu,av1,ivf,ogg,"
     "yuv4mpegpipe,nut,dv,mxf,mxf_opatom,rm,swf,wtv,nsv,gxf,dirac,vc1,vc1test,mjpeg,flic,smk,bink,avs2,avs3"
 )
+SOUND_DEMUXERS = f"{DEMUXERS},wav,mp3,flac,aac"
 
 _PNG, _GIF = b"\x89PNG\r\n\x1a\n", b"GIF8"
 _IMAGES = (_PNG, _GIF, b"\xff\xd8\xff", b"II*\0", b"MM\0*")

@@ -65,9 +65,11 @@ def write_video(
         raise video_error("frames", expected="an iterable of images", got=type(frames).__name__, cure=cure)
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     suffix = path.suffix.lower()
-    if suffix not in VIDEO_SUFFIXES and any(option is not None for option in (codec, crf, pixel_format, sound)):
+    options = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sound}
+    given = [name for name, value in options.items() if value is not None]
+    if given and suffix not in VIDEO_SUFFIXES:
         got, cure = repr(path.name), f"Take {', '.join(VIDEO_SUFFIXES)}."
-        raise video_error("codec, crf, pixel_format, sound", expected="a video file for them", got=got, cure=cure)
+        raise video_error(given[0], expected="a video file for it", got=got, cure=cure)
     if path.is_dir() or not path.suffix:
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
