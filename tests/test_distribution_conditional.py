@@ -237,6 +237,13 @@ def test_quantiles_and_samples_of_time():
 # --- time integrated out ----------------------------------------------------------------------------------
 
 
+def test_the_cdf_of_space_goes_from_zero_to_one():
+    marginal = _dist(1).marginal([0])
+    found = CDF(marginal, jnp.array([[-jnp.inf], [-30.0], [0.1], [30.0], [jnp.inf]]))
+    np.testing.assert_allclose(np.delete(found, 2), [0, 0, 1, 1], atol=1e-9)
+    assert 0.01 < found[2] < 0.99
+
+
 @pytest.mark.slow
 def test_space_marginal_is_the_law_of_the_samples():
     dist = _dist(2)

@@ -154,10 +154,7 @@ def test_last_finite_of_a_history_without_one_is_minus_infinity():
     assert loop._last_finite([np.nan, np.inf]) == -np.inf
 
 
-@pytest.mark.parametrize(
-    "covariance",
-    ["full", "diag", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("spherical", "tied"))],
-)
+@pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
 def test_newton_gain_matches_profile_derivatives(x64, covariance):
     """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)

@@ -260,6 +260,21 @@ def test_joint_is_marginal_times_conditional(given, x64):
     assert np.abs(wrong - mixture.log_prob(x)).max() > 1e-2
 
 
+def test_batches_have_their_own_moments_and_responsibilities(x64):
+    """Each of a batch as it is alone."""
+    loc = jnp.stack([jnp.asarray(_components().loc), 2 * jnp.asarray(_components().loc)])
+    tril = jnp.broadcast_to(jnp.asarray(TRIL), (2, 3, 2, 2))
+    batch = FoldedMixture(_components(loc=loc, scale_tril=tril), weights=WEIGHTS)
+    x = _points(2)
+    responsibilities = batch.responsibilities(x)
+    assert responsibilities.shape == (2, 3)
+    np.testing.assert_allclose(responsibilities.sum(-1), 1, rtol=1e-12)
+    for k in range(2):
+        alone = FoldedMixture(_components(loc=loc[k]), weights=WEIGHTS)
+        np.testing.assert_allclose(batch.variance[k], jnp.diagonal(alone.covariance_matrix), rtol=1e-9)
+        np.testing.assert_allclose(responsibilities[k], alone.responsibilities(x[k]), rtol=1e-9)
+
+
 def test_conditioning_the_marginal_over_space_leaves_time_out(x64):
     """Its density is a ratio of the marginals' densities; once by steps, once of the mixture itself."""
     mixture, x = _mixture(envelope=TimeLikelihood(1.0, 0.05)), _points(3)

@@ -23,6 +23,21 @@ def test_start_end_and_order(logits):
         assert np.all(np.diff(times) > 0)
 
 
+def test_cuts_of_frames():
+    """The first interval counts, too; half of all intervals are too many to be told from others."""
+    times = FrameTimes(make_time_logits(6, [1, 4]))
+    assert [times.cut_after(k) for k in range(5)] == [True, False, False, True, False]
+    assert make_time_logits(5, [1, 3]).tolist() == [0, 0, 0, 0]
+    assert is_cut(np.asarray(times.times())).dtype == bool
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0])
+def test_remapped_positions_have_the_rate_of_the_output(rate):
+    np.testing.assert_allclose(
+        remapped_positions([[0, 0], [2, 1]], fps=10, rate=rate), np.arange(20 * rate + 1) / rate / 2
+    )
+
+
 @pytest.mark.parametrize("extreme", [100.0, -100.0, 1e30])
 def test_extreme_weights_stay_in_order(extreme):
     times = np.asarray(FrameTimes(jnp.asarray([0.0, extreme, 1.0])).times())

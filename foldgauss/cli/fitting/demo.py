@@ -63,7 +63,7 @@ def demo(
     print_figures("Demo", figures)
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),
-        ("reconstruction.mp4", "the rendered model, for any browser (VP9)"),
+        ("reconstruction.mp4", "the rendered model, for any player (H.264)"),
         ("model.safetensors", "the model: try `foldgauss render` with --upsample 4"),
         (RECORD, "the figures above, and those of each frame"),
     ):
