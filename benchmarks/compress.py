@@ -1,16 +1,13 @@
-"""Bytes, loss and bits per pixel of compact files; beside x264 and AV1 at the same PSNR where ffmpeg is there.
+"""Bytes, loss and bits per pixel of compact files. Beside video codecs: benchmarks/codecs.py.
 
     python -m benchmarks.compress [--json FILE] [--model FILE --clip NAME --size HxW] [--loss DB] [--passes N]
 
 Without options: Bunny and bikes at 160x320, each fitted first with the command's defaults (40,000 Gaussians). *pruned*
 is the float32 file without the Gaussians that no frame shows or whose absence, all together, costs 0.01 dB; *rounded*
-is `passes=0`. Other coders are asked for the mean PSNR of RGB pictures that the compact file has, by bisection over
-their quality, with their slowest sensible presets; their files' bytes count whole.
+is `passes=0`.
 """
 
 import argparse
-import shutil
-import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -24,16 +21,11 @@ from benchmarks._common import console
 from foldgauss.io import Clip, read_video, save_compact, save_video_model
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.models.video_model import load_video_model
-from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit, psnr
+from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit
 from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
 SIZE, CLIPS, PRUNED_DB = (160, 320), ("bunny", "bikes"), 0.01
-#: Arguments of each coder; {q} is its quality, 0 the best.
-CODERS = {
-    "x264": ("libx264", ["-preset", "veryslow", "-crf"], 51),
-    "AV1": ("libsvtav1", ["-preset", "2", "-crf"], 63),
-}
 
 
 def pruned(model: VideoModel, clip: Clip) -> VideoModel:
@@ -54,29 +46,6 @@ def kept(model: VideoModel, indices: np.ndarray) -> VideoModel:
         return np.asarray(leaf)[indices] if np.ndim(leaf) else leaf
 
     return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
-
-
-def by_coder(name: str, clip: Clip, wanted: float, folder: Path) -> tuple[int, float] | None:
-    """Bytes and mean PSNR of the smallest file of a coder that has the PSNR wanted; None where it has no such coder."""
-    library, arguments, worst = CODERS[name]
-    num, height, width, _ = clip.frames.shape
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    best, low, high = None, 0, worst
-    while low <= high:
-        quality, path = (low + high) // 2, folder / f"{name}.mp4"
-        command = ["ffmpeg", "-v", "error", "-y", *raw, "-r", f"{clip.fps:g}", "-i", "-", "-c:v", library]
-        command += [*arguments, str(quality), "-pix_fmt", "yuv420p", str(path)]
-        if subprocess.run(command, input=clip.frames.tobytes(), check=False).returncode:
-            return None
-        back = ["ffmpeg", "-v", "error", "-i", str(path), *raw[:4], "-"]
-        shown = np.frombuffer(subprocess.run(back, capture_output=True, check=True).stdout, np.uint8)
-        shown = shown.reshape(-1, height, width, 3)[:num]
-        reached = float(np.mean([psnr(a, b) for a, b in zip(clip.frames, shown, strict=True)]))
-        if reached >= wanted:
-            best, low = (path.stat().st_size, reached), quality + 1
-        else:
-            high = quality - 1
-    return best
 
 
 def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespace, figures: dict) -> None:
@@ -100,15 +69,6 @@ def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespac
             path = save_compact(folder / f"{what}.fgz", made.quantized)
             lost = before - evaluate(load_video_model(path), clip.frames).mean_psnr
             row(what, path, lost, made.model.num_gaussians, seconds)
-        if shutil.which("ffmpeg") is None:
-            console.print("x264, AV1: not measured, since there is no ffmpeg here", style="dim")
-        else:
-            for coder in CODERS:
-                found = by_coder(coder, clip, before - lost, folder)
-                if found is None:
-                    console.print(f"{coder}: not measured, since this ffmpeg has no {CODERS[coder][0]}", style="dim")
-                else:
-                    rows.append((coder, found[0], before - found[1], 0, 0.0))
     base = rows[1][1]
     title = f"{name}, {model.num_frames} frames of {model.size[0]}x{model.size[1]}, {before:.2f} dB"
     shown = _common.table(title, "file", "bytes", "pruned / it", "loss (dB)", "bits per pixel", "Gaussians", "seconds")
