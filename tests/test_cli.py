@@ -235,6 +235,9 @@ def test_clip_with_alpha(tmp_path, capsys):
     assert figures["mean_psnr_on_white"] > 17
     assert run("render", target, "--out", tmp_path / "white", "--background", "#FFFFFF") == 0
     assert run("render", target, "--out", tmp_path / "black") == 0
+    assert run("render", target, "--out", tmp_path / "clear.mov", "--background", "none") == 0
+    assert read_video(tmp_path / "clear.mov").has_alpha
+    assert run("render", target, "--out", tmp_path / "clear.mp4", "--background", "none") == 2
     white, black = (cv2.imread(str(tmp_path / name / "00000.png")) for name in ("white", "black"))
     assert white[:4].mean() > 225
     assert black[:4].mean() < 30

@@ -85,3 +85,19 @@ def test_resumed_fit_has_the_same_bits():
     again = to_model(state, config, (48, 64), 25.0)
     for one, other in zip(*(jax.tree.leaves(m) for m in (again, fit(frames, config).model)), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_without_a_background_images_have_alpha(fitted):
+    """Over any color they are what is rendered over it."""
+    model = fitted.model
+    for k, image in enumerate(model.frames(background=None)):
+        assert image.shape == (*model.size, 4)
+        assert image[..., 3].min() < 100 < 200 < image[..., 3].max()
+        over = next(model.frames(model.frame_times.times()[k : k + 1], background=GREEN))
+        assert np.abs(composite(image, np.float32(GREEN)).astype(int) - over).max() <= 2
+    whole = np.asarray(model.render(frame=0, background=None))
+    expected = next(model.frames(background=None)) / 255
+    np.testing.assert_allclose(np.clip(whole, 0, 1), expected, atol=0.01)
+    sums = dataclasses.replace(model, compositing="sum")
+    with pytest.raises(ValueError, match="background: expected black"):
+        next(sums.frames(background=None))

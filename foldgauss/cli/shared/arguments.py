@@ -91,10 +91,15 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     return (int(first) if first else None), (int(last) if last else None)
 
 
-def parse_color(text: str) -> tuple[float, float, float]:
+def parse_color(text: str) -> tuple[float, float, float] | None:
+    """None for "none"."""
+    if text == "none":
+        return None
     digits = text.removeprefix("#")
     if not re.fullmatch("[0-9a-fA-F]{6}", digits):
-        raise WrongUse(f"--background: expected six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}.")
+        raise WrongUse(
+            f"--background: expected none, or six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}."
+        )
     return tuple(byte / 255 for byte in bytes.fromhex(digits))
 
 

@@ -19,7 +19,7 @@ from foldgauss.io.media.encoder import CODECS, Sound
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.lazy_frames import LazyFrames
 from foldgauss.io.media.video_writing import MAX_GIF_FPS, write_image, write_video
-from foldgauss.video.models.background import BLACK
+from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.metrics import Evaluation, evaluate
 
 CodecName = Annotated[
@@ -111,7 +111,7 @@ def render_to_file(
     fps: float,
     *,
     size: tuple[int, int] | None = None,
-    background: tuple[float, float, float] = BLACK,
+    background: Background = BLACK,
     image_format: str = "png",
     overwrite: bool = False,
     options: VideoOptions = VideoOptions(),  # noqa: B008

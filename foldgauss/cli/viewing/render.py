@@ -66,7 +66,11 @@ def render(
         str | None, typer.Option(metavar="T,T,..|A:B:N", help="These times of the model, in [0, 1]; or N from A to B.")
     ] = None,
     background: Annotated[
-        str, typer.Option(metavar="RRGGBB", help="Background color of a model of a clip with alpha, as ffffff.")
+        str,
+        typer.Option(
+            metavar="RRGGBB",
+            help="Background color of a model of a clip with alpha, as ffffff; none: images with alpha.",
+        ),
     ] = "000000",
     image_format: Annotated[
         str | None,

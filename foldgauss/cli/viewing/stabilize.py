@@ -56,7 +56,9 @@ def stabilize_command(
     upsample: Upsample = None,
     fps: Fps = None,
     speed: Speed = None,
-    background: Annotated[str, typer.Option(metavar="RRGGBB", help="Background color, as ffffff.")] = "000000",
+    background: Annotated[
+        str, typer.Option(metavar="RRGGBB", help="Background color, as ffffff; none: with alpha.")
+    ] = "000000",
     codec: CodecName = None,
     crf: Crf = None,
     pixel_format: PixelFormat = None,

@@ -133,7 +133,7 @@ def encode_video(
         for number, frame in enumerate(frames):
             image = _pad(frame, steps)
             if image.shape[2] == 4:
-                image = _straighten(image)
+                image = straighten(image)
             if number == 0:
                 stream.height, stream.width = image.shape[:2]
                 if matrix is not None:
@@ -209,7 +209,7 @@ def _pad(frame: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
     return np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge") if rows or columns else frame
 
 
-def _straighten(image: np.ndarray) -> np.ndarray:
+def straighten(image: np.ndarray) -> np.ndarray:
     """Colors divided by alpha, to nearest; 0 where alpha is 0."""
     alpha = image[..., 3:].astype(np.uint16)
     colors = (image[..., :3].astype(np.uint16) * 255 + alpha // 2) // np.maximum(alpha, 1)

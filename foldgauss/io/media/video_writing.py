@@ -13,7 +13,7 @@ from PIL import Image
 from foldgauss._runtime.checks import check_one_of
 from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, check_replaceable, output_error
 from foldgauss.io.media.clip import PathLike, check_fps, format_size, video_error
-from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video
+from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
@@ -101,7 +101,9 @@ def write_video(
 def write_frames(
     folder: PathLike, frames: Iterable[np.ndarray], *, overwrite: bool = False, image_format: str = "png"
 ) -> Path:
-    """Write frames, uint8 RGB of shape (height, width, 3), as 00000.png, 00001.png, ...; returns the folder.
+    """Write frames as 00000.png, 00001.png, ...; returns the folder.
+
+    Frames are uint8 RGB of shape (height, width, 3), or premultiplied RGBA of shape (height, width, 4).
 
     With `image_format="webp"` as 00000.webp and so on: lossless like PNG, and smaller. The folder appears whole or not
     at all. A folder that holds files is refused unless `overwrite`, and in any case if it holds anything but such
@@ -115,20 +117,22 @@ def write_frames(
     check = partial(check_replaceable, folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)")
     check()
     with atomic_folder(folder, check=check) as temporary:
-        for number, frame in enumerate(_check_frames(frames)):
+        for number, frame in enumerate(_check_frames(frames, channels=(3, 4))):
             (temporary / f"{number:05d}.{image_format}").write_bytes(encode(frame))
     return folder
 
 
 def write_image(path: PathLike, image: np.ndarray) -> Path:
-    """Write one uint8 RGB image of shape (height, width, 3) as PNG, whole or not at all; returns the path.
+    """Write one image as PNG, whole or not at all; returns the path.
+
+    It is uint8 RGB of shape (height, width, 3), or premultiplied RGBA of shape (height, width, 4).
 
     Raises `VideoError` for another extension or kind of array, `OutputError` where it cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise video_error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
-    data = _encode_png(_check_frame(image, None, "image"))
+    data = _encode_png(_check_frame(image, None, "image", channels=(3, 4)))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -160,7 +164,14 @@ def _check_frame(
 
 
 def _encode_png(frame: np.ndarray) -> bytes:
-    return cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return cv2.imencode(".png", _to_opencv(frame))[1].tobytes()
+
+
+def _to_opencv(frame: np.ndarray) -> np.ndarray:
+    """BGR, or BGRA with straight alpha."""
+    if frame.shape[2] == 3:
+        return cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    return cv2.cvtColor(straighten(frame), cv2.COLOR_RGBA2BGRA)
 
 
 def _encode_webp(frame: np.ndarray) -> bytes:
@@ -168,7 +179,7 @@ def _encode_webp(frame: np.ndarray) -> bytes:
     if max(frame.shape[:2]) > MAX_WEBP_SIDE:
         got = format_size(frame.shape)
         raise video_error("frames", expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP", got=got, cure="Take PNG.")
-    return cv2.imencode(".webp", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
+    return cv2.imencode(".webp", _to_opencv(frame), quality)[1].tobytes()
 
 
 # ------------------------------------------------------------------------------------------- animations

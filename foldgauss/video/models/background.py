@@ -12,6 +12,8 @@ from jaxtyping import Float, UInt8
 from foldgauss._runtime.checks import invalid
 
 BLACK = (0.0, 0.0, 0.0)
+#: Red, green and blue in [0, 1]; None: transparent, images get alpha.
+Background = tuple[float, float, float] | None
 _STREAM = 3  # random stream of the seed: others are the starts, the order of frames and growth
 
 
@@ -27,12 +29,15 @@ def composite(frame: UInt8[np.ndarray, "height width 4"], background: Float[np.n
     return np.minimum(frame[..., :3] + transmittance * behind + 0.5, 255).astype(np.uint8)
 
 
-def check_background(background: object, compositing: str = "over") -> Float[np.ndarray, "3"]:
-    """The background as float32 (3,). Raises ValueError unless it is a colour in [0, 1], and black for "sum"."""
-    color = np.asarray(background)
+def check_background(background: object, compositing: str = "over") -> Float[np.ndarray, " channels"]:
+    """The background as float32 (3,), or zeros (4,) for None. Raises ValueError unless it is a color in [0, 1] or None,
+    and black for "sum"."""
+    if background is None and compositing != "sum":
+        return np.zeros(4, np.float32)
+    color = np.asarray(BLACK if background is None else background)
     if color.shape != (3,) or color.dtype.kind not in "fiu" or not ((color >= 0) & (color <= 1)).all():
         raise invalid("background", expected="red, green and blue in [0, 1]", got=background)
-    if compositing == "sum" and color.any():
+    if compositing == "sum" and (color.any() or background is None):
         expected = "black for a model fitted with compositing 'sum'"
         raise invalid("background", expected=expected, got=background, cure="Sums have no alpha: all of it would show.")
     return color.astype(np.float32)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime import notebook_hooks
-from foldgauss.video.models.background import BLACK
+from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.video_model import choose_time
 
@@ -22,8 +22,8 @@ class RenderedVideo:
         *,
         frame: int | None = None,
         seconds: float | None = None,
-        background: tuple[float, float, float] = BLACK,
-    ) -> Float[np.ndarray, "height width 3"]:
+        background: Background = BLACK,
+    ) -> Float[np.ndarray, "height width channels"]:
         """The image at one moment, values about [0, 1], over `background`; as `VideoRenderer`, in NumPy.
 
         Exactly one of `time`, `frame` and `seconds` says which, as for `VideoModel.render`, which has the errors, too.
@@ -36,9 +36,10 @@ class RenderedVideo:
         times: np.ndarray | None = None,
         size: tuple[int, int] | None = None,
         *,
-        background: tuple[float, float, float] = BLACK,
-    ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
+        background: Background = BLACK,
+    ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
+        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3);
+        (height, width, 4), with premultiplied colors, where it is None."""
         yield from VideoRenderer(self, size, background=background).frames(times)
 
     def _repr_html_(self) -> str | None:

@@ -16,7 +16,7 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, Splats2D, cpu
 from foldgauss.render.splats import check_size
-from foldgauss.video.models.background import BLACK, check_background
+from foldgauss.video.models.background import BLACK, Background, check_background
 
 ROWS = 64  # of pixels per task
 
@@ -52,9 +52,11 @@ class RenderableVideo(Protocol):
 class VideoRenderer:
     """Renders a video at one size and many times: a model, an edited video, or one in segments.
 
-    **Shapes:** images are uint8 (height, width, 3). **Units:** times are those of the model, in [0, 1].
+    **Shapes:** images are uint8 (height, width, 3), or (height, width, 4) without a background. **Units:** times are
+    those of the model, in [0, 1].
 
-    `background`: red, green and blue in [0, 1] behind all splats; black, as in a fit of frames without alpha.
+    `background`: red, green and blue in [0, 1] behind all splats; black, as in a fit of frames without alpha; None for
+    images with alpha, whose colors are premultiplied.
 
     **Example:** `for image in VideoRenderer(model).frames(): ...`
 
@@ -67,7 +69,7 @@ class VideoRenderer:
         model: RenderableVideo,
         size: tuple[int, int] | None = None,
         *,
-        background: tuple[float, float, float] = BLACK,
+        background: Background = BLACK,
     ):
         self.model = model
         size = model.size if size is None else size
@@ -84,11 +86,13 @@ class VideoRenderer:
         """As `splats`, but of the nearer shot in the gap of a cut, and of the heavier image in a fade."""
         return max(self._prepared.weighted_splats(t), key=lambda part: part[0])[1]
 
-    def frame(self, t: float) -> UInt8[np.ndarray, "height width 3"]:
+    def frame(self, t: float) -> UInt8[np.ndarray, "height width channels"]:
         """The image at time t; in the gap of a cut the nearer shot's."""
         return to_bytes(self.image(t))
 
-    def frames(self, times: Float[np.ndarray, "frames"] | None = None) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    def frames(
+        self, times: Float[np.ndarray, "frames"] | None = None
+    ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
         """The images at `times` (default: the model's frame times), one by one."""
         chosen = np.asarray(self.model.frame_times.times() if times is None else times)
         close = 1e-6  # rounding of summed steps
@@ -98,7 +102,7 @@ class VideoRenderer:
         for t in chosen:
             yield self.frame(t)
 
-    def image(self, t: float) -> Float[np.ndarray, "3 height width"]:
+    def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""
         (first, splats), *others = self._prepared.weighted_splats(t)
         image = self._render(splats)
@@ -108,18 +112,21 @@ class VideoRenderer:
                 image += np.float32(weight) * self._render(splats)
         return image
 
-    def _render(self, splats: Splats2D) -> Float[np.ndarray, "3 height width"]:
-        leaves = splats.mean, splats.factor, splats.opacity, splats.color
+    def _render(self, splats: Splats2D) -> Float[np.ndarray, "channels height width"]:
+        color = splats.color
+        if len(self._background) > color.shape[-1]:
+            color = np.pad(color, ((0, 0), (0, 1)), constant_values=1)  # alpha is the image of ones over zero
+        leaves = splats.mean, splats.factor, splats.opacity, color
         model = self.model
         return cpu.forward(
             *leaves, self._background, self.size, compositing=model.compositing, options=model.options
         ).image
 
 
-def to_bytes(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "height width 3"]:
+def to_bytes(image: Float[np.ndarray, "channels height width"]) -> UInt8[np.ndarray, "height width channels"]:
     """Planar float32 about [0, 1] to interleaved uint8, rounded and clipped; NaN is 0."""
-    _, height, width = image.shape
-    out = np.empty((height, width, 3), np.uint8)
+    channels, height, width = image.shape
+    out = np.empty((height, width, channels), np.uint8)
     run_tasks(lambda top: _to_bytes(image, out, top, min(top + ROWS, height)), range(0, height, ROWS))
     return out
 
@@ -128,6 +135,6 @@ def to_bytes(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "h
 def _to_bytes(image, out, top, bottom):
     for y in range(top, bottom):
         for x in range(image.shape[2]):
-            for c in range(3):
+            for c in range(image.shape[0]):
                 level = image[c, y, x] * _f(255) + _f(0.5)
                 out[y, x, c] = _byte(nb.int32(min(max(level, _f(0)), _f(255))))

@@ -16,7 +16,7 @@ from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
-from foldgauss.video.models.background import BLACK, check_background
+from foldgauss.video.models.background import BLACK, Background, check_background
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
@@ -137,9 +137,11 @@ class VideoModel(eqx.Module):
         frame: int | None = None,
         seconds: float | None = None,
         engine: str = "auto",
-        background: tuple[float, float, float] = BLACK,
-    ) -> Float[Array, "height width 3"]:
+        background: Background = BLACK,
+    ) -> Float[Array, "height width channels"]:
         """The image at one moment, values about [0, 1], over `background`; see `foldgauss.render.render`.
+
+        With `background=None` it is (height, width, 4), with alpha and premultiplied colors.
 
         The moment is one of these; in the gap of a cut the nearer shot is shown:
 
@@ -156,19 +158,22 @@ class VideoModel(eqx.Module):
         t = choose_time(self, time, frame, seconds)
         t = snap_to_shots(jnp.asarray(t, jnp.float32), self.frame_times.times())
         splats = _splats_in_pixels(self, t, tuple(size))
-        behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)
-        return render(
-            splats, size, background=behind, engine=engine, compositing=self.compositing, options=self.options
-        )
+        behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)[:3]
+        how = {"engine": engine, "compositing": self.compositing, "options": self.options}
+        if background is not None:
+            return render(splats, size, background=behind, **how)
+        image, alpha = render(splats, size, return_alpha=True, **how)
+        return jnp.concatenate([image, alpha[..., None]], axis=-1)
 
     def frames(
         self,
         times: np.ndarray | None = None,
         size: tuple[int, int] | None = None,
         *,
-        background: tuple[float, float, float] = BLACK,
+        background: Background = BLACK,
     ) -> Iterator[np.ndarray]:
-        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3)."""
+        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3);
+        (height, width, 4), with premultiplied colors, where it is None."""
         yield from VideoRenderer(self, size, background=background).frames(times)
 
     def _repr_html_(self) -> str | None:
