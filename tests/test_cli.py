@@ -75,6 +75,21 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     assert "power 1" in told
 
 
+def test_render_of_one_frame(work, tmp_path, capsys, monkeypatch):
+    model = work / "model.safetensors"
+    images = list(load_video_model(model).frames())
+    for k in (0, 3, -1):
+        assert run("render", model, "--frame", k, "--out", tmp_path / f"{k}.png") == 0
+        np.testing.assert_array_equal(read_video(tmp_path / f"{k}.png").frames[0], images[k])
+    monkeypatch.chdir(tmp_path)
+    assert run("render", model, "--frame", 2) == 0
+    assert (tmp_path / "model.png").exists()
+    capsys.readouterr()
+    assert run("render", model, "--frame", 6, "--out", tmp_path / "a.png") == 2
+    assert "--frame: expected a frame from -6 to 5, got 6" in capsys.readouterr().err
+    assert run("render", model, "--frame", 1, "--times", "0.5", "--out", tmp_path / "a.png") == 2
+
+
 def test_render_chooses_the_encoding(work, tmp_path, capsys):
     model = work / "model.safetensors"
     sizes = []

@@ -58,7 +58,7 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
     """The sound of the fitted frames in the file `path`. `about`: the model's metadata; `fps`: of the clip."""
     if path is None:
         return None
-    if timeline.remap is not None or timeline.chosen is not None or (timeline.speed or 1.0) < 0:
+    if timeline.remap is not None or timeline.chosen is not None or timeline.is_single or (timeline.speed or 1.0) < 0:
         raise wrong_use("--sound", expected="a constant speed forwards", got="other times", cure="Leave --sound out.")
     if not path.is_file():
         raise wrong_use("--sound", expected="a file", got=f"{str(path)!r}, which is missing")

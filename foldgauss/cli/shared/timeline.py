@@ -23,16 +23,23 @@ Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow 
 
 @dataclasses.dataclass(frozen=True)
 class Timeline:
-    """Chooses the rendered times and the frame rate; `upsample`, `speed`, `remap` and `chosen` exclude each other."""
+    """Chooses the rendered times and the frame rate; all but `fps` exclude each other."""
 
     upsample: int | None = None
     fps: float | None = None
     speed: float | None = None
     remap: list[tuple[float, float]] | None = None
     chosen: np.ndarray | None = None
+    frame: int | None = None
 
     def __post_init__(self) -> None:
-        ways = {"upsample": self.upsample, "speed": self.speed, "remap": self.remap, "times": self.chosen}
+        ways = {
+            "upsample": self.upsample,
+            "speed": self.speed,
+            "remap": self.remap,
+            "times": self.chosen,
+            "frame": self.frame,
+        }
         given = [f"--{name}" for name, value in ways.items() if value is not None]
         if len(given) > 1:
             raise wrong_use(given[0], expected="one way to choose times", got=" and ".join(given))
@@ -45,6 +52,11 @@ class Timeline:
             expected = f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0"
             raise wrong_use("--speed", expected=expected, got=self.speed)
 
+    @property
+    def is_single(self) -> bool:
+        """Whether one image is asked for."""
+        return self.frame is not None or (self.chosen is not None and len(self.chosen) == 1)
+
     def rate(self, fps: float) -> float:
         """Frames per second of the output, given those of the clip."""
         return fps * (self.upsample or 1) if self.fps is None else self.fps
@@ -53,6 +65,11 @@ class Timeline:
         """The model times to render, in order."""
         if self.chosen is not None:
             return self.chosen
+        if self.frame is not None:
+            num = len(frame_times)
+            if not -num <= self.frame < num:
+                raise wrong_use("--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
+            return frame_times[[self.frame]]
         if self.upsample is not None:
             self._refuse_long("--upsample", (len(frame_times) - 1) * self.upsample)
             return interpolated_times(frame_times, self.upsample)

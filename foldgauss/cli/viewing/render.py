@@ -65,6 +65,9 @@ def render(
     times: Annotated[
         str | None, typer.Option(metavar="T,T,..|A:B:N", help="These times of the model, in [0, 1]; or N from A to B.")
     ] = None,
+    frame: Annotated[
+        int | None, typer.Option(metavar="K", help="Frame K alone, at its learned time; -1 is the last.")
+    ] = None,
     background: Annotated[
         str,
         typer.Option(
@@ -90,7 +93,7 @@ def render(
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a video, also between its frames."""
-    timeline = Timeline(upsample, fps, speed, parse_remap(remap), parse_times(times))
+    timeline = Timeline(upsample, fps, speed, parse_remap(remap), parse_times(times), frame)
     image_size, background_color = parse_size(size), parse_color(background)
     if out_path is None:
         out_path = _name_output(model_path, timeline, image_format)
@@ -127,7 +130,7 @@ def _name_output(model_path: Path, timeline: Timeline, image_format: str | None)
     """The default name of the video, image or folder; never that of the clip, which may be in this folder."""
     if image_format is not None:
         return name_after(model_path, "-frames")
-    suffix = IMAGE_SUFFIX if timeline.chosen is not None and len(timeline.chosen) == 1 else VIDEO_SUFFIXES[0]
+    suffix = IMAGE_SUFFIX if timeline.is_single else VIDEO_SUFFIXES[0]
     path = name_after(model_path, suffix)
     clip = read_origin(model_path).get("clip", path.name)  # if unknown, it may have that name
     return name_after(model_path, f".rendered{suffix}") if path.name == clip else path
