@@ -14,7 +14,9 @@ from foldgauss.video.fitting.adam import (
     adam_step,
     masked_adam,
     sparse_adam,
+    update_frame_times,
 )
+from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import columns
 
 
@@ -110,3 +112,16 @@ def test_all_implementations_take_the_same_steps():
         for part, judge in zip(one, own, strict=True):
             np.testing.assert_allclose(part, judge, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(by_optax, own[0], atol=2e-5)  # its bias corrections are float32
+
+
+def test_the_gap_of_a_cut_moves_as_far_in_time_as_other_intervals():
+    """Its weight alone is hundreds of frames long."""
+    logits = make_time_logits(40, [20])
+    before = np.diff(FrameTimes(logits).times())
+    for by_time in np.eye(40, dtype=np.float32)[[5, 30]]:
+        updated, _ = update_frame_times(logits, FRAME_TIME_ADAM.init(logits), by_time, 1e-3)
+        steps = np.abs(np.asarray(updated) - logits) * before
+        assert steps[19] == pytest.approx(np.median(steps), rel=0.05)  # Adam's epsilon counts where gradients are small
+    even = np.zeros(39, np.float32)
+    updated, _ = update_frame_times(even, FRAME_TIME_ADAM.init(even), by_time, 1e-3)
+    np.testing.assert_allclose(np.abs(np.asarray(updated)), 1e-3, rtol=1e-3)  # without cuts, Adam's own

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.frame_times import CUT_RATIO, FrameTimes
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 
@@ -202,8 +202,15 @@ def _rate_factors(rows, kinds, degree: int, units: RateUnits) -> Float[Array, "n
 
 @jax.jit
 def update_frame_times(logits, moments, by_time, rate):
-    """The softmax weights of the frame times and their moments after a step, given dL/dt_k."""
+    """The softmax weights of the frame times and their moments after a step, given dL/dt_k.
+
+    The interval of a cut is some hundred frames long: its weight moves by as much less, as otherwise a step that moves
+    other frames by a thousandth of a frame would move all frames after the cut by a tenth.
+    """
+    intervals = jax.nn.softmax(logits)
+    median = jnp.median(intervals)
+    slower = jnp.where(intervals > CUT_RATIO * median, median / intervals, 1)
     _, pull = jax.vjp(lambda weights: FrameTimes(weights).times(), logits)
     with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
         update, moments = FRAME_TIME_ADAM.update(pull(by_time)[0], moments)
-    return logits - rate * update, moments
+    return logits - rate * slower * update, moments
