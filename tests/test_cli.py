@@ -95,7 +95,8 @@ def test_render_chooses_the_encoding(work, tmp_path, capsys):
     sizes = []
     for crf in (0, 40):
         out = tmp_path / f"{crf}.mp4"
-        assert run("render", model, "--out", out, "--codec", "h265", "--pixel-format", "yuv444p", "--crf", crf) == 0
+        encoding = ("--codec", "h265", "--pixel-format", "yuv444p", "--crf", crf, "--size", "96x128")
+        assert run("render", model, "--out", out, *encoding) == 0
         sizes.append(out.stat().st_size)
         with av.open(str(out)) as container:
             codec = container.streams.video[0].codec_context

@@ -262,11 +262,12 @@ def test_alpha_is_written_and_read_back(tmp_path, name, error):
     ],
 )
 def test_codecs_and_pixel_formats(tmp_path, name, options, quality):
-    clip = read_video(write_video(tmp_path / name, _moving(5), 29.97, **options))
+    frames = _moving(5, 64, 96)
+    clip = read_video(write_video(tmp_path / name, frames, 29.97, **options))
     assert (clip.num_frames, clip.times, clip.notes) == (5, None, ())
     assert clip.fps == pytest.approx(29.97, rel=1e-3)
     with np.errstate(divide="ignore"):
-        assert _psnr(clip.frames, _moving(5)) >= quality
+        assert _psnr(clip.frames, frames) >= quality
 
 
 @pytest.mark.parametrize("image_format", ["png", "webp"])
@@ -362,6 +363,8 @@ def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):
         ("a.mp4", {"crf": 16.5}, ("crf", "whole number", "16.5")),
         ("a.mkv", {"crf": 16}, ("crf", "none for ffv1")),
         ("a.mp4", {"pixel_format": "rgb24"}, ("pixel_format", "yuv420p", "rgb24")),
+        ("a.mp4", {"codec": "h265"}, ("frames", "at least 64x64 for h265", "48x64", "h264")),
+        ("a.mp4", {"codec": "av1"}, ("frames", "at least 64x64 for av1", "48x64", "h264")),
         ("a.gif", {"crf": 3}, ("crf: expected a video file", "a.gif")),
         ("a", {"codec": "h264"}, ("codec: expected a video file", "'a'")),
     ],

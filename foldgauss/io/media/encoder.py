@@ -24,7 +24,8 @@ os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
 
 class Codec(NamedTuple):
     """`crf`: its default constant rate factor and the largest one; None for codecs without. `pixel_formats`: those
-    offered, the default first. `alpha_format`: the default of frames with alpha."""
+    offered, the default first. `alpha_format`: the default of frames with alpha. `min_side`: the least height and
+    width; with less x265 ends the process, and SVT-AV1 waits forever."""
 
     encoder: str
     suffixes: tuple[str, ...]
@@ -32,6 +33,7 @@ class Codec(NamedTuple):
     alpha_format: str | None = None
     crf: tuple[int, int] | None = None
     options: Mapping[str, str] = MappingProxyType({})
+    min_side: int = 1
 
 
 CODECS = {
@@ -42,9 +44,15 @@ CODECS = {
         ("yuv420p", "yuv444p", "yuv420p10le"),
         crf=(18, 51),
         options={"x265-params": "log-level=none"},
+        min_side=64,
     ),
     "av1": Codec(
-        "libsvtav1", (".mp4", ".webm", ".mkv"), ("yuv420p", "yuv420p10le"), crf=(20, 63), options={"preset": "6"}
+        "libsvtav1",
+        (".mp4", ".webm", ".mkv"),
+        ("yuv420p", "yuv420p10le"),
+        crf=(20, 63),
+        options={"preset": "6"},
+        min_side=64,
     ),
     "vp9": Codec(
         "libvpx-vp9",
@@ -84,9 +92,13 @@ class Encoding(NamedTuple):
 
 
 def choose_encoding(
-    suffix: str, codec: str | None, crf: int | None, pixel_format: str | None, *, has_alpha: bool = False
+    suffix: str, codec: str | None, crf: int | None, pixel_format: str | None, shape: tuple[int, int, int]
 ) -> Encoding:
-    """The encoding of a video file with this extension. Raises ValueError for options that do not fit together."""
+    """The encoding of a video file with this extension, for frames of (height, width, channels) `shape`.
+
+    Raises ValueError for options that do not fit together, `VideoError` for frames that the codec does not take.
+    """
+    has_alpha = shape[2] == 4
     name = codec or DEFAULT_CODECS[suffix]
     check_one_of("codec", name, CODECS)
     chosen = CODECS[name]
@@ -94,6 +106,9 @@ def choose_encoding(
         fitting = [other for other, one in CODECS.items() if suffix in one.suffixes]
         cure = f"For {suffix} take {', '.join(fitting)}."
         raise invalid("codec", expected=f"{name} in one of {', '.join(chosen.suffixes)}", got=f"{suffix}", cure=cure)
+    if min(shape[:2]) < chosen.min_side:
+        expected, got = f"at least {chosen.min_side}x{chosen.min_side} for {name}", f"{shape[0]}x{shape[1]}"
+        raise video_error("frames", expected=expected, got=f"{got} (height x width)", cure="Take h264, vp9 or ffv1.")
     if crf is not None:
         if chosen.crf is None:
             raise invalid("crf", expected=f"none for {name}, which has no such factor", got=f"{crf}")

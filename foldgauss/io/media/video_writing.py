@@ -83,7 +83,7 @@ def write_video(
         )
     frames = _check_frames(frames, channels=(3, 4))
     first = next(frames)
-    encoding = choose_encoding(suffix, codec, crf, pixel_format, has_alpha=first.shape[2] == 4)
+    encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
         check_sound(sound)
     with atomic_path(path, suffix=suffix) as temporary:
